@@ -1,0 +1,64 @@
+# Everything runs in .venv, which is made on the first call: `make demo`, `make test`. `make help` lists the rest.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+EXTRAS ?= dev,rl,viz
+PYTEST_ARGS ?=
+
+# A stamp is as new as the last install that succeeded, so an install is repeated only when what it reads has changed.
+CORE_STAMP := $(VENV)/.core-installed
+DEV_STAMP := $(VENV)/.dev-installed
+INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt
+
+export PIP_ROOT_USER_ACTION ?= ignore
+export PIP_DISABLE_PIP_VERSION_CHECK ?= 1
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help demo test lint docs bench format clean
+
+help: ## List the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+
+demo: $(CORE_STAMP) ## Plan 16 robots across a circle, execute the plan, write pictures to demo/
+	$(BIN)/d4orm demo --out demo
+
+test: $(DEV_STAMP) ## Run the whole test suite; PYTEST_ARGS='-m "not slow"' for the quick part
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+lint: $(DEV_STAMP) ## Check style, formatting, types and the layers
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+docs: $(DEV_STAMP) ## Build the documentation into docs/_build/html
+	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html
+
+bench: $(CORE_STAMP) ## Measure the engines on this machine, write bench/
+	$(BIN)/d4orm bench --out bench
+
+format: $(DEV_STAMP) ## Format the code and mend what ruff can
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean: ## Remove what the targets above made, .venv included
+	rm -rf $(VENV) demo bench docs/_build docs/reference build dist \
+	  .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+
+# Debian's Python may come without ensurepip; its own pip then puts one into the environment.
+$(VENV)/.created:
+	$(PYTHON) -m venv $(VENV) || { \
+	  $(PYTHON) -m venv --without-pip $(VENV) && \
+	  $(PYTHON) -m pip --python $(BIN)/python install --quiet pip; }
+	touch $@
+
+$(CORE_STAMP): pyproject.toml constraints.txt | $(VENV)/.created
+	@echo "Installing d4orm-env into $(VENV) ..."
+	$(INSTALL) --editable .
+	touch $@
+
+$(DEV_STAMP): pyproject.toml constraints.txt | $(VENV)/.created
+	@echo "Installing d4orm-env with [$(EXTRAS)] into $(VENV); the first time this takes some minutes ..."
+	$(INSTALL) --editable '.[$(EXTRAS)]'
+	touch $(CORE_STAMP) $@

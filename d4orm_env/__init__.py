@@ -1,0 +1,45 @@
+"""Multi-robot navigation with real dynamics: problems, environments, physics engines and an independent judge."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
+from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.core.world import World
+from d4orm_env.joint_env import register_environments
+from d4orm_env.rollout import rollout
+from d4orm_env.scenarios import list_scenarios, load_problem, make_problem, save_problem
+from d4orm_env.verify import VerificationReport, verify
+
+if TYPE_CHECKING:
+    from d4orm_env import functional, navigation_v0
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Problem",
+    "Team",
+    "Trajectory",
+    "VerificationReport",
+    "World",
+    "functional",
+    "list_scenarios",
+    "load_problem",
+    "make_problem",
+    "navigation_v0",
+    "rollout",
+    "save_problem",
+    "verify",
+]
+
+register_environments()
+
+
+def __getattr__(name: str) -> Any:
+    """Load the submodules that bring PettingZoo or JAX with them on first use only."""
+    if name in ("functional", "navigation_v0"):
+        return import_module(f"d4orm_env.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

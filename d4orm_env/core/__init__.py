@@ -1,0 +1,1 @@
+"""The physics, written once: dynamics, docking, collision, reward, observation and metrics."""

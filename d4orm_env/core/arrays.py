@@ -1,0 +1,81 @@
+"""Checked conversion of user input to read-only float32 arrays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float32]
+BoolArray = NDArray[np.bool_]
+
+
+def frozen_array(value: Any, name: str, shape: tuple[int | None, ...]) -> FloatArray:
+    """``value`` as a read-only, finite float32 array.
+
+    Args:
+        value: Anything NumPy can read as numbers.
+        name: What to call it in an error.
+        shape: Expected shape; ``None`` matches any length.
+
+    Raises:
+        ValueError: If it cannot be read, has another shape, or holds a value that is not finite.
+    """
+    try:
+        array = np.array(value, dtype=np.float32)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be an array of numbers, not {value!r}") from error
+    if array.size == 0 and 0 in shape or array.size == 0 and None in shape:
+        array = array.reshape([size or 0 for size in shape])
+    if array.ndim != len(shape) or any(want is not None and want != have for want, have in zip(shape, array.shape)):
+        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        raise ValueError(f"{name} has shape {array.shape}; expected ({wanted})")
+    if not np.isfinite(array).all():
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise ValueError(f"{name}{list(where)} is {array[where]}; every value must be finite")
+    array.setflags(write=False)
+    return array
+
+
+def frozen_per_robot(value: Any, name: str, num_robots: int) -> FloatArray:
+    """``value`` as ``(num_robots,)`` positive numbers; a single number is given to every robot.
+
+    Raises:
+        ValueError: As :func:`frozen_array`, or if a value is not positive; the message names the robot.
+    """
+    if np.ndim(value) == 0:
+        value = [value] * num_robots
+    array = frozen_array(value, name, (num_robots,))
+    if (array <= 0).any():
+        robot = int(np.argmax(array <= 0))
+        raise ValueError(f"{name} of robot_{robot} is {array[robot]:g}; it must be positive")
+    return array
+
+
+def positive_number(value: Any, name: str, *, zero_allowed: bool = False) -> float:
+    """``value`` as a finite positive float.
+
+    Raises:
+        ValueError: If it is not a number, not finite, negative, or zero where zero is not allowed.
+    """
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be a number, not {value!r}") from error
+    if not np.isfinite(number) or number < 0 or (number == 0 and not zero_allowed):
+        raise ValueError(f"{name} is {number:g}; it must be {'zero or more' if zero_allowed else 'positive'} and finite")
+    return number
+
+
+def whole_number(value: Any, name: str, minimum: int) -> int:
+    """``value`` as an int of at least ``minimum``.
+
+    Raises:
+        ValueError: If it is not a whole number or is too small.
+    """
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
+        raise ValueError(f"{name} must be a whole number, not {value!r}")
+    if value < minimum:
+        raise ValueError(f"{name} is {value}; it must be at least {minimum}")
+    return int(value)

@@ -1,0 +1,299 @@
+"""Robot models, each written once in scalar style.
+
+A model is a handful of pure functions on tuples of numbers. They contain no loops, no array library and no float
+literals, so that the CPU engine compiles them with numba, the JAX engine traces them over arrays whose last axis is the
+sample, and CasADi can differentiate them, all from the same source and in the caller's precision. Mathematical
+functions come in through :class:`Ops`.
+
+Sources: paper, section IV-B (the double integrators and the differential drive) and section VIII-D (the first-order
+holonomic ground robots).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+SPEED, ACCELERATION, TURN_RATE = range(3)
+"""Columns of a robot's limits: speed [m/s], acceleration [m/s^2], turn rate [rad/s]."""
+
+
+class Ops(NamedTuple):
+    """The mathematical functions a model may call, from whichever library compiles it."""
+
+    cos: Callable[..., Any]
+    sin: Callable[..., Any]
+    sqrt: Callable[..., Any]
+    minimum: Callable[..., Any]
+    maximum: Callable[..., Any]
+
+
+class ModelFunctions(NamedTuple):
+    """What a model computes. ``x`` is the state tuple, ``u`` the control tuple, ``limits`` the robot's three limits."""
+
+    derivative: Callable[..., Any]
+    """``(x, u, ops) -> dx/dt``."""
+    limit_control: Callable[..., Any]
+    """``(u, limits, ops) -> u`` inside the robot's limits."""
+    limit_state: Callable[..., Any]
+    """``(x, limits, ops) -> x`` at no more than the speed limit."""
+    velocity: Callable[..., Any]
+    """``(x, u, ops) -> `` velocity vector in the world frame [m/s]."""
+    rest: Callable[..., Any]
+    """``(x, zero) -> x`` standing still at the same place and heading."""
+    add_scaled: Callable[..., Any]
+    """``(x, s, k) -> x + s * k`` for tuples of this model's state size."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A robot model: its sizes, the meaning of its components and its functions.
+
+    Attributes:
+        name: Registry name.
+        dimension: Position dimensions ``d``, 2 or 3; the first ``d`` state components are the position [m].
+        state_names: One name per state component; ``len`` is the model's state size.
+        control_names: One name per control component; ``len`` is the model's control size.
+        control_limits: Column of the robot's limits that bounds each control component.
+        heading_index: State component holding the heading [rad], or ``None`` for a model without one.
+        speed_indices: State components holding velocity or speed [m/s].
+        functions: The scalar-style functions.
+    """
+
+    name: str
+    dimension: int
+    state_names: tuple[str, ...]
+    control_names: tuple[str, ...]
+    control_limits: tuple[int, ...]
+    heading_index: int | None
+    speed_indices: tuple[int, ...]
+    functions: ModelFunctions
+
+    @property
+    def state_size(self) -> int:
+        return len(self.state_names)
+
+    @property
+    def control_size(self) -> int:
+        return len(self.control_names)
+
+
+def add_scaled_2(x: Any, s: Any, k: Any) -> Any:
+    return (x[0] + s * k[0], x[1] + s * k[1])
+
+
+def add_scaled_4(x: Any, s: Any, k: Any) -> Any:
+    return (x[0] + s * k[0], x[1] + s * k[1], x[2] + s * k[2], x[3] + s * k[3])
+
+
+def add_scaled_6(x: Any, s: Any, k: Any) -> Any:
+    return (
+        x[0] + s * k[0],
+        x[1] + s * k[1],
+        x[2] + s * k[2],
+        x[3] + s * k[3],
+        x[4] + s * k[4],
+        x[5] + s * k[5],
+    )
+
+
+def norm_scale_2(a: Any, b: Any, limit: Any, ops: Ops) -> Any:
+    """Factor that brings the vector ``(a, b)`` to at most ``limit``; the maximum keeps the gradient finite at zero."""
+    return limit / ops.sqrt(ops.maximum(a * a + b * b, limit * limit))
+
+
+def norm_scale_3(a: Any, b: Any, c: Any, limit: Any, ops: Ops) -> Any:
+    """As :func:`norm_scale_2`, for a vector of three."""
+    return limit / ops.sqrt(ops.maximum(a * a + b * b + c * c, limit * limit))
+
+
+def clip(value: Any, limit: Any, ops: Ops) -> Any:
+    return ops.maximum(-limit, ops.minimum(limit, value))
+
+
+# Double integrator in the plane: x = [px, py, vx, vy], u = [ax, ay].
+
+
+def holonomic2d_derivative(x: Any, u: Any, ops: Ops) -> Any:
+    return (x[2], x[3], u[0], u[1])
+
+
+def holonomic2d_limit_control(u: Any, limits: Any, ops: Ops) -> Any:
+    scale = norm_scale_2(u[0], u[1], limits[ACCELERATION], ops)
+    return (u[0] * scale, u[1] * scale)
+
+
+def holonomic2d_limit_state(x: Any, limits: Any, ops: Ops) -> Any:
+    scale = norm_scale_2(x[2], x[3], limits[SPEED], ops)
+    return (x[0], x[1], x[2] * scale, x[3] * scale)
+
+
+def holonomic2d_velocity(x: Any, u: Any, ops: Ops) -> Any:
+    return (x[2], x[3])
+
+
+def holonomic2d_rest(x: Any, zero: Any) -> Any:
+    return (x[0], x[1], zero, zero)
+
+
+# Double integrator in space: x = [px, py, pz, vx, vy, vz], u = [ax, ay, az].
+
+
+def holonomic3d_derivative(x: Any, u: Any, ops: Ops) -> Any:
+    return (x[3], x[4], x[5], u[0], u[1], u[2])
+
+
+def holonomic3d_limit_control(u: Any, limits: Any, ops: Ops) -> Any:
+    scale = norm_scale_3(u[0], u[1], u[2], limits[ACCELERATION], ops)
+    return (u[0] * scale, u[1] * scale, u[2] * scale)
+
+
+def holonomic3d_limit_state(x: Any, limits: Any, ops: Ops) -> Any:
+    scale = norm_scale_3(x[3], x[4], x[5], limits[SPEED], ops)
+    return (x[0], x[1], x[2], x[3] * scale, x[4] * scale, x[5] * scale)
+
+
+def holonomic3d_velocity(x: Any, u: Any, ops: Ops) -> Any:
+    return (x[3], x[4], x[5])
+
+
+def holonomic3d_rest(x: Any, zero: Any) -> Any:
+    return (x[0], x[1], x[2], zero, zero, zero)
+
+
+# First-order holonomic: x = [px, py], u = [vx, vy].
+
+
+def velocity2d_derivative(x: Any, u: Any, ops: Ops) -> Any:
+    return (u[0], u[1])
+
+
+def velocity2d_limit_control(u: Any, limits: Any, ops: Ops) -> Any:
+    scale = norm_scale_2(u[0], u[1], limits[SPEED], ops)
+    return (u[0] * scale, u[1] * scale)
+
+
+def velocity2d_limit_state(x: Any, limits: Any, ops: Ops) -> Any:
+    return x
+
+
+def velocity2d_velocity(x: Any, u: Any, ops: Ops) -> Any:
+    return (u[0], u[1])
+
+
+def velocity2d_rest(x: Any, zero: Any) -> Any:
+    return x
+
+
+# Differential drive: x = [px, py, heading, speed], u = [turn rate, acceleration].
+
+
+def differential_drive_derivative(x: Any, u: Any, ops: Ops) -> Any:
+    return (x[3] * ops.cos(x[2]), x[3] * ops.sin(x[2]), u[0], u[1])
+
+
+def differential_drive_limit_control(u: Any, limits: Any, ops: Ops) -> Any:
+    return (clip(u[0], limits[TURN_RATE], ops), clip(u[1], limits[ACCELERATION], ops))
+
+
+def differential_drive_limit_state(x: Any, limits: Any, ops: Ops) -> Any:
+    return (x[0], x[1], x[2], clip(x[3], limits[SPEED], ops))
+
+
+def differential_drive_velocity(x: Any, u: Any, ops: Ops) -> Any:
+    return (x[3] * ops.cos(x[2]), x[3] * ops.sin(x[2]))
+
+
+def differential_drive_rest(x: Any, zero: Any) -> Any:
+    return (x[0], x[1], x[2], zero)
+
+
+MODELS: dict[str, Model] = {
+    model.name: model
+    for model in (
+        Model(
+            name="holonomic2d",
+            dimension=2,
+            state_names=("px", "py", "vx", "vy"),
+            control_names=("ax", "ay"),
+            control_limits=(ACCELERATION, ACCELERATION),
+            heading_index=None,
+            speed_indices=(2, 3),
+            functions=ModelFunctions(
+                holonomic2d_derivative,
+                holonomic2d_limit_control,
+                holonomic2d_limit_state,
+                holonomic2d_velocity,
+                holonomic2d_rest,
+                add_scaled_4,
+            ),
+        ),
+        Model(
+            name="holonomic3d",
+            dimension=3,
+            state_names=("px", "py", "pz", "vx", "vy", "vz"),
+            control_names=("ax", "ay", "az"),
+            control_limits=(ACCELERATION, ACCELERATION, ACCELERATION),
+            heading_index=None,
+            speed_indices=(3, 4, 5),
+            functions=ModelFunctions(
+                holonomic3d_derivative,
+                holonomic3d_limit_control,
+                holonomic3d_limit_state,
+                holonomic3d_velocity,
+                holonomic3d_rest,
+                add_scaled_6,
+            ),
+        ),
+        Model(
+            name="velocity2d",
+            dimension=2,
+            state_names=("px", "py"),
+            control_names=("vx", "vy"),
+            control_limits=(SPEED, SPEED),
+            heading_index=None,
+            speed_indices=(),
+            functions=ModelFunctions(
+                velocity2d_derivative,
+                velocity2d_limit_control,
+                velocity2d_limit_state,
+                velocity2d_velocity,
+                velocity2d_rest,
+                add_scaled_2,
+            ),
+        ),
+        Model(
+            name="differential_drive",
+            dimension=2,
+            state_names=("px", "py", "heading", "speed"),
+            control_names=("turn_rate", "acceleration"),
+            control_limits=(TURN_RATE, ACCELERATION),
+            heading_index=2,
+            speed_indices=(3,),
+            functions=ModelFunctions(
+                differential_drive_derivative,
+                differential_drive_limit_control,
+                differential_drive_limit_state,
+                differential_drive_velocity,
+                differential_drive_rest,
+                add_scaled_4,
+            ),
+        ),
+    )
+}
+"""All robot models by name, in the order of their codes."""
+
+MODEL_CODES: dict[str, int] = {name: code for code, name in enumerate(MODELS)}
+
+
+def get_model(name: str) -> Model:
+    """Look a model up by name.
+
+    Raises:
+        ValueError: If there is no such model; the message lists those there are.
+    """
+    try:
+        return MODELS[name]
+    except KeyError:
+        raise ValueError(f"model {name!r} is unknown; choose one of {', '.join(MODELS)}") from None

@@ -1,0 +1,60 @@
+"""Numbers that judge a trajectory."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.trajectory import Trajectory
+
+
+def arrival_times(arrived: Any, dt: float) -> np.ndarray:
+    """``(K,)`` time at which each robot docked [s]; infinite for one that never did.
+
+    Args:
+        arrived: ``(H+1, K)`` bool.
+        dt: Time step [s].
+    """
+    arrived = np.asarray(arrived)
+    return np.where(arrived.any(axis=0), arrived.argmax(axis=0) * dt, np.inf)
+
+
+def mean_squared_jerk(controls: Any, arrived: Any, dt: float) -> float:
+    """Mean squared norm of the jerk [m^2/s^6] over robots and over steps before arrival (paper, section VIII-C).
+
+    The jerk is the finite difference of the executed accelerations; for models driven otherwise, of their controls.
+
+    Args:
+        controls: ``(H, K, m)`` executed controls.
+        arrived: ``(H+1, K)`` bool.
+        dt: Time step [s].
+    """
+    jerk = np.diff(np.asarray(controls, np.float64), axis=0) / dt
+    moving = ~np.asarray(arrived)[1:-1]
+    return float((jerk**2).sum(axis=-1)[moving].mean()) if moving.any() else 0.0
+
+
+def trajectory_metrics(problem: Problem, trajectory: Trajectory) -> dict[str, float]:
+    """Success, travel time, makespan, reward, jerk and counts of what went wrong.
+
+    Returns:
+        ``success``: 1.0 when every robot arrived and none was in contact. ``travel_time``: mean arrival time [s], the
+        full duration for a robot that never arrived. ``makespan``: latest arrival [s], counted likewise. ``reward``:
+        mean over steps and robots (paper, Eq. for r(tau)). ``mean_squared_jerk``. ``arrived``, ``collided``,
+        ``margin_violated``: number of robots.
+    """
+    times = np.minimum(arrival_times(trajectory.arrived, problem.dt), len(trajectory.controls) * problem.dt)
+    arrived = trajectory.arrived[-1]
+    collided = trajectory.collided.any(axis=0)
+    return {
+        "success": float(arrived.all() and not collided.any()),
+        "travel_time": float(times.mean()),
+        "makespan": float(times.max()),
+        "reward": float(trajectory.rewards.mean()),
+        "mean_squared_jerk": mean_squared_jerk(trajectory.controls, trajectory.arrived, problem.dt),
+        "arrived": float(arrived.sum()),
+        "collided": float(collided.sum()),
+        "margin_violated": float(trajectory.margin_violated.any(axis=0).sum()),
+    }

@@ -1,0 +1,231 @@
+"""A planning problem: a team, its starts and goals, and the world it moves in."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.core.arrays import FloatArray, frozen_array, positive_number, whole_number
+from d4orm_env.core.dynamics import MODEL_CODES
+from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
+
+
+class ProblemArrays(NamedTuple):
+    """A problem as the engines read it: plain arrays, float32 unless said, one struct for numba and JAX alike.
+
+    Attributes:
+        model_codes: ``(K,)`` int32.
+        limits: ``(K, 3)`` speed, acceleration and turn rate limits.
+        radius: ``(K,)``.
+        start: ``(K, n)``.
+        goal: ``(K, d)``.
+        inverse_initial_distance: ``(K,)`` one over the distance from start to goal (at least the goal radius).
+        balls: ``(., d + 1)`` circles in the plane, spheres in space.
+        cylinders: ``(., 3)``.
+        boxes: ``(., 2 d)``.
+        bounds: ``(2, d)``, infinite where open.
+        time_step: ``(4,)`` dt, dt/2, dt/3, dt/6.
+        margin: ``()``.
+        squared_goal_radius: ``()``.
+        squared_goal_speed: ``()``, infinite without a limit.
+    """
+
+    model_codes: Any
+    limits: Any
+    radius: Any
+    start: Any
+    goal: Any
+    inverse_initial_distance: Any
+    balls: Any
+    cylinders: Any
+    boxes: Any
+    bounds: Any
+    time_step: Any
+    margin: Any
+    squared_goal_radius: Any
+    squared_goal_speed: Any
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A multi-robot trajectory planning problem (paper, section III-A), checked on construction.
+
+    Two problems are equal when everything but their names is equal to the bit; they hash accordingly.
+
+    Attributes:
+        team: The robots.
+        start: ``(K, n)`` initial states.
+        goal: ``(K, d)`` goal positions [m].
+        world: Obstacles and bounds; an empty open world of the team's dimension by default.
+        dt: Time step [s].
+        horizon: Number of steps ``H``.
+        margin: Safety margin epsilon [m] that plans keep to everything.
+        goal_radius: A robot within it has arrived [m].
+        goal_speed: Speed at which a robot may still dock [m/s]; ``None`` is no limit, as in the paper.
+        name: Where the problem comes from, for tables and pictures.
+
+    Raises:
+        ValueError: If a value is not finite, a shape is wrong, a number is not positive, or a start or goal is out of
+            bounds or in contact with another robot or an obstacle. The message names the robot, the value and the remedy.
+    """
+
+    team: Team
+    start: Any
+    goal: Any
+    world: World = field(default=None)  # type: ignore[assignment]
+    dt: float = 0.1
+    horizon: int = 100
+    margin: float = 0.05
+    goal_radius: float = 0.075
+    goal_speed: float | None = None
+    name: str = "custom"
+
+    def __post_init__(self) -> None:
+        team = self.team
+        if self.world is None:
+            object.__setattr__(self, "world", World(dimension=team.dimension))
+        if self.world.dimension != team.dimension:
+            raise ValueError(f"the world has dimension {self.world.dimension} and the team {team.dimension}; match them")
+        object.__setattr__(self, "start", frozen_array(self.start, "start", (team.num_robots, team.state_size)))
+        object.__setattr__(self, "goal", frozen_array(self.goal, "goal", (team.num_robots, team.dimension)))
+        object.__setattr__(self, "dt", positive_number(self.dt, "dt"))
+        object.__setattr__(self, "horizon", whole_number(self.horizon, "horizon", 1))
+        object.__setattr__(self, "margin", positive_number(self.margin, "margin", zero_allowed=True))
+        object.__setattr__(self, "goal_radius", positive_number(self.goal_radius, "goal_radius"))
+        if self.goal_speed is not None:
+            object.__setattr__(self, "goal_speed", positive_number(self.goal_speed, "goal_speed", zero_allowed=True))
+        self._check_start_states()
+        self._check_places("start", self.start[:, : team.dimension])
+        self._check_places("goal", self.goal)
+
+    def _check_start_states(self) -> None:
+        for robot, model in enumerate(self.team.robot_models):
+            state = self.start[robot]
+            if state[model.state_size :].any():
+                raise ValueError(
+                    f"start of robot_{robot} is {state.tolist()}; a {model.name} has {model.state_size} components, "
+                    f"so set the padding after them to zero"
+                )
+            speed = float(np.linalg.norm(state[list(model.speed_indices)])) if model.speed_indices else 0.0
+            limit = float(np.asarray(self.team.max_speed)[robot])
+            if speed > limit * (1 + 1e-5):
+                raise ValueError(f"start speed of robot_{robot} is {speed:g} m/s, above its limit of {limit:g} m/s")
+
+    def _check_places(self, what: str, places: FloatArray) -> None:
+        """Every start, or every goal, lies inside the world and touches nothing."""
+        radius = np.asarray(self.team.radius, np.float64)
+        clearance = self.world.clearance(places) - radius
+        for robot in np.flatnonzero(clearance <= 0):
+            raise ValueError(
+                f"{what} of robot_{robot} at {_point(places[robot])} is {-clearance[robot]:.3g} m inside an obstacle or "
+                f"outside the bounds (robot radius {radius[robot]:g} m); move it, or change the world"
+            )
+        points = places.astype(np.float64)
+        for robot in range(1, len(points)):
+            gaps = np.linalg.norm(points[:robot] - points[robot], axis=1) - radius[:robot] - radius[robot]
+            other = int(np.argmin(gaps))
+            if gaps[other] <= 0:
+                raise ValueError(
+                    f"{what}s of robot_{other} at {_point(points[other])} and robot_{robot} at {_point(points[robot])} "
+                    f"overlap by {-gaps[other]:.3g} m; move them at least {radius[robot] + radius[other]:g} m apart"
+                )
+
+    @property
+    def num_robots(self) -> int:
+        """``K``."""
+        return self.team.num_robots
+
+    @property
+    def dimension(self) -> int:
+        """Position dimensions ``d``."""
+        return self.team.dimension
+
+    @property
+    def state_size(self) -> int:
+        """``n``."""
+        return self.team.state_size
+
+    @property
+    def control_size(self) -> int:
+        """``m``."""
+        return self.team.control_size
+
+    @property
+    def duration(self) -> float:
+        """Time from start to horizon [s]."""
+        return self.dt * self.horizon
+
+    @cached_property
+    def arrays(self) -> ProblemArrays:
+        """The problem as the engines read it."""
+        goal_speed = np.inf if self.goal_speed is None else self.goal_speed
+        arrays = ProblemArrays(
+            model_codes=np.array([MODEL_CODES[name] for name in self.team.models], np.int32),
+            limits=self.team.limits,
+            radius=np.asarray(self.team.radius),
+            start=self.start,
+            goal=self.goal,
+            inverse_initial_distance=inverse_initial_distance(
+                self.start[:, : self.dimension], self.goal, self.goal_radius
+            ),
+            balls=self.world.balls,
+            cylinders=self.world.cylinders,
+            boxes=self.world.boxes,
+            bounds=self.world.bounds,
+            time_step=np.array([self.dt, self.dt / 2, self.dt / 3, self.dt / 6], np.float32),
+            margin=np.float32(self.margin),
+            squared_goal_radius=np.float32(self.goal_radius**2),
+            squared_goal_speed=np.float32(goal_speed**2),
+        )
+        for array in arrays:
+            if isinstance(array, np.ndarray):
+                array.setflags(write=False)
+        return arrays
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 over everything that defines the problem, the name left out."""
+        sha = hashlib.sha256(repr(self.team.models).encode())
+        for value in self.arrays:
+            array: NDArray[Any] = np.ascontiguousarray(value)
+            sha.update(f"{array.shape}{array.dtype}".encode())
+            sha.update(array.tobytes())
+        sha.update(f"{self.dt!r} {self.horizon} {self.margin!r} {self.goal_radius!r} {self.goal_speed!r}".encode())
+        return sha.hexdigest()
+
+    def __getstate__(self) -> dict[str, Any]:
+        # What is cached is made anew in a copy: NumPy would bring its read-only arrays back writable.
+        return {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Problem) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    def replace(self, **changes: Any) -> Problem:
+        """A copy with some attributes changed, checked again."""
+        return Problem(**{attribute.name: getattr(self, attribute.name) for attribute in fields(self)} | changes)
+
+    def select(self, robots: Sequence[int]) -> Problem:
+        """The problem of these robots only, in the order given."""
+        index = list(robots)
+        team = self.team.select(index)
+        return self.replace(team=team, start=self.start[index, : team.state_size], goal=self.goal[index])
+
+
+def inverse_initial_distance(positions: Any, goal: Any, goal_radius: float) -> FloatArray:
+    """``(K,)`` one over the start distance; a robot that starts at its goal counts from the goal radius."""
+    distance = np.linalg.norm(np.asarray(goal) - np.asarray(positions), axis=-1)
+    return (1.0 / np.maximum(distance, goal_radius)).astype(np.float32)
+
+
+def _point(place: Any) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in place) + ")"

@@ -1,0 +1,15 @@
+"""The reward of one robot at one step, in scalar style (paper, section III-D, with the obstacle term of section IV)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def step_reward(
+    distance: Any, inverse_initial_distance: Any, pair_violation: Any, obstacle_violation: Any, one: Any
+) -> Any:
+    """``1 - distance / initial distance``, minus one for any robot and minus one for any obstacle within the margin.
+
+    The violations are 0 or 1 and ``one`` is 1, all in the caller's precision.
+    """
+    return one - distance * inverse_initial_distance - pair_violation - obstacle_violation

@@ -1,0 +1,43 @@
+"""One time step of one robot, in scalar style: clip, integrate, limit the speed, dock.
+
+The order is the definition of a step for every engine: the control is clipped to the limits, RK4 integrates the model
+over ``dt``, the speed limit is applied, and a robot within its goal radius at no more than the goal speed has arrived.
+From then on it stands where it docked (paper, section III; docking as in the paper's reference code).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from d4orm_env.core.dynamics import ModelFunctions, Ops
+
+
+class TimeStep(NamedTuple):
+    """``dt`` and the fractions of it that RK4 needs, in the caller's precision."""
+
+    full: Any
+    half: Any
+    third: Any
+    sixth: Any
+
+
+def rk4(model: ModelFunctions, x: Any, u: Any, h: TimeStep, ops: Ops) -> Any:
+    """Classical fourth-order Runge-Kutta over one step with the control held constant."""
+    k1 = model.derivative(x, u, ops)
+    k2 = model.derivative(model.add_scaled(x, h.half, k1), u, ops)
+    k3 = model.derivative(model.add_scaled(x, h.half, k2), u, ops)
+    k4 = model.derivative(model.add_scaled(x, h.full, k3), u, ops)
+    x = model.add_scaled(x, h.sixth, k1)
+    x = model.add_scaled(x, h.third, k2)
+    x = model.add_scaled(x, h.third, k3)
+    return model.add_scaled(x, h.sixth, k4)
+
+
+def advance(model: ModelFunctions, x: Any, u: Any, limits: Any, h: TimeStep, ops: Ops) -> Any:
+    """The state after one step under a control that :meth:`ModelFunctions.limit_control` has clipped."""
+    return model.limit_state(rk4(model, x, u, h, ops), limits, ops)
+
+
+def arrives(squared_distance: Any, squared_speed: Any, squared_goal_radius: Any, squared_goal_speed: Any) -> Any:
+    """Whether a robot at this distance from its goal, at this speed, docks there."""
+    return (squared_distance <= squared_goal_radius) & (squared_speed <= squared_goal_speed)

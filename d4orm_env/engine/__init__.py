@@ -1,0 +1,1 @@
+"""Engines: the same physics compiled for CPUs (numba) and for whatever JAX runs on."""

@@ -1,0 +1,186 @@
+"""What an engine is, and how to get one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.problem import Problem, ProblemArrays
+from d4orm_env.core.trajectory import Trajectory
+
+ENGINES = ("auto", "cpu", "jax")
+
+
+class StepResult(NamedTuple):
+    """One step of the whole team.
+
+    Attributes:
+        states: ``(K, n)`` after the step.
+        controls: ``(K, m)`` as executed: clipped, zero for docked robots.
+        arrived: ``(K,)`` bool.
+        collided: ``(K,)`` bool, hard contact.
+        margin_violated: ``(K,)`` bool.
+        rewards: ``(K,)``.
+    """
+
+    states: FloatArray
+    controls: FloatArray
+    arrived: BoolArray
+    collided: BoolArray
+    margin_violated: BoolArray
+    rewards: FloatArray
+
+
+class MovingObstacles(NamedTuple):
+    """Bodies that move along known paths, such as the robots outside a group that is replanned.
+
+    Attributes:
+        positions: ``(H, O, d)`` where each body is after every step [m].
+        radius: ``(O,)`` [m].
+    """
+
+    positions: FloatArray
+    radius: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class SamplingTask:
+    """What to sample around and how to score it.
+
+    Attributes:
+        problem: The robots that are sampled, their world and horizon.
+        base: ``(H, K, m)`` controls that the sampled deformation is added to; zeros to sample controls themselves.
+        collisions: Whether robots are penalised for coming near each other and near ``moving``.
+        credit: ``"team"`` weights samples by the mean reward of the team (the paper), ``"robot"`` weights each robot's
+            part of a sample by that robot's own reward.
+        moving: Bodies to avoid that are not sampled, or ``None``.
+        arrived: ``(K,)`` robots docked from the beginning, or ``None`` for none.
+    """
+
+    problem: Problem
+    base: FloatArray
+    collisions: bool = True
+    credit: str = "team"
+    moving: MovingObstacles | None = None
+    arrived: BoolArray | None = None
+
+
+class SamplingRules(NamedTuple):
+    """The rules that tell one sampling method from another: pure functions of arrays, in NumPy or JAX alike.
+
+    Attributes:
+        weights: ``(rewards, array library) -> weights``: from ``(M,)`` or ``(K, M)`` rewards to weights that sum to
+            one over the last axis. Rewards that are not finite arrive as minus infinity and must get weight zero.
+        adapt: ``(noise, mean square deviation, array library) -> noise``: the noise of the next step, ``(H, K, m)``
+            factors on the schedule; ``None`` leaves the schedule alone and saves the second moment.
+    """
+
+    weights: Callable[..., Any]
+    adapt: Callable[..., Any] | None = None
+
+
+class SamplingResult(NamedTuple):
+    """One denoising run.
+
+    Attributes:
+        mean: ``(H, K, m)`` the last weighted mean of the deformations.
+        rewards: ``(N,)`` mean reward of the samples at each step.
+        excluded: Samples left out because their reward was not finite.
+    """
+
+    mean: FloatArray
+    rewards: FloatArray
+    excluded: int
+
+
+class Engine(Protocol):
+    """The operations that the environment and the planners need from the physics."""
+
+    name: str
+
+    def step(
+        self, arrays: ProblemArrays, states: FloatArray, arrived: BoolArray, controls: FloatArray
+    ) -> StepResult:
+        """One step of the team from ``states`` ``(K, n)`` under ``controls`` ``(K, m)``, clipped here.
+
+        ``arrays`` is ``problem.arrays``, or a copy with other goals where goals change on the way.
+        """
+        ...
+
+    def rollout(self, problem: Problem, controls: FloatArray) -> Trajectory:
+        """Roll ``controls`` ``(H, K, m)`` out from the problem's start."""
+        ...
+
+    def contacts(self, arrays: ProblemArrays, states: FloatArray) -> tuple[BoolArray, BoolArray]:
+        """``(collided (K,), margin_violated (K,))`` of a team standing at ``states`` ``(K, n)``."""
+        ...
+
+    def prepare(
+        self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int
+    ) -> None:
+        """Compile all that rolling out and :meth:`denoise` with arguments of this kind need, if it is not yet."""
+        ...
+
+    def denoise(
+        self,
+        task: SamplingTask,
+        rules: SamplingRules,
+        mean: FloatArray,
+        noise_scale: FloatArray,
+        num_samples: int,
+        seed: int,
+    ) -> SamplingResult:
+        """Run ``len(noise_scale)`` sample-score-update steps (paper, Algorithm 1, lines 2 to 7).
+
+        Each step draws ``num_samples`` deformations around ``mean`` ``(H, K, m)`` with the step's standard deviation,
+        rolls them out on top of ``task.base``, and replaces the mean by the weighted mean of the deformations.
+        The noise is a function of ``seed`` and the step alone.
+        """
+        ...
+
+
+def get_engine(name: str = "auto") -> Engine:
+    """The engine of that name.
+
+    ``"auto"`` is JAX where JAX sees an accelerator, and the CPU engine elsewhere.
+
+    Raises:
+        ValueError: If there is no such engine.
+    """
+    if name not in ENGINES:
+        raise ValueError(f"engine {name!r} is unknown; choose one of {', '.join(ENGINES)}")
+    if name == "auto":
+        name = "jax" if _accelerator_visible() else "cpu"
+    if name == "jax":
+        from d4orm_env.engine.jax import JaxEngine
+
+        return JaxEngine()
+    from d4orm_env.engine.cpu import CpuEngine
+
+    return CpuEngine()
+
+
+def _accelerator_visible() -> bool:
+    import jax
+
+    return jax.default_backend() != "cpu"
+
+
+def checked_controls(problem: Problem, controls: Any) -> FloatArray:
+    """``controls`` as a contiguous ``(H, K, m)`` float32 array.
+
+    Raises:
+        ValueError: If the shape is another, or a value is not finite.
+    """
+    array = np.ascontiguousarray(controls, dtype=np.float32)
+    expected = (problem.horizon, problem.num_robots, problem.control_size)
+    if array.shape != expected:
+        raise ValueError(f"controls have shape {array.shape}; expected (H, K, m) = {expected}")
+    if not np.isfinite(array).all():
+        step, robot, component = (int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise ValueError(f"controls[{step}, {robot}, {component}] is not finite; every control must be")
+    return array

@@ -1,0 +1,46 @@
+"""Compiled kernels on disk, invalidated by any change of the sources they are made of."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import numba
+from numba.core.caching import FunctionCache
+
+
+def fingerprint(modules: tuple[ModuleType, ...]) -> str:
+    """SHA-256 over the source text of these modules."""
+    return hashlib.sha256("".join(inspect.getsource(module) for module in modules).encode()).hexdigest()
+
+
+class _SourceKeyedCache(FunctionCache):
+    """numba notices an edit of the file a kernel is in, but not of the files it calls into; this adds them to the key."""
+
+    def __init__(self, function: Callable[..., Any], key: str) -> None:
+        super().__init__(function)
+        self._source_key = key
+
+    def _index_key(self, sig: Any, codegen: Any) -> Any:
+        return (*super()._index_key(sig, codegen), self._source_key)
+
+
+def cached_kernel(key: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator: compile with numba on first call, and keep the result on disk under ``key``.
+
+    Where neither the package's folder nor the user's cache folder can be written, kernels are compiled anew in every
+    process; set ``NUMBA_CACHE_DIR`` to a folder that can.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        dispatcher = numba.njit(nogil=True, **options)(function)
+        try:
+            dispatcher._cache = _SourceKeyedCache(function, key)
+        except RuntimeError:
+            pass
+        return dispatcher
+
+    return decorate

@@ -1,0 +1,334 @@
+"""The JAX engine: the same physics as pure array functions, for GPUs and TPUs, and for those who jit, vmap and grad.
+
+Arrays keep the samples on the last axis, ``(K, component, S)``, as on the CPU engine. A whole denoising run is one
+compiled scan; nothing returns to the host before it ends.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from d4orm_env.core import collision, reward, transition
+from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.dynamics import MODELS, Ops
+from d4orm_env.core.problem import Problem, ProblemArrays
+from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.engine import noise
+from d4orm_env.engine.base import (
+    MovingObstacles,
+    SamplingResult,
+    SamplingRules,
+    SamplingTask,
+    StepResult,
+    checked_controls,
+)
+
+OPS = Ops(jnp.cos, jnp.sin, jnp.sqrt, jnp.minimum, jnp.maximum)
+BIT_OPS = noise.BitOps(
+    uint32=lambda x: x.astype(jnp.uint32),
+    int32=lambda x: x.astype(jnp.int32),
+    to_float=lambda x: x.astype(jnp.float32),
+    float_bits=lambda x: jax.lax.bitcast_convert_type(x, jnp.int32),
+    bits_float=lambda x: jax.lax.bitcast_convert_type(x, jnp.float32),
+    sqrt=jnp.sqrt,
+)
+
+
+class Worlds(NamedTuple):
+    """A block of worlds on the way.
+
+    Attributes:
+        state: ``(K, n, S)``.
+        docked: ``(K, S)`` bool.
+        control: ``(K, m, S)`` executed last.
+    """
+
+    state: Any
+    docked: Any
+    control: Any
+
+
+def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, control: Any) -> Worlds:
+    """One step of every robot in every world, docking included.
+
+    Args:
+        models: The team's model names; static.
+        arrays: The problem.
+        worlds: Before the step.
+        control: ``(K, m, S)`` not yet clipped.
+    """
+    h = transition.TimeStep(*arrays.time_step)
+    state, executed, docked = worlds.state, jnp.zeros_like(control), worlds.docked
+    for name in dict.fromkeys(models):
+        model = MODELS[name]
+        functions = model.functions
+        robots = np.flatnonzero(np.array(models) == name)
+        limits = tuple(arrays.limits[robots, i][:, None] for i in range(3))
+        x = tuple(worlds.state[robots, i] for i in range(model.state_size))
+        u = functions.limit_control(tuple(control[robots, i] for i in range(model.control_size)), limits, OPS)
+        y = transition.advance(functions, x, u, limits, h, OPS)
+        gap2 = sum((y[i] - arrays.goal[robots, i][:, None]) ** 2 for i in range(model.dimension))
+        speed2 = sum(v * v for v in functions.velocity(y, u, OPS))
+        arrives = transition.arrives(gap2, speed2, arrays.squared_goal_radius, arrays.squared_goal_speed)
+        standing = worlds.docked[robots]
+        zero = jnp.zeros_like(gap2)
+        for i, (old, rest, new) in enumerate(zip(x, functions.rest(y, zero), y, strict=True)):
+            state = state.at[robots, i].set(jnp.where(standing, old, jnp.where(arrives, rest, new)))
+        for i, component in enumerate(u):
+            executed = executed.at[robots, i].set(jnp.where(standing, zero, component))
+        docked = docked.at[robots].set(standing | arrives)
+    return Worlds(state, docked, executed)
+
+
+def robot_contacts(arrays: ProblemArrays, place: Any, extra: Any) -> Any:
+    """``(K, S)`` bool: whether a robot at ``place`` ``(K, d, S)`` is within the radii plus ``extra`` of another."""
+    gaps = (place[:, None] - place[None, :]) ** 2
+    reach = arrays.radius[:, None] + arrays.radius[None, :] + extra
+    reach2 = jnp.where(jnp.eye(len(arrays.radius), dtype=bool), -1, reach * reach)
+    return (gaps.sum(axis=2) <= reach2[..., None]).any(axis=1)
+
+
+def moving_contacts(arrays: ProblemArrays, place: Any, obstacle: Any, radius: Any, extra: Any) -> Any:
+    """``(K, S)`` bool: the same towards bodies at ``obstacle`` ``(O, d)`` of ``radius`` ``(O,)``."""
+    gaps = (place[:, None] - obstacle[None, :, :, None]) ** 2
+    reach = arrays.radius[:, None] + radius[None, :] + extra
+    return (gaps.sum(axis=2) <= (reach * reach)[..., None]).any(axis=1)
+
+
+def obstacle_contacts(arrays: ProblemArrays, place: Any, extra: Any) -> Any:
+    """``(K, S)`` bool: the same towards static obstacles and bounds."""
+    d = place.shape[1]
+    reach = (arrays.radius + extra)[:, None]
+    hit = jnp.zeros((place.shape[0], place.shape[2]), bool)
+    for axis in range(d):
+        hit |= collision.leaves(place[:, axis], reach, arrays.bounds[0, axis], arrays.bounds[1, axis])
+    for kind, axes in ((arrays.balls, d), (arrays.cylinders, 2)):
+        if len(kind):
+            gaps = (place[:, None, :axes] - kind[None, :, :axes, None]) ** 2
+            total = reach[:, None] + kind[None, :, axes, None]
+            hit |= (gaps.sum(axis=2) <= total * total).any(axis=1)
+    if len(arrays.boxes):
+        lower, upper = arrays.boxes[None, :, :d, None], arrays.boxes[None, :, d:, None]
+        gaps = collision.axis_gap(place[:, None], lower, upper, jnp.float32(0), OPS) ** 2
+        hit |= (gaps.sum(axis=2) <= (reach * reach)[:, None]).any(axis=1)
+    return hit
+
+
+def goal_distance(arrays: ProblemArrays, place: Any) -> Any:
+    """``(K, S)`` distance of every robot to its goal; its gradient at the goal itself is zero."""
+    gap2 = ((place - arrays.goal[..., None]) ** 2).sum(axis=1)
+    tiny = jnp.float32(1e-12)
+    return jnp.where(gap2 > tiny, jnp.sqrt(jnp.maximum(gap2, tiny)), jnp.float32(0))
+
+
+def rewards_of(arrays: ProblemArrays, place: Any, pair_violation: Any, obstacle_violation: Any) -> Any:
+    """``(K, S)`` reward of one step."""
+    return reward.step_reward(
+        goal_distance(arrays, place),
+        arrays.inverse_initial_distance[:, None],
+        pair_violation.astype(jnp.float32),
+        obstacle_violation.astype(jnp.float32),
+        jnp.float32(1),
+    )
+
+
+def judge(arrays: ProblemArrays, place: Any) -> tuple[Any, Any, Any]:
+    """``(collided, margin violated, reward)`` of teams standing at ``place`` ``(K, d, S)``, each ``(K, S)``."""
+    zero = jnp.float32(0)
+    contact = robot_contacts(arrays, place, zero) | obstacle_contacts(arrays, place, zero)
+    pair, obstacle = robot_contacts(arrays, place, arrays.margin), obstacle_contacts(arrays, place, arrays.margin)
+    return contact, pair | obstacle, rewards_of(arrays, place, pair, obstacle)
+
+
+@partial(jax.jit, static_argnums=0)
+def _step(models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, control: Any) -> Any:
+    worlds = advance_worlds(models, arrays, worlds, control)
+    return worlds, judge(arrays, worlds.state[:, : arrays.goal.shape[1]])
+
+
+@partial(jax.jit, static_argnums=0)
+def _rollout(models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, controls: Any) -> Any:
+    def advance(worlds: Worlds, control: Any) -> Any:
+        worlds, verdict = _step(models, arrays, worlds, control)
+        return worlds, (worlds, verdict)
+
+    first = judge(arrays, worlds.state[:, : arrays.goal.shape[1]])
+    return first, jax.lax.scan(advance, worlds, controls)[1]
+
+
+class _Static(NamedTuple):
+    """What a compiled denoising run depends on besides shapes."""
+
+    models: tuple[str, ...]
+    rules: SamplingRules
+    num_samples: int
+    collisions: bool
+    credit: str
+
+
+class _Inputs(NamedTuple):
+    """What it is called with."""
+
+    arrays: ProblemArrays
+    base: Any
+    docked: Any
+    moving: MovingObstacles | None
+    seed: Any
+
+
+def _deformations(static: _Static, inputs: _Inputs, step: Any, time: Any, mean: Any, scale: Any) -> Any:
+    """``(K, m, M)`` samples of the deformation at one time step."""
+    num_robots, size = mean.shape
+    samples = jnp.arange(static.num_samples, dtype=jnp.uint32)[None, :]
+    robots = jnp.arange(num_robots, dtype=jnp.uint32)[:, None]
+    draws: list[Any] = []
+    for pair in range((size + 1) // 2):
+        key = noise.stream_key(*inputs.seed, step, robots, time, jnp.uint32(pair), BIT_OPS)
+        draws += noise.normal_pair(samples, key, BIT_OPS)
+    return mean[..., None] + scale[..., None] * jnp.stack(draws[:size], axis=1)
+
+
+def _score(static: _Static, inputs: _Inputs, step: Any, mean: Any, scale: Any) -> Any:
+    """Roll all samples out; returns rewards ``(K, M)`` summed over time and the deformations ``(H, K, m, M)``."""
+    arrays = inputs.arrays
+    d = arrays.goal.shape[1]
+    num_robots = arrays.goal.shape[0]
+
+    def advance(carry: Any, xs: Any) -> Any:
+        worlds, total = carry
+        time, base, mean_now, scale_now, obstacle = xs
+        deformation = _deformations(static, inputs, step, time, mean_now, scale_now)
+        worlds = advance_worlds(static.models, arrays, worlds, base[..., None] + deformation)
+        place = worlds.state[:, :d]
+        near_robot = jnp.zeros((num_robots, static.num_samples), bool)
+        if static.collisions:
+            near_robot = robot_contacts(arrays, place, arrays.margin)
+            if inputs.moving is not None:
+                near_robot |= moving_contacts(arrays, place, obstacle, inputs.moving.radius, arrays.margin)
+        near_obstacle = obstacle_contacts(arrays, place, arrays.margin)
+        return (worlds, total + rewards_of(arrays, place, near_robot, near_obstacle)), deformation
+
+    worlds = Worlds(
+        jnp.broadcast_to(arrays.start[..., None], (*arrays.start.shape, static.num_samples)),
+        jnp.broadcast_to(inputs.docked[:, None], (num_robots, static.num_samples)),
+        jnp.zeros((num_robots, mean.shape[2], static.num_samples)),
+    )
+    times = jnp.arange(len(mean), dtype=jnp.uint32)
+    obstacles = None if inputs.moving is None else inputs.moving.positions
+    carry = (worlds, jnp.zeros((num_robots, static.num_samples)))
+    (_, total), deformations = jax.lax.scan(advance, carry, (times, inputs.base, mean, scale, obstacles))
+    return total / len(mean), deformations
+
+
+def _denoise(static: _Static, inputs: _Inputs, mean: Any, noise_scale: Any) -> Any:
+    def update(carry: Any, xs: Any) -> Any:
+        mean, factor = carry
+        step, sigma = xs
+        rewards, deformations = _score(static, inputs, step, mean, factor * sigma)
+        if static.credit == "team":
+            rewards = rewards.mean(axis=0, keepdims=True)
+        finite = jnp.isfinite(rewards)
+        weights = static.rules.weights(jnp.where(finite, rewards, -jnp.inf), jnp)
+        weights = jnp.broadcast_to(weights, (mean.shape[1], static.num_samples))
+        # A sample that blew up has weight zero, and zero times infinity must not reach the mean.
+        usable = jnp.where(jnp.isfinite(deformations), deformations, 0)
+        new_mean = jnp.einsum("tkms,ks->tkm", usable, weights)
+        # Nothing to go by: every sample was excluded.
+        new_mean = jnp.where((weights.sum(axis=-1) > 0)[None, :, None], new_mean, mean)
+        if static.rules.adapt is not None:
+            deviation2 = jnp.einsum("tkms,ks->tkm", (usable - new_mean[..., None]) ** 2, weights)
+            factor = static.rules.adapt(deviation2, jnp)
+        average = jnp.where(finite, rewards, 0).sum() / jnp.maximum(finite.sum(), 1)
+        return (new_mean, factor), (average, (~finite).sum())
+
+    steps = jnp.arange(len(noise_scale), dtype=jnp.uint32)
+    (mean, _), (rewards, excluded) = jax.lax.scan(update, (mean, jnp.ones_like(mean)), (steps, noise_scale))
+    return mean, rewards, excluded.sum()
+
+
+@lru_cache(maxsize=256)
+def _compiled_denoise(static: _Static, treedef: Any, shapes: tuple[tuple[tuple[int, ...], Any], ...]) -> Any:
+    """The denoising run compiled for arguments of these shapes, ahead of the call."""
+    arguments = jax.tree.unflatten(treedef, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes])
+    return jax.jit(partial(_denoise, static)).lower(*arguments).compile()
+
+
+class JaxEngine:
+    """The physics in JAX, on whatever device JAX has chosen. Stateless: all instances are alike."""
+
+    name = "jax"
+
+    def step(
+        self, arrays: ProblemArrays, states: FloatArray, arrived: BoolArray, controls: FloatArray
+    ) -> StepResult:
+        """See :meth:`d4orm_env.engine.base.Engine.step`."""
+        models = tuple(tuple(MODELS)[code] for code in arrays.model_codes)
+        worlds = Worlds(states[..., None], np.asarray(arrived)[..., None], np.zeros_like(controls)[..., None])
+        worlds, verdict = _step(models, arrays, worlds, jnp.asarray(controls)[..., None])
+        collided, margin_violated, rewards = (np.asarray(value)[..., 0] for value in verdict)
+        state, docked, control = (np.asarray(value)[..., 0] for value in worlds)
+        return StepResult(state, control, docked, collided, margin_violated, rewards)
+
+    def rollout(self, problem: Problem, controls: FloatArray) -> Trajectory:
+        """See :meth:`d4orm_env.engine.base.Engine.rollout`.
+
+        Raises:
+            ValueError: If the controls have another shape than ``(H, K, m)`` or are not finite.
+        """
+        controls = checked_controls(problem, controls)
+        num_robots = problem.num_robots
+        worlds = Worlds(
+            problem.start[..., None],
+            np.zeros((num_robots, 1), bool),
+            np.zeros((num_robots, problem.control_size, 1), np.float32),
+        )
+        first, (worlds, verdicts) = _rollout(problem.team.models, problem.arrays, worlds, controls[..., None])
+        states = np.concatenate([problem.start[None], np.asarray(worlds.state)[..., 0]])
+        collided, margin_violated = (
+            np.concatenate([np.asarray(first[i])[None, :, 0], np.asarray(verdicts[i])[..., 0]]) for i in range(2)
+        )
+        return Trajectory(
+            states=states,
+            positions=np.ascontiguousarray(states[..., : problem.dimension]),
+            controls=np.asarray(worlds.control)[..., 0],
+            rewards=np.asarray(verdicts[2])[..., 0],
+            arrived=np.concatenate([np.zeros((1, num_robots), bool), np.asarray(worlds.docked)[..., 0]]),
+            collided=collided,
+            margin_violated=margin_violated,
+        )
+
+    def _lower(
+        self, task: SamplingTask, rules: SamplingRules, mean: FloatArray, noise_scale: FloatArray, num_samples: int, seed: int
+    ) -> tuple[Any, tuple[Any, ...]]:
+        problem = task.problem
+        docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
+        inputs = _Inputs(problem.arrays, task.base, docked, task.moving, noise.seed_words(seed))
+        static = _Static(problem.team.models, rules, num_samples, task.collisions, task.credit)
+        arguments = jax.tree.map(jnp.asarray, (inputs, mean, np.asarray(noise_scale, np.float32)))
+        leaves, treedef = jax.tree.flatten(arguments)
+        return _compiled_denoise(static, treedef, tuple((leaf.shape, leaf.dtype) for leaf in leaves)), arguments
+
+    def prepare(
+        self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int
+    ) -> None:
+        """See :meth:`d4orm_env.engine.base.Engine.prepare`."""
+        self._lower(task, rules, task.base, noise_scale, num_samples, 0)
+
+    def denoise(
+        self,
+        task: SamplingTask,
+        rules: SamplingRules,
+        mean: FloatArray,
+        noise_scale: FloatArray,
+        num_samples: int,
+        seed: int,
+    ) -> SamplingResult:
+        """See :meth:`d4orm_env.engine.base.Engine.denoise`."""
+        compiled, arguments = self._lower(task, rules, mean, noise_scale, num_samples, seed)
+        mean, rewards, excluded = compiled(*arguments)
+        return SamplingResult(np.asarray(mean), np.asarray(rewards), int(excluded))

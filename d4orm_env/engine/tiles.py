@@ -1,0 +1,403 @@
+"""The step of a tile of worlds, compiled with numba from the scalar functions of :mod:`d4orm_env.core`.
+
+A tile is a block of :data:`TILE` worlds (samples of a plan, or environments) that differ in their numbers only. All a
+tile needs lies in one flat float32 array, the workspace: for every robot :data:`ROWS` rows, every row one number per
+world. So every inner loop runs over worlds with distances between its operands that the compiler knows, which is what
+lets it vectorise without checking for overlap, and the tile stays in cache while all robots and pairs are visited. Flags
+are zeros and ones, because mixing widths would stop the vectoriser.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba
+import numpy as np
+from numba.extending import register_jitable
+
+from d4orm_env.core import collision, dynamics, reward, transition
+from d4orm_env.core.dynamics import MODEL_CODES, MODELS, Model, ModelFunctions, Ops
+
+ZERO = np.float32(0)
+ONE = np.float32(1)
+
+TILE = 64
+"""Worlds per tile."""
+
+# First rows of a robot in the workspace. Normals come in pairs, so the three control rows are followed by a spare one; a
+# power of two in all would map the same row of every robot to the same
+# cache set.
+STATE, CONTROL, GOAL, DOCKED, DISTANCE2, NEAR_ROBOT, NEAR_OBSTACLE, TOTAL = 0, 6, 10, 13, 14, 15, 16, 17
+SCRATCH, ROWS = 18, 19
+STRIDE = ROWS * TILE
+
+OPTIONS: dict[str, Any] = {"fastmath": {"contract", "nsz"}, "error_model": "numpy"}
+"""Contraction lets multiply-adds fuse; nothing that changes the meaning of NaN or infinity is allowed."""
+
+compiled = numba.njit(nogil=True, **OPTIONS)
+
+INLINED: dict[str, Any] = OPTIONS | {"forceinline": True}
+"""For functions that take functions (a model, ``Ops``): inlining leaves no function pointer behind, so that numba can
+keep the kernels on disk. And for those that take a problem's arrays, which are a long argument to pass by value."""
+
+inlined = numba.njit(nogil=True, **INLINED)
+
+for _function in (
+    dynamics.norm_scale_2,
+    dynamics.norm_scale_3,
+    dynamics.clip,
+    transition.rk4,
+    transition.advance,
+    transition.arrives,
+    collision.axis_gap,
+    collision.leaves,
+    reward.step_reward,
+):
+    # Lets compiled code call the core's plain Python functions, which stay as they are for everyone else.
+    register_jitable(**INLINED)(_function)
+
+
+@compiled
+def _sqrt(x: Any) -> Any:
+    return math.sqrt(x)
+
+
+@compiled
+def _minimum(a: Any, b: Any) -> Any:
+    return a if a < b else b
+
+
+@compiled
+def _maximum(a: Any, b: Any) -> Any:
+    return a if a > b else b
+
+
+# Reduction by multiples of pi/2 in two parts (Cody and Waite) and minimax polynomials on [-pi/4, pi/4]. Unlike calls of
+# libm these vectorise. Headings stay within a few turns, where the error is below 2e-7.
+_TWO_OVER_PI = np.float32(2 / np.pi)
+_HALF_PI_HIGH = np.float32(1.5703125)
+_HALF_PI_LOW = np.float32(np.pi / 2 - 1.5703125)
+_HALF = np.float32(0.5)
+_S1, _S2, _S3 = np.float32(-1.6666654611e-1), np.float32(8.3321608736e-3), np.float32(-1.9515295891e-4)
+_C1, _C2, _C3 = np.float32(4.166664568298827e-2), np.float32(-1.388731625493765e-3), np.float32(2.443315711809948e-5)
+
+
+@compiled
+def _shifted_sine(x: Any, quarters: Any) -> Any:
+    """``sin(x + quarters * pi / 2)``."""
+    nearest = np.floor(x * _TWO_OVER_PI + _HALF)
+    r = (x - nearest * _HALF_PI_HIGH) - nearest * _HALF_PI_LOW
+    r2 = r * r
+    sine = r + r * r2 * (_S1 + r2 * (_S2 + r2 * _S3))
+    cosine = ONE - _HALF * r2 + r2 * r2 * (_C1 + r2 * (_C2 + r2 * _C3))
+    quadrant = np.int32(nearest) + quarters
+    value = cosine if (quadrant & np.int32(1)) != np.int32(0) else sine
+    return -value if (quadrant & np.int32(2)) != np.int32(0) else value
+
+
+@compiled
+def sine(x: Any) -> Any:
+    return _shifted_sine(x, np.int32(0))
+
+
+@compiled
+def cosine(x: Any) -> Any:
+    return _shifted_sine(x, np.int32(1))
+
+
+OPS = Ops(cosine, sine, _sqrt, _minimum, _maximum)
+
+
+# Tuples of two to six numbers: consecutive rows of the workspace from offset ``o``, in world ``s``. Written out, because
+# the vectoriser gives up on loops over tuples.
+
+
+@compiled
+def _read2(w: Any, o: Any, s: Any) -> Any:
+    return (w[o + s], w[o + TILE + s])
+
+
+@compiled
+def _read3(w: Any, o: Any, s: Any) -> Any:
+    return (w[o + s], w[o + TILE + s], w[o + 2 * TILE + s])
+
+
+@compiled
+def _read4(w: Any, o: Any, s: Any) -> Any:
+    return _read2(w, o, s) + _read2(w, o + 2 * TILE, s)
+
+
+@compiled
+def _read6(w: Any, o: Any, s: Any) -> Any:
+    return _read3(w, o, s) + _read3(w, o + 3 * TILE, s)
+
+
+@compiled
+def _write2(w: Any, o: Any, s: Any, x: Any) -> None:
+    w[o + s] = x[0]
+    w[o + TILE + s] = x[1]
+
+
+@compiled
+def _write3(w: Any, o: Any, s: Any, x: Any) -> None:
+    _write2(w, o, s, x)
+    w[o + 2 * TILE + s] = x[2]
+
+
+@compiled
+def _write4(w: Any, o: Any, s: Any, x: Any) -> None:
+    _write3(w, o, s, x)
+    w[o + 3 * TILE + s] = x[3]
+
+
+@compiled
+def _write6(w: Any, o: Any, s: Any, x: Any) -> None:
+    _write4(w, o, s, x)
+    w[o + 4 * TILE + s] = x[4]
+    w[o + 5 * TILE + s] = x[5]
+
+
+@compiled
+def _pick2(first: Any, x: Any, y: Any) -> Any:
+    return (x[0] if first else y[0], x[1] if first else y[1])
+
+
+@compiled
+def _pick3(first: Any, x: Any, y: Any) -> Any:
+    return (x[0] if first else y[0], x[1] if first else y[1], x[2] if first else y[2])
+
+
+@compiled
+def _pick4(first: Any, x: Any, y: Any) -> Any:
+    return _pick2(first, x, y) + _pick2(first, (x[2], x[3]), (y[2], y[3]))
+
+
+@compiled
+def _pick6(first: Any, x: Any, y: Any) -> Any:
+    return _pick3(first, x, y) + _pick3(first, (x[3], x[4], x[5]), (y[3], y[4], y[5]))
+
+
+@compiled
+def _squared_norm2(v: Any) -> Any:
+    return v[0] * v[0] + v[1] * v[1]
+
+
+@compiled
+def _squared_norm3(v: Any) -> Any:
+    return v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+
+
+@compiled
+def _squared_gap2(x: Any, y: Any) -> Any:
+    return _squared_norm2((x[0] - y[0], x[1] - y[1]))
+
+
+@compiled
+def _squared_gap3(x: Any, y: Any) -> Any:
+    return _squared_norm3((x[0] - y[0], x[1] - y[1], x[2] - y[2]))
+
+
+@inlined
+def robot_rows(w: Any, k: Any) -> Any:
+    """The rows of robot ``k``. A view: indices into it are plainly not negative, which the vectoriser needs to know."""
+    return w[k * STRIDE : (k + 1) * STRIDE]
+
+
+_READ = {2: _read2, 3: _read3, 4: _read4, 6: _read6}
+_WRITE = {2: _write2, 3: _write3, 4: _write4, 6: _write6}
+_PICK = {2: _pick2, 3: _pick3, 4: _pick4, 6: _pick6}
+_SQUARED_NORM = {2: _squared_norm2, 3: _squared_norm3}
+_SQUARED_GAP = {2: _squared_gap2, 3: _squared_gap3}
+
+
+def _mover(model: Model) -> Any:
+    """The compiled step of one robot of this model in every world of a tile."""
+    functions = ModelFunctions(*(inlined(function) for function in model.functions))
+    read_x, write_x, pick_x = _READ[model.state_size], _WRITE[model.state_size], _PICK[model.state_size]
+    read_u, write_u, pick_u = _READ[model.control_size], _WRITE[model.control_size], _PICK[model.control_size]
+    read_goal = _READ[model.dimension]
+    squared_norm, squared_gap = _SQUARED_NORM[model.dimension], _SQUARED_GAP[model.dimension]
+    no_control = (ZERO,) * model.control_size
+
+    @compiled
+    def move(limits: Any, h: Any, docking: Any, w: Any) -> None:
+        for s in range(TILE):
+            x = read_x(w, STATE * TILE, s)
+            u = functions.limit_control(read_u(w, CONTROL * TILE, s), limits, OPS)
+            y = transition.advance(functions, x, u, limits, h, OPS)
+            gap2 = squared_gap(y, read_goal(w, GOAL * TILE, s))
+            speed2 = squared_norm(functions.velocity(y, u, OPS))
+            arrives = transition.arrives(gap2, speed2, docking[0], docking[1])
+            docked, distance2 = w[DOCKED * TILE + s], w[DISTANCE2 * TILE + s]
+            standing = docked > ZERO
+            write_x(w, STATE * TILE, s, pick_x(standing, x, pick_x(arrives, functions.rest(y, ZERO), y)))
+            write_u(w, CONTROL * TILE, s, pick_u(standing, no_control, u))
+            w[DOCKED * TILE + s] = ONE if standing | arrives else ZERO
+            w[DISTANCE2 * TILE + s] = distance2 if standing else gap2
+
+    return move
+
+
+_HOLONOMIC2D, _HOLONOMIC3D = MODEL_CODES["holonomic2d"], MODEL_CODES["holonomic3d"]
+_VELOCITY2D = MODEL_CODES["velocity2d"]
+_move_holonomic2d = _mover(MODELS["holonomic2d"])
+_move_holonomic3d = _mover(MODELS["holonomic3d"])
+_move_velocity2d = _mover(MODELS["velocity2d"])
+_move_differential_drive = _mover(MODELS["differential_drive"])
+
+
+@inlined
+def move_robot(arrays: Any, k: Any, w: Any) -> None:
+    """Move robot ``k`` one step in every world of the tile; its control rows hold the executed control afterwards."""
+    h = transition.TimeStep(arrays.time_step[0], arrays.time_step[1], arrays.time_step[2], arrays.time_step[3])
+    limits = (arrays.limits[k, 0], arrays.limits[k, 1], arrays.limits[k, 2])
+    docking = (arrays.squared_goal_radius, arrays.squared_goal_speed)
+    code = arrays.model_codes[k]
+    if code == _HOLONOMIC2D:
+        _move_holonomic2d(limits, h, docking, robot_rows(w, k))
+    elif code == _HOLONOMIC3D:
+        _move_holonomic3d(limits, h, docking, robot_rows(w, k))
+    elif code == _VELOCITY2D:
+        _move_velocity2d(limits, h, docking, robot_rows(w, k))
+    else:
+        _move_differential_drive(limits, h, docking, robot_rows(w, k))
+
+
+@inlined
+def clear_row(row: Any, num_robots: Any, w: Any) -> None:
+    """Set a row of every robot to zero."""
+    for k in range(num_robots):
+        robot = robot_rows(w, k)
+        for s in range(TILE):
+            robot[row * TILE + s] = ZERO
+
+
+@inlined
+def measure_goal_distance(num_robots: Any, dimension: Any, w: Any) -> None:
+    """Fill the squared distance to the goal from places."""
+    for k in range(num_robots):
+        robot = robot_rows(w, k)
+        for s in range(TILE):
+            total = ZERO
+            for axis in range(dimension):
+                gap = robot[(STATE + axis) * TILE + s] - robot[(GOAL + axis) * TILE + s]
+                total += gap * gap
+            robot[DISTANCE2 * TILE + s] = total
+
+
+@inlined
+def mark_pair(reach: Any, k: Any, other: Any, dimension: Any, w: Any) -> None:
+    """Flag two robots in every world where their centres are within ``reach``."""
+    reach2 = reach * reach
+    # Offsets into one array instead of two views, which would be checked for overlap at every call. Through uint32 they
+    # are plainly not negative.
+    a, b = np.int64(np.uint32(k * STRIDE)), np.int64(np.uint32(other * STRIDE))
+    near_a, near_b = a + NEAR_ROBOT * TILE, b + NEAR_ROBOT * TILE
+    if dimension == 2:
+        for s in range(TILE):
+            touches = ONE if _squared_gap2(_read2(w, a, s), _read2(w, b, s)) <= reach2 else ZERO
+            w[near_a + s] = _maximum(w[near_a + s], touches)
+            w[near_b + s] = _maximum(w[near_b + s], touches)
+    else:
+        for s in range(TILE):
+            touches = ONE if _squared_gap3(_read3(w, a, s), _read3(w, b, s)) <= reach2 else ZERO
+            w[near_a + s] = _maximum(w[near_a + s], touches)
+            w[near_b + s] = _maximum(w[near_b + s], touches)
+
+
+@inlined
+def mark_pairs(arrays: Any, extra: Any, w: Any) -> None:
+    """Flag every two robots closer than their radii plus ``extra``."""
+    for k in range(1, arrays.radius.shape[0]):
+        for other in range(k):
+            mark_pair(arrays.radius[k] + arrays.radius[other] + extra, k, other, arrays.goal.shape[1], w)
+
+
+@inlined
+def mark_round(reach: Any, k: Any, centre: Any, axes: Any, row: Any, w: Any) -> None:
+    """Flag robot ``k`` where it is within ``reach`` of a centre, over the first two or three axes."""
+    reach2 = reach * reach
+    robot = robot_rows(w, k)
+    flag = row * TILE
+    if axes == 2:
+        point = (centre[0], centre[1])
+        for s in range(TILE):
+            touches = ONE if _squared_gap2(_read2(robot, 0, s), point) <= reach2 else ZERO
+            robot[flag + s] = _maximum(robot[flag + s], touches)
+    else:
+        place = (centre[0], centre[1], centre[2])
+        for s in range(TILE):
+            touches = ONE if _squared_gap3(_read3(robot, 0, s), place) <= reach2 else ZERO
+            robot[flag + s] = _maximum(robot[flag + s], touches)
+
+
+@inlined
+def _mark_box(reach: Any, k: Any, box: Any, dimension: Any, w: Any) -> None:
+    reach2 = reach * reach
+    robot = robot_rows(w, k)
+    for s in range(TILE):
+        gap2 = ZERO
+        for axis in range(dimension):
+            gap = collision.axis_gap(robot[axis * TILE + s], box[axis], box[dimension + axis], ZERO, OPS)
+            gap2 += gap * gap
+        touches = ONE if gap2 <= reach2 else ZERO
+        robot[NEAR_OBSTACLE * TILE + s] = _maximum(robot[NEAR_OBSTACLE * TILE + s], touches)
+
+
+@inlined
+def mark_obstacles(arrays: Any, k: Any, extra: Any, w: Any) -> None:
+    """Flag robot ``k`` where it is within its radius plus ``extra`` of an obstacle or the bounds."""
+    dimension = arrays.goal.shape[1]
+    reach = arrays.radius[k] + extra
+    for i in range(arrays.balls.shape[0]):
+        mark_round(reach + arrays.balls[i, dimension], k, arrays.balls[i], dimension, NEAR_OBSTACLE, w)
+    for i in range(arrays.cylinders.shape[0]):
+        mark_round(reach + arrays.cylinders[i, 2], k, arrays.cylinders[i], 2, NEAR_OBSTACLE, w)
+    for i in range(arrays.boxes.shape[0]):
+        _mark_box(reach, k, arrays.boxes[i], dimension, w)
+    for axis in range(dimension):
+        lower, upper = arrays.bounds[0, axis], arrays.bounds[1, axis]
+        if lower > -np.inf or upper < np.inf:
+            robot = robot_rows(w, k)
+            for s in range(TILE):
+                outside = ONE if collision.leaves(robot[axis * TILE + s], reach, lower, upper) else ZERO
+                robot[NEAR_OBSTACLE * TILE + s] = _maximum(robot[NEAR_OBSTACLE * TILE + s], outside)
+
+
+def _motion_reader(model: Model) -> Any:
+    velocity_of = inlined(model.functions.velocity)
+    read_x, read_u = _READ[model.state_size], _READ[model.control_size]
+    dimension = model.dimension
+
+    @compiled
+    def read(o: Any, s: Any, w: Any, velocity: Any) -> None:
+        v = velocity_of(read_x(w, o + STATE * TILE, s), read_u(w, o + CONTROL * TILE, s), OPS)
+        for axis in range(dimension):
+            velocity[axis] = v[axis]
+
+    return read
+
+
+_velocity_holonomic2d = _motion_reader(MODELS["holonomic2d"])
+_velocity_holonomic3d = _motion_reader(MODELS["holonomic3d"])
+_velocity_velocity2d = _motion_reader(MODELS["velocity2d"])
+_velocity_differential_drive = _motion_reader(MODELS["differential_drive"])
+_HEADING = np.array([-1 if model.heading_index is None else model.heading_index for model in MODELS.values()])
+
+
+@inlined
+def read_motion(arrays: Any, k: Any, s: Any, w: Any, velocity: Any, heading: Any) -> None:
+    """Fill the velocity ``(d,)`` and the heading's cosine and sine ``(2,)`` of robot ``k`` in world ``s``."""
+    code = arrays.model_codes[k]
+    if code == _HOLONOMIC2D:
+        _velocity_holonomic2d(k * STRIDE, s, w, velocity)
+    elif code == _HOLONOMIC3D:
+        _velocity_holonomic3d(k * STRIDE, s, w, velocity)
+    elif code == _VELOCITY2D:
+        _velocity_velocity2d(k * STRIDE, s, w, velocity)
+    else:
+        _velocity_differential_drive(k * STRIDE, s, w, velocity)
+    index = _HEADING[code]
+    heading[0] = cosine(w[k * STRIDE + index * TILE + s]) if index >= 0 else ZERO
+    heading[1] = sine(w[k * STRIDE + index * TILE + s]) if index >= 0 else ZERO

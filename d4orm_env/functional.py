@@ -1,0 +1,154 @@
+"""The environment as pure JAX functions, which jit, vmap and grad.
+
+>>> import jax
+>>> from d4orm_env import functional, make_problem
+>>> problem = make_problem("circle", num_robots=8)
+>>> state = functional.reset(problem, jax.random.key(0))
+>>> state, step = jax.jit(functional.step)(problem, state, controls)
+
+Importing this module registers :class:`~d4orm_env.core.problem.Problem` as a JAX pytree: a problem is an ordinary traced
+argument, whose starts, goals, limits and obstacles may be mapped over or differentiated. Models, shapes and the horizon
+are static.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from d4orm_env.core.problem import Problem, ProblemArrays
+from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
+from d4orm_env.engine.jax import Worlds, advance_worlds, judge
+
+
+class State(NamedTuple):
+    """Where a team is.
+
+    Attributes:
+        states: ``(K, n)``.
+        arrived: ``(K,)`` bool, docked.
+        steps: ``()`` int32, steps taken.
+    """
+
+    states: Any
+    arrived: Any
+    steps: Any
+
+
+class Step(NamedTuple):
+    """What one step brought.
+
+    Attributes:
+        rewards: ``(K,)``.
+        arrived: ``(K,)`` bool.
+        collided: ``(K,)`` bool, hard contact.
+        margin_violated: ``(K,)`` bool.
+        truncated: ``()`` bool, the horizon is reached.
+        controls: ``(K, m)`` as executed.
+    """
+
+    rewards: Any
+    arrived: Any
+    collided: Any
+    margin_violated: Any
+    truncated: Any
+    controls: Any
+
+
+def reset(problem: Problem, key: Any) -> State:
+    """The team at its start.
+
+    Args:
+        problem: The problem.
+        key: A JAX random key; problems start where they say, so it has no effect, but APIs that vmap resets need it.
+
+    Returns:
+        The state at time zero.
+    """
+    del key
+    num_robots = len(problem.team.models)
+    return State(jnp.asarray(problem.start), jnp.zeros(num_robots, bool), jnp.int32(0))
+
+
+def step(problem: Problem, state: State, controls: Any) -> tuple[State, Step]:
+    """One time step, as every engine takes it.
+
+    Args:
+        problem: The problem.
+        state: Where the team is.
+        controls: ``(K, m)``, clipped here.
+
+    Returns:
+        The next state and what happened.
+    """
+    arrays = _arrays(problem)
+    worlds = Worlds(state.states[..., None], state.arrived[..., None], jnp.zeros_like(controls)[..., None])
+    worlds = advance_worlds(problem.team.models, arrays, worlds, jnp.asarray(controls)[..., None])
+    collided, margin_violated, rewards = judge(arrays, worlds.state[:, : arrays.goal.shape[1]])
+    steps = state.steps + 1
+    return State(worlds.state[..., 0], worlds.docked[..., 0], steps), Step(
+        rewards[:, 0],
+        worlds.docked[:, 0],
+        collided[:, 0],
+        margin_violated[:, 0],
+        steps >= problem.horizon,
+        worlds.control[..., 0],
+    )
+
+
+def _arrays(problem: Problem) -> ProblemArrays:
+    """:attr:`Problem.arrays` for a problem whose numbers may be traced."""
+    team, world = problem.team, problem.world
+    place = jnp.asarray(problem.start)[:, : team.dimension]
+    gap2 = ((place - problem.goal) ** 2).sum(axis=-1)
+    distance = jnp.sqrt(jnp.maximum(gap2, problem.goal_radius**2))
+    goal_speed = jnp.inf if problem.goal_speed is None else problem.goal_speed
+    dt = problem.dt
+    if world.lower is None:
+        bounds = jnp.array([[-jnp.inf] * team.dimension, [jnp.inf] * team.dimension], jnp.float32)
+    else:
+        bounds = jnp.stack([jnp.asarray(world.lower), jnp.asarray(world.upper)])
+    return ProblemArrays(
+        model_codes=None,
+        limits=jnp.stack([jnp.asarray(x) for x in (team.max_speed, team.max_acceleration, team.max_turn_rate)], axis=1),
+        radius=jnp.asarray(team.radius),
+        start=problem.start,
+        goal=jnp.asarray(problem.goal),
+        inverse_initial_distance=1 / distance,
+        balls=world.balls,
+        cylinders=world.cylinders,
+        boxes=world.boxes,
+        bounds=bounds,
+        time_step=jnp.stack([jnp.asarray(dt / part, jnp.float32) for part in (1, 2, 3, 6)]),
+        margin=jnp.asarray(problem.margin, jnp.float32),
+        squared_goal_radius=jnp.asarray(problem.goal_radius**2, jnp.float32),
+        squared_goal_speed=jnp.asarray(goal_speed**2, jnp.float32),
+    )
+
+
+_STATIC = {Problem: ("horizon", "name"), Team: ("models",), World: ("dimension",)}
+
+
+def _register(kind: type) -> None:
+    static = _STATIC[kind]
+    names = tuple(field.name for field in fields(kind) if field.name not in static)
+
+    def flatten(value: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        return tuple(getattr(value, name) for name in names), tuple(getattr(value, name) for name in static)
+
+    def unflatten(metadata: tuple[Any, ...], children: tuple[Any, ...]) -> Any:
+        # Not through __init__: tracers cannot be validated, and the problem they stand for has been.
+        value = object.__new__(kind)
+        for name, part in zip((*names, *static), (*children, *metadata), strict=True):
+            object.__setattr__(value, name, part)
+        return value
+
+    jax.tree_util.register_pytree_node(kind, flatten, unflatten)
+
+
+for _kind in _STATIC:
+    _register(_kind)

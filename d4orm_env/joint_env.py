@@ -1,0 +1,159 @@
+"""Multi-robot navigation as a Gymnasium environment: one agent steers the whole team."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.simulation import TeamStep, agent_infos, make_simulation
+from d4orm_env.viewer import RENDER_MODES, Viewer
+
+ENV_ID = "d4orm/Navigation-v0"
+
+
+class JointNavigationEnv(gymnasium.Env[FloatArray, FloatArray]):
+    """The joint environment, ``gymnasium.make("d4orm/Navigation-v0", scenario=..., num_robots=...)``.
+
+    The observation ``(K * D,)`` is all robots' local observations one after the other, the action ``(K * m,)`` all
+    their controls in physical units, the reward the team's mean reward (paper, section III-D). It terminates when every
+    robot has arrived, and truncates after ``max_cycles`` steps. Infos hold ``agents`` (one dictionary per robot, as in
+    :mod:`d4orm_env.navigation_v0`), ``metrics`` of the episode so far, and ``is_success``.
+
+    The arguments are those of :class:`d4orm_env.navigation_v0.parallel_env`.
+
+    Raises:
+        ValueError: For a bad argument, or when both a problem and a scenario's arguments are given.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012
+
+    def __init__(
+        self,
+        scenario: str | None = None,
+        num_robots: int | None = None,
+        *,
+        problem: Problem | None = None,
+        render_mode: str | None = None,
+        control_noise_std: Any = 0.0,
+        lifelong: bool = False,
+        max_cycles: int | None = None,
+        randomize_instance: bool = False,
+        num_neighbors: int = 4,
+        num_obstacles: int = 4,
+        **scenario_kwargs: Any,
+    ) -> None:
+        self._viewer = Viewer(render_mode)
+        self.render_mode = render_mode
+        self._simulation = make_simulation(
+            scenario,
+            num_robots,
+            problem,
+            randomize_instance,
+            scenario_kwargs,
+            max_cycles=max_cycles,
+            control_noise_std=control_noise_std,
+            lifelong=lifelong,
+            num_neighbors=num_neighbors,
+            num_obstacles=num_obstacles,
+        )
+        self.metadata = type(self).metadata | {"render_fps": max(1, round(1 / self.problem.dt))}
+        team_size, layout = self.problem.num_robots, self._simulation.layout
+        self._agents = [f"robot_{robot}" for robot in range(team_size)]
+        limits = self.problem.team.control_limits
+        # Padding has no limit of its own; a box must not be flat.
+        limits = np.where(limits > 0, limits, limits.max(axis=0)).ravel()
+        self.action_space = gymnasium.spaces.Box(-limits, limits)
+        self.observation_space = gymnasium.spaces.Box(np.tile(layout.low, team_size), np.tile(layout.high, team_size))
+
+    @property
+    def problem(self) -> Problem:
+        """The problem being run; with ``randomize_instance`` that of the present episode."""
+        return self._simulation.problem
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[FloatArray, dict[str, Any]]:
+        """Begin an episode; ``options`` are accepted and not used.
+
+        Returns:
+            Observation ``(K * D,)`` and infos.
+        """
+        super().reset(seed=seed)
+        step = self._simulation.reset(self.np_random)
+        if self.render_mode == "human":
+            self.render()
+        return step.observations.ravel(), self._infos(step)
+
+    def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
+        """Advance one time step under ``action`` ``(K * m,)``.
+
+        Returns:
+            Observation ``(K * D,)``, mean reward, whether all arrived, whether time is up, and infos.
+
+        Raises:
+            RuntimeError: Before the first reset, or after the end of an episode.
+            ValueError: If the action has another shape or a value that is not finite.
+        """
+        simulation = self._simulation
+        simulation.require_reset()
+        if simulation.out_of_time or simulation.arrived.all():
+            raise RuntimeError("the episode is over; call reset() to begin another")
+        step = simulation.step(self._controls(action))
+        terminated = bool(simulation.arrived.all())
+        truncated = simulation.out_of_time and not terminated
+        if self.render_mode == "human":
+            self.render()
+        return step.observations.ravel(), float(step.rewards.mean()), terminated, truncated, self._infos(step)
+
+    def state(self) -> FloatArray:
+        """The joint state; see :mod:`d4orm_env.joint_state`.
+
+        Raises:
+            RuntimeError: Before the first reset.
+        """
+        return self._simulation.state()
+
+    def metrics(self) -> dict[str, float]:
+        """The episode so far in numbers; see :meth:`d4orm_env.episode_record.EpisodeRecord.metrics`.
+
+        Raises:
+            RuntimeError: Before the first reset.
+        """
+        return self._simulation.metrics()
+
+    def render(self) -> Any:
+        """``(height, width, 3)`` uint8 frame in mode ``"rgb_array"``, else ``None``."""
+        return self._viewer.render(self._simulation)
+
+    def close(self) -> None:
+        """Close the window or picture, if there is one."""
+        self._viewer.close()
+
+    def _controls(self, action: FloatArray) -> FloatArray:
+        with np.errstate(over="ignore"):
+            controls = np.array(action, np.float32)
+        if controls.shape != self.action_space.shape:
+            raise ValueError(f"action has shape {controls.shape}; expected (K * m,) = {self.action_space.shape}")
+        controls = controls.reshape(self.problem.num_robots, self.problem.control_size)
+        if not np.isfinite(controls).all():
+            robot = int(np.argmin(np.isfinite(controls).all(axis=1)))
+            raise ValueError(f"action of robot_{robot} is {controls[robot].tolist()}; every value must be finite")
+        return controls
+
+    def _infos(self, step: TeamStep) -> dict[str, Any]:
+        metrics = self._simulation.metrics()
+        return {
+            "agents": agent_infos(self._agents, range(len(self._agents)), step),
+            "metrics": metrics,
+            "is_success": bool(metrics.get("success", 0.0)),
+        }
+
+
+def register_environments() -> None:
+    """Make the environments known to Gymnasium; a second call changes nothing."""
+    if ENV_ID not in gymnasium.registry:
+        gymnasium.register(id=ENV_ID, entry_point="d4orm_env.joint_env:JointNavigationEnv")

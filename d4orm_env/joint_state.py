@@ -1,0 +1,118 @@
+"""The joint state as one vector: what ``env.state()`` returns and how to read it.
+
+The vector is the concatenation, in this order, of
+
+====================  ==========  =====================================================================
+Part                  Size        Meaning
+====================  ==========  =====================================================================
+states                ``K * n``   states of the robots, row by row, padded with zeros
+goals                 ``K * d``   present goal positions [m]
+controls              ``K * m``   controls executed in the last step; zero after a reset
+arrived               ``K``       1 for a robot that has docked, else 0
+steps                 1           steps taken since the reset
+====================  ==========  =====================================================================
+
+Together with the problem that is all there is to know about an episode's present, so a planner can go on from it.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.problem import Problem
+
+
+class JointState(NamedTuple):
+    """A joint state, taken apart.
+
+    Attributes:
+        states: ``(K, n)`` states of the robots.
+        goals: ``(K, d)`` present goals [m].
+        controls: ``(K, m)`` controls executed in the last step.
+        arrived: ``(K,)`` bool, docked robots.
+        steps: Steps taken since the reset.
+    """
+
+    states: FloatArray
+    goals: FloatArray
+    controls: FloatArray
+    arrived: BoolArray
+    steps: int
+
+
+def join_state(joint: JointState) -> FloatArray:
+    """The float32 vector of a joint state, freshly allocated."""
+    flags_and_steps = np.array([*joint.arrived, joint.steps], np.float32)
+    return np.concatenate([joint.states.ravel(), joint.goals.ravel(), joint.controls.ravel(), flags_and_steps])
+
+
+def split_state(problem: Problem, state: Any) -> JointState:
+    """Take the vector that ``env.state()`` returned apart.
+
+    Args:
+        problem: The problem of the environment, ``env.unwrapped.problem``.
+        state: ``(K * (n + d + m + 1) + 1,)`` the vector.
+
+    Returns:
+        The parts, as copies.
+
+    Raises:
+        ValueError: If the vector's length does not fit the problem.
+    """
+    team_size, vector = problem.num_robots, np.array(state, np.float32)
+    widths = (problem.state_size, problem.dimension, problem.control_size, 1)
+    expected = team_size * sum(widths) + 1
+    if vector.shape != (expected,):
+        raise ValueError(f"state has shape {vector.shape}; a state of this problem has shape ({expected},)")
+    ends = np.cumsum([team_size * width for width in widths])
+    states, goals, controls, arrived, steps = np.split(vector, ends)
+    return JointState(
+        states.reshape(team_size, widths[0]),
+        goals.reshape(team_size, widths[1]),
+        controls.reshape(team_size, widths[2]),
+        arrived > 0.5,
+        round(float(steps[0])),
+    )
+
+
+def state_bounds(problem: Problem, places: FloatArray, max_cycles: int) -> tuple[FloatArray, FloatArray]:
+    """Finite bounds that every joint state of an episode keeps.
+
+    A robot gets no farther from its start than its limits allow in ``max_cycles`` steps; headings wind up likewise.
+
+    Args:
+        problem: The problem.
+        places: ``(2, d)`` box that holds every start and goal [m].
+        max_cycles: Steps in an episode.
+
+    Returns:
+        Lowest and highest joint state vector.
+    """
+    team, dimension = problem.team, problem.dimension
+    duration = max_cycles * problem.dt
+    speed, acceleration, turn_rate = (np.asarray(limit, np.float64) for limit in team.limits.T)
+    # Within a step a robot may exceed the speed limit, which is applied at its end.
+    reach = (speed + acceleration * problem.dt / 2) * duration
+    high = np.ones((problem.num_robots, problem.state_size))
+    for robot, model in enumerate(team.robot_models):
+        high[robot, list(model.speed_indices)] = speed[robot]
+        if model.heading_index is not None:
+            start = abs(float(problem.start[robot, model.heading_index]))
+            high[robot, model.heading_index] = start + 2 * np.pi + turn_rate[robot] * duration
+    low = -high
+    low[:, :dimension] = places[0] - reach[:, None]
+    high[:, :dimension] = places[1] + reach[:, None]
+    controls = np.where(team.control_limits > 0, team.control_limits, 1.0)
+    flags, steps = np.ones(problem.num_robots), [max_cycles]
+    goals = np.broadcast_to(places[:, None], (2, problem.num_robots, dimension))
+    slack = 1e-3 * (1 + np.abs(np.concatenate([low.ravel(), goals[0].ravel(), controls.ravel()])))
+    lowest = np.concatenate([low.ravel(), goals[0].ravel(), -controls.ravel()]) - slack
+    slack = 1e-3 * (1 + np.abs(np.concatenate([high.ravel(), goals[1].ravel(), controls.ravel()])))
+    highest = np.concatenate([high.ravel(), goals[1].ravel(), controls.ravel()]) + slack
+    return (
+        np.concatenate([lowest, 0 * flags, [0]]).astype(np.float32),
+        np.concatenate([highest, flags, steps]).astype(np.float32),
+    )

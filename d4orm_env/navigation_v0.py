@@ -1,0 +1,256 @@
+"""Multi-robot navigation as a PettingZoo environment: every robot is an agent.
+
+Each robot drives to its goal without touching the others, the obstacles or the bounds (paper, section III). Actions are
+controls in physical units, so that a plan's controls ``(H, K, m)`` can be stepped as they are.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.utils import seeding
+from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo.utils import parallel_to_aec
+from pettingzoo.utils.conversions import parallel_to_aec_wrapper
+
+from d4orm_env.core.arrays import FloatArray, whole_number
+from d4orm_env.core.problem import Problem
+from d4orm_env.simulation import agent_infos, make_simulation
+from d4orm_env.viewer import RENDER_MODES, Viewer
+
+__all__ = ["env", "parallel_env", "raw_env"]
+
+
+class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
+    """All robots act at once.
+
+    Agents are ``robot_0`` .. ``robot_{K-1}``. An agent that arrives is terminated and leaves ``agents``; its body stays
+    in the world at its goal. When ``max_cycles`` steps have been taken the others are truncated.
+
+    Args:
+        scenario: Name of a scenario; ``"circle"`` unless a problem is given.
+        num_robots: Size of the team; the scenario's default (8 for most) unless given.
+        problem: The problem to run instead of a scenario.
+        render_mode: ``"rgb_array"``, ``"human"`` or ``None``.
+        control_noise_std: Standard deviation of Gaussian execution noise, in the controls' units, for all components
+            or one per component. It is added before the control is clipped.
+        lifelong: A robot that arrives gets a fresh random goal, keeps moving and is not terminated; its info says
+            ``arrived`` at that step, and ``distance_to_goal`` is to the new goal.
+        max_cycles: Steps until truncation; the problem's horizon unless given. May be assigned later.
+        randomize_instance: Draw a new instance of the scenario at every reset.
+        num_neighbors: Nearest robots in an observation; missing ones are marked absent.
+        num_obstacles: Nearest obstacles in an observation; likewise.
+        **scenario_kwargs: Arguments of the scenario, such as ``model`` or ``seed``.
+
+    Raises:
+        ValueError: For a bad argument, or when both a problem and a scenario's arguments are given.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - declared mutable by PettingZoo
+        "name": "d4orm_navigation_v0",
+        "render_modes": list(RENDER_MODES),
+        "render_fps": 10,
+        "is_parallelizable": True,
+    }
+
+    def __init__(
+        self,
+        scenario: str | None = None,
+        num_robots: int | None = None,
+        *,
+        problem: Problem | None = None,
+        render_mode: str | None = None,
+        control_noise_std: Any = 0.0,
+        lifelong: bool = False,
+        max_cycles: int | None = None,
+        randomize_instance: bool = False,
+        num_neighbors: int = 4,
+        num_obstacles: int = 4,
+        **scenario_kwargs: Any,
+    ) -> None:
+        self._viewer = Viewer(render_mode)
+        self.render_mode = render_mode
+        self._simulation = make_simulation(
+            scenario,
+            num_robots,
+            problem,
+            randomize_instance,
+            scenario_kwargs,
+            max_cycles=max_cycles,
+            control_noise_std=control_noise_std,
+            lifelong=lifelong,
+            num_neighbors=num_neighbors,
+            num_obstacles=num_obstacles,
+        )
+        self.metadata = type(self).metadata | {"render_fps": max(1, round(1 / self.problem.dt))}
+        self.possible_agents = [f"robot_{robot}" for robot in range(self.problem.num_robots)]
+        self.agents: list[str] = []
+        self._robots = {agent: robot for robot, agent in enumerate(self.possible_agents)}
+        self._control_size = self.problem.control_size
+        self._make_spaces()
+        self._np_random: np.random.Generator | None = None
+
+    def _make_spaces(self) -> None:
+        layout = self._simulation.layout
+        limit = self.problem.team.control_limits.max(axis=0)
+        box = gymnasium.spaces.Box
+        self.observation_spaces = {agent: box(layout.low, layout.high) for agent in self.possible_agents}
+        self.action_spaces = {agent: box(-limit, limit) for agent in self.possible_agents}
+        self.state_space = box(*self._simulation.state_bounds)
+
+    @property
+    def problem(self) -> Problem:
+        """The problem being run; with ``randomize_instance`` that of the present episode."""
+        return self._simulation.problem
+
+    @property
+    def max_cycles(self) -> int:
+        """Steps until truncation; assigning it also makes a new ``state_space``, which counts steps."""
+        return self._simulation.max_cycles
+
+    @max_cycles.setter
+    def max_cycles(self, value: int) -> None:
+        self._simulation.max_cycles = whole_number(value, "max_cycles", 1)
+        self.state_space = gymnasium.spaces.Box(*self._simulation.state_bounds)
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """Where episodes draw their randomness from; seeded by :meth:`reset`."""
+        if self._np_random is None:
+            self._np_random = seeding.np_random()[0]
+        return self._np_random
+
+    def observation_space(self, agent: str) -> gymnasium.spaces.Box:
+        """``(D,)`` float32 box, the same for all agents."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> gymnasium.spaces.Box:
+        """``(m,)`` float32 box of the team's largest control limits, the same for all agents, in physical units.
+
+        The step clips every control to the robot's own limits.
+        """
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, FloatArray], dict[str, dict[str, Any]]]:
+        """Begin an episode.
+
+        Args:
+            seed: Seeds the noise, new goals and new instances; ``None`` goes on with the present generator.
+            options: Accepted for the API; none are used.
+
+        Returns:
+            Observations and infos of all agents.
+        """
+        if seed is not None:
+            self._np_random = seeding.np_random(seed)[0]
+        step = self._simulation.reset(self.np_random)
+        self.agents = self.possible_agents[:]
+        if self.render_mode == "human":
+            self.render()
+        return dict(zip(self.agents, step.observations)), agent_infos(self.agents, self._robots.values(), step)
+
+    def step(
+        self, actions: dict[str, FloatArray]
+    ) -> tuple[dict[str, FloatArray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+        """Advance one time step.
+
+        Args:
+            actions: ``(m,)`` control of every agent in ``agents``. Those of agents that have left are ignored.
+
+        Returns:
+            Observations, rewards, terminations, truncations and infos of the agents that acted, their last step
+            included; five empty dictionaries when no agent is left.
+
+        Raises:
+            RuntimeError: Before the first reset.
+            ValueError: If an action is missing, has another shape, or is not finite; the message names the agent.
+        """
+        simulation, acting = self._simulation, self.agents
+        simulation.require_reset()
+        if not acting:
+            return {}, {}, {}, {}, {}
+        robots = [self._robots[agent] for agent in acting]
+        controls = np.zeros((len(self.possible_agents), self._control_size), np.float32)
+        controls[robots] = self._collect(actions)
+        step = simulation.step(controls)
+        observations, rewards, arrived = step.observations, step.rewards.tolist(), step.arrived.tolist()
+        ends = not simulation.lifelong
+        terminations = {agent: ends and arrived[robot] for agent, robot in zip(acting, robots)}
+        out_of_time = simulation.out_of_time
+        self.agents = [] if out_of_time else [agent for agent in acting if not terminations[agent]]
+        if self.render_mode == "human":
+            self.render()
+        return (
+            {agent: observations[robot] for agent, robot in zip(acting, robots)},
+            {agent: rewards[robot] for agent, robot in zip(acting, robots)},
+            terminations,
+            {agent: out_of_time and not terminated for agent, terminated in terminations.items()},
+            agent_infos(acting, robots, step),
+        )
+
+    def state(self) -> FloatArray:
+        """The joint state, all a planner needs to go on from here; see :mod:`d4orm_env.joint_state`.
+
+        Raises:
+            RuntimeError: Before the first reset.
+        """
+        return self._simulation.state()
+
+    def metrics(self) -> dict[str, float]:
+        """The episode so far in numbers; see :meth:`d4orm_env.episode_record.EpisodeRecord.metrics`.
+
+        Raises:
+            RuntimeError: Before the first reset.
+        """
+        return self._simulation.metrics()
+
+    def render(self) -> Any:
+        """``(height, width, 3)`` uint8 frame in mode ``"rgb_array"``, else ``None``."""
+        return self._viewer.render(self._simulation)
+
+    def close(self) -> None:
+        """Close the window or picture, if there is one."""
+        self._viewer.close()
+
+    def _collect(self, actions: dict[str, FloatArray]) -> FloatArray:
+        """``(agents, m)`` the actions of the agents still acting, checked."""
+        try:
+            with np.errstate(over="ignore"):
+                block: FloatArray = np.array([actions[agent] for agent in self.agents], np.float32)
+        except (KeyError, TypeError, ValueError):
+            raise ValueError(self._complaint(actions)) from None
+        if block.shape != (len(self.agents), self._control_size) or not np.isfinite(block).all():
+            raise ValueError(self._complaint(actions))
+        if len(actions) != len(self.agents) and not actions.keys() <= self._robots.keys():
+            unknown = sorted(map(str, actions.keys() - self._robots.keys()))
+            raise ValueError(f"actions name unknown agents {', '.join(unknown)}; the agents are env.possible_agents")
+        return block
+
+    def _complaint(self, actions: dict[str, FloatArray]) -> str:
+        shape = (self._control_size,)
+        for agent in self.agents:
+            if agent not in actions:
+                return f"actions lack {agent}; give one for every agent in env.agents"
+            action = actions[agent]
+            try:
+                with np.errstate(over="ignore"):
+                    array = np.asarray(action, np.float32)
+            except (TypeError, ValueError):
+                return f"action of {agent} is {action!r}; it must be {shape[0]} numbers"
+            if array.shape != shape or not np.isfinite(array).all():
+                return f"action of {agent} is {action!r}; it must be {shape[0]} finite numbers, of shape {shape}"
+        raise AssertionError("every action is fine")
+
+
+def raw_env(*args: Any, **kwargs: Any) -> AECEnv[str, FloatArray, FloatArray | None]:
+    """The robots act in turn and move together when the last has chosen; arguments of :class:`parallel_env`."""
+    return parallel_to_aec_wrapper(parallel_env(*args, **kwargs))
+
+
+def env(*args: Any, **kwargs: Any) -> AECEnv[str, FloatArray, FloatArray | None]:
+    """:func:`raw_env`, with calls in the wrong order caught; arguments of :class:`parallel_env`."""
+    return parallel_to_aec(parallel_env(*args, **kwargs))

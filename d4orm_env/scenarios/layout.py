@@ -1,0 +1,134 @@
+"""From the places of robots and obstacles to a problem: headings, horizon, random obstacles, the final check."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
+from d4orm_env.scenarios.placement import Points, with_random_obstacles
+from d4orm_env.scenarios.settings import Settings
+
+MIN_HORIZON = 100
+MAX_HORIZON = 1_000_000
+HORIZON_SLACK = 1.6
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where a scenario puts things.
+
+    Attributes:
+        starts: ``(K, d)`` start positions [m].
+        goals: ``(K, d)`` goal positions [m].
+        world: Obstacles and bounds of the scenario itself.
+        travel: The distance the horizon is made for [m]: the same for every seed, so that problems that differ in
+            their seed alone have the same shapes.
+        half_extent: ``(d,)`` half the sides of the box around the origin that random obstacles are placed in [m].
+        is_round: Whether random obstacles keep to the ellipse inside that box.
+    """
+
+    starts: Points
+    goals: Points
+    world: World
+    travel: float
+    half_extent: Points
+    is_round: bool = False
+
+
+def build(settings: Settings, layout: Layout) -> Problem:
+    """The problem of that layout.
+
+    Raises:
+        ValueError: If the random obstacles do not fit, or a start or goal does not keep the margin.
+    """
+    team = settings.team
+    places = np.vstack([layout.starts, layout.goals])
+    horizon = settings.horizon
+    problem = Problem(
+        team=team,
+        start=start_states(team, layout.starts, layout.goals),
+        goal=layout.goals,
+        world=with_random_obstacles(settings, layout.world, places, layout.half_extent, is_round=layout.is_round),
+        dt=settings.dt,
+        horizon=default_horizon(team, settings.dt, layout.travel) if horizon is None else horizon,
+        margin=settings.margin,
+        goal_radius=settings.goal_radius,
+        goal_speed=settings.goal_speed,
+        name=settings.scenario,
+    )
+    require_margin(problem)
+    return problem
+
+
+def default_horizon(team: Team, dt: float, distance: float) -> int:
+    """Steps that give every robot time to drive ``distance`` and to give way to others.
+
+    At least 100 steps (the paper's horizon); more where 1.6 times the straight drive from rest to rest takes longer,
+    rounded up to whole tens. With the default limits and ``dt`` that is 100 steps up to 5.25 m.
+
+    Args:
+        team: The robots and their limits.
+        dt: Time step [s].
+        distance: Longest distance from a start to its goal [m].
+
+    Raises:
+        ValueError: If that takes more than a million steps.
+    """
+    speed, acceleration = np.float64(team.max_speed), np.float64(team.max_acceleration)
+    has_inertia = np.array([bool(model.speed_indices) for model in team.robot_models])
+    peak = np.where(has_inertia, np.minimum(speed, np.sqrt(acceleration * distance)), speed)
+    drive = float((distance / peak + np.where(has_inertia, peak / acceleration, 0.0)).max())
+    # The tolerance keeps limits that float32 cannot hold exactly from adding a step.
+    steps = HORIZON_SLACK * drive / dt * (1 - 1e-6)
+    if steps > MAX_HORIZON:
+        raise ValueError(
+            f"a straight drive of {distance:g} m with dt {dt:g} s needs {steps:.3g} steps; "
+            f"use a larger dt, faster robots or a shorter way, or give the horizon"
+        )
+    return max(MIN_HORIZON, 10 * math.ceil(steps / 10))
+
+
+def start_states(team: Team, starts: Points, goals: Points) -> Points:
+    """``(K, n)`` states at rest; a model that has a heading faces its goal (as in the paper's reference code)."""
+    states = np.zeros((team.num_robots, team.state_size))
+    states[:, : team.dimension] = starts
+    way = goals - starts
+    for robot, model in enumerate(team.robot_models):
+        if model.heading_index is not None:
+            states[robot, model.heading_index] = math.atan2(way[robot, 1], way[robot, 0])
+    return states
+
+
+def in_space(points: Any, dimension: int) -> Points:
+    """``(., 2)`` points of the plane as ``(., dimension)``: in space, at z = 0."""
+    planar: Points = np.asarray(points, np.float64).reshape(-1, 2)
+    return planar if dimension == 2 else np.hstack([planar, np.zeros((len(planar), 1))])
+
+
+def require_margin(problem: Problem) -> None:
+    """Check that the surfaces of robots and obstacles are more than the margin apart, at the start and at the goal.
+
+    Raises:
+        ValueError: If not: the problem would have no solution that keeps the margin.
+    """
+    radius = np.asarray(problem.team.radius, np.float64)
+    for what, places in (("start", problem.start[:, : problem.dimension]), ("goal", problem.goal)):
+        points = places.astype(np.float64)
+        gaps = problem.world.clearance(points) - radius
+        nearest = ["an obstacle or the bounds"] * len(points)
+        for robot in range(1, len(points)):
+            gap = np.linalg.norm(points[:robot] - points[robot], axis=1) - radius[:robot] - radius[robot]
+            if gap.min() < gaps[robot]:
+                gaps[robot], nearest[robot] = gap.min(), f"robot_{np.argmin(gap)}"
+        robot = int(np.argmin(gaps))
+        if gaps[robot] <= problem.margin:
+            raise ValueError(
+                f"scenario {problem.name!r}: the {what} of robot_{robot} is {gaps[robot]:.3g} m from {nearest[robot]}, "
+                f"and the margin is {problem.margin:g} m; make the scenario larger, or the radius or margin smaller"
+            )

@@ -1,0 +1,150 @@
+"""Random places for robots and obstacles, drawn again until they are free."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.core.world import World
+from d4orm_env.scenarios.settings import OBSTACLES, STARTS_AND_GOALS, Settings
+
+Points = NDArray[np.float64]
+
+FEW, MANY, ROUNDS = 8, 512, 70
+"""Candidates drawn at first and at most at once, and how often, before a place is held to be impossible."""
+
+DENSITY = {2: 0.4, 3: 0.25}
+"""Share of the area (volume) that random placement fills without fail; it jams at 0.547 (0.384)."""
+
+
+def scatter(settings: Settings, size: float) -> tuple[Points, Points]:
+    """Random starts and goals in the square (cube) of side ``size`` around the origin.
+
+    Starts keep more than the margin to each other, goals likewise, and no robot starts at its goal. Each place is drawn
+    uniformly, and drawn again until it is free.
+
+    Returns:
+        ``(K, d)`` starts and ``(K, d)`` goals.
+
+    Raises:
+        ValueError: If the robots do not fit; the message says the size that would do.
+    """
+    count, dimension = settings.num_robots, settings.team.dimension
+    random = settings.generator(STARTS_AND_GOALS)
+    half_extent = np.full(dimension, size / 2)
+    needed = max(size_for(count, settings.spacing, dimension), 3 * settings.goal_radius)
+    starts, goals = np.empty((0, dimension)), np.empty((0, dimension))
+    for robot in range(count if needed <= size else 0):
+        starts = _with_another(random, half_extent, starts, settings.spacing)
+        own = (starts[robot:], settings.goal_radius)
+        goals = _with_another(random, half_extent, goals, settings.spacing, own)
+        if min(len(starts), len(goals)) == robot:
+            break
+    if min(len(starts), len(goals)) < count:
+        raise ValueError(
+            f"scenario {settings.scenario!r}: {count} robots of radius {np.max(settings.team.radius):g} m with margin "
+            f"{settings.margin:g} m do not fit at random in a size of {size:g} m; "
+            f"use size={round_up(needed if needed > size else 1.2 * size)}"
+        )
+    return starts, goals
+
+
+def size_for(count: int, spacing: float, dimension: int) -> float:
+    """Side of the square (cube) that takes ``count`` random points ``spacing`` apart without fail [m]."""
+    ball = math.pi / 4 * spacing**2 if dimension == 2 else math.pi / 6 * spacing**3
+    return float((count * ball / DENSITY[dimension]) ** (1 / dimension)) if count > 1 else 0.0
+
+
+def with_random_obstacles(
+    settings: Settings, world: World, places: Points, half_extent: Points, *, is_round: bool
+) -> World:
+    """The world and ``settings.num_obstacles`` random circles, or spheres in space.
+
+    They keep more than the margin to every start and goal, and leave the largest robot a passage with its margin on
+    both sides, between each other and to everything else: no obstacle closes a way.
+
+    Args:
+        settings: Number and radius of obstacles, team, seed.
+        world: The world they are added to.
+        places: ``(2 K, d)`` starts, then goals [m].
+        half_extent: ``(d,)`` half the sides of the box around the origin that centres are drawn from [m].
+        is_round: Whether centres keep to the ellipse inside that box.
+
+    Raises:
+        ValueError: If so many do not fit; the message says how many do.
+    """
+    if not settings.num_obstacles:
+        return world
+    random = settings.generator(OBSTACLES)
+    size = float(np.float32(settings.obstacle_radius))
+    passage = 2 * (float(np.max(settings.team.radius)) + settings.margin)
+    reach = np.tile(np.float64(settings.team.radius), 2) + size + settings.margin
+    extent = np.maximum(half_extent, np.finfo(np.float64).tiny)
+    balls: Points = np.empty((0, world.dimension))
+
+    def is_free(centres: Points) -> NDArray[np.bool_]:
+        inside = ((centres / extent) ** 2).sum(axis=1) <= 1 if is_round else np.full(len(centres), True)
+        apart = _gaps(centres, places, reach) > 0
+        passable = (world.clearance(centres) > size + passage) & (_gaps(centres, balls, 2 * size + passage) > 0)
+        return np.asarray(inside & apart & passable)
+
+    for index in range(settings.num_obstacles):
+        ball = _first(random, half_extent, is_free)
+        if ball is None:
+            raise ValueError(
+                f"scenario {settings.scenario!r}: only {index} of {settings.num_obstacles} obstacles of radius "
+                f"{size:g} m fit between the robots; use num_obstacles={index}, a smaller obstacle_radius or a larger "
+                f"scenario"
+            )
+        balls = np.vstack([balls, ball])
+    kind = "circles" if world.dimension == 2 else "spheres"
+    rows = np.hstack([balls, np.full((len(balls), 1), size)])
+    obstacles: dict[str, Any] = {kind: np.vstack([world.balls, rows])}
+    return replace(world, **obstacles)
+
+
+def round_up(value: float) -> str:
+    """A length rounded up to the next centimetre, for an error that says what would do."""
+    return f"{math.floor(value * 100) / 100 + 0.01:.2f}" if value < 1e6 else f"{value * 1.01:.2e}"
+
+
+def _with_another(
+    random: np.random.Generator,
+    half_extent: Points,
+    points: Points,
+    spacing: float,
+    avoid: tuple[Points, float] | None = None,
+) -> Points:
+    """``points`` and a random one further than ``spacing`` from each, or just ``points`` if there is no room."""
+
+    def is_free(candidates: Points) -> NDArray[np.bool_]:
+        free = _gaps(candidates, points, spacing) > 0
+        return free if avoid is None else free & (_gaps(candidates, *avoid) > 0)
+
+    place = _first(random, half_extent, is_free)
+    return points if place is None else np.vstack([points, place])
+
+
+def _first(random: np.random.Generator, half_extent: Points, is_free: Any) -> Points | None:
+    """The first uniform random point that is free, or ``None`` if none of many was."""
+    for attempt in range(ROUNDS):
+        points = random.uniform(-half_extent, half_extent, (min(FEW << attempt, MANY), len(half_extent)))
+        # Rounded as the problem will hold them, so that what is checked is what is used.
+        points = points.astype(np.float32).astype(np.float64)
+        free = is_free(points)
+        if free.any():
+            first: Points = points[np.argmax(free)]
+            return first
+    return None
+
+
+def _gaps(candidates: Points, points: Points, reach: Any) -> Points:
+    """``(C,)`` how far each candidate is from all points, less their reach; infinite where there are none [m]."""
+    if not len(points):
+        return np.full(len(candidates), np.inf)
+    gaps: Points = (np.linalg.norm(candidates[:, None] - points, axis=-1) - reach).min(axis=1)
+    return gaps

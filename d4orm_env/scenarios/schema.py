@@ -1,0 +1,286 @@
+"""What a scenario file may hold, and the problem it means.
+
+The public description is the documented example ``examples/scenarios/mixed_team.yaml``.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from d4orm_env.core.dynamics import Model, get_model
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
+from d4orm_env.scenarios.registry import make_problem
+
+FLOAT32_MAX = float(str(np.finfo(np.float32).max))
+VERSION = 1
+
+SQUARED_MAX = 1e18
+"""Largest magnitude whose square, and a sum of such squares, float32 still holds."""
+
+Number = Annotated[float, Field(ge=-FLOAT32_MAX, le=FLOAT32_MAX)]
+Squared = Annotated[float, Field(ge=-SQUARED_MAX, le=SQUARED_MAX)]
+Place = Annotated[list[Squared], Field(min_length=2, max_length=3)]
+PlanarPlace = Annotated[list[Number], Field(min_length=2, max_length=2)]
+SpatialPlace = Annotated[list[Number], Field(min_length=3, max_length=3)]
+
+
+class Entry(BaseModel):
+    """Common strictness: no unknown fields, no text for numbers, no NaN or infinity."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+
+class RobotEntry(Entry):
+    """One robot. Lengths of ``start``, ``goal`` and ``velocity`` follow the model's dimension."""
+
+    model: str
+    start: Place
+    goal: Place
+    velocity: Place | None = None
+    heading: Number | None = None
+    speed: Squared | None = None
+    radius: Number = 0.15
+    max_speed: Number = 1.0
+    max_acceleration: Number = 1.0
+    max_turn_rate: Number = float(np.float32(np.pi / 2))
+
+    @model_validator(mode="after")
+    def _fits_model(self) -> RobotEntry:
+        model = get_model(self.model)
+        for name in ("start", "goal", "velocity"):
+            value = getattr(self, name)
+            if value is not None and len(value) != model.dimension:
+                raise ValueError(f"{name} {value} has {len(value)} components; a {model.name} needs {model.dimension}")
+        for name in ("velocity", "heading", "speed"):
+            if getattr(self, name) is not None and name not in start_fields(model):
+                known = ", ".join(("start", *start_fields(model)))
+                raise ValueError(f"a {model.name} starts without {name}; it has {known}")
+        return self
+
+    @property
+    def state(self) -> list[float]:
+        """The start state, defaults filled in; a robot with a heading faces its goal."""
+        model = get_model(self.model)
+        state = list(self.start)
+        if "velocity" in start_fields(model):
+            state += self.velocity or [0.0] * model.dimension
+        if "heading" in start_fields(model):
+            way = np.subtract(self.goal, self.start)
+            state += [float(np.arctan2(way[1], way[0])) if self.heading is None else self.heading]
+            state += [0.0 if self.speed is None else self.speed]
+        return state
+
+
+class RoundEntry(Entry):
+    """A circle or vertical cylinder: centre x, y and radius [m]."""
+
+    center: PlanarPlace
+    radius: Number
+
+    @property
+    def row(self) -> list[float]:
+        return [*self.center, self.radius]
+
+
+class SphereEntry(Entry):
+    """A sphere: centre x, y, z and radius [m]."""
+
+    center: SpatialPlace
+    radius: Number
+
+    @property
+    def row(self) -> list[float]:
+        return [*self.center, self.radius]
+
+
+class BoxEntry(Entry):
+    """An axis-aligned box, or the bounds of the world: two opposite corners [m]."""
+
+    lower: Place
+    upper: Place
+
+    @model_validator(mode="after")
+    def _corners_match(self) -> BoxEntry:
+        if len(self.lower) != len(self.upper):
+            raise ValueError(
+                f"lower has {len(self.lower)} components and upper {len(self.upper)}; give the same number"
+            )
+        return self
+
+    @property
+    def row(self) -> list[float]:
+        return [*self.lower, *self.upper]
+
+
+class WorldEntry(Entry):
+    """Obstacles and bounds; an open world without bounds."""
+
+    bounds: BoxEntry | None = None
+    circles: list[RoundEntry] = []
+    spheres: list[SphereEntry] = []
+    cylinders: list[RoundEntry] = []
+    boxes: list[BoxEntry] = []
+
+    def build(self, dimension: int) -> World:
+        rows = {
+            kind: [entry.row for entry in getattr(self, kind)] for kind in ("circles", "spheres", "cylinders", "boxes")
+        }
+        lower, upper = (self.bounds.lower, self.bounds.upper) if self.bounds else (None, None)
+        return World(dimension, **rows, lower=lower, upper=upper)
+
+
+class ProblemFile(Entry):
+    """The explicit form: every robot is listed."""
+
+    version: Literal[1]
+    name: str = "custom"
+    dt: Squared = 0.1
+    horizon: int = 100
+    margin: Squared = 0.05
+    goal_radius: Squared = 0.075
+    goal_speed: Squared | None = None
+    robots: list[RobotEntry] = Field(min_length=1)
+    world: WorldEntry = WorldEntry()
+
+    def build(self) -> Problem:
+        limits = ("radius", "max_speed", "max_acceleration", "max_turn_rate")
+        columns: dict[str, Any] = {name: [getattr(robot, name) for robot in self.robots] for name in limits}
+        team = Team(tuple(robot.model for robot in self.robots), **columns)
+        start = [robot.state + [0.0] * (team.state_size - len(robot.state)) for robot in self.robots]
+        return Problem(
+            team=team,
+            start=start,
+            goal=[robot.goal for robot in self.robots],
+            world=self.world.build(team.dimension),
+            dt=self.dt,
+            horizon=self.horizon,
+            margin=self.margin,
+            goal_radius=self.goal_radius,
+            goal_speed=self.goal_speed,
+            name=self.name,
+        )
+
+
+class ScenarioFile(BaseModel):
+    """The short form: a scenario's name and arguments, which :func:`make_problem` checks."""
+
+    model_config = ConfigDict(extra="allow", strict=True, frozen=True)
+
+    version: Literal[1]
+    scenario: str
+    name: str | None = None
+
+    def build(self) -> Problem:
+        problem = make_problem(self.scenario, **(self.model_extra or {}))
+        return problem if self.name is None else problem.replace(name=self.name)
+
+
+PARTS: dict[tuple[str, ...], type[BaseModel]] = {
+    (): ProblemFile,
+    ("robots",): RobotEntry,
+    ("world",): WorldEntry,
+    ("world", "bounds"): BoxEntry,
+    ("world", "circles"): RoundEntry,
+    ("world", "spheres"): SphereEntry,
+    ("world", "cylinders"): RoundEntry,
+    ("world", "boxes"): BoxEntry,
+}
+"""The schema of each part of the explicit form."""
+
+
+def start_fields(model: Model) -> tuple[str, ...]:
+    """What a start state of that model holds beside its position."""
+    if model.heading_index is not None:
+        return ("heading", "speed")
+    return ("velocity",) if model.speed_indices else ()
+
+
+def parse(data: Any) -> Problem:
+    """The problem that the content of a file means.
+
+    Raises:
+        ValueError: If it breaks the schema or makes no valid problem; one line that names the field.
+    """
+    if not isinstance(data, dict):
+        raise ValueError("expected fields such as 'version: 1' and 'robots:' or 'scenario:' at the top")
+    if "scenario" in data and ("robots" in data or "world" in data):
+        raise ValueError("scenario: give either a scenario and its arguments, or robots and world, not both")
+    form: type[ProblemFile] | type[ScenarioFile] = ScenarioFile if "scenario" in data else ProblemFile
+    try:
+        content = form.model_validate(data)
+    except ValidationError as error:
+        raise ValueError(_explain(error)) from None
+    # A value too large for float32 becomes infinite, and is then refused by name.
+    with np.errstate(over="ignore"):
+        return content.build()
+
+
+def describe(problem: Problem) -> dict[str, Any]:
+    """The content of a file that means that problem, to the bit: the inverse of :func:`parse`."""
+    settings = {name: getattr(problem, name) for name in ("dt", "horizon", "margin", "goal_radius", "goal_speed")}
+    robots = [_describe_robot(problem, robot) for robot in range(problem.num_robots)]
+    return {
+        "version": VERSION,
+        "name": str(problem.name).encode("utf-8", "replace").decode(),  # YAML has no lone surrogates
+        **settings,
+        "robots": robots,
+        "world": _describe_world(problem),
+    }
+
+
+def _describe_robot(problem: Problem, robot: int) -> dict[str, Any]:
+    team, dimension = problem.team, problem.dimension
+    model = team.robot_models[robot]
+    state = _decimals(problem.start[robot, : model.state_size])
+    entry: dict[str, Any] = {"model": model.name, "start": state[:dimension], "goal": _decimals(problem.goal[robot])}
+    if "velocity" in start_fields(model):
+        entry["velocity"] = state[dimension:]
+    if "heading" in start_fields(model):
+        entry["heading"], entry["speed"] = state[dimension:]
+    for name in ("radius", "max_speed", "max_acceleration", "max_turn_rate"):
+        (entry[name],) = _decimals(np.asarray(getattr(team, name))[[robot]])
+    return entry
+
+
+def _describe_world(problem: Problem) -> dict[str, Any]:
+    world, dimension = problem.world, problem.dimension
+    content: dict[str, Any] = {}
+    if world.lower is not None:
+        content["bounds"] = {"lower": _decimals(world.lower), "upper": _decimals(world.upper)}
+    for kind in ("circles", "spheres", "cylinders"):
+        rows = [_decimals(row) for row in getattr(world, kind)]
+        content[kind] = [{"center": row[:-1], "radius": row[-1]} for row in rows]
+    boxes = [_decimals(row) for row in world.boxes]
+    content["boxes"] = [{"lower": row[:dimension], "upper": row[dimension:]} for row in boxes]
+    return {kind: entries for kind, entries in content.items() if entries}
+
+
+def _decimals(values: Any) -> list[float]:
+    """float32 values as the shortest decimals that read back as the same float32."""
+    shortest = [float(str(value)) for value in values]
+    # Reading a decimal by way of float64 may round twice; the exact value never does.
+    return [number if np.float32(number) == value else float(value) for number, value in zip(shortest, values)]
+
+
+def _explain(error: ValidationError) -> str:
+    """The first error, as one line: where, what was expected, what was found."""
+    first = error.errors(include_url=False)[0]
+    names = tuple(part for part in first["loc"] if isinstance(part, str))
+    where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
+    if first["type"] == "extra_forbidden" and names[:-1] in PARTS:
+        message = f"unknown field; known are {', '.join(PARTS[names[:-1]].model_fields)}"
+    elif first["type"] == "missing":
+        message = "this field is missing"
+    elif first["type"] == "value_error":
+        message = str(first["ctx"]["error"])
+    else:
+        found = repr(first["input"])
+        message = (
+            f"{first['msg'][0].lower()}{first['msg'][1:]}, not {found if len(found) <= 60 else found[:57] + '...'}"
+        )
+    return f"{where}: {message}" if where else message

@@ -1,0 +1,118 @@
+"""The arguments every scenario shares, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from d4orm_env.core.arrays import positive_number, whole_number
+from d4orm_env.core.dynamics import get_model
+from d4orm_env.core.team import Team
+
+MAX_COUNT = 10_000
+"""Most robots or obstacles a generator makes: a slip of the finger must not fill the memory."""
+
+LARGEST = 10_000.0
+"""Largest length [m], time [s] and docking speed [m/s]; beyond it float32 holds no millimetres."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Arguments common to all scenarios. Defaults are the paper's and its reference code's.
+
+    Attributes:
+        scenario: Name of the scenario.
+        num_robots: ``K``.
+        seed: Seeds whatever the scenario draws: random starts and goals, random obstacles, jitter.
+        model: One model name for all robots, or ``K`` names.
+        num_obstacles: Random circles (spheres in space) placed inside the scenario.
+        obstacle_radius: Radius of circular obstacles [m].
+        radius: Robot radius [m], one or ``K``.
+        margin: Safety margin [m].
+        dt: Time step [s].
+        horizon: Number of steps; ``None`` follows :func:`~d4orm_env.scenarios.layout.default_horizon`.
+        goal_radius: A robot within it has arrived [m].
+        goal_speed: Speed at which a robot may still dock [m/s]; ``None`` is no limit.
+        max_speed: Speed limit [m/s], one or ``K``.
+        max_acceleration: Acceleration limit [m/s^2], one or ``K``.
+        max_turn_rate: Turn rate limit [rad/s], one or ``K``.
+
+    Raises:
+        ValueError: If a value makes no sense; the message names it.
+    """
+
+    scenario: str
+    num_robots: int = 8
+    seed: int = 0
+    model: Any = "holonomic2d"
+    num_obstacles: int = 0
+    obstacle_radius: float = 0.15
+    radius: Any = 0.15
+    margin: float = 0.05
+    dt: float = 0.1
+    horizon: int | None = None
+    goal_radius: float = 0.075
+    goal_speed: float | None = None
+    max_speed: Any = 1.0
+    max_acceleration: Any = 1.0
+    max_turn_rate: Any = float(np.pi / 2)
+
+    def __post_init__(self) -> None:
+        for name, minimum in (("num_robots", 1), ("seed", 0), ("num_obstacles", 0)):
+            object.__setattr__(self, name, whole_number(getattr(self, name), name, minimum))
+        for name in ("num_robots", "num_obstacles"):
+            if getattr(self, name) > MAX_COUNT:
+                raise ValueError(f"{name} is {getattr(self, name)}; scenarios make at most {MAX_COUNT}")
+        if self.horizon is not None:
+            object.__setattr__(self, "horizon", whole_number(self.horizon, "horizon", 1))
+        for name in ("dt", "goal_radius", "obstacle_radius"):
+            object.__setattr__(self, name, bounded(getattr(self, name), name))
+        object.__setattr__(self, "margin", bounded(self.margin, "margin", zero_allowed=True))
+        if self.goal_speed is not None:
+            object.__setattr__(self, "goal_speed", bounded(self.goal_speed, "goal_speed", zero_allowed=True))
+
+    @cached_property
+    def models(self) -> tuple[str, ...]:
+        """``K`` model names."""
+        if isinstance(self.model, str):
+            get_model(self.model)
+            return (self.model,) * self.num_robots
+        if not isinstance(self.model, Sequence) or not all(isinstance(name, str) for name in self.model):
+            raise ValueError(f"model must be the name of a model or one name per robot, not {self.model!r}")
+        if len(self.model) != self.num_robots:
+            raise ValueError(f"model lists {len(self.model)} names for {self.num_robots} robots; give one per robot")
+        return tuple(self.model)
+
+    @cached_property
+    def team(self) -> Team:
+        """The robots."""
+        return Team(self.models, self.radius, self.max_speed, self.max_acceleration, self.max_turn_rate)
+
+    @property
+    def spacing(self) -> float:
+        """Distance between the centres of the two largest robots whose surfaces are one margin apart [m]."""
+        return 2 * float(np.max(self.team.radius)) + self.margin
+
+    def generator(self, purpose: int) -> np.random.Generator:
+        """The seed's random numbers for one purpose: drawing obstacles does not move the robots."""
+        return np.random.default_rng([self.seed, purpose])
+
+
+STARTS_AND_GOALS, OBSTACLES, JITTER = range(3)
+"""Purposes of :meth:`Settings.generator`."""
+
+
+def bounded(value: Any, name: str, *, zero_allowed: bool = False) -> float:
+    """``value`` as a positive number no larger than scenarios are.
+
+    Raises:
+        ValueError: If it is not a positive finite number, or beyond :data:`LARGEST`.
+    """
+    number = positive_number(value, name, zero_allowed=zero_allowed)
+    if number > LARGEST:
+        raise ValueError(f"{name} is {number:g}; scenarios take at most {LARGEST:g}")
+    return number

@@ -1,0 +1,306 @@
+"""The world as it goes on: one team, step by step, behind every environment of this package.
+
+The environments are thin shells around :class:`Simulation`, which holds the state, the clock, the goals and the
+execution noise, and calls an engine for the physics and the observations.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from d4orm_env.core.arrays import BoolArray, FloatArray, frozen_array, whole_number
+from d4orm_env.core.observation import ObservationLayout
+from d4orm_env.core.problem import Problem, inverse_initial_distance
+from d4orm_env.engine.base import get_engine
+from d4orm_env.episode_record import EpisodeRecord
+from d4orm_env.joint_state import JointState, join_state, state_bounds
+from d4orm_env.lifelong import fresh_goal, goal_region, reached_goals
+
+_OPEN_WORLD_EXTENT = 1000.0
+_TRAIL_LENGTH = 50
+
+
+class TeamStep(NamedTuple):
+    """What a step or a reset tells about the team; every array is the caller's to keep.
+
+    Attributes:
+        observations: ``(K, D)`` local observations.
+        rewards: ``(K,)``; zero at a reset.
+        arrived: ``(K,)`` bool: docked, or in lifelong mode, reached a goal in this step.
+        collided: ``(K,)`` bool, hard contact.
+        margin_violated: ``(K,)`` bool.
+        distances: ``(K,)`` to the present goals [m].
+    """
+
+    observations: FloatArray
+    rewards: FloatArray
+    arrived: BoolArray
+    collided: BoolArray
+    margin_violated: BoolArray
+    distances: FloatArray
+
+
+class Simulation:
+    """A team in its world, stepped with the whole team's controls.
+
+    Args:
+        problem: What is simulated.
+        max_cycles: Steps in an episode; ``None`` is the problem's horizon.
+        control_noise_std: Standard deviation of the Gaussian noise added to the controls before they are clipped, in
+            the controls' own units: one number, or one per control component.
+        lifelong: Give a robot that arrives a fresh random goal and leave it moving, instead of docking it.
+        num_neighbors: Robots in an observation.
+        num_obstacles: Obstacles in an observation.
+        redraw: ``seed -> Problem`` draws a new instance at every reset; ``None`` keeps ``problem``.
+
+    Raises:
+        ValueError: For an argument out of range, or a ``redraw`` whose instances do not differ.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        *,
+        max_cycles: int | None = None,
+        control_noise_std: Any = 0.0,
+        lifelong: bool = False,
+        num_neighbors: int = 4,
+        num_obstacles: int = 4,
+        redraw: Callable[[int], Problem] | None = None,
+    ) -> None:
+        self.problem = problem
+        self.max_cycles = whole_number(problem.horizon if max_cycles is None else max_cycles, "max_cycles", 1)
+        self.noise_std = noise_std(control_noise_std, problem.control_size)
+        self.lifelong = lifelong
+        self.layout = ObservationLayout.for_problem(
+            problem,
+            num_neighbors=whole_number(num_neighbors, "num_neighbors", 0),
+            num_obstacles=whole_number(num_obstacles, "num_obstacles", 0),
+        )
+        self._engine = get_engine("cpu")
+        self._dimension = problem.dimension
+        self._redraw = redraw
+        if redraw is not None and redraw(0) == redraw(1):
+            raise ValueError(
+                f"scenario {problem.name!r} is the same for every seed, so randomize_instance has nothing to draw; "
+                "use a scenario with random starts and goals, or leave randomize_instance off"
+            )
+        self._places = goal_region(problem)
+        if redraw is not None and problem.world.lower is None:
+            # Nothing but the scenario bounds its instances in an open world, so leave ample room.
+            extent = max(_OPEN_WORLD_EXTENT, 10 * float(np.abs(self._places).max()))
+            self._places = np.array([[-extent], [extent]], np.float32).repeat(problem.dimension, axis=1)
+        self._running = False
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # NumPy unpickles read-only arrays as writable ones, for which the engine would have to compile anew.
+        self.__dict__ |= state
+        low, high = (frozen_array(bound, "bounds", (None,)) for bound in (self.layout.low, self.layout.high))
+        self.layout = replace(self.layout, low=low, high=high)
+        if self._running:
+            self._set_goals(self.arrays.goal, self.arrays.inverse_initial_distance)
+
+    @property
+    def state_bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Finite bounds of :meth:`state`, for the present ``max_cycles``."""
+        return state_bounds(self.problem, self._places, self.max_cycles)
+
+    @property
+    def out_of_time(self) -> bool:
+        """Whether ``max_cycles`` steps have been taken."""
+        return self.steps >= self.max_cycles
+
+    @property
+    def trail(self) -> FloatArray:
+        """``(T, K, d)`` positions over the last steps, the present last [m]."""
+        return np.stack(self._trail)
+
+    def require_reset(self) -> None:
+        """Raise ``RuntimeError`` unless an episode has begun."""
+        if not self._running:
+            raise RuntimeError("no episode has begun; call reset() first")
+
+    def reset(self, random: np.random.Generator) -> TeamStep:
+        """Begin an episode at the start; everything random in it follows from one draw from ``random``.
+
+        Raises:
+            ValueError: If the instance drawn does not fit the spaces fixed by the first one.
+        """
+        # One draw per episode, so that an episode's noise does not depend on how long those before it were.
+        self._random = np.random.default_rng(int(random.integers(2**63)))
+        if self._redraw is not None:
+            self._take_instance(self._redraw(int(self._random.integers(2**31))))
+        problem = self.problem
+        self.arrays = problem.arrays
+        self.states = problem.start
+        self.arrived = np.zeros(problem.num_robots, np.bool_)
+        self.controls = np.zeros((problem.num_robots, problem.control_size), np.float32)
+        self.steps = 0
+        self.collided, margin_violated = self._engine.contacts(self.arrays, self.states)
+        self.record = EpisodeRecord(problem.num_robots, problem.dt, self.lifelong)
+        self._trail: deque[FloatArray] = deque([self.states[:, : self._dimension]], _TRAIL_LENGTH)
+        self._running = True
+        return self._report(np.zeros(problem.num_robots, np.float32), self.arrived.copy(), margin_violated)
+
+    def step(self, controls: FloatArray) -> TeamStep:
+        """Advance one time step under ``controls`` ``(K, m)``; those of docked robots do not matter.
+
+        Raises:
+            RuntimeError: Before the first reset, or if lifelong mode finds no room for a goal.
+        """
+        self.require_reset()
+        if self.noise_std is not None:
+            noise = self._random.standard_normal(controls.shape, dtype=np.float32)
+            controls = controls + self.noise_std * noise
+        arrays = self.arrays
+        if self.lifelong:
+            # A goal radius that nothing is within: a robot under way to its next goal neither docks nor stops.
+            arrays = arrays._replace(squared_goal_radius=np.float32(-1))
+        result = self._engine.step(arrays, self.states, self.arrived, controls)
+        self.states, self.controls, self.collided = result.states, result.controls, result.collided
+        self.steps += 1
+        self._trail.append(self.states[:, : self._dimension])
+        if self.lifelong:
+            arrived = reached_goals(self.problem, self.arrays.goal, self.states, self.controls)
+            self._assign_goals(np.flatnonzero(arrived))
+        else:
+            self.arrived = result.arrived
+            arrived = result.arrived.copy()
+        self.record.add(result.rewards, arrived, result.collided, result.margin_violated)
+        return self._report(result.rewards, arrived, result.margin_violated)
+
+    def state(self) -> FloatArray:
+        """The joint state vector; see :mod:`d4orm_env.joint_state`."""
+        self.require_reset()
+        return join_state(JointState(self.states, self.arrays.goal, self.controls, self.arrived, self.steps))
+
+    def metrics(self) -> dict[str, float]:
+        """The episode so far in numbers; see :meth:`d4orm_env.episode_record.EpisodeRecord.metrics`."""
+        self.require_reset()
+        return self.record.metrics()
+
+    def _report(self, rewards: FloatArray, arrived: BoolArray, margin_violated: BoolArray) -> TeamStep:
+        time_left = max(0.0, 1.0 - self.steps / self.max_cycles)
+        observations = self._engine.observe(
+            self.arrays, self.layout, self.states, self.controls, self.arrived, time_left
+        )
+        offsets = self.arrays.goal - self.states[:, : self._dimension]
+        distances = np.sqrt(np.einsum("kd,kd->k", offsets, offsets))
+        return TeamStep(observations, rewards, arrived, self.collided, margin_violated, distances)
+
+    def _assign_goals(self, robots: Any) -> None:
+        if not len(robots):
+            return
+        problem, positions = self.problem, self.states[:, : self._dimension]
+        goals, scale = self.arrays.goal.copy(), self.arrays.inverse_initial_distance.copy()
+        for robot in robots:
+            goals[robot] = fresh_goal(problem, int(robot), positions, goals, self._random)
+        scale[robots] = inverse_initial_distance(positions[robots], goals[robots], problem.goal_radius)
+        self._set_goals(goals, scale)
+
+    def _set_goals(self, goals: FloatArray, inverse_initial_distance: FloatArray) -> None:
+        # Read-only like the arrays they replace: the engine compiles anew for writable ones.
+        goals.setflags(write=False)
+        inverse_initial_distance.setflags(write=False)
+        self.arrays = self.problem.arrays._replace(goal=goals, inverse_initial_distance=inverse_initial_distance)
+
+    def _take_instance(self, drawn: Problem) -> None:
+        """Make ``drawn`` the problem, if the spaces that were made for the first one hold it."""
+        old, places = self.problem, self._places
+        points = np.concatenate([drawn.start[:, : old.dimension], drawn.goal])
+        if (
+            drawn.team.models != old.team.models
+            or (drawn.team.control_limits != old.team.control_limits).any()
+            or (points < places[0]).any()
+            or (points > places[1]).any()
+        ):
+            raise ValueError(
+                f"the instance drawn from scenario {drawn.name!r} has another team or lies outside "
+                f"{places.tolist()} m, where the state space ends; use a scenario whose seed changes places only"
+            )
+        self.problem = drawn
+
+
+def noise_std(value: Any, control_size: int) -> FloatArray | None:
+    """``(m,)`` standard deviations from one number or one per component; ``None`` where all are zero.
+
+    Raises:
+        ValueError: If it has another shape, or a value is negative or not finite.
+    """
+    try:
+        with np.errstate(over="ignore"):
+            std = np.asarray(value, np.float32)
+    except (TypeError, ValueError):
+        raise ValueError(f"control_noise_std must be a number or one per control component, not {value!r}") from None
+    if std.shape not in ((), (control_size,)):
+        raise ValueError(
+            f"control_noise_std has shape {std.shape}; give one number, or {control_size}, one per control component"
+        )
+    if not np.isfinite(std).all() or (std < 0).any():
+        raise ValueError(f"control_noise_std is {std.tolist()}; it must be zero or more and finite")
+    return np.broadcast_to(std, (control_size,)).copy() if std.any() else None
+
+
+def make_simulation(
+    scenario: str | None,
+    num_robots: int | None,
+    problem: Problem | None,
+    randomize_instance: bool,
+    scenario_kwargs: dict[str, Any],
+    **settings: Any,
+) -> Simulation:
+    """The simulation that an environment's arguments ask for: of a scenario, or of a given problem.
+
+    Args:
+        scenario: Name of a scenario; ``None`` is ``"circle"``.
+        num_robots: ``None`` is the scenario's default.
+        problem: Simulate this problem instead; excludes the scenario's arguments.
+        randomize_instance: Draw a new instance of the scenario at every reset.
+        scenario_kwargs: Further arguments of the scenario.
+        settings: Passed on to :class:`Simulation`.
+
+    Raises:
+        ValueError: If both a problem and a scenario's arguments are given, or one of them is bad.
+    """
+    if num_robots is not None:
+        scenario_kwargs = {"num_robots": num_robots, **scenario_kwargs}
+    if problem is not None:
+        given = [*([] if scenario is None else ["scenario"]), *scenario_kwargs]
+        if given or randomize_instance:
+            named = ", ".join(given + ["randomize_instance"] * randomize_instance)
+            raise ValueError(f"problem= excludes the scenario arguments ({named}); give one or the other")
+        return Simulation(problem, **settings)
+
+    # Imported here, since scenario files bring pydantic and YAML along, which a given problem does not need.
+    from d4orm_env.scenarios import make_problem
+
+    name = "circle" if scenario is None else scenario
+    first = make_problem(name, **scenario_kwargs)
+
+    redraw = partial(_draw, make_problem, name, scenario_kwargs) if randomize_instance else None
+    return Simulation(first, redraw=redraw, **settings)
+
+
+def _draw(make_problem: Callable[..., Problem], name: str, arguments: dict[str, Any], seed: int) -> Problem:
+    return make_problem(name, **(arguments | {"seed": seed}))
+
+
+def agent_infos(names: Any, robots: Any, step: TeamStep) -> dict[str, dict[str, Any]]:
+    """Fresh info dictionaries of some robots, in plain Python values."""
+    arrived, collided = step.arrived.tolist(), step.collided.tolist()
+    margin_violated, distances = step.margin_violated.tolist(), step.distances.tolist()
+    return {
+        name: {
+            "arrived": arrived[robot],
+            "collided": collided[robot],
+            "margin_violated": margin_violated[robot],
+            "distance_to_goal": distances[robot],
+        }
+        for name, robot in zip(names, robots)
+    }

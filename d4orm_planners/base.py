@@ -1,0 +1,271 @@
+"""The planner interface and the one loop that drives every planner: budget, callback, stopping, best plan so far."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray, positive_number, whole_number
+from d4orm_env.core.metrics import trajectory_metrics
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.engine.base import Engine, checked_controls, get_engine
+from d4orm_env.verify import verify
+from d4orm_planners.plan import IterationRecord, Plan
+
+Callback = Callable[[IterationRecord], Any]
+
+
+class Stopwatch:
+    """Wall time of a solve, without the time spent compiling."""
+
+    def __init__(self) -> None:
+        self._start = time.perf_counter()
+        self._paused = 0.0
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds so far."""
+        return time.perf_counter() - self._start - self._paused
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Leave the time of the block out."""
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._paused += time.perf_counter() - begin
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannerConfig:
+    """Settings that every planner takes.
+
+    Attributes:
+        engine: ``"auto"``, ``"cpu"`` or ``"jax"``.
+        max_iterations: Iterations after which :meth:`Planner.solve` gives up, unless told otherwise in the call.
+        improve: Go on improving after the first solution, until the time or iteration budget is used up. By default the
+            first solution ends the search.
+    """
+
+    engine: str = "auto"
+    max_iterations: int = 50
+    improve: bool = False
+
+    def __post_init__(self) -> None:
+        whole_number(self.max_iterations, "max_iterations", 1)
+        if not isinstance(self.improve, bool):
+            raise ValueError(f"improve must be True or False, not {self.improve!r}")
+        get_engine(self.engine)
+
+    @classmethod
+    def setting_names(cls) -> tuple[str, ...]:
+        """Names of all settings, in order."""
+        return tuple(field.name for field in fields(cls))
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Controls and what they lead to.
+
+    Attributes:
+        controls: ``(H, K, m)`` as executed: inside the limits, zero once docked.
+        trajectory: Their rollout.
+        solved: Whether everyone arrives, the margin is kept at every step, and :func:`d4orm_env.verify` agrees.
+        failed: ``(K,)`` robots that do not arrive, or violate the margin at some step.
+    """
+
+    controls: FloatArray
+    trajectory: Trajectory
+    solved: bool
+    failed: np.ndarray
+
+    @property
+    def rank(self) -> tuple[bool, int, float]:
+        """Larger is better: solved before unsolved, then fewer failed robots, then more reward."""
+        reward = float(self.trajectory.rewards.mean())
+        return (True, 0, reward) if self.solved else (False, -int(self.failed.sum()), reward)
+
+
+def evaluate_controls(engine: Engine, problem: Problem, controls: FloatArray) -> Candidate:
+    """Roll controls out and judge them."""
+    trajectory = engine.rollout(problem, controls)
+    # The start itself cannot be planned away, so it does not count.
+    failed = ~trajectory.arrived[-1] | trajectory.margin_violated[1:].any(axis=0)
+    solved = not failed.any() and verify(problem, trajectory.controls).ok
+    return Candidate(trajectory.controls, trajectory, solved, failed)
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """What a planner's iteration hands to the loop.
+
+    Attributes:
+        controls: ``(H, K, m)`` the new candidate.
+        denoising_steps: Sample-score-update steps spent.
+    """
+
+    controls: FloatArray
+    denoising_steps: int
+
+
+class Planner(ABC):
+    """A method that turns a problem into a plan. Instances hold settings only; everything else lives in a solve.
+
+    Attributes:
+        name: Registry name.
+        config: The settings.
+    """
+
+    name: ClassVar[str]
+    config_class: ClassVar[type[PlannerConfig]] = PlannerConfig
+    presets: ClassVar[dict[str, dict[str, Any]]] = {}
+
+    def __init__(self, config: PlannerConfig) -> None:
+        self.config = config
+
+    @abstractmethod
+    def iterate(self, search: Search) -> Iteration:
+        """One iteration from the search's current candidate to the next."""
+
+    def solve(
+        self,
+        problem: Problem,
+        seed: int = 0,
+        time_limit: float | None = None,
+        max_iterations: int | None = None,
+        callback: Callback | None = None,
+        initial_controls: Any = None,
+    ) -> Plan:
+        """Plan until a solution is found (or on, with ``improve``), the budget is used up, or Ctrl-C is pressed.
+
+        Args:
+            problem: What to solve.
+            seed: Non-negative seed; the same seed gives the same plan.
+            time_limit: Seconds, compilation not counted; checked after every iteration.
+            max_iterations: Iterations; the configured number by default.
+            callback: Called with an :class:`IterationRecord` after every iteration; returning ``True`` stops.
+            initial_controls: ``(H, K, m)`` to start from, zeros by default.
+
+        Returns:
+            The best plan found: a solved one with the most reward, else the one with the fewest robots failing.
+
+        Raises:
+            ValueError: If an argument makes no sense; the message names it.
+        """
+        search = Search(self, problem, seed, initial_controls)
+        if time_limit is not None:
+            time_limit = positive_number(time_limit, "time_limit")
+        limit = self.config.max_iterations if max_iterations is None else whole_number(max_iterations, "max_iterations", 1)
+        status = "iteration_limit"
+        try:
+            while True:
+                if search.best.solved and not self.config.improve:
+                    status = "solved"
+                    break
+                if search.iteration >= limit:
+                    break
+                if time_limit is not None and search.watch.elapsed >= time_limit:
+                    status = "time_limit"
+                    break
+                record = search.advance()
+                if callback is not None:
+                    with search.watch.paused():
+                        stop = callback(record)
+                    if stop is True:
+                        status = "stopped"
+                        break
+        except KeyboardInterrupt:
+            status = "interrupted"
+        return search.plan(status)
+
+
+class Search:
+    """One solve on its way.
+
+    Attributes:
+        problem: The problem.
+        engine: What rolls out and samples.
+        seed: The solve's seed.
+        watch: Time used.
+        current: The candidate that the next iteration starts from.
+        best: The best candidate so far.
+        iteration: Iterations done.
+        memory: What a planner keeps between its own iterations.
+    """
+
+    def __init__(self, planner: Planner, problem: Problem, seed: int, initial_controls: Any) -> None:
+        self.planner = planner
+        self.problem = problem
+        self.engine = get_engine(planner.config.engine)
+        self.seed = whole_number(seed, "seed", 0)
+        shape = (problem.horizon, problem.num_robots, problem.control_size)
+        if initial_controls is None:
+            controls = np.zeros(shape, np.float32)
+        else:
+            try:
+                controls = checked_controls(problem, initial_controls)
+            except ValueError as error:
+                raise ValueError(f"initial_controls: {error}") from None
+        self.watch = Stopwatch()
+        with self.watch.paused():
+            # The first rollout may compile.
+            self.engine.rollout(problem, controls)
+        self.current = self.best = evaluate_controls(self.engine, problem, controls)
+        self.iteration = 0
+        self.denoising_steps = 0
+        self.history: list[IterationRecord] = []
+        self.memory: dict[str, Any] = {}
+
+    def iteration_seed(self, stream: int = 0) -> int:
+        """A seed for one denoising run of the present iteration."""
+        words = np.random.SeedSequence([self.seed, self.iteration, stream]).generate_state(1, np.uint64)
+        return int(words[0])
+
+    def advance(self) -> IterationRecord:
+        """Run one iteration, judge it and remember the best."""
+        iteration = self.planner.iterate(self)
+        self.current = evaluate_controls(self.engine, self.problem, iteration.controls)
+        self.iteration += 1
+        self.denoising_steps += iteration.denoising_steps
+        if self.current.rank > self.best.rank:
+            self.best = self.current
+        trajectory = self.current.trajectory
+        record = IterationRecord(
+            iteration=self.iteration,
+            wall_time=self.watch.elapsed,
+            denoising_steps=self.denoising_steps,
+            reward=float(trajectory.rewards.mean()),
+            solved=self.current.solved,
+            num_failed=int(self.current.failed.sum()),
+            num_margin_violated=int(trajectory.margin_violated[1:].any(axis=0).sum()),
+            num_not_arrived=int((~trajectory.arrived[-1]).sum()),
+            best_reward=float(self.best.trajectory.rewards.mean()),
+            best_solved=self.best.solved,
+        )
+        self.history.append(record)
+        return record
+
+    def plan(self, status: str) -> Plan:
+        """The best candidate as a plan."""
+        return Plan(
+            planner=self.planner.name,
+            problem=self.problem,
+            seed=self.seed,
+            controls=self.best.controls,
+            solved=self.best.solved,
+            status=status,
+            iterations=self.iteration,
+            denoising_steps=self.denoising_steps,
+            wall_time=self.watch.elapsed,
+            history=tuple(self.history),
+            trajectory=self.best.trajectory,
+            metrics=trajectory_metrics(self.problem, self.best.trajectory),
+        )

@@ -1,0 +1,172 @@
+"""Plans: what planners return, and their files."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import zipfile
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.scenarios.schema import describe, parse
+
+FORMAT = "d4orm-plan-1"
+
+
+@dataclass(frozen=True)
+class IterationRecord:
+    """The state of a solve after one iteration.
+
+    Attributes:
+        iteration: From 1.
+        wall_time: Seconds since the solve began, compilation not counted.
+        denoising_steps: Sample-score-update steps so far.
+        reward: Mean reward of this iteration's candidate.
+        solved: Whether this iteration's candidate is a solution.
+        num_failed: Robots that do not arrive or violate the margin.
+        num_margin_violated: Robots that come within the margin of anything, at any step.
+        num_not_arrived: Robots that are not at their goal at the horizon.
+        best_reward: Mean reward of the best candidate so far.
+        best_solved: Whether that one is a solution.
+    """
+
+    iteration: int
+    wall_time: float
+    denoising_steps: int
+    reward: float
+    solved: bool
+    num_failed: int
+    num_margin_violated: int
+    num_not_arrived: int
+    best_reward: float
+    best_solved: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Controls for a whole team, how they were found and what they lead to.
+
+    Attributes:
+        planner: Name of the planner.
+        problem: The problem.
+        seed: The seed.
+        controls: ``(H, K, m)`` inside the limits, zero once docked.
+        solved: Whether everyone arrives, the margin is kept at every step, and :func:`d4orm_env.verify` found no fault.
+        status: ``"solved"``, ``"iteration_limit"``, ``"time_limit"``, ``"stopped"`` (by the callback) or ``"interrupted"``.
+        iterations: Iterations done.
+        denoising_steps: Sample-score-update steps done.
+        wall_time: Seconds, first-call compilation excluded.
+        history: One record per iteration.
+        trajectory: Rollout of the controls.
+        metrics: See :func:`d4orm_env.core.metrics.trajectory_metrics`.
+    """
+
+    planner: str
+    problem: Problem
+    seed: int
+    controls: FloatArray
+    solved: bool
+    status: str
+    iterations: int
+    denoising_steps: int
+    wall_time: float
+    history: tuple[IterationRecord, ...]
+    trajectory: Trajectory
+    metrics: dict[str, float]
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the plan, its problem and its trajectory to an ``.npz`` file.
+
+        Raises:
+            ValueError: If the path does not end in ``.npz``.
+            OSError: If it cannot be written; nothing is left behind then.
+        """
+        target = _npz_path(path)
+        header = {
+            "format": FORMAT,
+            "problem": describe(self.problem),
+            "history": [asdict(record) for record in self.history],
+            **{name: getattr(self, name) for name in _SCALARS},
+        }
+        arrays = {field.name: getattr(self.trajectory, field.name) for field in fields(Trajectory)}
+        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".npz")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
+            os.replace(temporary, target)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Plan:
+        """Read a plan that :meth:`save` wrote. Nothing is unpickled.
+
+        Raises:
+            FileNotFoundError: If there is no such file.
+            ValueError: If the file is damaged or is not a plan.
+        """
+        source = _npz_path(path)
+        try:
+            with np.load(source, allow_pickle=False) as file:
+                content = {name: file[name] for name in file.files}
+            header = json.loads(str(content.pop("header")))
+            if header.pop("format") != FORMAT:
+                raise ValueError("written by another version")
+            problem = parse(header.pop("problem"))
+            history = tuple(IterationRecord(**record) for record in header.pop("history"))
+            trajectory = _checked_trajectory(problem, content)
+            return cls(
+                problem=problem, history=history, trajectory=trajectory, controls=trajectory.controls, **_checked(header)
+            )
+        except FileNotFoundError:
+            raise FileNotFoundError(f"there is no plan at {source}") from None
+        except (ValueError, KeyError, TypeError, EOFError, OSError, zipfile.BadZipFile, AttributeError) as error:
+            raise ValueError(f"{source} is not a readable plan ({_first_line(error)}); write it anew with Plan.save") from error
+
+
+_SCALARS = ("planner", "seed", "solved", "status", "iterations", "denoising_steps", "wall_time", "metrics")
+
+
+def _npz_path(path: str | os.PathLike[str]) -> Path:
+    target = Path(path)
+    if target.suffix != ".npz":
+        raise ValueError(f"plan file {str(target)!r} must end in .npz")
+    return target
+
+
+def _checked(header: dict[str, Any]) -> dict[str, Any]:
+    kinds = {"planner": str, "seed": int, "solved": bool, "status": str, "iterations": int, "denoising_steps": int}
+    for name, kind in {**kinds, "wall_time": (int, float), "metrics": dict}.items():
+        if not isinstance(header[name], kind):  # type: ignore[arg-type]
+            raise ValueError(f"{name} is {header[name]!r}")
+    return {name: header[name] for name in _SCALARS}
+
+
+def _checked_trajectory(problem: Problem, content: dict[str, Any]) -> Trajectory:
+    steps, robots = problem.horizon, problem.num_robots
+    shapes = {
+        "states": (steps + 1, robots, problem.state_size),
+        "positions": (steps + 1, robots, problem.dimension),
+        "controls": (steps, robots, problem.control_size),
+        "rewards": (steps, robots),
+        "arrived": (steps + 1, robots),
+        "collided": (steps + 1, robots),
+        "margin_violated": (steps + 1, robots),
+    }
+    for name, shape in shapes.items():
+        kind = "f" if name in ("states", "positions", "controls", "rewards") else "b"
+        if content[name].shape != shape or content[name].dtype.kind != kind or not np.isfinite(content[name]).all():
+            raise ValueError(f"{name} does not fit the problem")
+    return Trajectory(**{name: content[name] for name in shapes})
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -1,0 +1,127 @@
+"""Policies: what acts in an ``env.step`` loop. They see observations and ``env.state()``, and nothing else of the env."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.joint_state import JointState, split_state
+from d4orm_planners.base import Planner
+from d4orm_planners.plan import Plan
+
+Actions = dict[str, FloatArray]
+
+
+class Policy(ABC):
+    """Something that chooses every robot's control at every step."""
+
+    name: ClassVar[str]
+
+    def reset(self, env: Any, seed: int = 0) -> None:
+        """Get ready for an episode that ``env.reset()`` has begun.
+
+        Args:
+            env: A :mod:`d4orm_env.navigation_v0` parallel environment, wrapped or not.
+            seed: Seeds whatever the policy draws.
+        """
+        self.problem: Problem = env.unwrapped.problem
+        self._begin(env, seed)
+
+    def act(self, observations: dict[str, Any], state: Any) -> Actions:
+        """Controls for the agents in ``observations``.
+
+        Args:
+            observations: The environment's observations; their keys are the agents that act.
+            state: ``env.state()``.
+
+        Returns:
+            ``{agent: (m,) float32 control}``.
+        """
+        joint = split_state(self.problem, state)
+        controls = self._controls(joint)
+        return {agent: controls[int(agent.rsplit("_", 1)[1])] for agent in observations}
+
+    def _begin(self, env: Any, seed: int) -> None:
+        """What the policy does at a reset beyond looking at the problem."""
+
+    @abstractmethod
+    def _controls(self, joint: JointState) -> FloatArray:
+        """``(K, m)`` controls of the whole team."""
+
+
+class OpenLoop(Policy):
+    """Plans once at the reset and executes the plan, whatever happens.
+
+    Attributes:
+        planner: What makes the plan.
+        plan: The plan of the present episode.
+    """
+
+    name = "open-loop"
+
+    def __init__(self, planner: Planner | None = None, plan: Plan | None = None, time_limit: float | None = None) -> None:
+        if (planner is None) == (plan is None):
+            raise ValueError("an open-loop policy needs either a planner or a plan")
+        self.planner = planner
+        self.plan = plan
+        self.time_limit = time_limit
+
+    def _begin(self, env: Any, seed: int) -> None:
+        if self.planner is not None:
+            self.plan = self.planner.solve(self.problem, seed=seed, time_limit=self.time_limit)
+        elif self.plan is not None and self.plan.problem != self.problem:
+            raise ValueError("the plan was made for another problem than the environment's; plan for this one")
+
+    def _controls(self, joint: JointState) -> FloatArray:
+        assert self.plan is not None
+        if joint.steps >= len(self.plan.controls):
+            return np.zeros_like(self.plan.controls[0])
+        return self.plan.controls[joint.steps]
+
+
+class RandomControls(Policy):
+    """Controls drawn uniformly from the box of each robot's limits."""
+
+    name = "random"
+
+    def _begin(self, env: Any, seed: int) -> None:
+        self._generator = np.random.default_rng(seed)
+
+    def _controls(self, joint: JointState) -> FloatArray:
+        limit = self.problem.team.control_limits
+        return self._generator.uniform(-limit, limit).astype(np.float32)
+
+
+class DriveToGoal(Policy):
+    """Drives straight to the goal and brakes for it, as if nobody else were there."""
+
+    name = "goal"
+
+    def _controls(self, joint: JointState) -> FloatArray:
+        problem = self.problem
+        controls = np.zeros((problem.num_robots, problem.control_size), np.float32)
+        for robot, model in enumerate(problem.team.robot_models):
+            speed, acceleration, turn_rate = (float(limit) for limit in problem.team.limits[robot])
+            state = joint.states[robot]
+            to_goal = joint.goals[robot] - state[: model.dimension]
+            distance = float(np.linalg.norm(to_goal))
+            # The fastest speed from which the robot can still stop at its goal.
+            wanted_speed = min(speed, float(np.sqrt(2 * acceleration * distance)))
+            wanted = to_goal / max(distance, 1e-6) * wanted_speed
+            if model.name == "velocity2d":
+                controls[robot, :2] = to_goal / max(distance, 1e-6) * min(speed, distance / problem.dt)
+            elif model.heading_index is None:
+                controls[robot, : model.control_size] = (wanted - state[list(model.speed_indices)]) / problem.dt
+            else:
+                turn = np.arctan2(to_goal[1], to_goal[0]) - state[model.heading_index]
+                turn = (turn + np.pi) % (2 * np.pi) - np.pi
+                facing = max(float(np.cos(turn)), 0.0)
+                controls[robot, 0] = np.clip(turn / problem.dt, -turn_rate, turn_rate)
+                controls[robot, 1] = (wanted_speed * facing - state[model.speed_indices[0]]) / problem.dt
+        # What exceeds a robot's limits the environment clips.
+        limit = problem.team.control_limits
+        return np.clip(controls, -limit, limit)

@@ -1,0 +1,87 @@
+"""Planners and policies by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+from d4orm_planners.base import Planner
+from d4orm_planners.d4orm import D4orm
+from d4orm_planners.policy import DriveToGoal, OpenLoop, Policy, RandomControls
+from d4orm_planners.rivals import CEM, MBD, MPPI, IterativeMBD
+
+PLANNERS: Mapping[str, type[Planner]] = MappingProxyType(
+    {planner.name: planner for planner in (D4orm, MPPI, CEM, MBD, IterativeMBD)}
+)
+"""Every planner class by its name."""
+
+POLICIES: Mapping[str, type[Policy]] = MappingProxyType({policy.name: policy for policy in (DriveToGoal, RandomControls)})
+"""The policies that are no planners; every planner is an open-loop policy too."""
+
+
+def list_planners() -> tuple[str, ...]:
+    """Names that :func:`make_planner` accepts."""
+    return tuple(PLANNERS)
+
+
+def list_policies() -> tuple[str, ...]:
+    """Names that :func:`make_policy` accepts."""
+    return (*PLANNERS, *POLICIES)
+
+
+def describe_planner(name: str) -> str:
+    """The first sentence of a planner's documentation."""
+    return _summary(_find(name, PLANNERS, "planner"))
+
+
+def make_planner(name: str, *, preset: str | None = None, **config: Any) -> Planner:
+    """A planner by name.
+
+    Args:
+        name: One of :func:`list_planners`.
+        preset: ``"paper"`` for the paper's algorithm and parameters to the letter; ``None`` for this project's defaults.
+        **config: Settings that differ from the preset; see the planner's configuration class.
+
+    Raises:
+        ValueError: For an unknown planner, preset or setting, or a setting that makes no sense.
+    """
+    kind = _find(name, PLANNERS, "planner")
+    if preset is not None and preset not in kind.presets:
+        raise ValueError(f"preset {preset!r} of planner {name!r} is unknown; choose one of {', '.join(kind.presets)}")
+    known = kind.config_class.setting_names()
+    for setting in config:
+        if setting not in known:
+            raise ValueError(f"{setting!r} is no setting of planner {name!r}; it takes {', '.join(known)}")
+    settings = kind.presets[preset] if preset is not None else {}
+    return kind(kind.config_class(**{**settings, **config}))
+
+
+def make_policy(name: str, **config: Any) -> Policy:
+    """A policy by name: a planner's name for executing its plan open loop, or one of the policies.
+
+    Args:
+        name: One of :func:`list_policies`.
+        **config: For a planner, its settings and ``preset``, and the budget of the solve (``time_limit``,
+            ``max_iterations``); for a policy, its own settings.
+
+    Raises:
+        ValueError: For an unknown name or setting.
+    """
+    if name in PLANNERS:
+        budget = {key: config.pop(key) for key in ("time_limit",) if key in config}
+        return OpenLoop(make_planner(name, **config), **budget)
+    kind = _find(name, {**PLANNERS, **POLICIES}, "policy")
+    if config:
+        raise ValueError(f"policy {name!r} takes no settings, but was given {', '.join(config)}")
+    return kind()
+
+
+def _find(name: str, table: Mapping[str, Any], what: str) -> Any:
+    if name not in table:
+        raise ValueError(f"{what} {name!r} is unknown; choose one of {', '.join(table)}")
+    return table[name]
+
+
+def _summary(kind: type) -> str:
+    return (kind.__doc__ or "").strip().splitlines()[0]

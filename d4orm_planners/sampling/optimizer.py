@@ -1,0 +1,96 @@
+"""The loop that MPPI, CEM, MBD, i-MBD and D4orm share: propose, sample and score, weight, update (paper, Algorithm 1).
+
+After every step the new mean is the weighted mean of the samples. For the denoising methods this is Algorithm 1 exactly:
+substituting the score estimate of line 5 into line 6 gives ``U_{i-1} = sqrt(alpha_bar_{i-1}) * U_bar``, and line 3 of the
+next step samples around ``U_{i-1} / sqrt(alpha_bar_{i-1}) = U_bar``. A method is therefore a schedule of standard
+deviations, a rule for the weights, and where an iteration starts.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray, positive_number, whole_number
+from d4orm_env.engine.base import SamplingRules, SamplingTask
+from d4orm_planners.base import Iteration, Planner, PlannerConfig, Search
+
+CREDITS = ("team", "robot")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamplingConfig(PlannerConfig):
+    """Settings of the sampling planners.
+
+    Attributes:
+        num_samples: ``M``, trajectories per step.
+        num_steps: ``N``, steps per iteration.
+        temperature: ``lambda`` of the softmax over normalised rewards.
+        beta_start: First variance of the diffusion schedule.
+        beta_end: Last variance of the diffusion schedule.
+        credit: ``"team"`` weights samples by the team's mean reward, as in the paper; ``"robot"`` weights each robot's
+            part of a sample by the robot's own reward, which keeps the signal from diluting with the number of robots.
+    """
+
+    num_samples: int = 1024
+    num_steps: int = 100
+    temperature: float = 0.3
+    beta_start: float = 1e-4
+    beta_end: float = 2e-2
+    credit: str = "team"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        whole_number(self.num_samples, "num_samples", 2)
+        whole_number(self.num_steps, "num_steps", 1)
+        positive_number(self.temperature, "temperature")
+        for name in ("beta_start", "beta_end"):
+            beta = positive_number(getattr(self, name), name)
+            if beta >= 1:
+                raise ValueError(f"{name} is {beta:g}; it must lie between 0 and 1")
+        if self.beta_start > self.beta_end:
+            raise ValueError(f"beta_start {self.beta_start:g} is above beta_end {self.beta_end:g}; swap them")
+        if self.credit not in CREDITS:
+            raise ValueError(f"credit {self.credit!r} is unknown; choose one of {', '.join(CREDITS)}")
+
+
+class SamplingPlanner(Planner):
+    """A planner whose iteration is one run of the sampling loop over the whole team."""
+
+    config: Any
+
+    @abstractmethod
+    def noise_scale(self) -> FloatArray:
+        """``(N,)`` standard deviation of the samples at every step of an iteration."""
+
+    @abstractmethod
+    def rules(self) -> SamplingRules:
+        """The method's weights, and how it adapts its noise."""
+
+    @abstractmethod
+    def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
+        """``(base, mean)``, each ``(H, K, m)``: samples of this iteration are drawn around ``mean`` on top of ``base``."""
+
+    def task(self, search: Search, base: FloatArray) -> SamplingTask:
+        """What this iteration samples and scores."""
+        return SamplingTask(search.problem, base, credit=self.config.credit)
+
+    def iterate(self, search: Search) -> Iteration:
+        """See :meth:`Planner.iterate`."""
+        base, mean = self.initial(search)
+        task, rules, noise_scale = self.task(search, base), self.rules(), self.noise_scale()
+        with search.watch.paused():
+            search.engine.prepare(task, rules, noise_scale, self.config.num_samples)
+        result = search.engine.denoise(
+            task, rules, mean, noise_scale, self.config.num_samples, search.iteration_seed()
+        )
+        return Iteration(base + result.mean, len(noise_scale))
+
+
+def standard_normal(search: Search, stream: int) -> FloatArray:
+    """``(H, K, m)`` standard normal numbers of this iteration."""
+    generator = np.random.default_rng(search.iteration_seed(stream))
+    return generator.standard_normal(search.current.controls.shape, dtype=np.float32)

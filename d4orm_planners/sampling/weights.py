@@ -1,0 +1,50 @@
+"""Rules that turn the rewards of samples into weights: pure, over the last axis, for NumPy and JAX arrays alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class SoftmaxWeights:
+    """``exp(normalised reward / temperature)``, normalised to sum to one (paper, Eq. for the Monte Carlo estimate).
+
+    Rewards are brought to mean zero and standard deviation one over the samples (paper, section III-C).
+
+    Attributes:
+        temperature: ``lambda``; smaller values follow the best samples more closely.
+    """
+
+    temperature: float
+
+    def __call__(self, rewards: Any, xp: Any) -> Any:
+        """Weights of ``rewards`` ``(..., M)``; a sample at minus infinity gets none."""
+        usable = rewards > -xp.inf
+        count = xp.maximum(usable.sum(-1, keepdims=True), 1)
+        mean = xp.where(usable, rewards, 0).sum(-1, keepdims=True) / count
+        deviation = xp.where(usable, rewards - mean, 0)
+        # Below this spread all samples are as good as equal, and amplifying rounding would be noise.
+        spread = xp.maximum(xp.sqrt((deviation * deviation).sum(-1, keepdims=True) / count), 1e-6)
+        score = xp.where(usable, deviation / spread, -xp.inf)
+        best = score.max(-1, keepdims=True)
+        weight = xp.where(usable, xp.exp((score - xp.where(best > -xp.inf, best, 0)) / self.temperature), 0)
+        return weight / xp.maximum(weight.sum(-1, keepdims=True), 1e-30)
+
+
+@dataclass(frozen=True)
+class EliteWeights:
+    """Equal weights for the best samples, none for the rest (the cross-entropy method).
+
+    Attributes:
+        fraction: Share of samples that are elite.
+    """
+
+    fraction: float
+
+    def __call__(self, rewards: Any, xp: Any) -> Any:
+        """Weights of ``rewards`` ``(..., M)``; a sample at minus infinity is never elite."""
+        count = max(1, round(self.fraction * rewards.shape[-1]))
+        threshold = xp.sort(rewards, axis=-1)[..., -count][..., None]
+        elite = (rewards >= threshold) & (rewards > -xp.inf)
+        return elite / xp.maximum(elite.sum(-1, keepdims=True), 1)

@@ -1,0 +1,55 @@
+"""Sphinx configuration. Build with ``make docs``."""
+
+from __future__ import annotations
+
+from importlib.metadata import version as installed_version
+from typing import Any
+
+project = "d4orm-env"
+author = "d4orm-env contributors"
+copyright = "2026, d4orm-env contributors"
+release = installed_version("d4orm-env")
+version = release
+
+extensions = ["myst_parser", "sphinx.ext.apidoc", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
+exclude_patterns = ["_build"]
+
+myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 3
+
+# One page per module that exists, so that none can be forgotten; api.md leads to them.
+apidoc_modules = [
+    {
+        "path": f"../{package}",
+        "destination": f"reference/{package}",
+        "separate_modules": True,
+        "module_first": True,
+        "automodule_options": {"members", "show-inheritance"},
+    }
+    for package in ("d4orm_env", "d4orm_planners")
+]
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+# Optional extras that a build of the documentation does without.
+autodoc_mock_imports = ["casadi", "msgpack", "pyrvo", "ray", "zenoh"]
+# As fields of the class and not as entries of their own: autodoc lists the documented attributes itself.
+napoleon_use_ivar = True
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+
+html_theme = "furo"
+html_title = "d4orm-env"
+
+
+def _skip_described_field(app: Any, what: str, name: str, member: Any, skip: bool, options: Any) -> bool | None:
+    """Leave out a NamedTuple's ``Alias for field number 0``: the class's own docstring describes the field."""
+    is_alias = str(getattr(member, "__doc__", "")).startswith("Alias for field number")
+    return True if is_alias else None
+
+
+def setup(app: Any) -> None:
+    """Connect what the extensions leave to the project."""
+    app.connect("autodoc-skip-member", _skip_described_field)

@@ -1,0 +1,77 @@
+"""Problems and controls that the tests of the environments share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
+from d4orm_env.scenarios import list_scenarios
+
+MODELS_2D = ("holonomic2d", "velocity2d", "differential_drive")
+SPATIAL_ONLY = ("sphere", "amswarm_1", "amswarm_2", "amswarm_3", "amswarm_4", "amswarm_5")
+
+
+def scenario_cases(num_robots: int) -> list[dict[str, Any]]:
+    """Arguments of every scenario with every model that it takes."""
+    cases: list[dict[str, Any]] = []
+    for scenario in list_scenarios():
+        if scenario == "heterogeneous":
+            cases.append({"scenario": scenario, "num_robots": num_robots})
+        elif scenario.startswith("amswarm"):
+            cases.append({"scenario": scenario})
+        elif scenario in SPATIAL_ONLY:
+            cases.append({"scenario": scenario, "num_robots": num_robots})
+        else:
+            models = (*MODELS_2D, "holonomic3d")
+            cases += [{"scenario": scenario, "num_robots": num_robots, "model": model} for model in models]
+    return cases
+
+
+def case_name(case: dict[str, Any]) -> str:
+    return "-".join(str(value) for key, value in case.items() if key != "num_robots")
+
+
+def line_problem(distances: list[float], model: str = "velocity2d", **changes: Any) -> Problem:
+    """Robots one metre apart in y, each with its goal that far ahead in x."""
+    team = Team((model,) * len(distances))
+    start = np.zeros((len(distances), team.state_size))
+    start[:, 1] = np.arange(len(distances))
+    goal = start[:, : team.dimension] + np.eye(team.dimension)[0] * np.array(distances)[:, None]
+    return Problem(team, start, goal, **changes)
+
+
+def mixed_problem() -> Problem:
+    """Models of different state sizes, radii and limits, and so with padding; goals near enough to drift into."""
+    team = Team(
+        ("velocity2d", "differential_drive", "holonomic2d"),
+        radius=[0.1, 0.15, 0.2],
+        max_speed=[0.5, 1.0, 1.5],
+        max_acceleration=[1.0, 0.5, 2.0],
+    )
+    start = [[0, 0, 0, 0], [1, 0, 0.5, 0], [2, 0, 0.1, -0.2]]
+    return Problem(team, start, [[0.1, 0.1], [1.1, 0.1], [2.0, 0.2]], horizon=60)
+
+
+def straight_drive(problem: Problem, throttle: Any = 1.0) -> np.ndarray:
+    """``(H, K, m)`` controls that drive every robot that faces its goal straight at it, at that share of its limits."""
+    offsets = problem.goal - problem.start[:, : problem.dimension]
+    ahead = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
+    controls = np.zeros((problem.num_robots, problem.control_size), np.float32)
+    for robot, model in enumerate(problem.team.robot_models):
+        limit = problem.team.control_limits[robot]
+        direction = [0.0, 1.0] if model.heading_index is not None else ahead[robot]
+        controls[robot, : model.control_size] = limit[: model.control_size] * np.array(direction)
+    controls *= np.broadcast_to(throttle, problem.num_robots)[:, None]
+    return np.repeat(controls[None], problem.horizon, axis=0)
+
+
+def act(env: Any, controls: np.ndarray) -> dict[str, np.ndarray]:
+    """The rows of ``controls`` ``(K, m)`` as actions of the agents still in the environment."""
+    return {agent: controls[env.possible_agents.index(agent)] for agent in env.agents}
+
+
+def sampled_actions(env: Any) -> dict[str, np.ndarray]:
+    return {agent: env.action_space(agent).sample() for agent in env.agents}
