@@ -35,6 +35,11 @@ def describe_planner(name: str) -> str:
     return _summary(_find(name, PLANNERS, "planner"))
 
 
+def describe_policy(name: str) -> str:
+    """The first sentence of a policy's documentation."""
+    return _summary(_find(name, POLICIES, "policy"))
+
+
 def make_planner(name: str, *, preset: str | None = None, **config: Any) -> Planner:
     """A planner by name.
 

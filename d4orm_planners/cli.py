@@ -1,0 +1,337 @@
+"""The command ``d4orm``.
+
+Exit status 0: done; 1: no solution found in the budget; 2: bad input, with one line on stderr that says what to change.
+Heavy imports happen inside the commands, so that ``--help`` is quick.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from d4orm_env.core.problem import Problem
+    from d4orm_planners.plan import Plan
+
+# Typer carries its own copy of click, whose base class it does not export.
+ClickException: Any = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
+
+app = typer.Typer(
+    name="d4orm",
+    help="Plan and run teams of robots that cross each other's way without touching.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+Scenario = Annotated[str, typer.Option("--scenario", "-s", help="Scenario name (see `d4orm scenarios`) or a YAML file.")]
+Robots = Annotated[int | None, typer.Option("--robots", "-k", help="Number of robots; the scenario's own by default.")]
+Model = Annotated[str | None, typer.Option("--model", "-m", help="Robot model; the scenario's own by default.")]
+Obstacles = Annotated[int | None, typer.Option("--obstacles", help="Random obstacles to add.")]
+Seed = Annotated[int, typer.Option("--seed", help="Seed of the scenario and of the planner.")]
+PlannerName = Annotated[str, typer.Option("--planner", "-p", help="Planner (see `d4orm planners`).")]
+Preset = Annotated[str | None, typer.Option("--preset", help="`paper` for the paper's parameters.")]
+Settings = Annotated[list[str] | None, typer.Option("--set", help="A planner setting, as num_samples=512; repeatable.")]
+Engine = Annotated[str, typer.Option("--engine", help="auto, cpu or jax.")]
+TimeLimit = Annotated[float | None, typer.Option("--time-limit", help="Seconds for planning.")]
+MaxIterations = Annotated[int | None, typer.Option("--max-iterations", help="Iterations for planning.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no tables.")]
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")] = Path("demo"),
+    robots: Annotated[int, typer.Option("--robots", "-k", help="Number of robots.")] = 16,
+    seed: Seed = 0,
+    engine: Engine = "auto",
+) -> None:
+    """Plan robots across a circle, execute the plan in the environment, verify it, and write pictures."""
+    from d4orm_env.render import save_animation, save_picture
+
+    _make_folder(out)
+    problem = _problem("circle", robots, None, None, seed)
+    plan = _solve(problem, "d4orm", None, None, engine, seed, None, None, quiet=False)
+    _print_plan(plan)
+    _require_solved(plan)
+    episode = _execute(plan, seed)
+    files = {"plan": out / "plan.npz", "picture": out / "plan.png", "animation": out / "execution.gif"}
+    plan.save(files["plan"])
+    title = f"{problem.num_robots} robots, planned by D4orm in {plan.wall_time:.2f} s"
+    save_picture(problem, episode.trajectory, files["picture"], title=title)
+    save_animation(problem, episode.trajectory, files["animation"])
+    for name, path in files.items():
+        typer.echo(f"{name:<10} {path}")
+    if not episode.metrics["success"]:
+        raise typer.Exit(1)
+
+
+@app.command("plan")
+def plan_command(
+    scenario: Scenario = "circle",
+    robots: Robots = None,
+    model: Model = None,
+    obstacles: Obstacles = None,
+    seed: Seed = 0,
+    planner: PlannerName = "d4orm",
+    preset: Preset = None,
+    settings: Settings = None,
+    engine: Engine = "auto",
+    time_limit: TimeLimit = None,
+    max_iterations: MaxIterations = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Plan file to write, .npz.")] = None,
+    picture: Annotated[Path | None, typer.Option("--picture", help="Picture to write: .png, .svg or .pdf.")] = None,
+    animation: Annotated[Path | None, typer.Option("--animation", help="Animation to write: .gif or .mp4.")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Plan for a team; write the plan, a picture or an animation."""
+    for path, suffixes in ((out, (".npz",)), (picture, (".png", ".svg", ".pdf")), (animation, (".gif", ".mp4"))):
+        _check_target(path, suffixes)
+    problem = _problem(scenario, robots, model, obstacles, seed)
+    plan = _solve(problem, planner, preset, settings, engine, seed, time_limit, max_iterations, quiet)
+    if not quiet:
+        _print_plan(plan)
+    if out is not None:
+        plan.save(out)
+    _draw(problem, plan.trajectory, picture, animation)
+    for path in (out, picture, animation):
+        if path is not None and not quiet:
+            typer.echo(f"wrote {path}")
+    _require_solved(plan)
+
+
+@app.command()
+def run(
+    plan_file: Annotated[Path | None, typer.Argument(help="Plan to execute; plans anew without one.")] = None,
+    scenario: Scenario = "circle",
+    robots: Robots = None,
+    model: Model = None,
+    obstacles: Obstacles = None,
+    seed: Seed = 0,
+    policy: Annotated[str, typer.Option("--policy", "-p", help="Planner or policy to run.")] = "d4orm",
+    noise: Annotated[float, typer.Option("--noise", help="Standard deviation of the execution noise.")] = 0.0,
+    picture: Annotated[Path | None, typer.Option("--picture", help="Picture to write: .png, .svg or .pdf.")] = None,
+    animation: Annotated[Path | None, typer.Option("--animation", help="Animation to write: .gif or .mp4.")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Run a plan or a policy in the environment, step by step, and judge what happened."""
+    from d4orm_env import navigation_v0
+    from d4orm_planners.episode import run_episode
+    from d4orm_planners.plan import Plan
+    from d4orm_planners.policy import OpenLoop
+    from d4orm_planners.registry import make_policy
+
+    for path, suffixes in ((picture, (".png", ".svg", ".pdf")), (animation, (".gif", ".mp4"))):
+        _check_target(path, suffixes)
+    if plan_file is not None:
+        plan = Plan.load(plan_file)
+        problem, actor = plan.problem, OpenLoop(plan=plan)
+    else:
+        problem, actor = _problem(scenario, robots, model, obstacles, seed), make_policy(policy)
+    env = navigation_v0.parallel_env(problem=problem, control_noise_std=noise)
+    episode = run_episode(env, actor, seed=seed)
+    env.close()
+    _draw(problem, episode.trajectory, picture, animation)
+    if not quiet:
+        _print_table("Execution", _episode_rows(episode.metrics))
+    if not episode.metrics["success"]:
+        raise typer.Exit(1)
+
+
+@app.command()
+def scenarios() -> None:
+    """List the scenarios."""
+    from d4orm_env.scenarios import describe_scenario, list_scenarios
+
+    _print_table("Scenarios", [(name, describe_scenario(name)) for name in list_scenarios()])
+
+
+@app.command()
+def planners() -> None:
+    """List the planners and policies."""
+    from d4orm_planners.registry import POLICIES, describe_planner, describe_policy, list_planners
+
+    _print_table("Planners", [(name, describe_planner(name)) for name in list_planners()])
+    _print_table("Policies", [(name, describe_policy(name)) for name in POLICIES])
+
+
+def _problem(scenario: str, robots: int | None, model: str | None, obstacles: int | None, seed: int) -> Problem:
+    from d4orm_env.scenarios import load_problem, make_problem
+
+    if Path(scenario).suffix in (".yaml", ".yml"):
+        given = {"--robots": robots, "--model": model, "--obstacles": obstacles}
+        for option, value in given.items():
+            if value is not None:
+                raise ValueError(f"{option} {value} does not go with a scenario file; change it in {scenario}")
+        return load_problem(scenario)
+    return make_problem(scenario, num_robots=robots, seed=seed, model=model, num_obstacles=obstacles)
+
+
+def _solve(
+    problem: Problem,
+    planner: str,
+    preset: str | None,
+    settings: list[str] | None,
+    engine: str,
+    seed: int,
+    time_limit: float | None,
+    max_iterations: int | None,
+    quiet: bool,
+) -> Plan:
+    from d4orm_planners.progress import SolveProgress
+    from d4orm_planners.registry import make_planner
+
+    chosen = make_planner(planner, preset=preset, **{"engine": engine, **_parse_settings(settings)})
+    limit = max_iterations if max_iterations is not None else chosen.config.max_iterations
+    with SolveProgress(planner, problem.num_robots, limit, enabled=not quiet) as progress:
+        return chosen.solve(
+            problem, seed=seed, time_limit=time_limit, max_iterations=max_iterations, callback=progress.update
+        )
+
+
+def _parse_settings(settings: list[str] | None) -> dict[str, Any]:
+    import yaml
+
+    values = {}
+    for setting in settings or []:
+        name, separator, text = setting.partition("=")
+        if not separator or not name:
+            raise ValueError(f"--set {setting!r} is not of the form name=value, as num_samples=512")
+        try:
+            values[name] = yaml.safe_load(text)
+        except yaml.YAMLError:
+            raise ValueError(f"--set {setting!r}: the value cannot be read") from None
+    return values
+
+
+def _execute(plan: Plan, seed: int) -> Any:
+    from d4orm_env import navigation_v0, verify
+    from d4orm_planners.episode import run_episode
+    from d4orm_planners.policy import OpenLoop
+
+    env = navigation_v0.parallel_env(problem=plan.problem)
+    episode = run_episode(env, OpenLoop(plan=plan), seed=seed)
+    env.close()
+    report = verify(plan.problem, plan.controls)
+    rows = [
+        *_episode_rows(episode.metrics),
+        ("verified", "yes" if report.ok else "no: " + "; ".join(str(violation) for violation in report.violations[:3])),
+        ("closest approach", f"{report.min_separation * 100:.1f} cm between surfaces"),
+    ]
+    _print_table("Executed in the environment", rows)
+    return episode
+
+
+def _episode_rows(metrics: dict[str, float]) -> list[tuple[str, str]]:
+    return [
+        ("success", "yes" if metrics["success"] else "no"),
+        ("arrived", f"{metrics['arrived']:.0f}"),
+        ("robots in contact", f"{metrics['collided']:.0f}"),
+        ("travel time", f"{metrics['travel_time']:.2f} s"),
+        ("makespan", f"{metrics['makespan']:.2f} s"),
+    ]
+
+
+def _print_plan(plan: Plan) -> None:
+    metrics = plan.metrics
+    rows = [
+        ("solved", "yes" if plan.solved else f"no ({plan.status})"),
+        ("planning time", f"{plan.wall_time:.2f} s"),
+        ("iterations", f"{plan.iterations}"),
+        ("travel time", f"{metrics['travel_time']:.2f} s"),
+        ("makespan", f"{metrics['makespan']:.2f} s"),
+        ("reward", f"{metrics['reward']:.3f}"),
+    ]
+    if not plan.solved:
+        rows.append(("not arrived", f"{plan.problem.num_robots - metrics['arrived']:.0f}"))
+        rows.append(("too close", f"{metrics['margin_violated']:.0f}"))
+    _print_table(f"Plan by {plan.planner}, {plan.problem.num_robots} robots", rows)
+
+
+def _print_table(title: str, rows: list[tuple[str, str]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", show_header=False)
+    for row in rows:
+        table.add_row(*row)
+    Console().print(table)
+
+
+def _draw(problem: Problem, trajectory: Any, picture: Path | None, animation: Path | None) -> None:
+    from d4orm_env.render import save_animation, save_picture
+
+    if picture is not None:
+        save_picture(problem, trajectory, picture)
+    if animation is not None:
+        save_animation(problem, trajectory, animation)
+
+
+def _require_solved(plan: Plan) -> None:
+    if not plan.solved:
+        typer.echo(f"no solution found ({plan.status.replace('_', ' ')} after {plan.iterations} iterations)", err=True)
+        raise typer.Exit(1)
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"folder {str(folder)!r} cannot be made ({error.strerror}); choose another") from None
+    _check_writable(folder)
+
+
+def _check_target(path: Path | None, suffixes: tuple[str, ...]) -> None:
+    """Find out before planning whether a file can be written."""
+    if path is None:
+        return
+    if path.suffix not in suffixes:
+        raise ValueError(f"output file {str(path)!r} must end in {' or '.join(suffixes)}")
+    if not path.parent.is_dir():
+        raise ValueError(f"folder {str(path.parent)!r} does not exist; create it first")
+    if path.is_dir():
+        raise ValueError(f"output file {str(path)!r} is a folder")
+    _check_writable(path.parent)
+
+
+def _check_writable(folder: Path) -> None:
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        reason = error.strerror or "refused"
+        raise ValueError(f"folder {str(folder)!r} cannot be written to ({reason}); choose another") from None
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line and exit."""
+    try:
+        status = app(arguments, standalone_mode=False)
+    except ClickException as error:
+        status = _complain(error.format_message())
+    except (ValueError, OSError) as error:
+        status = _complain(_message(error))
+    except (KeyboardInterrupt, typer.Abort):
+        status = 130
+    sys.exit(status if isinstance(status, int) else 0)
+
+
+def _message(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename or 'file'}: {error.strerror}"
+    return str(error)
+
+
+def _complain(message: str) -> int:
+    line = " ".join(message.split())
+    sys.stderr.write(f"d4orm: {line}{os.linesep}")
+    return 2
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,47 @@
+"""A live line on the terminal while a planner works."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+from d4orm_planners.plan import IterationRecord
+
+
+class SolveProgress:
+    """Shows iteration, reward, robots failing and time; the callback of a solve.
+
+    On a terminal the line is live; elsewhere nothing is printed.
+    """
+
+    def __init__(self, planner: str, num_robots: int, max_iterations: int, enabled: bool = True) -> None:
+        self._num_robots = num_robots
+        self._progress = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            TextColumn("iteration {task.completed}/{task.total}  {task.fields[detail]}"),
+            TimeElapsedColumn(),
+            console=Console(stderr=True),
+            disable=not enabled,
+            transient=True,
+        )
+        self._task = self._progress.add_task(planner, total=max_iterations, detail="compiling and sampling ...")
+
+    def __enter__(self) -> SolveProgress:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def update(self, record: IterationRecord) -> Any:
+        """Show one iteration."""
+        failing = "solved" if record.solved else f"{record.num_failed} of {self._num_robots} robots failing"
+        detail = f"reward {record.reward:.3f}  {failing}"
+        self._progress.update(self._task, completed=record.iteration, detail=detail)
