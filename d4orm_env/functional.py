@@ -6,9 +6,9 @@
 >>> state = functional.reset(problem, jax.random.key(0))
 >>> state, step = jax.jit(functional.step)(problem, state, controls)
 
-Importing this module registers :class:`~d4orm_env.core.problem.Problem` as a JAX pytree: a problem is an ordinary traced
-argument, whose starts, goals, limits and obstacles may be mapped over or differentiated. Models, shapes and the horizon
-are static.
+Importing this module registers :class:`~d4orm_env.core.problem.Problem` as a JAX pytree: a problem is an ordinary
+traced argument, whose starts, goals, limits and obstacles may be mapped over or differentiated. Models, shapes and the
+horizon are static.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ def _register(kind: type) -> None:
 
     def unflatten(metadata: tuple[Any, ...], children: tuple[Any, ...]) -> Any:
         # Not through __init__: tracers cannot be validated, and the problem they stand for has been.
-        value = object.__new__(kind)
+        value: Any = object.__new__(kind)
         for name, part in zip((*names, *static), (*children, *metadata), strict=True):
             object.__setattr__(value, name, part)
         return value

@@ -42,8 +42,8 @@ class JointNavigationEnv(gymnasium.Env[FloatArray, FloatArray]):
         lifelong: bool = False,
         max_cycles: int | None = None,
         randomize_instance: bool = False,
-        num_neighbors: int = 4,
-        num_obstacles: int = 4,
+        observed_robots: int = 4,
+        observed_obstacles: int = 4,
         **scenario_kwargs: Any,
     ) -> None:
         self._viewer = Viewer(render_mode)
@@ -57,8 +57,8 @@ class JointNavigationEnv(gymnasium.Env[FloatArray, FloatArray]):
             max_cycles=max_cycles,
             control_noise_std=control_noise_std,
             lifelong=lifelong,
-            num_neighbors=num_neighbors,
-            num_obstacles=num_obstacles,
+            observed_robots=observed_robots,
+            observed_obstacles=observed_obstacles,
         )
         self.metadata = type(self).metadata | {"render_fps": max(1, round(1 / self.problem.dt))}
         team_size, layout = self.problem.num_robots, self._simulation.layout

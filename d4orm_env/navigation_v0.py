@@ -40,8 +40,8 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
             ``arrived`` at that step, and ``distance_to_goal`` is to the new goal.
         max_cycles: Steps until truncation; the problem's horizon unless given. May be assigned later.
         randomize_instance: Draw a new instance of the scenario at every reset.
-        num_neighbors: Nearest robots in an observation; missing ones are marked absent.
-        num_obstacles: Nearest obstacles in an observation; likewise.
+        observed_robots: Nearest robots in an observation; missing ones are marked absent.
+        observed_obstacles: Nearest obstacles in an observation; likewise.
         **scenario_kwargs: Arguments of the scenario, such as ``model`` or ``seed``.
 
     Raises:
@@ -66,8 +66,8 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
         lifelong: bool = False,
         max_cycles: int | None = None,
         randomize_instance: bool = False,
-        num_neighbors: int = 4,
-        num_obstacles: int = 4,
+        observed_robots: int = 4,
+        observed_obstacles: int = 4,
         **scenario_kwargs: Any,
     ) -> None:
         self._viewer = Viewer(render_mode)
@@ -81,8 +81,8 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
             max_cycles=max_cycles,
             control_noise_std=control_noise_std,
             lifelong=lifelong,
-            num_neighbors=num_neighbors,
-            num_obstacles=num_obstacles,
+            observed_robots=observed_robots,
+            observed_obstacles=observed_obstacles,
         )
         self.metadata = type(self).metadata | {"render_fps": max(1, round(1 / self.problem.dt))}
         self.possible_agents = [f"robot_{robot}" for robot in range(self.problem.num_robots)]

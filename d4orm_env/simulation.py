@@ -17,7 +17,7 @@ import numpy as np
 from d4orm_env.core.arrays import BoolArray, FloatArray, frozen_array, whole_number
 from d4orm_env.core.observation import ObservationLayout
 from d4orm_env.core.problem import Problem, inverse_initial_distance
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.episode_record import EpisodeRecord
 from d4orm_env.joint_state import JointState, join_state, state_bounds
 from d4orm_env.lifelong import fresh_goal, goal_region, reached_goals
@@ -55,8 +55,8 @@ class Simulation:
         control_noise_std: Standard deviation of the Gaussian noise added to the controls before they are clipped, in
             the controls' own units: one number, or one per control component.
         lifelong: Give a robot that arrives a fresh random goal and leave it moving, instead of docking it.
-        num_neighbors: Robots in an observation.
-        num_obstacles: Obstacles in an observation.
+        observed_robots: Robots in an observation.
+        observed_obstacles: Obstacles in an observation.
         redraw: ``seed -> Problem`` draws a new instance at every reset; ``None`` keeps ``problem``.
 
     Raises:
@@ -70,8 +70,8 @@ class Simulation:
         max_cycles: int | None = None,
         control_noise_std: Any = 0.0,
         lifelong: bool = False,
-        num_neighbors: int = 4,
-        num_obstacles: int = 4,
+        observed_robots: int = 4,
+        observed_obstacles: int = 4,
         redraw: Callable[[int], Problem] | None = None,
     ) -> None:
         self.problem = problem
@@ -80,10 +80,10 @@ class Simulation:
         self.lifelong = lifelong
         self.layout = ObservationLayout.for_problem(
             problem,
-            num_neighbors=whole_number(num_neighbors, "num_neighbors", 0),
-            num_obstacles=whole_number(num_obstacles, "num_obstacles", 0),
+            num_neighbors=whole_number(observed_robots, "observed_robots", 0),
+            num_obstacles=whole_number(observed_obstacles, "observed_obstacles", 0),
         )
-        self._engine = get_engine("cpu")
+        self._engine = CpuEngine()
         self._dimension = problem.dimension
         self._redraw = redraw
         if redraw is not None and redraw(0) == redraw(1):

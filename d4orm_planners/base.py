@@ -163,7 +163,9 @@ class Planner(ABC):
         search = Search(self, problem, seed, initial_controls)
         if time_limit is not None:
             time_limit = positive_number(time_limit, "time_limit")
-        limit = self.config.max_iterations if max_iterations is None else whole_number(max_iterations, "max_iterations", 1)
+        limit = (
+            self.config.max_iterations if max_iterations is None else whole_number(max_iterations, "max_iterations", 1)
+        )
         status = "iteration_limit"
         try:
             while True:

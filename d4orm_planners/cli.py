@@ -30,7 +30,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-Scenario = Annotated[str, typer.Option("--scenario", "-s", help="Scenario name (see `d4orm scenarios`) or a YAML file.")]
+Scenario = Annotated[
+    str, typer.Option("--scenario", "-s", help="Scenario name (see `d4orm scenarios`) or a YAML file.")
+]
 Robots = Annotated[int | None, typer.Option("--robots", "-k", help="Number of robots; the scenario's own by default.")]
 Model = Annotated[str | None, typer.Option("--model", "-m", help="Robot model; the scenario's own by default.")]
 Obstacles = Annotated[int | None, typer.Option("--obstacles", help="Random obstacles to add.")]
@@ -123,14 +125,15 @@ def run(
     from d4orm_env import navigation_v0
     from d4orm_planners.episode import run_episode
     from d4orm_planners.plan import Plan
-    from d4orm_planners.policy import OpenLoop
+    from d4orm_planners.policy import OpenLoop, Policy
     from d4orm_planners.registry import make_policy
 
     for path, suffixes in ((picture, (".png", ".svg", ".pdf")), (animation, (".gif", ".mp4"))):
         _check_target(path, suffixes)
     if plan_file is not None:
         plan = Plan.load(plan_file)
-        problem, actor = plan.problem, OpenLoop(plan=plan)
+        problem: Problem = plan.problem
+        actor: Policy = OpenLoop(plan=plan)
     else:
         problem, actor = _problem(scenario, robots, model, obstacles, seed), make_policy(policy)
     env = navigation_v0.parallel_env(problem=problem, control_noise_std=noise)

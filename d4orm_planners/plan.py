@@ -59,7 +59,8 @@ class Plan:
         seed: The seed.
         controls: ``(H, K, m)`` inside the limits, zero once docked.
         solved: Whether everyone arrives, the margin is kept at every step, and :func:`d4orm_env.verify` found no fault.
-        status: ``"solved"``, ``"iteration_limit"``, ``"time_limit"``, ``"stopped"`` (by the callback) or ``"interrupted"``.
+        status: ``"solved"``, ``"iteration_limit"``, ``"time_limit"``, ``"stopped"`` (by the callback) or
+            ``"interrupted"``.
         iterations: Iterations done.
         denoising_steps: Sample-score-update steps done.
         wall_time: Seconds, first-call compilation excluded.
@@ -124,12 +125,18 @@ class Plan:
             history = tuple(IterationRecord(**record) for record in header.pop("history"))
             trajectory = _checked_trajectory(problem, content)
             return cls(
-                problem=problem, history=history, trajectory=trajectory, controls=trajectory.controls, **_checked(header)
+                problem=problem,
+                history=history,
+                trajectory=trajectory,
+                controls=trajectory.controls,
+                **_checked(header),
             )
         except FileNotFoundError:
             raise FileNotFoundError(f"there is no plan at {source}") from None
         except (ValueError, KeyError, TypeError, EOFError, OSError, zipfile.BadZipFile, AttributeError) as error:
-            raise ValueError(f"{source} is not a readable plan ({_first_line(error)}); write it anew with Plan.save") from error
+            raise ValueError(
+                f"{source} is not a readable plan ({_first_line(error)}); write it anew with Plan.save"
+            ) from error
 
 
 _SCALARS = ("planner", "seed", "solved", "status", "iterations", "denoising_steps", "wall_time", "metrics")

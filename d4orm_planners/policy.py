@@ -1,4 +1,4 @@
-"""Policies: what acts in an ``env.step`` loop. They see observations and ``env.state()``, and nothing else of the env."""
+"""Policies: what acts in an ``env.step`` loop, from observations and ``env.state()`` alone."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Policy(ABC):
         controls = self._controls(joint)
         return {agent: controls[int(agent.rsplit("_", 1)[1])] for agent in observations}
 
-    def _begin(self, env: Any, seed: int) -> None:
+    def _begin(self, env: Any, seed: int) -> None:  # noqa: B027 - a hook that most policies need not fill
         """What the policy does at a reset beyond looking at the problem."""
 
     @abstractmethod
@@ -63,7 +63,9 @@ class OpenLoop(Policy):
 
     name = "open-loop"
 
-    def __init__(self, planner: Planner | None = None, plan: Plan | None = None, time_limit: float | None = None) -> None:
+    def __init__(
+        self, planner: Planner | None = None, plan: Plan | None = None, time_limit: float | None = None
+    ) -> None:
         if (planner is None) == (plan is None):
             raise ValueError("an open-loop policy needs either a planner or a plan")
         self.planner = planner

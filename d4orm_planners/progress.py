@@ -18,6 +18,7 @@ class SolveProgress:
     """
 
     def __init__(self, planner: str, num_robots: int, max_iterations: int, enabled: bool = True) -> None:
+        console = Console(stderr=True)
         self._num_robots = num_robots
         self._progress = Progress(
             SpinnerColumn(),
@@ -25,8 +26,8 @@ class SolveProgress:
             BarColumn(bar_width=24),
             TextColumn("iteration {task.completed}/{task.total}  {task.fields[detail]}"),
             TimeElapsedColumn(),
-            console=Console(stderr=True),
-            disable=not enabled,
+            console=console,
+            disable=not (enabled and console.is_terminal),
             transient=True,
         )
         self._task = self._progress.add_task(planner, total=max_iterations, detail="compiling and sampling ...")

@@ -16,7 +16,9 @@ PLANNERS: Mapping[str, type[Planner]] = MappingProxyType(
 )
 """Every planner class by its name."""
 
-POLICIES: Mapping[str, type[Policy]] = MappingProxyType({policy.name: policy for policy in (DriveToGoal, RandomControls)})
+POLICIES: Mapping[str, type[Policy]] = MappingProxyType(
+    {policy.name: policy for policy in (DriveToGoal, RandomControls)}
+)
 """The policies that are no planners; every planner is an open-loop policy too."""
 
 
@@ -45,7 +47,8 @@ def make_planner(name: str, *, preset: str | None = None, **config: Any) -> Plan
 
     Args:
         name: One of :func:`list_planners`.
-        preset: ``"paper"`` for the paper's algorithm and parameters to the letter; ``None`` for this project's defaults.
+        preset: ``"paper"`` for the paper's algorithm and parameters to the letter; ``None`` for this project's
+            defaults.
         **config: Settings that differ from the preset; see the planner's configuration class.
 
     Raises:

@@ -1,7 +1,7 @@
 """The sampling methods that the paper compares with D4orm (sections III-C and IV, appendix B).
 
-They run on the same loop and differ from D4orm in their rules only: the schedule of the noise, the weights, and where an
-iteration starts.
+They run on the same loop and differ from D4orm in their rules only: the schedule of the noise, the weights, and where
+an iteration starts.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, positive_number
 from d4orm_env.engine.base import SamplingRules
 from d4orm_planners.base import Search
-from d4orm_planners.sampling.optimizer import SamplingConfig, SamplingPlanner, standard_normal
+from d4orm_planners.sampling.optimizer import PAPER, SamplingConfig, SamplingPlanner, standard_normal
 from d4orm_planners.sampling.schedule import alpha_bar, annealed, constant
-from d4orm_planners.sampling.weights import EliteWeights, SoftmaxWeights
+from d4orm_planners.sampling.weights import EliteWeights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,15 +42,11 @@ class MPPI(SamplingPlanner):
 
     name: ClassVar[str] = "mppi"
     config_class = MPPIConfig
-    presets: ClassVar[dict[str, dict[str, Any]]] = {"paper": {}}
+    presets: ClassVar[dict[str, dict[str, Any]]] = {"paper": PAPER}
 
     def noise_scale(self) -> FloatArray:
         """See :meth:`SamplingPlanner.noise_scale`."""
         return constant(self.config.num_steps, self.config.sigma)
-
-    def rules(self) -> SamplingRules:
-        """See :meth:`SamplingPlanner.rules`."""
-        return SamplingRules(weights=SoftmaxWeights(float(self.config.temperature)))
 
     def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
         """See :meth:`SamplingPlanner.initial`."""
@@ -100,7 +96,7 @@ class CEM(SamplingPlanner):
 
     name: ClassVar[str] = "cem"
     config_class = CEMConfig
-    presets: ClassVar[dict[str, dict[str, Any]]] = {"paper": {}}
+    presets: ClassVar[dict[str, dict[str, Any]]] = {"paper": PAPER}
 
     def noise_scale(self) -> FloatArray:
         """See :meth:`SamplingPlanner.noise_scale`."""
@@ -126,10 +122,6 @@ class _DirectDenoising(SamplingPlanner):
         """See :meth:`SamplingPlanner.noise_scale`."""
         return annealed(self.config.num_steps, self.config.beta_start, self.config.beta_end)
 
-    def rules(self) -> SamplingRules:
-        """See :meth:`SamplingPlanner.rules`."""
-        return SamplingRules(weights=SoftmaxWeights(float(self.config.temperature)))
-
     def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
         """See :meth:`SamplingPlanner.initial`."""
         final = alpha_bar(self.config.num_steps, self.config.beta_start, self.config.beta_end)[-1]
@@ -153,14 +145,14 @@ class MBD(_DirectDenoising):
 
     name: ClassVar[str] = "mbd"
     config_class = MBDConfig
-    presets: ClassVar[dict[str, dict[str, Any]]] = {"paper": {}}
+    presets: ClassVar[dict[str, dict[str, Any]]] = {"paper": {**PAPER, "num_steps": 10_000}}
 
 
 class IterativeMBD(_DirectDenoising):
     """i-MBD: model-based diffusion restarted from its last result as if that were noise (paper, section IV-A)."""
 
     name: ClassVar[str] = "i-mbd"
-    presets: ClassVar[dict[str, dict[str, Any]]] = {"paper": {}}
+    presets: ClassVar[dict[str, dict[str, Any]]] = {"paper": PAPER}
 
     def noisy_controls(self, search: Search) -> FloatArray:
         """The last result, or noise in the first iteration."""

@@ -23,10 +23,11 @@ def frozen_array(value: Any, name: str, shape: tuple[int | None, ...]) -> FloatA
         ValueError: If it cannot be read, has another shape, or holds a value that is not finite.
     """
     try:
-        array = np.array(value, dtype=np.float32)
+        # Adding zero makes -0.0 a plain zero, so that equal problems have equal bits.
+        array = np.array(value, dtype=np.float32) + np.float32(0)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be an array of numbers, not {value!r}") from error
-    if array.size == 0 and 0 in shape or array.size == 0 and None in shape:
+    if (array.size == 0 and 0 in shape) or (array.size == 0 and None in shape):
         array = array.reshape([size or 0 for size in shape])
     if array.ndim != len(shape) or any(want is not None and want != have for want, have in zip(shape, array.shape)):
         wanted = ", ".join("any" if size is None else str(size) for size in shape)
@@ -64,7 +65,9 @@ def positive_number(value: Any, name: str, *, zero_allowed: bool = False) -> flo
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be a number, not {value!r}") from error
     if not np.isfinite(number) or number < 0 or (number == 0 and not zero_allowed):
-        raise ValueError(f"{name} is {number:g}; it must be {'zero or more' if zero_allowed else 'positive'} and finite")
+        raise ValueError(
+            f"{name} is {number:g}; it must be {'zero or more' if zero_allowed else 'positive'} and finite"
+        )
     return number
 
 

@@ -1,7 +1,7 @@
 """What one robot sees of the world: itself, its goal, its nearest neighbours and the nearest obstacles.
 
-:func:`observe_robot` is written with plain loops over small arrays, so that the CPU engine compiles it as it stands. All
-vectors are in the world's frame, relative to the robot, in SI units.
+:func:`observe_robot` is written with plain loops over small arrays, so that the CPU engine compiles it as it stands.
+All vectors are in the world's frame, relative to the robot, in SI units.
 """
 
 from __future__ import annotations
@@ -84,7 +84,12 @@ class ObservationLayout:
         names = [f"velocity_{axis}" for axis in axes] + ["heading_cos", "heading_sin", "speed"]
         names += [f"goal_{axis}" for axis in axes] + ["time_left", "arrived", "radius", "max_speed", "max_acceleration"]
         for i in range(self.num_neighbors):
-            parts = ["present", *(f"position_{axis}" for axis in axes), *(f"velocity_{axis}" for axis in axes), "radius"]
+            parts = [
+                "present",
+                *(f"position_{axis}" for axis in axes),
+                *(f"velocity_{axis}" for axis in axes),
+                "radius",
+            ]
             names += [f"neighbor_{i}.{part}" for part in parts]
         for i in range(self.num_obstacles):
             names += [f"obstacle_{i}.{part}" for part in ("present", *(f"position_{axis}" for axis in axes), "gap")]

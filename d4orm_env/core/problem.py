@@ -73,7 +73,8 @@ class Problem:
 
     Raises:
         ValueError: If a value is not finite, a shape is wrong, a number is not positive, or a start or goal is out of
-            bounds or in contact with another robot or an obstacle. The message names the robot, the value and the remedy.
+            bounds or in contact with another robot or an obstacle. The message names the robot, the value and the
+            remedy.
     """
 
     team: Team
@@ -92,7 +93,9 @@ class Problem:
         if self.world is None:
             object.__setattr__(self, "world", World(dimension=team.dimension))
         if self.world.dimension != team.dimension:
-            raise ValueError(f"the world has dimension {self.world.dimension} and the team {team.dimension}; match them")
+            raise ValueError(
+                f"the world has dimension {self.world.dimension} and the team {team.dimension}; match them"
+            )
         object.__setattr__(self, "start", frozen_array(self.start, "start", (team.num_robots, team.state_size)))
         object.__setattr__(self, "goal", frozen_array(self.goal, "goal", (team.num_robots, team.dimension)))
         object.__setattr__(self, "dt", positive_number(self.dt, "dt"))
@@ -124,17 +127,17 @@ class Problem:
         clearance = self.world.clearance(places) - radius
         for robot in np.flatnonzero(clearance <= 0):
             raise ValueError(
-                f"{what} of robot_{robot} at {_point(places[robot])} is {-clearance[robot]:.3g} m inside an obstacle or "
-                f"outside the bounds (robot radius {radius[robot]:g} m); move it, or change the world"
+                f"{what} of robot_{robot} at {_point(places[robot])} is {-clearance[robot]:.3g} m inside an "
+                f"obstacle or outside the bounds (robot radius {radius[robot]:g} m); move it, or change the world"
             )
         points = places.astype(np.float64)
-        for robot in range(1, len(points)):
-            gaps = np.linalg.norm(points[:robot] - points[robot], axis=1) - radius[:robot] - radius[robot]
+        for later in range(1, len(points)):
+            gaps = np.linalg.norm(points[:later] - points[later], axis=1) - radius[:later] - radius[later]
             other = int(np.argmin(gaps))
             if gaps[other] <= 0:
                 raise ValueError(
-                    f"{what}s of robot_{other} at {_point(points[other])} and robot_{robot} at {_point(points[robot])} "
-                    f"overlap by {-gaps[other]:.3g} m; move them at least {radius[robot] + radius[other]:g} m apart"
+                    f"{what}s of robot_{other} at {_point(points[other])} and robot_{later} at {_point(points[later])} "
+                    f"overlap by {-gaps[other]:.3g} m; move them at least {radius[later] + radius[other]:g} m apart"
                 )
 
     @property

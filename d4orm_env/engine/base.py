@@ -102,9 +102,7 @@ class Engine(Protocol):
 
     name: str
 
-    def step(
-        self, arrays: ProblemArrays, states: FloatArray, arrived: BoolArray, controls: FloatArray
-    ) -> StepResult:
+    def step(self, arrays: ProblemArrays, states: FloatArray, arrived: BoolArray, controls: FloatArray) -> StepResult:
         """One step of the team from ``states`` ``(K, n)`` under ``controls`` ``(K, m)``, clipped here.
 
         ``arrays`` is ``problem.arrays``, or a copy with other goals where goals change on the way.
@@ -115,13 +113,7 @@ class Engine(Protocol):
         """Roll ``controls`` ``(H, K, m)`` out from the problem's start."""
         ...
 
-    def contacts(self, arrays: ProblemArrays, states: FloatArray) -> tuple[BoolArray, BoolArray]:
-        """``(collided (K,), margin_violated (K,))`` of a team standing at ``states`` ``(K, n)``."""
-        ...
-
-    def prepare(
-        self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int
-    ) -> None:
+    def prepare(self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int) -> None:
         """Compile all that rolling out and :meth:`denoise` with arguments of this kind need, if it is not yet."""
         ...
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 from collections.abc import Callable
+from contextlib import suppress
 from types import ModuleType
 from typing import Any
 
@@ -18,7 +19,7 @@ def fingerprint(modules: tuple[ModuleType, ...]) -> str:
 
 
 class _SourceKeyedCache(FunctionCache):
-    """numba notices an edit of the file a kernel is in, but not of the files it calls into; this adds them to the key."""
+    """numba notices an edit of the file a kernel is in, but not of the files it calls into: this adds those."""
 
     def __init__(self, function: Callable[..., Any], key: str) -> None:
         super().__init__(function)
@@ -37,10 +38,8 @@ def cached_kernel(key: str, **options: Any) -> Callable[[Callable[..., Any]], An
 
     def decorate(function: Callable[..., Any]) -> Any:
         dispatcher = numba.njit(nogil=True, **options)(function)
-        try:
+        with suppress(RuntimeError):
             dispatcher._cache = _SourceKeyedCache(function, key)
-        except RuntimeError:
-            pass
         return dispatcher
 
     return decorate

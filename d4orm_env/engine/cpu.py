@@ -209,9 +209,7 @@ class CpuEngine:
     def __init__(self, num_threads: int | None = None) -> None:
         self._threads = Threads(num_threads or available_cores())
 
-    def step(
-        self, arrays: ProblemArrays, states: FloatArray, arrived: BoolArray, controls: FloatArray
-    ) -> StepResult:
+    def step(self, arrays: ProblemArrays, states: FloatArray, arrived: BoolArray, controls: FloatArray) -> StepResult:
         """See :meth:`d4orm_env.engine.base.Engine.step`."""
         state, control = np.array(states, np.float32)[None], np.array(controls, np.float32)[None]
         docked = np.array(arrived, bool)[None]
@@ -223,7 +221,7 @@ class CpuEngine:
         return StepResult(state[0], control[0], docked[0], collided[0], violated[0], rewards[0])
 
     def contacts(self, arrays: ProblemArrays, states: FloatArray) -> tuple[BoolArray, BoolArray]:
-        """See :meth:`d4orm_env.engine.base.Engine.contacts`."""
+        """``(collided (K,), margin_violated (K,))`` of a team standing at ``states`` ``(K, n)``."""
         state = np.array(states, np.float32)[None]
         control = np.zeros((1, len(states), 1), np.float32)
         docked = np.zeros((1, len(states)), bool)
@@ -240,7 +238,19 @@ class CpuEngine:
         arrived: BoolArray,
         time_left: float,
     ) -> FloatArray:
-        """See :meth:`d4orm_env.engine.base.Engine.observe`."""
+        """What every robot sees.
+
+        Args:
+            arrays: The problem.
+            layout: Which components there are, and their bounds.
+            states: ``(K, n)``.
+            controls: ``(K, m)`` executed last.
+            arrived: ``(K,)`` bool.
+            time_left: Share of the time left, 1 to 0.
+
+        Returns:
+            ``(K, D)`` observations inside the layout's bounds.
+        """
         out = np.empty((1, len(states), layout.size), np.float32)
         observe_worlds(
             _typed(arrays),
@@ -285,10 +295,8 @@ class CpuEngine:
             margin_violated=violated[:, 0],
         )
 
-    def prepare(
-        self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int
-    ) -> None:
-        """See :meth:`d4orm_env.engine.base.Engine.prepare`: one compilation serves every problem, so a tiny run will do."""
+    def prepare(self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int) -> None:
+        """See :meth:`d4orm_env.engine.base.Engine.prepare`; one compilation serves every problem."""
         del noise_scale, num_samples
         if not sampling.average_noise.signatures:
             self.denoise(task, rules, task.base, np.zeros(1, np.float32), LANES, 0)

@@ -184,12 +184,13 @@ class _Inputs(NamedTuple):
 def _deformations(static: _Static, inputs: _Inputs, step: Any, time: Any, mean: Any, scale: Any) -> Any:
     """``(K, m, M)`` samples of the deformation at one time step."""
     num_robots, size = mean.shape
-    samples = jnp.arange(static.num_samples, dtype=jnp.uint32)[None, :]
+    counters, signs = noise.antithetic(jnp.arange(static.num_samples, dtype=jnp.uint32)[None, :], BIT_OPS)
     robots = jnp.arange(num_robots, dtype=jnp.uint32)[:, None]
+    low, high = inputs.seed
     draws: list[Any] = []
     for pair in range((size + 1) // 2):
-        key = noise.stream_key(*inputs.seed, step, robots, time, jnp.uint32(pair), BIT_OPS)
-        draws += noise.normal_pair(samples, key, BIT_OPS)
+        key = noise.stream_key(low, high, step, robots, time, jnp.uint32(pair), BIT_OPS)
+        draws += [signs * draw for draw in noise.normal_pair(counters, key, BIT_OPS)]
     return mean[..., None] + scale[..., None] * jnp.stack(draws[:size], axis=1)
 
 
@@ -263,9 +264,7 @@ class JaxEngine:
 
     name = "jax"
 
-    def step(
-        self, arrays: ProblemArrays, states: FloatArray, arrived: BoolArray, controls: FloatArray
-    ) -> StepResult:
+    def step(self, arrays: ProblemArrays, states: FloatArray, arrived: BoolArray, controls: FloatArray) -> StepResult:
         """See :meth:`d4orm_env.engine.base.Engine.step`."""
         models = tuple(tuple(MODELS)[code] for code in arrays.model_codes)
         worlds = Worlds(states[..., None], np.asarray(arrived)[..., None], np.zeros_like(controls)[..., None])
@@ -303,7 +302,13 @@ class JaxEngine:
         )
 
     def _lower(
-        self, task: SamplingTask, rules: SamplingRules, mean: FloatArray, noise_scale: FloatArray, num_samples: int, seed: int
+        self,
+        task: SamplingTask,
+        rules: SamplingRules,
+        mean: FloatArray,
+        noise_scale: FloatArray,
+        num_samples: int,
+        seed: int,
     ) -> tuple[Any, tuple[Any, ...]]:
         problem = task.problem
         docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
@@ -313,9 +318,7 @@ class JaxEngine:
         leaves, treedef = jax.tree.flatten(arguments)
         return _compiled_denoise(static, treedef, tuple((leaf.shape, leaf.dtype) for leaf in leaves)), arguments
 
-    def prepare(
-        self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int
-    ) -> None:
+    def prepare(self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int) -> None:
         """See :meth:`d4orm_env.engine.base.Engine.prepare`."""
         self._lower(task, rules, task.base, noise_scale, num_samples, 0)
 

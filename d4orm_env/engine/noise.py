@@ -2,8 +2,9 @@
 order, on any number of threads, with nothing stored.
 
 A 64-bit stream key stands for (seed, step, robot, time, pair of components). The sample number is the counter: it is
-mixed with the key by a 32-bit integer hash (three multiplications, xor-shifts between them, with full avalanche), and the
-Box-Muller transform turns the hash into two independent normals. Written in scalar style like the models.
+mirrored (see :func:`antithetic`), mixed with the key by a 32-bit integer hash (three multiplications, xor-shifts
+between them, with full avalanche), and the Box-Muller transform turns the hash into two independent normals. Written in
+scalar style like the models.
 """
 
 from __future__ import annotations
@@ -38,6 +39,8 @@ MULTIPLIER_1, MULTIPLIER_2, MULTIPLIER_3 = _u(0xED5AD4BB), _u(0xAC4C1B51), _u(0x
 MULTIPLIER_ANGLE, GOLDEN = _u(0x846CA68B), _u(0x9E3779B9)
 S9, S11, S14, S15, S16, S17 = _u(9), _u(11), _u(14), _u(15), _u(16), _u(17)
 SIGN_BIT, S30, S31 = _u(0x80000000), _u(30), _u(31)
+S5, S6, LOW_BIT, LOW_5_BITS = _u(5), _u(6), _u(1), _u(31)
+MIRROR = 32
 
 HALF, ONE, MINUS_TWO = np.float32(0.5), np.float32(1), np.float32(-2)
 TWO_TO_MINUS_23 = np.float32(2.0**-23)
@@ -46,9 +49,19 @@ EXPONENT_SHIFT = np.int32(23)
 LN2 = np.float32(np.log(2))
 
 # Fitted: log(1 + f) = f * P(f) on [sqrt(1/2) - 1, sqrt(2) - 1] to 5e-7, sin(pi/2 t) = t * Q(t^2) on [0, 1] to 2e-6.
-P0, P1, P2, P3 = np.float32(1.0000017240), np.float32(-0.5000243878), np.float32(0.3330756453), np.float32(-0.2485827128)
+P0, P1, P2, P3 = (
+    np.float32(1.0000017240),
+    np.float32(-0.5000243878),
+    np.float32(0.3330756453),
+    np.float32(-0.2485827128),
+)
 P4, P5, P6 = np.float32(0.2055282466), np.float32(-0.1910518105), np.float32(0.1220986040)
-Q0, Q1, Q2, Q3 = np.float32(1.5707963253), np.float32(-0.6459270505), np.float32(0.0794877072), np.float32(-0.0043569856)
+Q0, Q1, Q2, Q3 = (
+    np.float32(1.5707963253),
+    np.float32(-0.6459270505),
+    np.float32(0.0794877072),
+    np.float32(-0.0043569856),
+)
 
 
 def xor_shift(x: Any, places: Any, ops: BitOps) -> Any:
@@ -84,6 +97,20 @@ def normal_pair(sample: Any, key: Any, ops: BitOps) -> Any:
     x = with_sign(radius * quarter_sine(turn), ops.uint32(second << S30), ops)
     y = with_sign(radius * quarter_sine(ONE - turn), ops.uint32(second << S31), ops)
     return x, y
+
+
+def antithetic(sample: Any, ops: BitOps) -> Any:
+    """``(counter, sign)`` of a sample: of every 64 samples the second 32 mirror the first.
+
+    Mirrored samples cost half the noise, and the odd part of the sampling error cancels between the two.
+
+    Args:
+        sample: uint32 sample number.
+        ops: The library's operations.
+    """
+    counter = ops.uint32(ops.uint32(ops.uint32(sample >> S6) << S5) + ops.uint32(sample & LOW_5_BITS))
+    half = ops.int32(ops.uint32(sample >> S5) & LOW_BIT)
+    return counter, ONE + MINUS_TWO * ops.to_float(half)
 
 
 def unit_interval(bits: Any, ops: BitOps) -> Any:

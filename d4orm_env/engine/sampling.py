@@ -15,6 +15,7 @@ from numba.extending import register_jitable
 from d4orm_env.core import collision, dynamics, reward, transition
 from d4orm_env.engine import noise, tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.noise import MIRROR
 from d4orm_env.engine.tiles import (
     CONTROL,
     DISTANCE2,
@@ -45,6 +46,7 @@ for _function in (
     noise.xor_shift,
     noise.hash32,
     noise.stream_key,
+    noise.antithetic,
     noise.normal_pair,
     noise.unit_interval,
     noise.quarter_sine,
@@ -89,11 +91,15 @@ BIT_OPS = noise.BitOps(_uint32, _int32, _to_float, _float_bits, _bits_float, _sq
 
 @compiled
 def _perturb(key: Any, first: Any, offset: Any, scale: Any, rows: Any) -> None:
-    """Fill two rows with ``offset + scale * noise``."""
-    for s in range(TILE):
-        x, y = noise.normal_pair(np.uint32(first + s), key, BIT_OPS)
-        rows[s] = offset[0] + scale[0] * x
-        rows[TILE + s] = offset[1] + scale[1] * y
+    """Fill two rows with ``offset + scale * noise``, mirrored as :func:`noise.antithetic` says."""
+    counter = first // 2
+    for s in range(MIRROR):
+        x, y = noise.normal_pair(np.uint32(counter + s), key, BIT_OPS)
+        x, y = scale[0] * x, scale[1] * y
+        rows[s] = offset[0] + x
+        rows[MIRROR + s] = offset[0] - x
+        rows[TILE + s] = offset[1] + y
+        rows[TILE + MIRROR + s] = offset[1] - y
 
 
 @inlined
@@ -361,10 +367,11 @@ def _weighted_moments(key: Any, samples: Any, weights: Any, count: Any) -> Any:
         for lane in range(LANES):
             # The lists are padded with weight zero to a whole number of blocks.
             i = block * LANES + lane
-            x, y = noise.normal_pair(samples[i], key, BIT_OPS)
+            counter, sign = noise.antithetic(samples[i], BIT_OPS)
+            x, y = noise.normal_pair(counter, key, BIT_OPS)
             weight = weights[i]
-            sums[0, lane] += weight * x
-            sums[1, lane] += weight * y
+            sums[0, lane] += sign * weight * x
+            sums[1, lane] += sign * weight * y
             sums[2, lane] += weight * x * x
             sums[3, lane] += weight * y * y
     return sums[0].sum(), sums[1].sum(), sums[2].sum(), sums[3].sum()

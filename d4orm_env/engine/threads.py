@@ -1,7 +1,7 @@
 """A few threads that share the parts of one kernel call.
 
-numba's own parallel loops need a threading layer that other threads may enter too, which is not there on every platform.
-Kernels that release the interpreter's lock need no more than this.
+numba's own parallel loops need a threading layer that other threads may enter too, which is not there on every
+platform. Kernels that release the interpreter's lock need no more than this.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 A tile is a block of :data:`TILE` worlds (samples of a plan, or environments) that differ in their numbers only. All a
 tile needs lies in one flat float32 array, the workspace: for every robot :data:`ROWS` rows, every row one number per
 world. So every inner loop runs over worlds with distances between its operands that the compiler knows, which is what
-lets it vectorise without checking for overlap, and the tile stays in cache while all robots and pairs are visited. Flags
-are zeros and ones, because mixing widths would stop the vectoriser.
+lets it vectorise without checking for overlap, and the tile stays in cache while all robots and pairs are visited.
+Flags are zeros and ones, because mixing widths would stop the vectoriser.
 """
 
 from __future__ import annotations
@@ -25,9 +25,8 @@ ONE = np.float32(1)
 TILE = 64
 """Worlds per tile."""
 
-# First rows of a robot in the workspace. Normals come in pairs, so the three control rows are followed by a spare one; a
-# power of two in all would map the same row of every robot to the same
-# cache set.
+# First rows of a robot in the workspace. Normals come in pairs, so the three control rows are followed by a spare one;
+# a power of two in all would map the same row of every robot to the same cache set.
 STATE, CONTROL, GOAL, DOCKED, DISTANCE2, NEAR_ROBOT, NEAR_OBSTACLE, TOTAL = 0, 6, 10, 13, 14, 15, 16, 17
 SCRATCH, ROWS = 18, 19
 STRIDE = ROWS * TILE
@@ -109,8 +108,8 @@ def cosine(x: Any) -> Any:
 OPS = Ops(cosine, sine, _sqrt, _minimum, _maximum)
 
 
-# Tuples of two to six numbers: consecutive rows of the workspace from offset ``o``, in world ``s``. Written out, because
-# the vectoriser gives up on loops over tuples.
+# Tuples of two to six numbers: consecutive rows of the workspace from offset ``o``, in world ``s``. Written out,
+# because the vectoriser gives up on loops over tuples.
 
 
 @compiled

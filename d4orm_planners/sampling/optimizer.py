@@ -1,9 +1,9 @@
 """The loop that MPPI, CEM, MBD, i-MBD and D4orm share: propose, sample and score, weight, update (paper, Algorithm 1).
 
-After every step the new mean is the weighted mean of the samples. For the denoising methods this is Algorithm 1 exactly:
-substituting the score estimate of line 5 into line 6 gives ``U_{i-1} = sqrt(alpha_bar_{i-1}) * U_bar``, and line 3 of the
-next step samples around ``U_{i-1} / sqrt(alpha_bar_{i-1}) = U_bar``. A method is therefore a schedule of standard
-deviations, a rule for the weights, and where an iteration starts.
+After every step the new mean is the weighted mean of the samples. For the denoising methods this is Algorithm 1
+exactly: substituting the score estimate of line 5 into line 6 gives ``U_{i-1} = sqrt(alpha_bar_{i-1}) * U_bar``, and
+line 3 of the next step samples around ``U_{i-1} / sqrt(alpha_bar_{i-1}) = U_bar``. A method is therefore a schedule of
+standard deviations, a rule for the weights, and where an iteration starts.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, positive_number, whole_number
 from d4orm_env.engine.base import SamplingRules, SamplingTask
 from d4orm_planners.base import Iteration, Planner, PlannerConfig, Search
+from d4orm_planners.sampling.weights import SoftmaxWeights
 
 CREDITS = ("team", "robot")
 
@@ -29,6 +30,7 @@ class SamplingConfig(PlannerConfig):
         num_samples: ``M``, trajectories per step.
         num_steps: ``N``, steps per iteration.
         temperature: ``lambda`` of the softmax over normalised rewards.
+        weight_cutoff: Softmax weights below this share of the largest count as zero.
         beta_start: First variance of the diffusion schedule.
         beta_end: Last variance of the diffusion schedule.
         credit: ``"team"`` weights samples by the team's mean reward, as in the paper; ``"robot"`` weights each robot's
@@ -38,6 +40,7 @@ class SamplingConfig(PlannerConfig):
     num_samples: int = 1024
     num_steps: int = 100
     temperature: float = 0.3
+    weight_cutoff: float = 1e-3
     beta_start: float = 1e-4
     beta_end: float = 2e-2
     credit: str = "team"
@@ -47,6 +50,8 @@ class SamplingConfig(PlannerConfig):
         whole_number(self.num_samples, "num_samples", 2)
         whole_number(self.num_steps, "num_steps", 1)
         positive_number(self.temperature, "temperature")
+        if positive_number(self.weight_cutoff, "weight_cutoff", zero_allowed=True) >= 1:
+            raise ValueError(f"weight_cutoff is {self.weight_cutoff:g}; it must be below 1")
         for name in ("beta_start", "beta_end"):
             beta = positive_number(getattr(self, name), name)
             if beta >= 1:
@@ -55,6 +60,10 @@ class SamplingConfig(PlannerConfig):
             raise ValueError(f"beta_start {self.beta_start:g} is above beta_end {self.beta_end:g}; swap them")
         if self.credit not in CREDITS:
             raise ValueError(f"credit {self.credit!r} is unknown; choose one of {', '.join(CREDITS)}")
+
+
+PAPER = {"num_samples": 1024, "num_steps": 100, "weight_cutoff": 0.0}
+"""What the paper's experiments share (section IV-B)."""
 
 
 class SamplingPlanner(Planner):
@@ -66,13 +75,13 @@ class SamplingPlanner(Planner):
     def noise_scale(self) -> FloatArray:
         """``(N,)`` standard deviation of the samples at every step of an iteration."""
 
-    @abstractmethod
     def rules(self) -> SamplingRules:
-        """The method's weights, and how it adapts its noise."""
+        """The method's weights, and how it adapts its noise: the softmax, unless a method says otherwise."""
+        return SamplingRules(weights=SoftmaxWeights(float(self.config.temperature), float(self.config.weight_cutoff)))
 
     @abstractmethod
     def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
-        """``(base, mean)``, each ``(H, K, m)``: samples of this iteration are drawn around ``mean`` on top of ``base``."""
+        """``(base, mean)``, each ``(H, K, m)``: samples are drawn around ``mean`` on top of ``base``."""
 
     def task(self, search: Search, base: FloatArray) -> SamplingTask:
         """What this iteration samples and scores."""
@@ -84,9 +93,7 @@ class SamplingPlanner(Planner):
         task, rules, noise_scale = self.task(search, base), self.rules(), self.noise_scale()
         with search.watch.paused():
             search.engine.prepare(task, rules, noise_scale, self.config.num_samples)
-        result = search.engine.denoise(
-            task, rules, mean, noise_scale, self.config.num_samples, search.iteration_seed()
-        )
+        result = search.engine.denoise(task, rules, mean, noise_scale, self.config.num_samples, search.iteration_seed())
         return Iteration(base + result.mean, len(noise_scale))
 
 

@@ -1,7 +1,7 @@
 """Noise schedules: the standard deviation of the samples at every step of one iteration.
 
-The diffusion schedule is a property of the fraction of steps done: 100 variances ``beta`` rise linearly, and for another
-number of steps the cumulative product is interpolated (paper, section III-B and appendix, "Noise Schedule").
+The diffusion schedule is a property of the fraction of steps done: 100 variances ``beta`` rise linearly, and for
+another number of steps the cumulative product is interpolated (paper, section III-B and appendix, "Noise Schedule").
 """
 
 from __future__ import annotations

@@ -14,9 +14,12 @@ class SoftmaxWeights:
 
     Attributes:
         temperature: ``lambda``; smaller values follow the best samples more closely.
+        cutoff: Weights below this share of the largest are dropped. What they would add is less than the sampling
+            error, and the engine need not average over their samples.
     """
 
     temperature: float
+    cutoff: float = 0.0
 
     def __call__(self, rewards: Any, xp: Any) -> Any:
         """Weights of ``rewards`` ``(..., M)``; a sample at minus infinity gets none."""
@@ -29,6 +32,7 @@ class SoftmaxWeights:
         score = xp.where(usable, deviation / spread, -xp.inf)
         best = score.max(-1, keepdims=True)
         weight = xp.where(usable, xp.exp((score - xp.where(best > -xp.inf, best, 0)) / self.temperature), 0)
+        weight = xp.where(weight >= self.cutoff, weight, 0)
         return weight / xp.maximum(weight.sum(-1, keepdims=True), 1e-30)
 
 
