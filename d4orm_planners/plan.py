@@ -116,7 +116,8 @@ class Plan:
         """
         source = _npz_path(path)
         try:
-            with np.load(source, allow_pickle=False) as file:
+            # Opened here, because np.load leaves a file that is no archive open.
+            with source.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
                 content = {name: file[name] for name in file.files}
             header = json.loads(str(content.pop("header")))
             if header.pop("format") != FORMAT:

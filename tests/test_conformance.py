@@ -29,7 +29,7 @@ VARIANTS: list[dict[str, Any]] = [
     {"problem": line_problem([0.3, 0.5], goal_radius=0.25), "lifelong": True},
     {"scenario": "circle", "num_robots": 3, "control_noise_std": (0.2, 0.1)},
     {"scenario": "random", "num_robots": 3, "randomize_instance": True},
-    {"scenario": "circle", "num_robots": 2, "num_neighbors": 0, "num_obstacles": 0},
+    {"scenario": "circle", "num_robots": 2, "observed_robots": 0, "observed_obstacles": 0},
 ]
 VARIANT_NAMES = ["early-arrivals", "mixed-team", "one-robot", "lifelong", "noise", "new-instances", "blind"]
 CASES = [

@@ -241,7 +241,7 @@ def test_a_missing_action_is_refused_by_name() -> None:
         ({"control_noise_std": "much"}, "control_noise_std must be a number"),
         ({"control_noise_std": [0.1, 0.1, 0.1]}, "control_noise_std has shape"),
         ({"max_cycles": 0}, "max_cycles is 0"),
-        ({"num_neighbors": -1}, "num_neighbors"),
+        ({"observed_robots": -1}, "observed_robots"),
     ],
 )
 def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:

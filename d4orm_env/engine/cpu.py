@@ -15,6 +15,7 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine import noise, sampling, tiles
 from d4orm_env.engine.base import SamplingResult, SamplingRules, SamplingTask, StepResult, checked_controls
 from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.noise import MIRROR
 from d4orm_env.engine.sampling import LANES
 from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_env.engine.tiles import (
@@ -365,29 +366,40 @@ class _Sampling:
     def moments(self, step: int, weights: Any, with_second: bool) -> tuple[FloatArray, FloatArray]:
         """``(H, K, m)`` weighted mean of the noise and, if asked for, of its square."""
         num_steps, num_robots, _ = self.base.shape
-        samples, compact, counts = _with_weight(np.asarray(weights, np.float32))
-        if len(counts) == 1:
-            samples, compact, counts = (np.repeat(a, num_robots, axis=0) for a in (samples, compact, counts))
+        rows = np.asarray(weights, np.float32)
+        counters, odd, even, counts = _by_counter(np.repeat(rows, num_robots, axis=0) if len(rows) == 1 else rows)
         first = np.zeros_like(self.base)
         second = np.zeros_like(self.base) if with_second else np.zeros((0, 0, 0), np.float32)
         self.threads.over(
             num_steps,
-            lambda part: sampling.average_noise(self.seed, step, samples, compact, counts, part, first, second),
+            lambda part: sampling.average_noise(self.seed, step, counters, odd, even, counts, part, first, second),
         )
         return first, second
 
 
-def _with_weight(weights: FloatArray) -> tuple[Any, FloatArray, Any]:
-    """The samples with positive weight, ``(rows, .)`` numbers, weights and counts, padded to whole blocks of lanes."""
-    counts = (weights > 0).sum(axis=1)
+def _by_counter(weights: FloatArray) -> tuple[Any, FloatArray, FloatArray, Any]:
+    """Weights ``(K, M)`` of samples gathered by the counter of their noise, which a sample shares with its mirror.
+
+    Returns:
+        ``(K, .)`` counters, their weights in an odd moment (sample minus mirror) and in an even one (sample plus
+        mirror), and ``(K,)`` how many there are. Counters without weight are left out, and the lists are padded to
+        whole blocks of lanes.
+    """
+    num_rows, num_samples = weights.shape
+    padded = np.zeros((num_rows, -(-num_samples // TILE) * TILE), np.float32)
+    padded[:, :num_samples] = weights
+    halves = padded.reshape(num_rows, -1, 2, MIRROR)
+    odd = (halves[:, :, 0] - halves[:, :, 1]).reshape(num_rows, -1)
+    even = (halves[:, :, 0] + halves[:, :, 1]).reshape(num_rows, -1)
+    rows, columns = np.nonzero(even)
+    counts = np.bincount(rows, minlength=num_rows)
     width = -(-int(counts.max()) // LANES) * LANES
-    samples = np.zeros((len(weights), width), np.uint32)
-    compact = np.zeros((len(weights), width), np.float32)
-    for row, count in enumerate(counts):
-        chosen = np.flatnonzero(weights[row] > 0)
-        samples[row, :count] = chosen
-        compact[row, :count] = weights[row, chosen]
-    return samples, compact, counts
+    place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+    counters = np.zeros((num_rows, width), np.uint32)
+    counters[rows, place] = columns
+    compact = np.zeros((2, num_rows, width), np.float32)
+    compact[:, rows, place] = odd[rows, columns], even[rows, columns]
+    return counters, compact[0], compact[1], counts
 
 
 _ONE_WORLD = np.array([0, 1])

@@ -39,14 +39,13 @@ from d4orm_env.engine.tiles import (
 )
 
 SOURCES = fingerprint((dynamics, transition, collision, reward, noise, tiles))
-LANES = 16
-"""Width of blocked sums and extents: fixed, so that results do not depend on the machine's vectors."""
+LANES = 32
+"""Width of blocked sums: fixed, so that results do not depend on the machine's vectors."""
 
 for _function in (
     noise.xor_shift,
     noise.hash32,
     noise.stream_key,
-    noise.antithetic,
     noise.normal_pair,
     noise.unit_interval,
     noise.quarter_sine,
@@ -327,51 +326,72 @@ def score_tiles(
 
 @cached_kernel(SOURCES, **OPTIONS)
 def average_noise(
-    seed: Any, step: Any, samples: Any, weights: Any, counts: Any, time_range: Any, first_moment: Any,
+    seed: Any,
+    step: Any,
+    counters: Any,
+    odd: Any,
+    even: Any,
+    counts: Any,
+    time_range: Any,
+    first_moment: Any,
     second_moment: Any,
-) -> None:  # fmt: skip
+) -> None:
     """Weighted mean of the noise, and of its square, made again for the samples that have any weight.
 
     Args:
         seed: Two uint32 words.
         step: Number of the denoising step.
-        samples: ``(K, .)`` uint32 numbers of the samples that count for each robot.
-        weights: ``(K, .)`` their weights.
-        counts: ``(K,)`` how many of them there are.
+        counters: ``(K, .)`` uint32, the noise that counts for each robot.
+        odd: ``(K, .)`` weight of the noise: that of its sample minus that of the mirrored one.
+        even: ``(K, .)`` weight of its square: the sum of the two.
+        counts: ``(K,)`` how many counters there are; the lists are padded with weight zero to whole blocks.
         time_range: First time step and the one after the last.
         first_moment: ``(H, K, m)``, output.
         second_moment: ``(H, K, m)``, output, or an empty array to do without.
     """
     num_controls = first_moment.shape[2]
+    with_square = second_moment.size > 0
+    w = np.empty(6 * LANES, np.float32)
     for t in range(time_range[0], time_range[1]):
         for k in range(first_moment.shape[1]):
             for pair in range((num_controls + 1) // 2):
                 key = noise.stream_key(
                     seed[0], seed[1], np.uint32(step), np.uint32(k), np.uint32(t), np.uint32(pair), BIT_OPS
                 )
-                mean_x, mean_y, square_x, square_y = _weighted_moments(key, samples[k], weights[k], counts[k])
-                first_moment[t, k, 2 * pair] = mean_x
-                if 2 * pair + 1 < num_controls:
-                    first_moment[t, k, 2 * pair + 1] = mean_y
-                if second_moment.size > 0:
-                    second_moment[t, k, 2 * pair] = square_x
-                    if 2 * pair + 1 < num_controls:
-                        second_moment[t, k, 2 * pair + 1] = square_y
+                _sum_moments(key, counters[k], odd[k], even[k], counts[k], with_square, w)
+                for row in range(min(2, num_controls - 2 * pair)):
+                    first_moment[t, k, 2 * pair + row] = _total(w, 2 + row)
+                    if with_square:
+                        second_moment[t, k, 2 * pair + row] = _total(w, 4 + row)
 
 
-@compiled
-def _weighted_moments(key: Any, samples: Any, weights: Any, count: Any) -> Any:
-    """Sums in fixed lanes, so that they vectorise and still come out the same everywhere."""
-    sums = np.zeros((4, LANES), np.float32)
-    for block in range((count + LANES - 1) // LANES):
+@inlined
+def _sum_moments(key: Any, counters: Any, odd: Any, even: Any, count: Any, with_square: Any, w: Any) -> None:
+    """Sums over blocks of :data:`LANES`, lane by lane, so that they vectorise and come out the same everywhere.
+
+    ``w`` ``(6 * LANES,)`` holds one block of the noise's two components, then the running sums: first moments of both,
+    second moments of both.
+    """
+    w[2 * LANES :] = ZERO
+    for first in range(0, count, LANES):
+        counter, weight = counters[first : first + LANES], odd[first : first + LANES]
         for lane in range(LANES):
-            # The lists are padded with weight zero to a whole number of blocks.
-            i = block * LANES + lane
-            counter, sign = noise.antithetic(samples[i], BIT_OPS)
-            x, y = noise.normal_pair(counter, key, BIT_OPS)
-            weight = weights[i]
-            sums[0, lane] += sign * weight * x
-            sums[1, lane] += sign * weight * y
-            sums[2, lane] += weight * x * x
-            sums[3, lane] += weight * y * y
-    return sums[0].sum(), sums[1].sum(), sums[2].sum(), sums[3].sum()
+            x, y = noise.normal_pair(counter[lane], key, BIT_OPS)
+            w[lane] = x
+            w[LANES + lane] = y
+        for lane in range(LANES):
+            w[2 * LANES + lane] += weight[lane] * w[lane]
+            w[3 * LANES + lane] += weight[lane] * w[LANES + lane]
+        if with_square:
+            weight = even[first : first + LANES]
+            for lane in range(LANES):
+                w[4 * LANES + lane] += weight[lane] * w[lane] * w[lane]
+                w[5 * LANES + lane] += weight[lane] * w[LANES + lane] * w[LANES + lane]
+
+
+@inlined
+def _total(w: Any, row: Any) -> Any:
+    total = ZERO
+    for lane in range(LANES):
+        total += w[row * LANES + lane]
+    return total

@@ -44,7 +44,7 @@ class Threads:
     def over(self, count: int, work: Callable[[Any], None]) -> None:
         """Call ``work(array([first, last]))`` on parts that together make up ``range(count)``, and wait for all."""
         parts = min(self.num_threads, count)
-        edges = np.linspace(0, count, parts + 1).astype(np.int64)
+        edges = np.array([count * part // parts for part in range(parts + 1)])
         if parts == 1:
             work(edges)
             return

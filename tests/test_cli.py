@@ -1,0 +1,172 @@
+"""The command line: what it does, and that bad input gets one clear line, exit status 2, and leaves no file behind."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from d4orm_planners import cli
+from d4orm_planners.plan import Plan
+
+QUICK = ("--set", "num_samples=64", "--set", "num_steps=5", "--max-iterations", "1")
+
+
+class Outcome:
+    """Exit status and output of one call."""
+
+    def __init__(self, status: int, out: str, err: str) -> None:
+        self.status, self.out, self.err = status, out, err
+
+
+@pytest.fixture
+def d4orm(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Runs the command line inside ``tmp_path``."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: str) -> Outcome:
+        with pytest.raises(SystemExit) as exit_:
+            cli.main(list(arguments))
+        captured = capsys.readouterr()
+        return Outcome(int(exit_.value.code or 0), captured.out, captured.err)
+
+    return call
+
+
+def test_plan_writes_the_plan_and_its_pictures(d4orm, tmp_path: Path) -> None:
+    files = ("--out", "plan.npz", "--picture", "plan.png", "--animation", "plan.gif")
+    outcome = d4orm("plan", "--robots", "2", "--seed", "3", *files)
+    assert outcome.status == 0, outcome.err
+    plan = Plan.load(tmp_path / "plan.npz")
+    assert plan.solved
+    assert plan.seed == 3
+    assert plan.problem.num_robots == 2
+    assert "solved" in outcome.out
+    assert "yes" in outcome.out
+    assert {path.name for path in tmp_path.iterdir()} == {"plan.npz", "plan.png", "plan.gif"}
+
+
+def test_run_executes_a_plan_file(d4orm) -> None:
+    assert d4orm("plan", "--robots", "2", "--out", "plan.npz", "--quiet").status == 0
+    outcome = d4orm("run", "plan.npz")
+    assert outcome.status == 0, outcome.err
+    assert "success" in outcome.out
+
+
+def test_run_of_a_policy_that_collides_exits_with_one(d4orm) -> None:
+    outcome = d4orm("run", "--policy", "goal", "--robots", "2")
+    assert outcome.status == 1
+    assert "robots in contact" in outcome.out
+
+
+def test_no_solution_in_the_budget_exits_with_one_and_still_writes_the_best_plan(d4orm, tmp_path: Path) -> None:
+    outcome = d4orm("plan", "--robots", "8", *QUICK, "--out", "plan.npz")
+    assert outcome.status == 1
+    assert outcome.err.startswith("no solution found")
+    assert not Plan.load(tmp_path / "plan.npz").solved
+
+
+def test_demo_plans_executes_verifies_and_says_where(d4orm, tmp_path: Path) -> None:
+    outcome = d4orm("demo", "--robots", "3", "--out", "pictures")
+    assert outcome.status == 0, outcome.err
+    written = {path.name for path in (tmp_path / "pictures").iterdir()}
+    assert written == {"plan.npz", "plan.png", "execution.gif"}
+    assert "verified" in outcome.out
+    for name in written:
+        assert name in outcome.out
+
+
+def test_scenario_file(d4orm, tmp_path: Path) -> None:
+    robot = "{model: velocity2d, start: [0, 0], goal: [1, 0]}"
+    (tmp_path / "mine.yaml").write_text(f"version: 1\nname: mine\nrobots:\n  - {robot}\n")
+    assert d4orm("plan", "--scenario", "mine.yaml", "--quiet").status == 0
+
+
+@pytest.mark.parametrize("command", ["scenarios", "planners"])
+def test_lists(d4orm, command: str) -> None:
+    outcome = d4orm(command)
+    assert outcome.status == 0
+    assert {"scenarios": "amswarm_5", "planners": "d4orm"}[command] in outcome.out
+
+
+BAD = [
+    (("plan", "--robots", "0"), "num_robots is 0"),
+    (("plan", "--robots", "three"), "--robots"),
+    (("plan", "--planner", "nope"), "planner 'nope' is unknown; choose one of d4orm"),
+    (("plan", "--preset", "nope"), "preset 'nope'"),
+    (("plan", "--scenario", "nope"), "scenario 'nope' is unknown"),
+    (("plan", "--scenario", "missing.yaml"), "missing.yaml"),
+    (("plan", "--scenario", "nan.yaml"), "finite"),
+    (("plan", "--scenario", "overlap.yaml"), "overlap"),
+    (("plan", "--scenario", "good.yaml", "--robots", "4"), "--robots 4 does not go with a scenario file"),
+    (("plan", "--model", "hovercraft"), "model 'hovercraft' is unknown"),
+    (("plan", "--engine", "gpu"), "engine 'gpu' is unknown"),
+    (("plan", "--set", "num_samples"), "name=value"),
+    (("plan", "--set", "num_samples=1"), "num_samples is 1"),
+    (("plan", "--set", "nonsense=1"), "nonsense"),
+    (("plan", "--seed", "-1"), "seed is -1"),
+    (("plan", "--time-limit", "0"), "time_limit is 0"),
+    (("plan", "--max-iterations", "0"), "max_iterations is 0"),
+    (("plan", "--out", "plan.txt"), "must end in .npz"),
+    (("plan", "--out", "missing/plan.npz"), "'missing' does not exist"),
+    (("plan", "--picture", "plan.bmp"), "must end in .png"),
+    (("plan", "--no-such-option",), "--no-such-option"),
+    (("run", "truncated.npz"), "truncated.npz is not a readable plan"),
+    (("run", "absent.npz"), "absent.npz"),
+    (("run", "--noise", "-1"), "control_noise_std is -1"),
+    (("run", "--policy", "nope"), "policy 'nope' is unknown"),
+    (("demo", "--out", "good.yaml"), "good.yaml"),
+    (("demo", "--robots", "500"), "diameter"),
+    (("nonsense",), "nonsense"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
+def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: Sequence[str], message: str) -> None:
+    line = "version: 1\nname: x\nrobots:\n"
+    robot = "  - {model: velocity2d, start: [%s, 0], goal: [%s, 1]}\n"
+    (tmp_path / "good.yaml").write_text(line + robot % (0, 0))
+    (tmp_path / "nan.yaml").write_text(line + robot % (".nan", 0))
+    (tmp_path / "overlap.yaml").write_text(line + robot % (0, 0) + robot % (0.1, 5))
+    assert d4orm("plan", "--scenario", "good.yaml", "--quiet", *QUICK, "--out", "whole.npz").status in (0, 1)
+    (tmp_path / "truncated.npz").write_bytes((tmp_path / "whole.npz").read_bytes()[:500])
+    before = sorted(tmp_path.rglob("*"))
+    outcome = d4orm(*arguments)
+    assert outcome.status == 2
+    assert outcome.err.count("\n") == 1
+    assert outcome.err.startswith("d4orm: ")
+    assert message in outcome.err
+    # A folder made for the demo is no half-written file.
+    assert [path for path in sorted(tmp_path.rglob("*")) if path.name != "demo"] == before
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs a folder that not even root can write to")
+@pytest.mark.parametrize("arguments", [("plan", "--out", "/proc/plan.npz"), ("demo", "--out", "/proc/demo")])
+def test_unwritable_folder(d4orm, arguments: Sequence[str]) -> None:
+    outcome = d4orm(*arguments)
+    assert outcome.status == 2
+    assert outcome.err.count("\n") == 1
+    assert "choose another" in outcome.err
+
+
+@pytest.mark.parametrize("command", [[], ["demo"], ["plan"], ["run"], ["scenarios"], ["planners"]])
+def test_help(d4orm, command: list[str]) -> None:
+    outcome = d4orm(*command, "--help")
+    assert outcome.status == 0
+    assert "--help" in outcome.out
+
+
+def test_help_loads_nothing_heavy() -> None:
+    code = (
+        "import sys\nfrom d4orm_planners import cli\n"
+        "try:\n    cli.main(['--help'])\nexcept SystemExit:\n    pass\n"
+        "print([m for m in ('numba', 'jax', 'torch', 'matplotlib', 'pettingzoo') if m in sys.modules])"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env={**os.environ, "COLUMNS": "100"}
+    )
+    assert result.stdout.splitlines()[-1] == "[]"
