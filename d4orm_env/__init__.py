@@ -11,11 +11,12 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
 from d4orm_env.joint_env import register_environments
 from d4orm_env.rollout import rollout
-from d4orm_env.scenarios import list_scenarios, load_problem, make_problem, save_problem
+from d4orm_env.scenarios import list_scenarios, make_problem
 from d4orm_env.verify import VerificationReport, verify
 
 if TYPE_CHECKING:
     from d4orm_env import functional, navigation_v0
+    from d4orm_env.scenarios import load_problem, save_problem
 
 __version__ = "0.1.0"
 
@@ -39,7 +40,9 @@ register_environments()
 
 
 def __getattr__(name: str) -> Any:
-    """Load the submodules that bring PettingZoo or JAX with them on first use only."""
+    """Load what brings PettingZoo, JAX or pydantic with it on first use only."""
+    if name in ("load_problem", "save_problem"):
+        return getattr(import_module("d4orm_env.scenarios"), name)
     if name in ("functional", "navigation_v0"):
         return import_module(f"d4orm_env.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

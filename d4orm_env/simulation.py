@@ -17,7 +17,6 @@ import numpy as np
 from d4orm_env.core.arrays import BoolArray, FloatArray, frozen_array, whole_number
 from d4orm_env.core.observation import ObservationLayout
 from d4orm_env.core.problem import Problem, inverse_initial_distance
-from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.episode_record import EpisodeRecord
 from d4orm_env.joint_state import JointState, join_state, state_bounds
 from d4orm_env.lifelong import fresh_goal, goal_region, reached_goals
@@ -83,6 +82,9 @@ class Simulation:
             num_neighbors=whole_number(observed_robots, "observed_robots", 0),
             num_obstacles=whole_number(observed_obstacles, "observed_obstacles", 0),
         )
+        # Here, because importing the compiler takes longer than importing all the rest of the package.
+        from d4orm_env.engine.cpu import CpuEngine
+
         self._engine = CpuEngine()
         self._dimension = problem.dimension
         self._redraw = redraw

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from d4orm_planners.base import Planner, PlannerConfig
-from d4orm_planners.episode import Episode, run_episode
-from d4orm_planners.plan import IterationRecord, Plan
-from d4orm_planners.policy import OpenLoop, Policy
-from d4orm_planners.registry import list_planners, list_policies, make_planner, make_policy
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from d4orm_planners.base import Planner, PlannerConfig
+    from d4orm_planners.episode import Episode, run_episode
+    from d4orm_planners.plan import IterationRecord, Plan
+    from d4orm_planners.policy import OpenLoop, Policy
+    from d4orm_planners.registry import list_planners, list_policies, make_planner, make_policy
 
 __all__ = [
     "Episode",
@@ -22,3 +26,19 @@ __all__ = [
     "make_policy",
     "run_episode",
 ]
+
+_HOMES = {
+    "base": ("Planner", "PlannerConfig"),
+    "episode": ("Episode", "run_episode"),
+    "plan": ("IterationRecord", "Plan"),
+    "policy": ("OpenLoop", "Policy"),
+    "registry": ("list_planners", "list_policies", "make_planner", "make_policy"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import on first use, so that ``d4orm --help`` need not wait for the engines."""
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(f"d4orm_planners.{home}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,6 +1,20 @@
 """Named scenarios and scenario files."""
 
-from d4orm_env.scenarios.files import load_problem, save_problem
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from d4orm_env.scenarios.registry import describe_scenario, list_scenarios, make_problem
 
+if TYPE_CHECKING:
+    from d4orm_env.scenarios.files import load_problem, save_problem
+
 __all__ = ["describe_scenario", "list_scenarios", "load_problem", "make_problem", "save_problem"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import the file schema on first use only: building it takes as long as importing everything else."""
+    if name in ("load_problem", "save_problem"):
+        return getattr(import_module("d4orm_env.scenarios.files"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
