@@ -54,6 +54,6 @@ class Viewer:
         self._renderer = self._problem = None
 
     def _open(self, problem: Problem) -> Any:
-        from d4orm_env.render import pictures
+        from d4orm_env.render import frames
 
-        return pictures.FrameRenderer(problem) if self._mode == "rgb_array" else pictures.WindowRenderer(problem)
+        return frames.FrameRenderer(problem) if self._mode == "rgb_array" else frames.WindowRenderer(problem)

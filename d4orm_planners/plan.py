@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 import zipfile
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.scenarios.schema import describe, parse
@@ -97,14 +97,8 @@ class Plan:
             **{name: getattr(self, name) for name in _SCALARS},
         }
         arrays = {field.name: getattr(self.trajectory, field.name) for field in fields(Trajectory)}
-        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".npz")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
-            os.replace(temporary, target)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        with replaced_when_done(target) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:

@@ -23,7 +23,8 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
 from d4orm_env.render import FrameRenderer, WindowRenderer, plot_trajectory, save_animation, save_picture
 from d4orm_env.render.animation import frame_steps
-from d4orm_env.render.pictures import CONTACT, contact_points, robot_colors, view_limits
+from d4orm_env.render.panels import CONTACT, robot_colors, view_limits
+from d4orm_env.render.pictures import contact_points
 
 CONTACT_RGB = np.round(255 * np.array(mpl.colors.to_rgb(CONTACT))).astype(int)
 

@@ -10,16 +10,24 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from d4orm_env.render.animation import save_animation
-    from d4orm_env.render.pictures import FrameRenderer, WindowRenderer, plot_trajectory, save_picture
+    from d4orm_env.render.frames import FrameRenderer, WindowRenderer
+    from d4orm_env.render.pictures import plot_trajectory, save_picture
+
+_HOMES = {
+    "FrameRenderer": "frames",
+    "WindowRenderer": "frames",
+    "plot_trajectory": "pictures",
+    "save_animation": "animation",
+    "save_picture": "pictures",
+}
 
 __all__ = ["FrameRenderer", "WindowRenderer", "plot_trajectory", "save_animation", "save_picture"]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in __all__:
+    if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    leaf = "animation" if name == "save_animation" else "pictures"
-    return getattr(import_module(f"{__name__}.{leaf}"), name)
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:

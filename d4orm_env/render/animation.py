@@ -14,17 +14,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from d4orm_env.core.arrays import positive_number, whole_number
+from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.metrics import arrival_times
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.render.pictures import (
-    FrameRenderer,
-    checked_trajectory,
-    contact_points,
-    picture_palette,
-    replaced_when_done,
-    view_limits,
-)
+from d4orm_env.render.frames import FrameRenderer
+from d4orm_env.render.panels import picture_palette, view_limits
+from d4orm_env.render.pictures import checked_trajectory, contact_points
 
 __all__ = ["ANIMATION_SUFFIXES", "save_animation"]
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import os
 import re
-import uuid
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios.schema import describe, parse
 
@@ -56,20 +56,11 @@ def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:
         ValueError: If the file cannot be written; nothing is left behind.
     """
     target = Path(path)
-    partial = target.with_name(f".{target.name}.{uuid.uuid4().hex}.partial")
     try:
-        try:
-            with partial.open("x", encoding="utf-8") as file:
-                file.write(_format(describe(problem)))
-                file.flush()
-                os.fsync(file.fileno())
-            partial.replace(target)
-        finally:
-            partial.unlink(missing_ok=True)
+        with replaced_when_done(target) as temporary:
+            temporary.write_text(_format(describe(problem)), encoding="utf-8")
     except OSError as error:
-        raise ValueError(
-            f"{target}: cannot be written ({error.strerror}); choose a file in a folder you own"
-        ) from error
+        raise ValueError(f"{target}: cannot be written ({error}); choose a file in a folder you own") from error
 
 
 def _read_text(path: Path) -> str:

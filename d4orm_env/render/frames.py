@@ -1,0 +1,206 @@
+"""Frames for the environment's render modes, and a live window, with matplotlib."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.registry import backend_registry
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from d4orm_env.core.problem import Problem
+from d4orm_env.render.panels import INK, Array, Panel, TeamLayer, view_limits
+
+__all__ = ["FrameRenderer", "WindowRenderer"]
+
+
+class FrameRenderer:
+    """Draws one moment after another into an image: the environment's ``rgb_array`` mode, and animations.
+
+    The world is drawn once and kept; a frame redraws only what moves.
+
+    Args:
+        problem: Team, world, and the starts and goals that the view is fitted to.
+        size: Width and height [pixels]. Spatial problems get a view of space, and a view from above beside it where
+            the image is at least 1.6 times as wide as high.
+        points: ``(..., d)`` further positions that must be in view; the view grows when a robot leaves it.
+
+    Raises:
+        ValueError: If the size is below 64 x 64.
+    """
+
+    def __init__(self, problem: Problem, size: tuple[int, int] = (480, 480), points: Any = ()) -> None:
+        self.problem, self.size = problem, (int(size[0]), int(size[1]))
+        if min(self.size) < 64:
+            raise ValueError(f"size is {size}; a frame needs at least 64 x 64 pixels")
+        self._closed = False
+        self._build(view_limits(problem, points))
+
+    def _build(self, limits: Array) -> None:
+        width, height = self.size
+        scale = float(np.clip(min(width, height) / 480, 0.5, 2.0))
+        figure = Figure(figsize=(width / (100 * scale), height / (100 * scale)), dpi=100 * scale)
+        self._canvas = FigureCanvasAgg(figure)
+        panels = self._panels(figure, limits)
+        self._layers = [TeamLayer(panel, self.problem) for panel in panels]
+        self._caption = figure.text(0.5, 0.965, "", ha="center", va="center", fontsize=10, color=INK, animated=True)
+        for layer in self._layers:
+            for artist in layer.artists:
+                artist.set_animated(True)
+        self._limits = limits
+        self._canvas.draw()
+        self._background = self._canvas.copy_from_bbox(figure.bbox)
+
+    def _panels(self, figure: Figure, limits: Array) -> list[Panel]:
+        if self.problem.dimension == 2:
+            places = [("plane", (0.12, 0.1, 0.85, 0.83))]
+        elif self.size[0] >= 1.6 * self.size[1]:
+            places = [("space", (0.015, 0.04, 0.44, 0.84)), ("above", (0.57, 0.1, 0.42, 0.83))]
+        else:
+            places = [("space", (0.01, 0.04, 0.86, 0.86))]
+        panels = []
+        for view, rectangle in places:
+            panel = Panel(figure, 111, self.problem, limits, view)
+            panel.axes.set_position(rectangle)
+            panels.append(panel)
+        return panels
+
+    def draw(
+        self,
+        states: Any,
+        arrived: Any,
+        collided: Any,
+        goals: Any = None,
+        trail: Any = None,
+        *,
+        contacts: Any = (),
+        caption: str | None = None,
+    ) -> NDArray[np.uint8]:
+        """Draw one moment.
+
+        Args:
+            states: ``(K, n)``.
+            arrived: ``(K,)`` bool; these robots are drawn paler.
+            collided: ``(K,)`` bool; these robots get a star.
+            goals: ``(K, d)`` where they differ from the problem's.
+            trail: ``(T, K, d)`` positions up to now, oldest first.
+            contacts: ``(N, d)`` further points to mark with a star, such as earlier contacts.
+            caption: Text above the picture; by default how many robots have arrived.
+
+        Returns:
+            ``(height, width, 3)`` image, the caller's own.
+
+        Raises:
+            ValueError: If the states have another shape or are not finite.
+            RuntimeError: After :meth:`close`.
+        """
+        if self._closed:
+            raise RuntimeError("this renderer is closed; make a new one to draw again")
+        states, d = np.asarray(states), self.problem.dimension
+        arrived, collided = np.asarray(arrived, bool), np.asarray(collided, bool)
+        expected = (self.problem.num_robots, self.problem.state_size)
+        if states.shape != expected or not np.isfinite(states).all():
+            raise ValueError(f"states must be finite and of shape (K, n) = {expected}; these have {states.shape}")
+        goals = self.problem.goal if goals is None else np.asarray(goals)
+        trail = np.empty((0, len(states), d)) if trail is None else np.asarray(trail)
+        contacts = np.concatenate([np.reshape(contacts, (-1, d)), states[collided, :d]])
+        self._keep_in_view(np.concatenate([states[:, :d], goals]))
+        for layer in self._layers:
+            layer.update(states, arrived, goals, trail, contacts)
+        self._caption.set_text(f"arrived {arrived.sum()} of {len(arrived)}" if caption is None else caption)
+        return self._paint()
+
+    def _keep_in_view(self, places: Array) -> None:
+        reach = np.max(self.problem.team.radius)
+        lower, upper = places.min(axis=0) - reach, places.max(axis=0) + reach
+        if (lower < self._limits[0]).any() or (upper > self._limits[1]).any():
+            room = 0.15 * (self._limits[1] - self._limits[0])
+            self._build(
+                np.stack(
+                    [
+                        np.where(lower < self._limits[0], lower - room, self._limits[0]),
+                        np.where(upper > self._limits[1], upper + room, self._limits[1]),
+                    ]
+                )
+            )
+
+    def _paint(self) -> NDArray[np.uint8]:
+        self._canvas.restore_region(self._background)
+        for layer in self._layers:
+            for artist in layer.artists:
+                if layer.panel.spatial:
+                    artist.do_3d_projection()
+                layer.panel.axes.draw_artist(artist)
+        self._canvas.figure.draw_artist(self._caption)
+        return np.array(self._canvas.buffer_rgba())[..., :3].copy()
+
+    def close(self) -> None:
+        """Let go of the figure. Closing twice is fine."""
+        if not self._closed:
+            self._closed = True
+            del self._canvas, self._layers, self._caption, self._background
+
+
+class WindowRenderer:
+    """Shows the frames of a :class:`FrameRenderer` in a window, at the pace of the problem's time step.
+
+    The window is that of matplotlib's backend. Without a display that backend draws to memory only, and so does this:
+    frames are made, and no window opens.
+
+    Args:
+        problem: As for :class:`FrameRenderer`.
+        size: As for :class:`FrameRenderer`.
+    """
+
+    def __init__(self, problem: Problem, size: tuple[int, int] = (480, 480)) -> None:
+        self._frames = FrameRenderer(problem, size)
+        self._period = problem.dt
+        self._manager: Any = None
+        self._image: Any = None
+        self._last = -np.inf
+        self._open_window(problem, size)
+
+    @property
+    def has_window(self) -> bool:
+        """Whether there is a window: not without a display, nor after the user closed it."""
+        return self._manager is not None
+
+    def _open_window(self, problem: Problem, size: tuple[int, int]) -> None:
+        canvas_class = backend_registry.load_backend_module(mpl.get_backend()).FigureCanvas
+        if not canvas_class.required_interactive_framework:
+            return
+        figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100)
+        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+        axes.set_axis_off()
+        self._image = axes.imshow(np.full((size[1], size[0], 3), 255, np.uint8))
+        self._manager = canvas_class.new_manager(figure, 1)
+        self._manager.set_window_title(f"d4orm: {problem.name}")
+        self._manager.canvas.mpl_connect("close_event", self._forget_window)
+        self._manager.show()
+
+    def _forget_window(self, event: Any) -> None:
+        self._manager = None
+
+    def draw(
+        self, states: Any, arrived: Any, collided: Any, goals: Any = None, trail: Any = None, **marks: Any
+    ) -> NDArray[np.uint8]:
+        """Draw one moment as :meth:`FrameRenderer.draw` does, show it, and wait until it is time for the next."""
+        frame = self._frames.draw(states, arrived, collided, goals, trail, **marks)
+        if self._manager is not None:
+            canvas = self._manager.canvas
+            self._image.set_data(frame)
+            canvas.draw()
+            canvas.start_event_loop(max(1e-3, self._period - (time.monotonic() - self._last)))
+            self._last = time.monotonic()
+        return frame
+
+    def close(self) -> None:
+        """Close the window. Closing twice is fine."""
+        self._frames.close()
+        if self._manager is not None:
+            manager, self._manager = self._manager, None
+            manager.destroy()

@@ -1,0 +1,250 @@
+"""Drawing primitives: a panel in data coordinates, the world, and the team on it.
+
+Everything is drawn to scale, as polygons and line segments, so that one code draws the plane, a view of space, and
+space seen from above. Robots are told apart by the Okabe-Ito palette, which colour-blind readers can tell apart too,
+and larger teams by a perceptually uniform map. Only matplotlib figures are used, never pyplot's global state.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from numpy.typing import NDArray
+
+from d4orm_env.core.problem import Problem
+
+OKABE_ITO = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#000000", "#F0E442")
+OBSTACLE, OBSTACLE_EDGE, BOUND, SHADOW, INK = "#C9CDD2", "#6B7280", "#374151", "#D9DCE1", "#1F2937"
+CONTACT, MARGIN, CLEAR = "#D0021B", "#F7B6BD", (1.0, 1.0, 1.0, 0.0)
+
+_ANGLES = np.linspace(0, 2 * np.pi, 36, endpoint=False)
+_CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
+_DIAMOND = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+_STAR = np.stack([np.sin(np.pi * np.arange(16) / 8), np.cos(np.pi * np.arange(16) / 8)], axis=-1)
+_STAR[1::2] *= 0.5
+ARRIVED_SHADE = 0.45
+_AZIMUTH, _SPATIAL_ELEVATION, _FLAT_ELEVATION = -60.0, 25.0, 45.0
+
+Array = NDArray[Any]
+
+
+def robot_colors(num_robots: int) -> Array:
+    """``(K, 3)`` RGB colours: Okabe-Ito for up to eight robots, a perceptually uniform map for more."""
+    if num_robots <= len(OKABE_ITO):
+        return np.array([to_rgb(color) for color in OKABE_ITO[:num_robots]])
+    return np.asarray(mpl.colormaps["viridis"](np.linspace(0, 0.92, num_robots)))[:, :3]
+
+
+def picture_palette(num_robots: int, size: int) -> Array:
+    """``(size, 3)`` uint8 colours that a picture of the team is made of: every solid one, then blends with white."""
+    shades = np.array([1.0, 0.85, 0.65, ARRIVED_SHADE, 0.2])[:, None, None]
+    flat = np.array([to_rgb(color) for color in (CONTACT, MARGIN, OBSTACLE, OBSTACLE_EDGE, BOUND, INK, SHADOW)])
+    grays = np.repeat(np.linspace(0, 1, 12), 3).reshape(-1, 3)
+    robots = robot_colors(num_robots)
+    most = (size - len(flat) - len(grays)) // len(shades)
+    robots = robots[np.unique(np.linspace(0, num_robots - 1, most).round().astype(int))]
+    colors = np.concatenate([flat, grays, (shades * robots + 1 - shades).reshape(-1, 3)])
+    return np.resize(np.round(255 * colors), (size, 3)).astype(np.uint8)
+
+
+def view_limits(problem: Problem, points: Any = ()) -> Array:
+    """``(2, d)`` lower and upper corner of what a picture shows [m].
+
+    That is every start, goal, obstacle and further point with some room around them, and the bounds where they are
+    near. Neither side of the plane is shown at less than 0.4 of the other.
+
+    Args:
+        problem: The problem.
+        points: ``(..., d)`` further robot positions that must be in view.
+    """
+    d, world, reach = problem.dimension, problem.world, float(np.max(problem.team.radius))
+    places = np.concatenate([problem.start[:, :d], problem.goal, np.reshape(points, (-1, d))]).astype(np.float64)
+    lows, highs = [places.min(axis=0) - reach], [places.max(axis=0) + reach]
+    for ball in world.balls:
+        lows.append(ball[:d] - ball[d])
+        highs.append(ball[:d] + ball[d])
+    for cylinder in world.cylinders:
+        lows.append(np.append(cylinder[:2] - cylinder[2], lows[0][2]))
+        highs.append(np.append(cylinder[:2] + cylinder[2], highs[0][2]))
+    for box in world.boxes:
+        lows.append(box[:d])
+        highs.append(box[d:])
+    lower, upper = np.min(lows, axis=0), np.max(highs, axis=0)
+    span = float(np.max(upper - lower))
+    room = max(1.5 * reach, 0.05 * span)
+    bounds = world.bounds.astype(np.float64)
+    below = np.where(bounds[0] > lower - 0.3 * span, bounds[0] - 0.25 * room, lower - room)
+    above = np.where(bounds[1] < upper + 0.3 * span, bounds[1] + 0.25 * room, upper + room)
+    limits = np.stack([np.minimum(lows[0], below), np.maximum(highs[0], above)])
+    sides = np.ptp(limits[:, :2], axis=0)
+    limits[:, :2] += np.outer([-0.5, 0.5], np.maximum(0.4 * sides.max() - sides, 0))
+    return limits
+
+
+class Panel:
+    """One view of the world on one axes: the plane, space, or space seen from above.
+
+    Attributes:
+        axes: Where it draws.
+        spatial: Whether this is a view of space (mplot3d, orthographic, so that spheres are circles).
+        right, up: ``(2,)`` or ``(3,)`` unit vectors that span the plane of the picture.
+    """
+
+    def __init__(self, figure: Figure, place: Any, problem: Problem, limits: Array, view: str) -> None:
+        self.spatial = view == "space"
+        self.limits = limits if self.spatial else limits[:, :2]
+        self.axes: Any = figure.add_subplot(place, projection="3d" if self.spatial else None)
+        if self.spatial:
+            self._look_at_space()
+        else:
+            self.right, self.up = np.eye(2)
+            self.axes.set(xlim=self.limits[:, 0], ylim=self.limits[:, 1], aspect="equal")
+        self.axes.set(xlabel="x [m]", ylabel="y [m]")
+        self.axes.tick_params(labelsize=8, color=BOUND)
+        draw_world(self, problem)
+
+    def _look_at_space(self) -> None:
+        axes, size = self.axes, self.limits[1] - self.limits[0]
+        degrees = _SPATIAL_ELEVATION if size[2] > 0.5 * size[:2].max() else _FLAT_ELEVATION
+        elevation, azimuth = np.deg2rad([degrees, _AZIMUTH])
+        self.right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        self.up = np.array(
+            [-np.sin(elevation) * np.cos(azimuth), -np.sin(elevation) * np.sin(azimuth), np.cos(elevation)]
+        )
+        axes.set_proj_type("ortho")
+        axes.view_init(elev=degrees, azim=_AZIMUTH)
+        axes.set(xlim=self.limits[:, 0], ylim=self.limits[:, 1], zlim=self.limits[:, 2])
+        flat = degrees == _FLAT_ELEVATION
+        axes.set_box_aspect(size, zoom=1.0 if flat else 0.9)
+        axes.locator_params(axis="z", nbins=max(2, round(6 * size[2] / size[:2].max())))
+        if flat:  # a label would lie on the ticks of so short an axis
+            axes.zaxis.set_major_formatter("{x:g} m")
+        else:
+            axes.set_zlabel("z [m]")
+        axes.computed_zorder = False
+        for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+            axis.set_pane_color((0.97, 0.97, 0.98, 1.0))
+            axis._axinfo["grid"].update(color="#E5E7EB", linewidth=0.6)
+
+    def flatten(self, points: Any) -> Array:
+        """Points ``(..., d)`` in the coordinates of this panel: ``z`` is dropped in a view from above."""
+        return np.asarray(points, np.float64)[..., : len(self.right)]
+
+    def outlines(self, centres: Any, radius: Any, shape: Array = _CIRCLE) -> Array:
+        """``(N, vertices, .)`` copies of a shape of unit size, facing the reader."""
+        offsets = shape[:, :1] * self.right + shape[:, 1:] * self.up
+        corners: Array = self.flatten(centres)[:, None] + np.broadcast_to(radius, len(centres))[:, None, None] * offsets
+        return corners
+
+    def polygons(self, vertices: Any, **style: Any) -> Any:
+        """Draw filled polygons and return the collection."""
+        if self.spatial:
+            return self.axes.add_collection3d(Poly3DCollection(vertices, **style), autolim=False)
+        return self.axes.add_collection(PolyCollection(vertices, **style), autolim=False)
+
+    def segments(self, paths: Any, **style: Any) -> Any:
+        """Draw open paths and return the collection."""
+        if self.spatial:
+            return self.axes.add_collection3d(Line3DCollection(paths, **style), autolim=False)
+        return self.axes.add_collection(LineCollection(paths, **style), autolim=False)
+
+
+def draw_world(panel: Panel, problem: Problem) -> None:
+    """Obstacles and bounds."""
+    world = problem.world
+    solid = {"facecolors": OBSTACLE, "edgecolors": OBSTACLE_EDGE, "linewidths": 0.8, "zorder": 1}
+    if panel.spatial:
+        _draw_solids(panel, problem)
+    else:
+        for discs in (world.balls, world.cylinders):
+            panel.polygons(panel.outlines(discs[:, :2], discs[:, -1]), **solid)
+        corners = [(0, 1), (2, 1), (2, 3), (0, 3)]
+        flat = world.boxes[:, [0, 1, problem.dimension, problem.dimension + 1]]
+        panel.polygons([box[np.array(corner)] for box in flat for corner in [corners]], **solid)
+    if world.lower is not None:
+        x, y = world.bounds[:, :2].T
+        rectangle = np.array([(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1]), (x[0], y[0])])
+        if panel.spatial:
+            rectangle = np.column_stack([rectangle, np.full(5, panel.limits[0, 2])])
+        panel.segments([rectangle], colors=BOUND, linewidths=1.4, zorder=1)
+
+
+def _draw_solids(panel: Panel, problem: Problem) -> None:
+    """The obstacles of a view of space, translucent: nothing may hide behind them."""
+    style = {"facecolors": (*to_rgb(OBSTACLE), 0.4), "edgecolors": (*to_rgb(OBSTACLE_EDGE), 0.6), "zorder": 1}
+    for *centre, radius in problem.world.spheres:
+        panel.polygons(panel.outlines([centre], radius), linewidths=0.8, **style)
+        rings = np.stack([np.column_stack([_CIRCLE, 0 * _ANGLES]), np.column_stack([0 * _ANGLES, _CIRCLE])])
+        panel.polygons(np.array(centre) + radius * rings, **(style | {"facecolors": "none", "linewidths": 0.4}))
+    for x, y, radius in problem.world.cylinders:
+        ring = np.array([x, y]) + radius * _CIRCLE
+        low, high = (np.column_stack([ring, np.full(len(ring), z)]) for z in panel.limits[:, 2])
+        sides = np.stack([low, np.roll(low, 1, axis=0), np.roll(high, 1, axis=0), high], axis=1)
+        panel.polygons(sides, **(style | {"edgecolors": "none"}))
+        panel.polygons([low, high], linewidths=0.8, **style)
+    for box in problem.world.boxes:
+        corners = np.array(list(product(*box.reshape(2, 3).T)))
+        faces = [(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5)]
+        panel.polygons(corners[np.array(faces)], linewidths=0.8, **style)
+
+
+class TeamLayer:
+    """The robots of one panel: goals, trails, bodies, headings and contacts, drawn once and then moved.
+
+    Attributes:
+        artists: The matplotlib artists, in drawing order.
+    """
+
+    def __init__(self, panel: Panel, problem: Problem) -> None:
+        self.panel, self.problem = panel, problem
+        self.colors = robot_colors(problem.num_robots)
+        self.radius = np.asarray(problem.team.radius, np.float64)
+        self.drives = [k for k, model in enumerate(problem.team.robot_models) if model.heading_index is not None]
+        span = float(np.max(panel.limits[1] - panel.limits[0]))
+        self.mark_size = float(np.clip(self.radius.mean(), 0.015 * span, 0.03 * span))
+        few = problem.num_robots <= 16
+        lines, trail = (1.1 if few else 0.7), (1.6 if few else 0.8)
+        self.dark = self.colors[self.drives] @ [0.299, 0.587, 0.114] < 0.6
+        # One transparent face each: mplot3d sorts edge colours by depth together with the faces, or not at all.
+        self.hollow = {"facecolors": [CLEAR] * problem.num_robots, "edgecolors": self.colors}
+        empty = np.empty((0, 4, len(panel.right)))
+        self.shadows = panel.segments(empty, colors=SHADOW, linewidths=trail, zorder=1.5)
+        self.goals = panel.polygons(empty, **self.hollow, linewidths=lines, zorder=3)
+        self.trails = panel.segments(empty, colors=self.colors, linewidths=trail, alpha=0.85, zorder=4)
+        self.bodies = panel.polygons(empty, facecolors=self.colors, edgecolors=INK, linewidths=0.7, zorder=5)
+        self.headings = panel.segments(empty, linewidths=1.6, capstyle="round", zorder=6)
+        self.contacts = panel.polygons(empty, facecolors=CONTACT, edgecolors="white", linewidths=0.7, zorder=7)
+        self.artists = [self.shadows, self.goals, self.trails, self.bodies, self.headings, self.contacts]
+
+    def update(self, states: Array, arrived: Array, goals: Array, trail: Array, contacts: Array) -> None:
+        """Move everything; the shapes are those of :meth:`FrameRenderer.draw`, with ``(N, d)`` contacts."""
+        panel, d = self.panel, self.problem.dimension
+        positions = states[:, :d]
+        paths = panel.flatten(trail).swapaxes(0, 1)
+        self.trails.set_segments(paths)
+        if panel.spatial:
+            floor = panel.limits[0, 2]
+            self.shadows.set_segments(np.concatenate([paths[..., :2], np.full_like(paths[..., :1], floor)], axis=-1))
+        self.goals.set_verts(panel.outlines(goals, 1.5 * self.radius, _DIAMOND))
+        self.bodies.set_verts(panel.outlines(positions, self.radius))
+        shade = np.where(arrived[:, None], ARRIVED_SHADE, 1.0)
+        self.bodies.set_facecolor(shade * self.colors + 1 - shade)
+        self.headings.set_segments(self.heading_lines(states))
+        white = self.dark & ~arrived[self.drives]
+        self.headings.set_color(["white" if on_dark else INK for on_dark in white])
+        self.contacts.set_verts(panel.outlines(contacts, self.mark_size, _STAR))
+
+    def heading_lines(self, states: Array) -> Array:
+        """``(., 2, 2)`` lines from the centre to the front of every robot that has a heading."""
+        models = self.problem.team.robot_models
+        angle = np.array([states[k, models[k].heading_index] for k in self.drives], np.float64)
+        front = self.radius[self.drives, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        centre = states[self.drives, :2].astype(np.float64)
+        return np.stack([centre, centre + front], axis=1)

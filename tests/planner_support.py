@@ -1,0 +1,122 @@
+"""Problems, settings and reference formulas that the tests of the planners share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
+from d4orm_env.engine import noise
+from d4orm_planners.base import Planner
+from d4orm_planners.plan import IterationRecord
+from d4orm_planners.registry import PLANNERS, make_planner
+
+CHEAP = {"engine": "cpu", "num_samples": 64, "num_steps": 5, "max_iterations": 2}
+"""Settings that plan in no time, and badly."""
+
+BIT_OPS = noise.BitOps(
+    uint32=lambda x: np.asarray(x).astype(np.uint32),
+    int32=lambda x: np.asarray(x).astype(np.int32),
+    to_float=lambda x: np.asarray(x).astype(np.float32),
+    float_bits=lambda x: np.asarray(x).view(np.int32),
+    bits_float=lambda x: np.asarray(x).view(np.float32),
+    sqrt=np.sqrt,
+)
+
+
+def cheap_planner(name: str, **config: Any) -> Planner:
+    """A planner with those of the cheap settings that it has."""
+    known = PLANNERS[name].config_class.setting_names()
+    return make_planner(name, **{key: value for key, value in CHEAP.items() if key in known} | config)
+
+
+def hop_problem(num_robots: int = 3, **changes: Any) -> Problem:
+    """Robots side by side with their goals half a metre ahead: near enough for a few samples to find."""
+    team = Team(("holonomic2d",) * num_robots)
+    start = np.zeros((num_robots, 4))
+    start[:, 1] = np.arange(num_robots)
+    return Problem(team, start, start[:, :2] + [0.5, 0], **({"horizon": 30} | changes))
+
+
+def walled_in_problem() -> Problem:
+    """One robot whose goal stands inside a closed ring of circles."""
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    ring = np.column_stack([3 + 0.8 * np.cos(angle), 0.8 * np.sin(angle), np.full(12, 0.25)])
+    return Problem(Team(("holonomic2d",)), [[0, 0, 0, 0]], [[3, 0]], World(circles=ring), horizon=60)
+
+
+class Recorder:
+    """A callback that keeps the records, and stops or raises after some of them."""
+
+    def __init__(self, stop_after: int | None = None, error: BaseException | None = None) -> None:
+        self.records: list[IterationRecord] = []
+        self._stop_after = stop_after
+        self._error = error
+
+    def __call__(self, record: IterationRecord) -> bool:
+        self.records.append(record)
+        last = self._stop_after is not None and len(self.records) >= self._stop_after
+        if last and self._error is not None:
+            raise self._error
+        return last
+
+
+def engine_noise(problem: Problem, seed: int, step: int, num_samples: int) -> np.ndarray:
+    """``(M, H, K, m)`` the standard normals that every engine draws in one step, in float64."""
+    counters, signs = noise.antithetic(np.arange(num_samples, dtype=np.uint32), BIT_OPS)
+    low, high = (np.array([word], np.uint32) for word in noise.seed_words(seed))
+    words = [np.array([value], np.uint32) for value in range(max(problem.horizon, problem.num_robots) + 1)]
+    draws = np.empty((num_samples, problem.horizon, problem.num_robots, problem.control_size))
+    for time in range(problem.horizon):
+        for robot in range(problem.num_robots):
+            for pair in range((problem.control_size + 1) // 2):
+                step_word = np.array([step], np.uint32)
+                key = noise.stream_key(low, high, step_word, words[robot], words[time], words[pair], BIT_OPS)
+                both = np.stack(noise.normal_pair(counters, key, BIT_OPS), axis=-1) * signs[:, None]
+                width = min(2, problem.control_size - 2 * pair)
+                draws[:, time, robot, 2 * pair : 2 * pair + width] = both[:, :width]
+    return draws
+
+
+def softmax(rewards: np.ndarray, temperature: float) -> np.ndarray:
+    """``exp(r / lambda)`` over its sum, for rewards brought to mean zero and deviation one."""
+    score = (rewards - rewards.mean()) / rewards.std()
+    likelihood = np.exp(score / temperature)
+    return likelihood / likelihood.sum()
+
+
+def algorithm_1(
+    initial: np.ndarray,
+    alpha_bar: list[float],
+    draw: Callable[[int], np.ndarray],
+    reward: Callable[[np.ndarray], np.ndarray],
+    temperature: float,
+) -> np.ndarray:
+    """The paper's Algorithm 1, line by line, in float64.
+
+    Args:
+        initial: ``U_N``, ``(H, K, m)``.
+        alpha_bar: ``alpha_bar_i`` for ``i`` from 1 to N.
+        draw: ``(M, H, K, m)`` standard normals of the step with that number, 0 being the first (``i = N``).
+        reward: ``(M,)`` or ``(M, K)`` rewards of the samples ``(M, H, K, m)``: the team's, or each robot's own.
+        temperature: ``lambda``.
+    """
+    cumulative = np.concatenate([[1.0], alpha_bar])
+    controls = initial.astype(np.float64)
+    for step, i in enumerate(range(len(alpha_bar), 0, -1)):
+        abar, alpha = cumulative[i], cumulative[i] / cumulative[i - 1]
+        samples = controls / np.sqrt(abar) + np.sqrt(1 / abar - 1) * draw(step)  # line 3
+        rewards = reward(samples)  # line 4
+        if rewards.ndim == 1:
+            mean = np.tensordot(softmax(rewards, temperature), samples, axes=1)  # line 5
+        else:
+            robots = range(rewards.shape[1])
+            parts = [np.tensordot(softmax(rewards[:, k], temperature), samples[:, :, k], axes=1) for k in robots]
+            mean = np.stack(parts, axis=1)
+        score = -controls / (1 - abar) + np.sqrt(abar) / (1 - abar) * mean  # line 6
+        controls = (controls + (1 - abar) * score) / np.sqrt(alpha)  # line 7
+    return controls
