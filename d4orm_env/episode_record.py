@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
@@ -40,34 +42,60 @@ class EpisodeRecord:
             self._arrival_step[new] = np.minimum(self._arrival_step[new], self._steps)
 
     def metrics(self) -> dict[str, float]:
-        """The episode so far.
+        """The episode so far, as plain numbers; see :func:`episode_metrics`."""
+        metrics = episode_metrics(
+            self._steps,
+            self._dt,
+            self._reward,
+            self._goals_reached,
+            self._collisions,
+            self._margin_violations,
+            None if self._lifelong else self._arrival_step,
+        )
+        return {name: float(value) for name, value in metrics.items()}
 
-        Returns:
-            ``steps``; ``reward``: mean over steps and robots; ``goals_reached``; ``goals_per_robot_minute``;
-            ``collisions`` and ``margin_violations``: robot-steps in contact, or within the margin; ``collided`` and
-            ``margin_violated``: robots that ever were. Unless lifelong also ``arrived``: robots docked; ``success``:
-            1.0 when all have docked and none was ever in contact; ``travel_time`` and ``makespan``: mean and latest
-            arrival [s], with the time so far for a robot that has not docked.
-        """
-        team_size, elapsed = len(self._collisions), self._steps * self._dt
-        goals = int(self._goals_reached.sum())
-        collided = int(np.count_nonzero(self._collisions))
-        metrics = {
-            "steps": float(self._steps),
-            "reward": self._reward / (team_size * self._steps) if self._steps else 0.0,
-            "goals_reached": float(goals),
-            "goals_per_robot_minute": goals / (team_size * elapsed / 60) if self._steps else 0.0,
-            "collisions": float(self._collisions.sum()),
-            "margin_violations": float(self._margin_violations.sum()),
-            "collided": float(collided),
-            "margin_violated": float(np.count_nonzero(self._margin_violations)),
+
+def episode_metrics(
+    steps: Any, dt: float, reward: Any, goals: Any, contacts: Any, violations: Any, arrival_step: Any
+) -> dict[str, Any]:
+    """Episodes in numbers, of one world or, with leading axes, of many.
+
+    Args:
+        steps: ``(...)`` steps taken.
+        dt: Time step [s].
+        reward: ``(...)`` sum over steps and robots.
+        goals: ``(..., K)`` goals reached by each robot.
+        contacts: ``(..., K)`` steps in contact.
+        violations: ``(..., K)`` steps within the margin.
+        arrival_step: ``(..., K)`` step of docking, infinite for not yet; ``None`` in lifelong mode.
+
+    Returns:
+        ``steps``; ``reward``: mean over steps and robots; ``goals_reached``; ``goals_per_robot_minute``;
+        ``collisions`` and ``margin_violations``: robot-steps in contact, or within the margin; ``collided`` and
+        ``margin_violated``: robots that ever were. Unless lifelong also ``arrived``: robots docked; ``success``:
+        1.0 when all have docked and none was ever in contact; ``travel_time`` and ``makespan``: mean and latest
+        arrival [s], with the time so far for a robot that has not docked. Each ``(...)`` float64.
+    """
+    team_size, elapsed = contacts.shape[-1], np.asarray(steps, np.float64) * dt
+    robot_steps = team_size * np.maximum(steps, 1)
+    reached = goals.sum(axis=-1).astype(np.float64)
+    collided = np.count_nonzero(contacts, axis=-1)
+    metrics = {
+        "steps": np.asarray(steps, np.float64),
+        "reward": np.asarray(reward / robot_steps),
+        "goals_reached": reached,
+        "goals_per_robot_minute": 60 * reached / (robot_steps * dt),
+        "collisions": contacts.sum(axis=-1).astype(np.float64),
+        "margin_violations": violations.sum(axis=-1).astype(np.float64),
+        "collided": np.asarray(collided, np.float64),
+        "margin_violated": np.asarray(np.count_nonzero(violations, axis=-1), np.float64),
+    }
+    if arrival_step is not None:
+        times = np.minimum(arrival_step * dt, elapsed[..., None])
+        metrics |= {
+            "arrived": reached.copy(),
+            "success": ((reached == team_size) & (np.asarray(collided) == 0)).astype(np.float64),
+            "travel_time": times.mean(axis=-1),
+            "makespan": times.max(axis=-1),
         }
-        if not self._lifelong:
-            times = np.minimum(self._arrival_step * self._dt, elapsed)
-            metrics |= {
-                "arrived": float(goals),
-                "success": float(goals == team_size and not collided),
-                "travel_time": float(times.mean()),
-                "makespan": float(times.max()),
-            }
-        return metrics
+    return metrics

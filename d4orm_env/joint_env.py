@@ -9,7 +9,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.simulation import TeamStep, agent_infos, make_simulation
+from d4orm_env.simulation import Simulation, TeamStep, agent_infos, make_simulation
 from d4orm_env.viewer import RENDER_MODES, Viewer
 
 ENV_ID = "d4orm/Navigation-v0"
@@ -61,13 +61,8 @@ class JointNavigationEnv(gymnasium.Env[FloatArray, FloatArray]):
             observed_obstacles=observed_obstacles,
         )
         self.metadata = type(self).metadata | {"render_fps": max(1, round(1 / self.problem.dt))}
-        team_size, layout = self.problem.num_robots, self._simulation.layout
-        self._agents = [f"robot_{robot}" for robot in range(team_size)]
-        limits = self.problem.team.control_limits
-        # Padding has no limit of its own; a box must not be flat.
-        limits = np.where(limits > 0, limits, limits.max(axis=0)).ravel()
-        self.action_space = gymnasium.spaces.Box(-limits, limits)
-        self.observation_space = gymnasium.spaces.Box(np.tile(layout.low, team_size), np.tile(layout.high, team_size))
+        self._agents = [f"robot_{robot}" for robot in range(self.problem.num_robots)]
+        self.observation_space, self.action_space = joint_spaces(self._simulation)
 
     @property
     def problem(self) -> Problem:
@@ -153,7 +148,21 @@ class JointNavigationEnv(gymnasium.Env[FloatArray, FloatArray]):
         }
 
 
+def joint_spaces(simulation: Simulation) -> tuple[gymnasium.Space[FloatArray], gymnasium.Space[FloatArray]]:
+    """Spaces of the joint observation ``(K * D,)`` and of the joint action ``(K * m,)``."""
+    team, layout = simulation.problem.team, simulation.layout
+    limits = team.control_limits
+    # Padding has no limit of its own; a box must not be flat.
+    limits = np.where(limits > 0, limits, limits.max(axis=0)).ravel()
+    observations = gymnasium.spaces.Box(np.tile(layout.low, team.num_robots), np.tile(layout.high, team.num_robots))
+    return observations, gymnasium.spaces.Box(-limits, limits)
+
+
 def register_environments() -> None:
     """Make the environments known to Gymnasium; a second call changes nothing."""
     if ENV_ID not in gymnasium.registry:
-        gymnasium.register(id=ENV_ID, entry_point="d4orm_env.joint_env:JointNavigationEnv")
+        gymnasium.register(
+            id=ENV_ID,
+            entry_point="d4orm_env.joint_env:JointNavigationEnv",
+            vector_entry_point="d4orm_env.vector_env:NavigationVectorEnv",
+        )

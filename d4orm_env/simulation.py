@@ -123,6 +123,34 @@ class Simulation:
         """``(T, K, d)`` positions over the last steps, the present last [m]."""
         return np.stack(self._trail)
 
+    @property
+    def redraws(self) -> bool:
+        """Whether every reset draws a new instance."""
+        return self._redraw is not None
+
+    def draw_instance(self, random: np.random.Generator) -> Problem:
+        """A new instance of the scenario.
+
+        Raises:
+            RuntimeError: If there is nothing to draw from.
+            ValueError: If the spaces that were made for the first instance do not hold it.
+        """
+        if self._redraw is None:
+            raise RuntimeError("this simulation keeps its problem; give redraw to draw instances")
+        drawn, old, places = self._redraw(int(random.integers(2**31))), self.problem, self._places
+        points = np.concatenate([drawn.start[:, : old.dimension], drawn.goal])
+        if (
+            drawn.team.models != old.team.models
+            or (drawn.team.control_limits != old.team.control_limits).any()
+            or (points < places[0]).any()
+            or (points > places[1]).any()
+        ):
+            raise ValueError(
+                f"the instance drawn from scenario {drawn.name!r} has another team or lies outside "
+                f"{places.tolist()} m, where the state space ends; use a scenario whose seed changes places only"
+            )
+        return drawn
+
     def require_reset(self) -> None:
         """Raise ``RuntimeError`` unless an episode has begun."""
         if not self._running:
@@ -136,8 +164,8 @@ class Simulation:
         """
         # One draw per episode, so that an episode's noise does not depend on how long those before it were.
         self._random = np.random.default_rng(int(random.integers(2**63)))
-        if self._redraw is not None:
-            self._take_instance(self._redraw(int(self._random.integers(2**31))))
+        if self.redraws:
+            self.problem = self.draw_instance(self._random)
         problem = self.problem
         self.arrays = problem.arrays
         self.states = problem.start
@@ -211,22 +239,6 @@ class Simulation:
         goals.setflags(write=False)
         inverse_initial_distance.setflags(write=False)
         self.arrays = self.problem.arrays._replace(goal=goals, inverse_initial_distance=inverse_initial_distance)
-
-    def _take_instance(self, drawn: Problem) -> None:
-        """Make ``drawn`` the problem, if the spaces that were made for the first one hold it."""
-        old, places = self.problem, self._places
-        points = np.concatenate([drawn.start[:, : old.dimension], drawn.goal])
-        if (
-            drawn.team.models != old.team.models
-            or (drawn.team.control_limits != old.team.control_limits).any()
-            or (points < places[0]).any()
-            or (points > places[1]).any()
-        ):
-            raise ValueError(
-                f"the instance drawn from scenario {drawn.name!r} has another team or lies outside "
-                f"{places.tolist()} m, where the state space ends; use a scenario whose seed changes places only"
-            )
-        self.problem = drawn
 
 
 def noise_std(value: Any, control_size: int) -> FloatArray | None:

@@ -147,6 +147,59 @@ def run(
 
 
 @app.command()
+def bench(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write bench.json and bench.md to.")] = Path(
+        "bench"
+    ),
+    quick: Annotated[bool, typer.Option("--quick", help="Small sizes and few repetitions, about a minute.")] = False,
+    robots: Annotated[str | None, typer.Option("--robots", "-k", help="Team sizes, as 4,8,16.")] = None,
+    models: Annotated[str | None, typer.Option("--models", help="Robot models, separated by commas.")] = None,
+    engines: Annotated[str | None, typer.Option("--engines", help="Of cpu, jax and plain, with commas.")] = None,
+    seeds: Annotated[int | None, typer.Option("--seeds", help="Seeds for the first feasible plan.")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Measure the engines, the environments and the planner on this machine."""
+    from datetime import UTC, datetime
+
+    from d4orm_planners.evaluation.benchmark import QUICK, BenchmarkSettings, parts, run_parts
+    from d4orm_planners.evaluation.live import PartsProgress
+    from d4orm_planners.evaluation.report import write_report
+    from d4orm_planners.evaluation.timing import describe_machine
+
+    given: dict[str, Any] = {
+        "robots": _numbers("--robots", robots),
+        "models": _names(models),
+        "engines": _names(engines),
+    }
+    chosen = {name: value for name, value in {**given, "seeds": seeds}.items() if value is not None}
+    settings = BenchmarkSettings(**{**(QUICK if quick else {}), **chosen})
+    _make_folder(out)
+    machine, date = describe_machine(), datetime.now(UTC).isoformat(timespec="seconds")
+    with PartsProgress(enabled=not quiet) as progress:
+        results = run_parts(list(parts(settings)), progress.update)
+    command = " ".join(["d4orm", *sys.argv[1:]])
+    for path in write_report(out, settings, machine, command, date, results):
+        if not quiet:
+            typer.echo(f"wrote {path}")
+
+
+@app.command()
+def warmup(quiet: Quiet = False) -> None:
+    """Compile ahead what planning and the environments need, so that the next start is quick."""
+    from d4orm_planners.evaluation.warmup import warm_up
+
+    report = warm_up()
+    if not quiet:
+        typer.echo(
+            f"{len(report.compiled)} kernels compiled, {len(report.loaded)} found in the cache, {report.seconds:.1f} s"
+        )
+        for folder in report.folders:
+            typer.echo(f"cache {folder}")
+    if not report.folders:
+        raise ValueError("no cache folder can be written to; set NUMBA_CACHE_DIR to one that can")
+
+
+@app.command()
 def scenarios() -> None:
     """List the scenarios."""
     from d4orm_env.scenarios import describe_scenario, list_scenarios
@@ -210,6 +263,19 @@ def _parse_settings(settings: list[str] | None) -> dict[str, Any]:
         except yaml.YAMLError:
             raise ValueError(f"--set {setting!r}: the value cannot be read") from None
     return values
+
+
+def _names(text: str | None) -> tuple[str, ...] | None:
+    return None if text is None else tuple(name.strip() for name in text.split(","))
+
+
+def _numbers(option: str, text: str | None) -> tuple[int, ...] | None:
+    if text is None:
+        return None
+    try:
+        return tuple(int(number) for number in text.split(","))
+    except ValueError:
+        raise ValueError(f"{option} {text!r} is not a list of whole numbers, as 4,8,16") from None
 
 
 def _execute(plan: Plan, seed: int) -> Any:

@@ -29,6 +29,11 @@ class D4ormConfig(SamplingConfig):
     credit: str = "robot"
     random_start: bool = False
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.random_start, bool):
+            raise ValueError(f"random_start must be True or False, not {self.random_start!r}")
+
 
 class D4orm(SamplingPlanner):
     """Iterative deformation: denoise a change of the team's controls and add it to them, until everyone passes."""

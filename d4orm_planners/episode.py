@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.arrays import whole_number
-from d4orm_env.core.metrics import trajectory_metrics
+from d4orm_env.core.arrays import BoolArray, FloatArray, whole_number
+from d4orm_env.core.metrics import mean_squared_jerk
+from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.joint_state import split_state
+from d4orm_env.engine.base import Engine, get_engine
+from d4orm_env.joint_state import JointState, split_state
 from d4orm_planners.policy import Policy
 
 
@@ -20,7 +22,8 @@ class Episode:
 
     Attributes:
         trajectory: The executed motion, ``T`` steps long; ``T`` is at most the horizon.
-        metrics: Of the trajectory, see :func:`d4orm_env.core.metrics.trajectory_metrics`, with the environment's own.
+        metrics: The environment's own, see :meth:`d4orm_env.episode_record.EpisodeRecord.metrics`, and
+            ``mean_squared_jerk``, see :func:`d4orm_env.core.metrics.mean_squared_jerk`.
         observations: Observations of all agents at the reset and after every step.
         infos: Infos likewise.
     """
@@ -49,43 +52,66 @@ def run_episode(env: Any, policy: Policy, seed: int = 0) -> Episode:
     observations, infos = env.reset(seed=seed)
     problem = env.unwrapped.problem
     policy.reset(env, seed=seed)
+    engine = get_engine("cpu")
     joints = [split_state(problem, env.state())]
     all_observations, all_infos = [observations], [infos]
-    rewards: list[np.ndarray] = []
+    outcomes = [_outcome(engine, problem, joints[0], joints[0], dict.fromkeys(infos, 0.0), infos)]
     while env.agents:
-        agents = list(env.agents)
-        acting = {agent: observations[agent] for agent in agents}
-        observations, gained, _, _, infos = env.step(policy.act(acting, env.state()))
+        acting = {agent: observations[agent] for agent in env.agents}
+        observations, rewards, _, _, infos = env.step(policy.act(acting, env.state()))
         joints.append(split_state(problem, env.state()))
         all_observations.append(observations)
         all_infos.append(infos)
-        rewards.append(_rewards(problem.num_robots, gained, rewards))
-    collided, violated = (_flags(problem.num_robots, all_infos, name) for name in ("collided", "margin_violated"))
-    states = np.stack([joint.states for joint in joints])
-    trajectory = Trajectory(
-        states=states,
-        positions=states[..., : problem.dimension],
-        controls=np.stack([joint.controls for joint in joints[1:]]),
-        rewards=np.stack(rewards),
-        arrived=np.stack([joint.arrived for joint in joints]),
-        collided=collided,
-        margin_violated=violated,
-    )
-    metrics = {**trajectory_metrics(problem, trajectory), **env.unwrapped.metrics()}
+        outcomes.append(_outcome(engine, problem, joints[-2], joints[-1], rewards, infos))
+    trajectory = _trajectory(problem, joints, outcomes)
+    jerk = mean_squared_jerk(trajectory.controls, trajectory.arrived, problem.dt)
+    metrics = {**env.unwrapped.metrics(), "mean_squared_jerk": jerk}
     return Episode(trajectory, metrics, tuple(all_observations), tuple(all_infos))
 
 
-def _rewards(num_robots: int, gained: dict[str, float], before: list[np.ndarray]) -> np.ndarray:
-    """Rewards of all robots; one that has left stands at its goal and goes on gaining what it gained last."""
-    rewards = before[-1].copy() if before else np.zeros(num_robots, np.float32)
-    for agent, reward in gained.items():
-        rewards[int(agent.rsplit("_", 1)[1])] = reward
-    return rewards
+class _Outcome(NamedTuple):
+    """What a step did to every robot, each ``(K,)``."""
+
+    rewards: FloatArray
+    collided: BoolArray
+    margin_violated: BoolArray
 
 
-def _flags(num_robots: int, infos: list[dict[str, dict[str, Any]]], name: str) -> np.ndarray:
-    flags = np.zeros((len(infos), num_robots), bool)
-    for time, info in enumerate(infos):
-        for agent, values in info.items():
-            flags[time, int(agent.rsplit("_", 1)[1])] = values[name]
-    return flags
+def _outcome(
+    engine: Engine,
+    problem: Problem,
+    before: JointState,
+    after: JointState,
+    rewards: dict[str, float],
+    infos: dict[str, dict[str, Any]],
+) -> _Outcome:
+    """What the environment reports on its agents after a step or a reset, and the same for robots that have left.
+
+    Those stand at their goals and may be run into. The environment reports on them no more, so for them the step is
+    taken again with the controls that were executed.
+    """
+    size = problem.num_robots
+    outcome = _Outcome(np.zeros(size, np.float32), np.zeros(size, bool), np.zeros(size, bool))
+    if len(rewards) < size:
+        again = engine.step(problem.arrays, before.states, before.arrived, after.controls)
+        outcome = _Outcome(again.rewards, again.collided, again.margin_violated)
+    for agent, reward in rewards.items():
+        robot = int(agent.rsplit("_", 1)[1])
+        outcome.rewards[robot] = reward
+        outcome.collided[robot] = infos[agent]["collided"]
+        outcome.margin_violated[robot] = infos[agent]["margin_violated"]
+    return outcome
+
+
+def _trajectory(problem: Problem, joints: list[JointState], outcomes: list[_Outcome]) -> Trajectory:
+    """What was seen at the reset and after every step, as one trajectory."""
+    states = np.stack([joint.states for joint in joints])
+    return Trajectory(
+        states=states,
+        positions=states[..., : problem.dimension],
+        controls=np.stack([joint.controls for joint in joints[1:]]),
+        rewards=np.stack([outcome.rewards for outcome in outcomes[1:]]),
+        arrived=np.stack([joint.arrived for joint in joints]),
+        collided=np.stack([outcome.collided for outcome in outcomes]),
+        margin_violated=np.stack([outcome.margin_violated for outcome in outcomes]),
+    )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import zipfile
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -128,7 +127,7 @@ class Plan:
             )
         except FileNotFoundError:
             raise FileNotFoundError(f"there is no plan at {source}") from None
-        except (ValueError, KeyError, TypeError, EOFError, OSError, zipfile.BadZipFile, AttributeError) as error:
+        except Exception as error:  # a damaged archive makes zipfile, zlib and NumPy raise errors of a dozen kinds
             raise ValueError(
                 f"{source} is not a readable plan ({_first_line(error)}); write it anew with Plan.save"
             ) from error
@@ -164,8 +163,8 @@ def _checked_trajectory(problem: Problem, content: dict[str, Any]) -> Trajectory
         "margin_violated": (steps + 1, robots),
     }
     for name, shape in shapes.items():
-        kind = "f" if name in ("states", "positions", "controls", "rewards") else "b"
-        if content[name].shape != shape or content[name].dtype.kind != kind or not np.isfinite(content[name]).all():
+        kind = np.float32 if name in ("states", "positions", "controls", "rewards") else np.bool_
+        if content[name].shape != shape or content[name].dtype != kind or not np.isfinite(content[name]).all():
             raise ValueError(f"{name} does not fit the problem")
     return Trajectory(**{name: content[name] for name in shapes})
 

@@ -7,9 +7,11 @@ from types import MappingProxyType
 from typing import Any
 
 from d4orm_planners.base import Planner
+from d4orm_planners.cem import CEM
 from d4orm_planners.d4orm import D4orm
+from d4orm_planners.mbd import MBD, IterativeMBD
+from d4orm_planners.mppi import MPPI
 from d4orm_planners.policy import DriveToGoal, OpenLoop, Policy, RandomControls
-from d4orm_planners.rivals import CEM, MBD, MPPI, IterativeMBD
 
 PLANNERS: Mapping[str, type[Planner]] = MappingProxyType(
     {planner.name: planner for planner in (D4orm, MPPI, CEM, MBD, IterativeMBD)}
@@ -39,7 +41,7 @@ def describe_planner(name: str) -> str:
 
 def describe_policy(name: str) -> str:
     """The first sentence of a policy's documentation."""
-    return _summary(_find(name, POLICIES, "policy"))
+    return _summary(_find(name, {**PLANNERS, **POLICIES}, "policy"))
 
 
 def make_planner(name: str, *, preset: str | None = None, **config: Any) -> Planner:

@@ -164,8 +164,12 @@ def test_elite_by_hand(xp: Any) -> None:
     np.testing.assert_array_equal(weigh(EliteWeights(0.01), [5, 1, 8, 2], xp), [0, 0, 1, 0])
 
 
+# Of a size that float32 tells apart whatever the order of a sum.
+REWARDS = st.integers(-640, 640).map(lambda number: number / 64)
+
+
 @pytest.mark.parametrize("rule", RULES, ids=repr)
-@given(arrays.arrays(np.float32, (2, 16), elements=st.floats(-100, 100, width=32) | st.just(-np.inf)))
+@given(arrays.arrays(np.float32, (2, 16), elements=REWARDS | st.just(-np.inf)))
 def test_weights_are_a_distribution_and_both_libraries_agree(rule: Any, rewards: np.ndarray) -> None:
     ours = weigh(rule, rewards, np)
     assert (ours >= 0).all()

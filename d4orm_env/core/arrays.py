@@ -23,8 +23,10 @@ def frozen_array(value: Any, name: str, shape: tuple[int | None, ...]) -> FloatA
         ValueError: If it cannot be read, has another shape, or holds a value that is not finite.
     """
     try:
-        # Adding zero makes -0.0 a plain zero, so that equal problems have equal bits.
-        array = np.array(value, dtype=np.float32) + np.float32(0)
+        # A value too large for float32 becomes infinite, and is refused as such below.
+        with np.errstate(over="ignore"):
+            # Adding zero makes -0.0 a plain zero, so that equal problems have equal bits.
+            array = np.array(value, dtype=np.float32) + np.float32(0)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be an array of numbers, not {value!r}") from error
     if (array.size == 0 and 0 in shape) or (array.size == 0 and None in shape):
@@ -54,11 +56,24 @@ def frozen_per_robot(value: Any, name: str, num_robots: int) -> FloatArray:
     return array
 
 
+def restore_frozen(instance: Any, state: dict[str, Any]) -> None:
+    """Set the attributes of a frozen dataclass from a pickle; NumPy brings its read-only arrays back writable."""
+    for name, value in state.items():
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)
+        object.__setattr__(instance, name, value)
+
+
+LARGEST = 1e18
+"""Numbers must stay below it: float32 still holds their squares."""
+
+
 def positive_number(value: Any, name: str, *, zero_allowed: bool = False) -> float:
     """``value`` as a finite positive float.
 
     Raises:
-        ValueError: If it is not a number, not finite, negative, or zero where zero is not allowed.
+        ValueError: If it is not a number, not finite, negative, zero where zero is not allowed, or beyond
+            :data:`LARGEST`.
     """
     try:
         number = float(value)
@@ -68,6 +83,8 @@ def positive_number(value: Any, name: str, *, zero_allowed: bool = False) -> flo
         raise ValueError(
             f"{name} is {number:g}; it must be {'zero or more' if zero_allowed else 'positive'} and finite"
         )
+    if number > LARGEST:
+        raise ValueError(f"{name} is {number:g}; it must be at most {LARGEST:g}")
     return number
 
 

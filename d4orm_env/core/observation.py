@@ -7,6 +7,7 @@ All vectors are in the world's frame, relative to the robot, in SI units.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -56,10 +57,13 @@ class ObservationLayout:
         speed = float(np.max(problem.team.max_speed))
         radius = float(np.max(problem.team.radius))
         places = np.concatenate([problem.start[:, :d], problem.goal, *_corners(problem)])
-        # Nobody gets further than the widest distance between places, plus a full-speed drive from either end.
-        reach = float(np.linalg.norm(np.ptp(places, axis=0))) + 2 * speed * problem.duration + 2 * radius
+        acceleration = float(np.max(problem.team.max_acceleration))
+        # Nobody gets further than the widest distance between places, plus a full-speed drive from either end. Within a
+        # step a robot may exceed the speed limit, which is applied at its end.
+        drive = (speed + acceleration * problem.dt / 2) * problem.duration
+        reach = float(np.linalg.norm(np.ptp(places, axis=0))) + 2 * drive + 2 * radius
         own = [speed] * d + [1.0, 1.0, speed] + [reach] * d
-        own += [1.0, 1.0, radius, speed, float(np.max(problem.team.max_acceleration))]
+        own += [1.0, 1.0, radius, speed, acceleration]
         neighbor = [1.0] + [reach] * d + [2 * speed] * d + [radius]
         obstacle = [1.0] + [reach] * d + [reach]
         high = np.array(own + neighbor * num_neighbors + obstacle * num_obstacles, np.float32)
@@ -76,6 +80,13 @@ class ObservationLayout:
     def size(self) -> int:
         """Number of components ``D``."""
         return len(self.low)
+
+    @cached_property
+    def bounds(self) -> FloatArray:
+        """``(2, D)`` lower and upper bounds in one array, read-only."""
+        bounds: FloatArray = np.stack([self.low, self.high])
+        bounds.setflags(write=False)
+        return bounds
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -192,8 +203,10 @@ def _find_nearest_robots(k: Any, position: Any, nearest: Any) -> None:
     nearest[:, 0] = np.inf
     for other in range(position.shape[0]):
         if other != k:
-            gap2 = 0.0
-            for axis in range(position.shape[1]):
+            # Starting from the first axis and not from a literal keeps the sum in the caller's precision.
+            gap = position[other, 0] - position[k, 0]
+            gap2 = gap * gap
+            for axis in range(1, position.shape[1]):
                 gap = position[other, axis] - position[k, axis]
                 gap2 += gap * gap
             row = insert_nearest(gap2, nearest)
@@ -227,8 +240,9 @@ def _find_nearest_obstacles(place: Any, arrays: Any, nearest: Any) -> None:
 
 
 def _insert_round(place: Any, centre: Any, radius: Any, nearest: Any) -> None:
-    distance2 = 0.0
-    for axis in range(centre.shape[0]):
+    gap = centre[0] - place[0]
+    distance2 = gap * gap
+    for axis in range(1, centre.shape[0]):
         gap = centre[axis] - place[axis]
         distance2 += gap * gap
     distance = np.sqrt(distance2)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import FloatArray, frozen_array, positive_number, whole_number
+from d4orm_env.core.arrays import FloatArray, frozen_array, positive_number, restore_frozen, whole_number
 from d4orm_env.core.dynamics import MODEL_CODES
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
@@ -127,7 +127,7 @@ class Problem:
         clearance = self.world.clearance(places) - radius
         for robot in np.flatnonzero(clearance <= 0):
             raise ValueError(
-                f"{what} of robot_{robot} at {_point(places[robot])} is {-clearance[robot]:.3g} m inside an "
+                f"{what} of robot_{robot} at {_point(places[robot])} is {0 - clearance[robot]:.3g} m inside an "
                 f"obstacle or outside the bounds (robot radius {radius[robot]:g} m); move it, or change the world"
             )
         points = places.astype(np.float64)
@@ -137,7 +137,7 @@ class Problem:
             if gaps[other] <= 0:
                 raise ValueError(
                     f"{what}s of robot_{other} at {_point(points[other])} and robot_{later} at {_point(points[later])} "
-                    f"overlap by {-gaps[other]:.3g} m; move them at least {radius[later] + radius[other]:g} m apart"
+                    f"overlap by {0 - gaps[other]:.3g} m; move them more than {radius[later] + radius[other]:g} m apart"
                 )
 
     @property
@@ -204,8 +204,11 @@ class Problem:
         return sha.hexdigest()
 
     def __getstate__(self) -> dict[str, Any]:
-        # What is cached is made anew in a copy: NumPy would bring its read-only arrays back writable.
+        # What is cached is made anew in a copy.
         return {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        restore_frozen(self, state)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Problem) and self.digest == other.digest

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, frozen_per_robot
+from d4orm_env.core.arrays import FloatArray, frozen_per_robot, restore_frozen
 from d4orm_env.core.dynamics import ACCELERATION, SPEED, TURN_RATE, Model, get_model
 
 
@@ -45,6 +46,9 @@ class Team:
             raise ValueError(f"models {sorted(set(self.models))} mix 2D and 3D robots; a team moves in one dimension")
         for name in ("radius", "max_speed", "max_acceleration", "max_turn_rate"):
             object.__setattr__(self, name, frozen_per_robot(getattr(self, name), name, len(self.models)))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        restore_frozen(self, state)
 
     @property
     def num_robots(self) -> int:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, frozen_array
+from d4orm_env.core.arrays import FloatArray, frozen_array, restore_frozen
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +57,9 @@ class World:
                 object.__setattr__(self, name, frozen_array(getattr(self, name), f"bounds {name}", (self.dimension,)))
             if (self.lower >= self.upper).any():
                 raise ValueError(f"bounds lower {self.lower.tolist()} must lie below upper {self.upper.tolist()}")
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        restore_frozen(self, state)
 
     @property
     def num_obstacles(self) -> int:

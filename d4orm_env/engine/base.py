@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -157,6 +159,10 @@ def get_engine(name: str = "auto") -> Engine:
 
 
 def _accelerator_visible() -> bool:
+    # JAX sees accelerators through plugin packages. Where none is installed there is no need to import JAX to ask it,
+    # which would take longer than planning.
+    if "jax" not in sys.modules and not any(find_spec(plugin) for plugin in ("jax_plugins", "libtpu")):
+        return False
     import jax
 
     return jax.default_backend() != "cpu"

@@ -5,201 +5,18 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba.extending import register_jitable
 
-from d4orm_env.core import collision, dynamics, observation, reward, transition
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.observation import ObservationLayout
 from d4orm_env.core.problem import Problem, ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.engine import noise, sampling, tiles
+from d4orm_env.engine import noise, sampling
 from d4orm_env.engine.base import SamplingResult, SamplingRules, SamplingTask, StepResult, checked_controls
-from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.noise import MIRROR
 from d4orm_env.engine.sampling import LANES
 from d4orm_env.engine.threads import Threads, available_cores
-from d4orm_env.engine.tiles import (
-    CONTROL,
-    DISTANCE2,
-    DOCKED,
-    GOAL,
-    NEAR_OBSTACLE,
-    NEAR_ROBOT,
-    ONE,
-    OPTIONS,
-    STATE,
-    STRIDE,
-    TILE,
-    ZERO,
-    compiled,
-)
-
-SOURCES = fingerprint((dynamics, transition, collision, reward, observation, tiles))
-
-for _function in (
-    observation.observe_robot,
-    observation.insert_nearest,
-    observation._find_nearest_robots,
-    observation._find_nearest_obstacles,
-    observation._insert_round,
-):
-    register_jitable(**OPTIONS)(_function)
-
-
-@compiled
-def _load(goal: Any, state: Any, control: Any, docked: Any, first: Any, w: Any) -> None:
-    """Put worlds from number ``first`` on into the lanes of a tile."""
-    for s in range(min(TILE, state.shape[0] - first)):
-        for k in range(state.shape[1]):
-            o = k * STRIDE + s
-            for i in range(state.shape[2]):
-                w[o + (STATE + i) * TILE] = state[first + s, k, i]
-            for i in range(control.shape[2]):
-                w[o + (CONTROL + i) * TILE] = control[first + s, k, i]
-            for axis in range(goal.shape[2]):
-                w[o + (GOAL + axis) * TILE] = goal[first + s, k, axis]
-            w[o + DOCKED * TILE] = ONE if docked[first + s, k] else ZERO
-
-
-@compiled
-def _store(state: Any, control: Any, docked: Any, first: Any, w: Any) -> None:
-    """The reverse of :func:`_load`, for what a step changes."""
-    for s in range(min(TILE, state.shape[0] - first)):
-        for k in range(state.shape[1]):
-            o = k * STRIDE + s
-            for i in range(state.shape[2]):
-                state[first + s, k, i] = w[o + (STATE + i) * TILE]
-            for i in range(control.shape[2]):
-                control[first + s, k, i] = w[o + (CONTROL + i) * TILE]
-            docked[first + s, k] = w[o + DOCKED * TILE] > ZERO
-
-
-@compiled
-def _judge(arrays: Any, inverse: Any, first: Any, w: Any, collided: Any, violated: Any, rewards: Any) -> None:
-    """Flag contacts and margin violations and compute rewards; all outputs ``(B, K)``."""
-    num_robots = arrays.radius.shape[0]
-    tiles.clear_row(NEAR_ROBOT, num_robots, w)
-    tiles.clear_row(NEAR_OBSTACLE, num_robots, w)
-    # Whatever is in contact is within the margin too, so the second level adds to the flags of the first.
-    for level in range(2):
-        extra = ZERO if level == 0 else arrays.margin
-        flags = collided if level == 0 else violated
-        tiles.mark_pairs(arrays, extra, w)
-        for k in range(num_robots):
-            tiles.mark_obstacles(arrays, k, extra, w)
-        for s in range(min(TILE, collided.shape[0] - first)):
-            for k in range(num_robots):
-                o = k * STRIDE + s
-                flags[first + s, k] = w[o + NEAR_ROBOT * TILE] + w[o + NEAR_OBSTACLE * TILE] > ZERO
-    for s in range(min(TILE, collided.shape[0] - first)):
-        for k in range(num_robots):
-            o = k * STRIDE + s
-            distance, near_robot = np.sqrt(w[o + DISTANCE2 * TILE]), w[o + NEAR_ROBOT * TILE]
-            near_obstacle = w[o + NEAR_OBSTACLE * TILE]
-            rewards[first + s, k] = reward.step_reward(
-                distance, inverse[first + s, k], near_robot, near_obstacle, ONE
-            )  # fmt: skip
-
-
-@compiled
-def _step_worlds(
-    arrays: Any, goal: Any, inverse: Any, state: Any, control: Any, docked: Any, collided: Any, violated: Any,
-    rewards: Any, tile_range: Any, w: Any,
-) -> None:  # fmt: skip
-    num_robots, dimension = arrays.goal.shape
-    for index in range(tile_range[0], tile_range[1]):
-        first = index * TILE
-        _load(goal, state, control, docked, first, w)
-        tiles.measure_goal_distance(num_robots, dimension, w)
-        for k in range(num_robots):
-            tiles.move_robot(arrays, k, w)
-        _judge(arrays, inverse, first, w, collided, violated, rewards)
-        _store(state, control, docked, first, w)
-
-
-@cached_kernel(SOURCES, **OPTIONS)
-def step_worlds(
-    arrays: Any, goal: Any, inverse: Any, state: Any, control: Any, docked: Any, collided: Any, violated: Any,
-    rewards: Any, tile_range: Any,
-) -> None:  # fmt: skip
-    """Step ``B`` worlds of one problem in place; each has its own goals and start distances.
-
-    Args:
-        arrays: The problem.
-        goal: ``(B, K, d)``.
-        inverse: ``(B, K)`` one over the start distances.
-        state: ``(B, K, n)``.
-        control: ``(B, K, m)``; holds the executed controls afterwards.
-        docked: ``(B, K)`` bool.
-        collided: ``(B, K)`` bool, output.
-        violated: ``(B, K)`` bool, output.
-        rewards: ``(B, K)``, output.
-        tile_range: First tile of worlds and the one after the last.
-    """
-    w = np.zeros(arrays.radius.shape[0] * STRIDE, np.float32)
-    _step_worlds(arrays, goal, inverse, state, control, docked, collided, violated, rewards, tile_range, w)
-
-
-@cached_kernel(SOURCES, **OPTIONS)
-def roll_out(
-    arrays: Any, goal: Any, inverse: Any, controls: Any, states: Any, docked: Any, collided: Any, violated: Any,
-    rewards: Any,
-) -> None:  # fmt: skip
-    """Step a single world through ``controls`` ``(H, 1, K, m)``, keeping every step; time comes first everywhere."""
-    w = np.zeros(arrays.radius.shape[0] * STRIDE, np.float32)
-    only = np.array([0, 1])
-    _load(goal, states[0], controls[0], docked[0], 0, w)
-    tiles.measure_goal_distance(arrays.goal.shape[0], arrays.goal.shape[1], w)
-    _judge(arrays, inverse, 0, w, collided[0], violated[0], rewards[0])
-    for t in range(controls.shape[0]):
-        states[t + 1] = states[t]
-        docked[t + 1] = docked[t]
-        _step_worlds(
-            arrays, goal, inverse, states[t + 1], controls[t], docked[t + 1], collided[t + 1], violated[t + 1],
-            rewards[t], only, w,
-        )  # fmt: skip
-
-
-@cached_kernel(SOURCES, **OPTIONS)
-def judge_worlds(
-    arrays: Any, goal: Any, inverse: Any, state: Any, control: Any, docked: Any, collided: Any, violated: Any
-) -> None:
-    """Contacts and margin violations of ``B`` worlds as they stand; arguments as in :func:`step_worlds`."""
-    w = np.zeros(arrays.radius.shape[0] * STRIDE, np.float32)
-    rewards = np.empty(collided.shape, np.float32)
-    for first in range(0, state.shape[0], TILE):
-        _load(goal, state, control, docked, first, w)
-        tiles.measure_goal_distance(arrays.goal.shape[0], arrays.goal.shape[1], w)
-        _judge(arrays, inverse, first, w, collided, violated, rewards)
-
-
-@cached_kernel(SOURCES, **OPTIONS)
-def observe_worlds(
-    arrays: Any, goal: Any, state: Any, control: Any, docked: Any, time_left: Any, low: Any, high: Any,
-    num_neighbors: Any, num_obstacles: Any, world_range: Any, out: Any,
-) -> None:  # fmt: skip
-    """Fill ``out`` ``(B, K, D)`` with what every robot of a range of worlds sees; ``time_left`` is ``(B,)``."""
-    num_robots, d = arrays.goal.shape
-    position, velocity = np.empty((num_robots, d), np.float32), np.empty((num_robots, d), np.float32)
-    heading, arrived = np.empty((num_robots, 2), np.float32), np.empty(num_robots, np.float32)
-    nearest_robots = np.empty((num_neighbors, 2), np.float32)
-    nearest_obstacles = np.empty((num_obstacles, 1 + d), np.float32)
-    w = np.zeros(num_robots * STRIDE, np.float32)
-    for b in range(world_range[0], world_range[1]):
-        _load(goal[b : b + 1], state[b : b + 1], control[b : b + 1], docked[b : b + 1], 0, w)
-        for k in range(num_robots):
-            position[k] = state[b, k, :d]
-            tiles.read_motion(arrays, k, 0, w, velocity[k], heading[k])
-            arrived[k] = ONE if docked[b, k] else ZERO
-            if docked[b, k]:
-                velocity[k] = ZERO
-        for k in range(num_robots):
-            observation.observe_robot(
-                k, arrays, goal[b], position, velocity, heading, arrived, time_left[b], nearest_robots,
-                nearest_obstacles, out[b, k],
-            )  # fmt: skip
-            for i in range(out.shape[2]):
-                out[b, k, i] = min(max(out[b, k, i], low[i]), high[i])
+from d4orm_env.engine.tiles import TILE
+from d4orm_env.engine.worlds import WorldBatch, advance_worlds, judge_worlds, observe_world, roll_out, step_worlds
 
 
 class CpuEngine:
@@ -215,9 +32,9 @@ class CpuEngine:
         state, control = np.array(states, np.float32)[None], np.array(controls, np.float32)[None]
         docked = np.array(arrived, bool)[None]
         collided, violated, rewards = np.empty_like(docked), np.empty_like(docked), np.empty(docked.shape, np.float32)
-        goal, inverse = _single(arrays)
+        arrays = _typed(arrays)
         step_worlds(
-            _typed(arrays), goal, inverse, state, control, docked, collided, violated, rewards, _ONE_WORLD
+            arrays, *_single(arrays), state, control, docked, collided, violated, rewards, _ONE_WORLD
         )  # fmt: skip
         return StepResult(state[0], control[0], docked[0], collided[0], violated[0], rewards[0])
 
@@ -227,7 +44,8 @@ class CpuEngine:
         control = np.zeros((1, len(states), 1), np.float32)
         docked = np.zeros((1, len(states)), bool)
         collided, violated = np.empty_like(docked), np.empty_like(docked)
-        judge_worlds(_typed(arrays), *_single(arrays), state, control, docked, collided, violated)
+        arrays = _typed(arrays)
+        judge_worlds(arrays, *_single(arrays), state, control, docked, collided, violated)
         return collided[0], violated[0]
 
     def observe(
@@ -252,22 +70,49 @@ class CpuEngine:
         Returns:
             ``(K, D)`` observations inside the layout's bounds.
         """
-        out = np.empty((1, len(states), layout.size), np.float32)
-        observe_worlds(
-            _typed(arrays),
+        out: FloatArray = np.empty((1, len(states), layout.size), np.float32)
+        arrays = _typed(arrays)
+        observe_world(
+            arrays,
             _single(arrays)[0],
             np.array(states, np.float32)[None],
             np.array(controls, np.float32)[None],
             np.array(arrived, bool)[None],
-            np.array([time_left], np.float32),
-            layout.low,
-            layout.high,
+            time_left,
+            layout.bounds,
             layout.num_neighbors,
             layout.num_obstacles,
-            _ONE_WORLD,
             out,
         )
-        return out[0]
+        seen: FloatArray = out[0]
+        return seen
+
+    def advance(
+        self,
+        arrays: ProblemArrays,
+        layout: ObservationLayout,
+        max_cycles: int,
+        orders: Any,
+        batch: WorldBatch,
+        out: FloatArray,
+    ) -> None:
+        """Step, reset and observe the worlds of a batch in place, each as it is ordered to.
+
+        Args:
+            arrays: The problem that the worlds share; each has its own starts and goals.
+            layout: Which components an observation has, and their bounds.
+            max_cycles: Steps in an episode.
+            orders: ``(B,)`` uint8, one of :data:`~d4orm_env.engine.worlds.STEP` and its like for every world.
+            batch: The worlds; ``batch.control`` holds what to do.
+            out: ``(B, K, D)`` observations, output; those of skipped worlds are not written.
+        """
+        arrays = _typed(arrays)
+        self._threads.over(
+            -(-len(orders) // TILE),
+            lambda part: advance_worlds(
+                arrays, layout.bounds, layout.num_neighbors, layout.num_obstacles, max_cycles, orders, batch, part, out
+            ),
+        )
 
     def rollout(self, problem: Problem, controls: FloatArray) -> Trajectory:
         """See :meth:`d4orm_env.engine.base.Engine.rollout`.
@@ -282,9 +127,9 @@ class CpuEngine:
         docked = np.zeros((steps + 1, 1, num_robots), bool)
         collided, violated = np.empty_like(docked), np.empty_like(docked)
         rewards = np.empty((steps, 1, num_robots), np.float32)
-        arrays = problem.arrays
+        arrays = _typed(problem.arrays)
         roll_out(
-            _typed(arrays), *_single(arrays), executed, states, docked, collided, violated, rewards
+            arrays, *_single(arrays), executed, states, docked, collided, violated, rewards
         )  # fmt: skip
         return Trajectory(
             states=states[:, 0],
@@ -406,14 +251,15 @@ _ONE_WORLD = np.array([0, 1])
 
 
 def _single(arrays: ProblemArrays) -> tuple[FloatArray, FloatArray]:
-    """Goals and inverse start distances as of one world."""
-    goal, inverse = arrays.goal[None], arrays.inverse_initial_distance[None]
-    goal.flags.writeable = inverse.flags.writeable = False
-    return goal, inverse
+    """Goals and inverse start distances as of one world, of arrays that are :func:`_typed`."""
+    return arrays.goal[None], arrays.inverse_initial_distance[None]
 
 
 def _typed(arrays: ProblemArrays) -> ProblemArrays:
     """The arrays with replaced goals made read-only like the rest, so that one compilation serves all."""
-    goal, inverse = arrays.goal.view(), arrays.inverse_initial_distance.view()
+    goal, inverse = arrays.goal, arrays.inverse_initial_distance
+    if not (goal.flags.writeable or inverse.flags.writeable):
+        return arrays
+    goal, inverse = goal.view(), inverse.view()
     goal.flags.writeable = inverse.flags.writeable = False
     return arrays._replace(goal=goal, inverse_initial_distance=inverse)

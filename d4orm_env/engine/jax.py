@@ -123,7 +123,8 @@ def goal_distance(arrays: ProblemArrays, place: Any) -> Any:
     """``(K, S)`` distance of every robot to its goal; its gradient at the goal itself is zero."""
     gap2 = ((place - arrays.goal[..., None]) ** 2).sum(axis=1)
     tiny = jnp.float32(1e-12)
-    return jnp.where(gap2 > tiny, jnp.sqrt(jnp.maximum(gap2, tiny)), jnp.float32(0))
+    # Asked this way round, a place that is not a number stays one: it must not pass for the goal.
+    return jnp.where(gap2 <= tiny, jnp.float32(0), jnp.sqrt(jnp.maximum(gap2, tiny)))
 
 
 def rewards_of(arrays: ProblemArrays, place: Any, pair_violation: Any, obstacle_violation: Any) -> Any:

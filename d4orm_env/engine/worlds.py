@@ -1,0 +1,416 @@
+"""Kernels that step and observe many worlds of one problem at once, compiled with numba.
+
+The worlds share the team, the obstacles and the bounds; each has its own goals, state and clock. A single environment
+is a batch of one.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba.extending import register_jitable
+
+from d4orm_env.core import collision, dynamics, observation, reward, transition
+from d4orm_env.engine import tiles
+from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.tiles import (
+    CONTROL,
+    DISTANCE2,
+    DOCKED,
+    GOAL,
+    NEAR_OBSTACLE,
+    NEAR_ROBOT,
+    ONE,
+    OPTIONS,
+    STATE,
+    STRIDE,
+    TILE,
+    ZERO,
+    compiled,
+    inlined,
+)
+
+SOURCES = fingerprint((dynamics, transition, collision, reward, observation, tiles))
+
+for _function in (
+    observation.observe_robot,
+    observation.insert_nearest,
+    observation._find_nearest_robots,
+    observation._find_nearest_obstacles,
+    observation._insert_round,
+):
+    register_jitable(**OPTIONS)(_function)
+
+
+@compiled
+def _load_world(goal: Any, state: Any, control: Any, docked: Any, b: Any, s: Any, w: Any) -> None:
+    """Put world ``b`` into lane ``s`` of a tile."""
+    for k in range(state.shape[1]):
+        o = k * STRIDE + s
+        for i in range(state.shape[2]):
+            w[o + (STATE + i) * TILE] = state[b, k, i]
+        for i in range(control.shape[2]):
+            w[o + (CONTROL + i) * TILE] = control[b, k, i]
+        for axis in range(goal.shape[2]):
+            w[o + (GOAL + axis) * TILE] = goal[b, k, axis]
+        w[o + DOCKED * TILE] = ONE if docked[b, k] else ZERO
+
+
+@compiled
+def _load(goal: Any, state: Any, control: Any, docked: Any, first: Any, w: Any) -> None:
+    """Put worlds from number ``first`` on into the lanes of a tile."""
+    for s in range(min(TILE, state.shape[0] - first)):
+        _load_world(goal, state, control, docked, first + s, s, w)
+
+
+@compiled
+def _store_world(state: Any, control: Any, docked: Any, b: Any, s: Any, w: Any) -> None:
+    """The reverse of :func:`_load_world`, for what a step changes."""
+    for k in range(state.shape[1]):
+        o = k * STRIDE + s
+        for i in range(state.shape[2]):
+            state[b, k, i] = w[o + (STATE + i) * TILE]
+        for i in range(control.shape[2]):
+            control[b, k, i] = w[o + (CONTROL + i) * TILE]
+        docked[b, k] = w[o + DOCKED * TILE] > ZERO
+
+
+@compiled
+def _store(state: Any, control: Any, docked: Any, first: Any, w: Any) -> None:
+    """The reverse of :func:`_load`, for what a step changes."""
+    for s in range(min(TILE, state.shape[0] - first)):
+        _store_world(state, control, docked, first + s, s, w)
+
+
+@compiled
+def _judge(arrays: Any, inverse: Any, first: Any, w: Any, collided: Any, violated: Any, rewards: Any) -> None:
+    """Flag contacts and margin violations and compute rewards; all outputs ``(B, K)``."""
+    num_robots = arrays.radius.shape[0]
+    tiles.clear_row(NEAR_ROBOT, num_robots, w)
+    tiles.clear_row(NEAR_OBSTACLE, num_robots, w)
+    # Whatever is in contact is within the margin too, so the second level adds to the flags of the first.
+    for level in range(2):
+        extra = ZERO if level == 0 else arrays.margin
+        flags = collided if level == 0 else violated
+        tiles.mark_pairs(arrays, extra, w)
+        for k in range(num_robots):
+            tiles.mark_obstacles(arrays, k, extra, w)
+        for s in range(min(TILE, collided.shape[0] - first)):
+            for k in range(num_robots):
+                o = k * STRIDE + s
+                flags[first + s, k] = w[o + NEAR_ROBOT * TILE] + w[o + NEAR_OBSTACLE * TILE] > ZERO
+    for s in range(min(TILE, collided.shape[0] - first)):
+        for k in range(num_robots):
+            o = k * STRIDE + s
+            distance, near_robot = np.sqrt(w[o + DISTANCE2 * TILE]), w[o + NEAR_ROBOT * TILE]
+            near_obstacle = w[o + NEAR_OBSTACLE * TILE]
+            rewards[first + s, k] = reward.step_reward(
+                distance, inverse[first + s, k], near_robot, near_obstacle, ONE
+            )  # fmt: skip
+
+
+@compiled
+def _step_worlds(
+    arrays: Any, goal: Any, inverse: Any, state: Any, control: Any, docked: Any, collided: Any, violated: Any,
+    rewards: Any, tile_range: Any, w: Any,
+) -> None:  # fmt: skip
+    num_robots, dimension = arrays.goal.shape
+    for index in range(tile_range[0], tile_range[1]):
+        first = index * TILE
+        _load(goal, state, control, docked, first, w)
+        tiles.measure_goal_distance(num_robots, dimension, w)
+        for k in range(num_robots):
+            tiles.move_robot(arrays, k, w)
+        _judge(arrays, inverse, first, w, collided, violated, rewards)
+        _store(state, control, docked, first, w)
+
+
+@cached_kernel(SOURCES, **OPTIONS)
+def step_worlds(
+    arrays: Any, goal: Any, inverse: Any, state: Any, control: Any, docked: Any, collided: Any, violated: Any,
+    rewards: Any, tile_range: Any,
+) -> None:  # fmt: skip
+    """Step ``B`` worlds of one problem in place; each has its own goals and start distances.
+
+    Args:
+        arrays: The problem.
+        goal: ``(B, K, d)``.
+        inverse: ``(B, K)`` one over the start distances.
+        state: ``(B, K, n)``.
+        control: ``(B, K, m)``; holds the executed controls afterwards.
+        docked: ``(B, K)`` bool.
+        collided: ``(B, K)`` bool, output.
+        violated: ``(B, K)`` bool, output.
+        rewards: ``(B, K)``, output.
+        tile_range: First tile of worlds and the one after the last.
+    """
+    w = np.zeros(arrays.radius.shape[0] * STRIDE, np.float32)
+    _step_worlds(arrays, goal, inverse, state, control, docked, collided, violated, rewards, tile_range, w)
+
+
+@cached_kernel(SOURCES, **OPTIONS)
+def roll_out(
+    arrays: Any, goal: Any, inverse: Any, controls: Any, states: Any, docked: Any, collided: Any, violated: Any,
+    rewards: Any,
+) -> None:  # fmt: skip
+    """Step a single world through ``controls`` ``(H, 1, K, m)``, keeping every step; time comes first everywhere."""
+    w = np.zeros(arrays.radius.shape[0] * STRIDE, np.float32)
+    only = np.array([0, 1])
+    _load(goal, states[0], controls[0], docked[0], 0, w)
+    tiles.measure_goal_distance(arrays.goal.shape[0], arrays.goal.shape[1], w)
+    _judge(arrays, inverse, 0, w, collided[0], violated[0], rewards[0])
+    for t in range(controls.shape[0]):
+        states[t + 1] = states[t]
+        docked[t + 1] = docked[t]
+        _step_worlds(
+            arrays, goal, inverse, states[t + 1], controls[t], docked[t + 1], collided[t + 1], violated[t + 1],
+            rewards[t], only, w,
+        )  # fmt: skip
+
+
+@cached_kernel(SOURCES, **OPTIONS)
+def judge_worlds(
+    arrays: Any, goal: Any, inverse: Any, state: Any, control: Any, docked: Any, collided: Any, violated: Any
+) -> None:
+    """Contacts and margin violations of ``B`` worlds as they stand; arguments as in :func:`step_worlds`."""
+    w = np.zeros(arrays.radius.shape[0] * STRIDE, np.float32)
+    rewards = np.empty(collided.shape, np.float32)
+    for first in range(0, state.shape[0], TILE):
+        _load(goal, state, control, docked, first, w)
+        tiles.measure_goal_distance(arrays.goal.shape[0], arrays.goal.shape[1], w)
+        _judge(arrays, inverse, first, w, collided, violated, rewards)
+
+
+class Eyes(NamedTuple):
+    """Scratch for the observations of one world: what robots see of each other, and the nearest things so far."""
+
+    position: Any
+    velocity: Any
+    heading: Any
+    arrived: Any
+    nearest_robots: Any
+    nearest_obstacles: Any
+
+
+@compiled
+def _open_eyes(num_robots: Any, dimension: Any, num_neighbors: Any, num_obstacles: Any) -> Any:
+    return Eyes(
+        np.empty((num_robots, dimension), np.float32), np.empty((num_robots, dimension), np.float32),
+        np.empty((num_robots, 2), np.float32), np.empty(num_robots, np.float32),
+        np.empty((num_neighbors, 2), np.float32), np.empty((num_obstacles, 1 + dimension), np.float32),
+    )  # fmt: skip
+
+
+@inlined
+def _observe(
+    arrays: Any, goal: Any, docked: Any, time_left: Any, s: Any, w: Any, bounds: Any, eyes: Any, out: Any
+) -> None:
+    """Fill ``out`` ``(K, D)`` with what the robots of the world in lane ``s`` see, inside ``bounds`` ``(2, D)``."""
+    num_robots, dimension = goal.shape
+    for k in range(num_robots):
+        for axis in range(dimension):
+            eyes.position[k, axis] = w[k * STRIDE + (STATE + axis) * TILE + s]
+        tiles.read_motion(arrays, k, s, w, eyes.velocity[k], eyes.heading[k])
+        eyes.arrived[k] = ONE if docked[k] else ZERO
+        for axis in range(dimension):
+            if docked[k]:
+                eyes.velocity[k, axis] = ZERO
+    for k in range(num_robots):
+        row = out[k]
+        observation.observe_robot(
+            k, arrays, goal, eyes.position, eyes.velocity, eyes.heading, eyes.arrived, time_left, eyes.nearest_robots,
+            eyes.nearest_obstacles, row,
+        )  # fmt: skip
+        for i in range(row.shape[0]):
+            value = row[i]
+            value = value if value > bounds[0, i] else bounds[0, i]
+            row[i] = value if value < bounds[1, i] else bounds[1, i]
+
+
+@cached_kernel(SOURCES, **OPTIONS)
+def observe_world(
+    arrays: Any, goal: Any, state: Any, control: Any, docked: Any, time_left: Any, bounds: Any, num_neighbors: Any,
+    num_obstacles: Any, out: Any,
+) -> None:  # fmt: skip
+    """Fill ``out`` ``(1, K, D)`` with what every robot of a single world sees."""
+    num_robots, dimension = arrays.goal.shape
+    w = np.empty(num_robots * STRIDE, np.float32)
+    _load_world(goal, state, control, docked, 0, 0, w)
+    eyes = _open_eyes(num_robots, dimension, num_neighbors, num_obstacles)
+    _observe(arrays, goal[0], docked[0], np.float32(time_left), 0, w, bounds, eyes, out[0])
+
+
+STEP, RESET, LOOK, SKIP = (np.uint8(order) for order in range(4))
+"""What to do with a world: step it, put it back to its start, only observe it, or leave it alone altogether."""
+
+
+class WorldBatch(NamedTuple):
+    """``B`` worlds in the middle of their episodes; kernels change them in place.
+
+    Attributes:
+        start: ``(B, K, n)`` where an episode begins.
+        goal: ``(B, K, d)``.
+        inverse: ``(B, K)`` one over the start distances.
+        state: ``(B, K, n)``.
+        control: ``(B, K, m)``; what to do goes in, what was executed comes out.
+        docked: ``(B, K)`` bool.
+        steps: ``(B,)`` int64 steps since the reset.
+        distance: ``(B, K)`` to the goals.
+        collided: ``(B, K)`` bool, hard contact.
+        violated: ``(B, K)`` bool, within the margin.
+        rewards: ``(B, K)`` of each robot where it stands now.
+        reward: ``(B,)`` float64 mean of the team in the last step; zero at a reset.
+        terminated: ``(B,)`` bool: all have docked.
+        truncated: ``(B,)`` bool: out of time before that.
+        total_reward: ``(B,)`` float64 sum over robots and steps of the episode.
+        arrival: ``(B, K)`` int64 step of docking, 0 for not yet.
+        contacts: ``(B, K)`` int64 steps in contact.
+        violations: ``(B, K)`` int64 steps within the margin.
+    """
+
+    start: Any
+    goal: Any
+    inverse: Any
+    state: Any
+    control: Any
+    docked: Any
+    steps: Any
+    distance: Any
+    collided: Any
+    violated: Any
+    rewards: Any
+    reward: Any
+    terminated: Any
+    truncated: Any
+    total_reward: Any
+    arrival: Any
+    contacts: Any
+    violations: Any
+
+    @classmethod
+    def of(cls, start: Any, goal: Any, inverse: Any, control_size: int) -> WorldBatch:
+        """Worlds with these starts and goals, all values but those still to be set by a reset."""
+        worlds, robots = inverse.shape
+        flags, counts = np.zeros((worlds, robots), np.bool_), np.zeros((worlds, robots), np.int64)
+        return cls(
+            start=np.array(start, np.float32),
+            goal=np.array(goal, np.float32),
+            inverse=np.array(inverse, np.float32),
+            state=np.array(start, np.float32),
+            control=np.zeros((worlds, robots, control_size), np.float32),
+            docked=flags.copy(),
+            steps=np.zeros(worlds, np.int64),
+            distance=np.zeros((worlds, robots), np.float32),
+            collided=flags.copy(),
+            violated=flags.copy(),
+            rewards=np.zeros((worlds, robots), np.float32),
+            reward=np.zeros(worlds),
+            terminated=np.zeros(worlds, np.bool_),
+            truncated=np.zeros(worlds, np.bool_),
+            total_reward=np.zeros(worlds),
+            arrival=counts.copy(),
+            contacts=counts.copy(),
+            violations=counts.copy(),
+        )
+
+
+@compiled
+def _restart(batch: Any, b: Any) -> None:
+    # Loops, because numba takes seconds to compile assignments of slices.
+    for k in range(batch.docked.shape[1]):
+        for i in range(batch.state.shape[2]):
+            batch.state[b, k, i] = batch.start[b, k, i]
+        for i in range(batch.control.shape[2]):
+            batch.control[b, k, i] = ZERO
+        batch.docked[b, k] = False
+        batch.arrival[b, k] = batch.contacts[b, k] = batch.violations[b, k] = 0
+    batch.steps[b] = 0
+    batch.reward[b] = batch.total_reward[b] = 0
+    batch.terminated[b] = batch.truncated[b] = False
+
+
+@compiled
+def _tally(batch: Any, max_cycles: Any, b: Any) -> None:
+    """Count the step that world ``b`` has just taken, and see whether its episode has ended."""
+    num_robots = batch.docked.shape[1]
+    batch.steps[b] += 1
+    total, everybody = 0.0, True
+    for k in range(num_robots):
+        total += batch.rewards[b, k]
+        batch.contacts[b, k] += batch.collided[b, k]
+        batch.violations[b, k] += batch.violated[b, k]
+        if batch.docked[b, k] and batch.arrival[b, k] == 0:
+            batch.arrival[b, k] = batch.steps[b]
+        everybody &= batch.docked[b, k]
+    batch.reward[b] = total / num_robots
+    batch.total_reward[b] += total
+    batch.terminated[b] = everybody
+    batch.truncated[b] = batch.steps[b] >= max_cycles and not everybody
+
+
+@inlined
+def _move_tile(arrays: Any, batch: Any, orders: Any, first: Any, count: Any, w: Any) -> None:
+    """Step the worlds of a tile that are to be stepped; the others wait as if all their robots had docked."""
+    num_robots = batch.docked.shape[1]
+    for s in range(count):
+        if orders[first + s] != STEP:
+            for k in range(num_robots):
+                w[k * STRIDE + DOCKED * TILE + s] = ONE
+    for k in range(num_robots):
+        tiles.move_robot(arrays, k, w)
+    for s in range(count):
+        b = first + s
+        if orders[b] == STEP:
+            _store_world(batch.state, batch.control, batch.docked, b, s, w)
+        else:
+            _load_world(batch.goal, batch.state, batch.control, batch.docked, b, s, w)
+
+
+@cached_kernel(SOURCES, **OPTIONS)
+def advance_worlds(
+    arrays: Any, bounds: Any, num_neighbors: Any, num_obstacles: Any, max_cycles: Any, orders: Any, batch: Any,
+    tile_range: Any, out: Any,
+) -> None:  # fmt: skip
+    """Step, reset and observe worlds, each as it is ordered to.
+
+    Args:
+        arrays: The problem that the worlds share; its starts and goals are not looked at.
+        bounds: ``(2, D)`` lowest and highest observation.
+        num_neighbors: Robots in an observation.
+        num_obstacles: Obstacles in an observation.
+        max_cycles: Steps in an episode.
+        orders: ``(B,)`` uint8, one of ``STEP``, ``RESET``, ``LOOK`` and ``SKIP`` for every world.
+        batch: The worlds, a :class:`WorldBatch`.
+        tile_range: First tile of worlds and the one after the last.
+        out: ``(B, K, D)`` observations; those of skipped worlds are not written.
+    """
+    num_robots, dimension = arrays.goal.shape
+    w = np.zeros(num_robots * STRIDE, np.float32)
+    eyes = _open_eyes(num_robots, dimension, num_neighbors, num_obstacles)
+    for index in range(tile_range[0], tile_range[1]):
+        first = index * TILE
+        count = min(TILE, orders.shape[0] - first)
+        moving, busy = False, False
+        for s in range(count):
+            order = orders[first + s]
+            moving |= order == STEP
+            busy |= order != SKIP
+            if order == RESET:
+                _restart(batch, first + s)
+        if not busy:
+            continue
+        _load(batch.goal, batch.state, batch.control, batch.docked, first, w)
+        tiles.measure_goal_distance(num_robots, dimension, w)
+        if moving:
+            _move_tile(arrays, batch, orders, first, count, w)
+        _judge(arrays, batch.inverse, first, w, batch.collided, batch.violated, batch.rewards)
+        for s in range(count):
+            b = first + s
+            if orders[b] == STEP:
+                _tally(batch, max_cycles, b)
+            if orders[b] != SKIP:
+                for k in range(num_robots):
+                    batch.distance[b, k] = np.sqrt(w[k * STRIDE + DISTANCE2 * TILE + s])
+                time_left = np.float32(max(0.0, 1.0 - batch.steps[b] / max_cycles))
+                _observe(arrays, batch.goal[b], batch.docked[b], time_left, s, w, bounds, eyes, out[b])

@@ -1,0 +1,75 @@
+"""The cross-entropy method for the whole team (paper, appendix B)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray, positive_number
+from d4orm_env.engine.base import SamplingRules
+from d4orm_planners.base import Search
+from d4orm_planners.sampling.optimizer import PAPER, SamplingConfig, SamplingPlanner
+from d4orm_planners.sampling.schedule import constant
+from d4orm_planners.sampling.weights import EliteWeights
+
+
+@dataclass(frozen=True, kw_only=True)
+class CEMConfig(SamplingConfig):
+    """Settings of the cross-entropy method; temperature and betas do not apply.
+
+    Attributes:
+        elite_fraction: Share of samples that are averaged.
+        sigma: Standard deviation of the samples of an iteration's first step.
+        adapt_variance: Let the variance follow that of the elite, as the method is usually written.
+        sigma_floor: Smallest standard deviation that the adaptation may reach.
+    """
+
+    elite_fraction: float = 0.05
+    sigma: float = 1.0
+    adapt_variance: bool = False
+    sigma_floor: float = 0.05
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        positive_number(self.sigma, "sigma")
+        positive_number(self.sigma_floor, "sigma_floor")
+        if positive_number(self.elite_fraction, "elite_fraction") > 1:
+            raise ValueError(f"elite_fraction is {self.elite_fraction:g}; it must be at most 1")
+        if not isinstance(self.adapt_variance, bool):
+            raise ValueError(f"adapt_variance must be True or False, not {self.adapt_variance!r}")
+
+
+@dataclass(frozen=True)
+class EliteDeviation:
+    """Noise factors from the spread of the elite, relative to ``sigma`` and not below ``floor``."""
+
+    sigma: float
+    floor: float
+
+    def __call__(self, mean_square_deviation: Any, xp: Any) -> Any:
+        """``(H, K, m)`` factors on the schedule."""
+        return xp.maximum(xp.sqrt(xp.maximum(mean_square_deviation, 0)), self.floor) / self.sigma
+
+
+class CEM(SamplingPlanner):
+    """The cross-entropy method: the mean of the elite samples is the next mean (paper, appendix B)."""
+
+    name: ClassVar[str] = "cem"
+    config_class = CEMConfig
+    presets: ClassVar[dict[str, dict[str, Any]]] = {"paper": PAPER}
+
+    def noise_scale(self) -> FloatArray:
+        """See :meth:`SamplingPlanner.noise_scale`."""
+        return constant(self.config.num_steps, self.config.sigma)
+
+    def rules(self) -> SamplingRules:
+        """See :meth:`SamplingPlanner.rules`."""
+        config = self.config
+        adapt = EliteDeviation(float(config.sigma), float(config.sigma_floor)) if config.adapt_variance else None
+        return SamplingRules(weights=EliteWeights(float(config.elite_fraction)), adapt=adapt)
+
+    def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
+        """See :meth:`SamplingPlanner.initial`."""
+        return search.current.controls, np.zeros_like(search.current.controls)

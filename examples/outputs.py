@@ -1,0 +1,63 @@
+"""What the study scripts share: their arguments, and writing tables and plots so that no file is ever half-written."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+from d4orm_env.core.files import replaced_when_done
+
+COLOURS = {"d4orm": "#0072B2", "default": "#56B4E9", "mppi": "#D55E00", "cem": "#009E73", "i-mbd": "#CC79A7"}
+"""One colour per method in every plot, told apart by the colour-blind too."""
+
+plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True})
+plt.rcParams.update({"grid.alpha": 0.25, "legend.frameon": False, "figure.dpi": 110})
+
+
+def argument_parser(description: str | None) -> argparse.ArgumentParser:
+    """A parser with the arguments that every script has."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("examples/output"), help="folder for the results")
+    parser.add_argument("--quick", action="store_true", help="a small version, for a first look and for the tests")
+    return parser
+
+
+def count(text: str) -> int:
+    """A command-line number of at least one."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{number} is too few; give at least 1")
+    return number
+
+
+def save_figure(figure: Any, path: Path) -> None:
+    """Write a matplotlib figure and close it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replaced_when_done(path) as temporary:
+        figure.savefig(temporary)
+    plt.close(figure)
+    print(f"wrote {path}")
+
+
+def save_table(rows: Sequence[dict[str, Any]], path: Path) -> None:
+    """Write rows of equal keys to ``path`` (``.csv``) and beside it as Markdown, and print the latter."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    names = list(rows[0])
+    markdown = [f"| {' | '.join(names)} |", f"|{'---|' * len(names)}"]
+    markdown += [f"| {' | '.join(str(row[name]) for name in names)} |" for row in rows]
+    with replaced_when_done(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, names)
+        writer.writeheader()
+        writer.writerows(rows)
+    with replaced_when_done(path.with_suffix(".md")) as temporary:
+        temporary.write_text("\n".join(markdown) + "\n")
+    print("\n".join(markdown))
+    print(f"wrote {path} and {path.with_suffix('.md').name}")

@@ -1,0 +1,140 @@
+"""What the tests of the core and the engines share: engines by name, plain NumPy operations, problems at hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from d4orm_env.core.dynamics import Ops
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
+from d4orm_env.engine import noise
+from d4orm_env.engine.base import Engine, SamplingRules, SamplingTask, StepResult
+
+ENGINE_NAMES = ("cpu", "jax")
+MODEL_NAMES = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive")
+STANDING = {2: "velocity2d", 3: "holonomic3d"}
+"""A model that stays where it is under zero control, by dimension."""
+
+NUMPY_OPS = Ops(np.cos, np.sin, np.sqrt, np.minimum, np.maximum)
+NUMPY_BITS = noise.BitOps(
+    uint32=lambda x: np.asarray(x).astype(np.uint32),
+    int32=lambda x: np.asarray(x).astype(np.int32),
+    to_float=lambda x: np.asarray(x).astype(np.float32),
+    float_bits=lambda x: np.asarray(x, np.float32).view(np.int32),
+    bits_float=lambda x: np.asarray(x, np.int32).view(np.float32),
+    sqrt=np.sqrt,
+)
+
+
+def words(*values: int) -> list[np.ndarray]:
+    """Each value as an array of one uint32: unlike scalars, arrays wrap without a warning."""
+    return [np.array([value], np.uint32) for value in values]
+
+
+def stream(seed: int = 0, step: int = 0, robot: int = 0, time: int = 0, pair: int = 0) -> Any:
+    """The keys of one stream of noise."""
+    low, high = noise.seed_words(seed)
+    return noise.stream_key(*words(int(low), int(high), step, robot, time, pair), NUMPY_BITS)
+
+
+def engine_noise(problem: Problem, seed: int, step: int, num_samples: int) -> np.ndarray:
+    """``(M, H, K, m)`` float32: the standard normals that an engine adds in one denoising step."""
+    counters, signs = noise.antithetic(np.arange(num_samples, dtype=np.uint32), NUMPY_BITS)
+    size = problem.control_size
+    draws = np.empty((num_samples, problem.horizon, problem.num_robots, size), np.float32)
+    for time in range(problem.horizon):
+        for robot in range(problem.num_robots):
+            for pair in range((size + 1) // 2):
+                both = noise.normal_pair(counters, stream(seed, step, robot, time, pair), NUMPY_BITS)
+                for component, draw in zip(range(2 * pair, size), both):
+                    draws[:, time, robot, component] = signs * draw
+    return draws
+
+
+def open_problem(
+    num_robots: int, dimension: int = 2, world: World | None = None, radius: Any = 0.25, **changes: Any
+) -> Problem:
+    """Robots far from each other, from their goals and from everything near the origin."""
+    team = Team((STANDING[dimension],) * num_robots, radius=radius)
+    place = np.zeros((num_robots, dimension))
+    place[:, 0] = 100 + 10 * np.arange(num_robots)
+    start = np.zeros((num_robots, team.state_size))
+    start[:, :dimension] = place
+    return Problem(team, start, place + 3, world, **changes)
+
+
+def stand(engine: Engine, problem: Problem, positions: Any) -> StepResult:
+    """What an engine says of the team standing still at ``positions`` ``(K, d)``, which no problem need allow."""
+    states = np.zeros((problem.num_robots, problem.state_size), np.float32)
+    states[:, : problem.dimension] = positions
+    controls = np.zeros((problem.num_robots, problem.control_size), np.float32)
+    result = engine.step(problem.arrays, states, np.zeros(problem.num_robots, bool), controls)
+    np.testing.assert_array_equal(result.states, states)
+    return result
+
+
+def random_controls(problem: Problem, seed: int, scale: float = 1.5) -> np.ndarray:
+    """``(H, K, m)`` smooth controls, some of them beyond the limits."""
+    generator = np.random.default_rng(seed)
+    steady = generator.standard_normal((1, problem.num_robots, problem.control_size))
+    wobble = generator.standard_normal((problem.horizon, problem.num_robots, problem.control_size))
+    controls = (scale * steady + 0.5 * wobble) * problem.team.control_limits
+    return controls.astype(np.float32)
+
+
+def toward_goals(problem: Problem) -> np.ndarray:
+    """``(H, K, m)`` controls that push every robot toward its goal, so that the team meets in the middle."""
+    controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
+    ahead = problem.goal - problem.start[:, : problem.dimension]
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    for robot, model in enumerate(problem.team.robot_models):
+        if model.heading_index is None:
+            controls[:, robot, : problem.dimension] = ahead[robot]
+        else:
+            controls[:, robot, 1] = 1
+    return controls
+
+
+@dataclass(frozen=True)
+class SameWeights:
+    """Rules that ignore the rewards: rows of weights fixed beforehand, one for the team or one per robot.
+
+    Attributes:
+        rows: Nested tuples ``(1 or K, M)``, so that the rules can be hashed.
+    """
+
+    rows: tuple[tuple[float, ...], ...]
+
+    @classmethod
+    def picking(cls, samples: Any, num_samples: int) -> SameWeights:
+        """All weight on one sample, for the team or for each robot."""
+        return cls(tuple(tuple(float(i == sample) for i in range(num_samples)) for sample in samples))
+
+    def __call__(self, rewards: Any, xp: Any) -> Any:
+        del rewards
+        return xp.asarray(self.rows, dtype=np.float32)
+
+
+class RecordedWeights:
+    """Rules for the CPU engine that keep the rewards they are called with."""
+
+    def __init__(self, weights: Callable[[Any, Any], Any]) -> None:
+        self.rewards: list[np.ndarray] = []
+        self._weights = weights
+
+    def __call__(self, rewards: Any, xp: Any) -> Any:
+        self.rewards.append(rewards.copy())
+        return self._weights(rewards, xp)
+
+
+def cpu_rewards(engine: Engine, task: SamplingTask, sigma: float, num_samples: int, seed: int) -> np.ndarray:
+    """``(1, M)`` or ``(K, M)`` rewards of the samples of one step around zero."""
+    recorded = RecordedWeights(lambda rewards, xp: xp.full_like(rewards, 1 / rewards.shape[-1]))
+    mean = np.zeros_like(task.base)
+    engine.denoise(task, SamplingRules(recorded), mean, np.array([sigma], np.float32), num_samples, seed)
+    return recorded.rewards[0]

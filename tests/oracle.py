@@ -1,0 +1,35 @@
+"""The plain JAX formulation as the tests use it: what an engine should say, computed the way anyone would write it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from engine_support import engine_noise
+
+from d4orm_env.core.problem import Problem
+from d4orm_env.engine.base import SamplingTask
+from d4orm_planners.evaluation import plain
+
+TEMPERATURE = 0.3
+
+
+def sample_controls(task: SamplingTask, mean: Any, sigma: float, num_samples: int, seed: int, step: int) -> np.ndarray:
+    """``(M, H, K, m)`` deformations of one step, from the engines' own noise."""
+    normals = engine_noise(task.problem, seed, step, num_samples)
+    return (mean + np.float32(sigma) * normals).astype(np.float32)
+
+
+def score(problem: Problem, controls: Any) -> np.ndarray:
+    """``(M, K)`` mean rewards of ``controls`` ``(M, H, K, m)``."""
+    model, team = plain.plain_team(problem)
+    return np.asarray(plain.score(model, team, np.asarray(controls, np.float32)))
+
+
+def denoise(task: SamplingTask, mean: Any, noise_scale: Any, num_samples: int, seed: int) -> np.ndarray:
+    """``(H, K, m)`` mean after a run with team weights, on the engines' own noise."""
+    for step, sigma in enumerate(noise_scale):
+        samples = sample_controls(task, mean, sigma, num_samples, seed, step)
+        rewards = score(task.problem, task.base[None] + samples).mean(axis=1)
+        mean = np.asarray(plain.softmax_mean(rewards, samples, TEMPERATURE))
+    return mean

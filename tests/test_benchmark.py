@@ -1,0 +1,193 @@
+"""The benchmark and the warm-up: what they measure and write. How fast anything is, is not tested here."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from d4orm_planners import cli
+from d4orm_planners.evaluation import benchmark, report, timing
+from d4orm_planners.evaluation.benchmark import BenchmarkSettings, parts, run_parts
+from d4orm_planners.evaluation.probes import measure_startup
+from d4orm_planners.evaluation.timing import Spread, measure
+
+TINY: dict[str, Any] = {
+    "robots": (2, 3),
+    "models": ("holonomic2d",),
+    "num_samples": 64,
+    "horizon": 10,
+    "num_steps": 2,
+    "repetitions": 2,
+    "time_limit": 0.2,
+    "most_robots_slow": 2,
+    "env_steps": 10,
+    "num_worlds": 3,
+    "plan_robots": (2,),
+    "seeds": 2,
+    "plan_time_limit": 5.0,
+    "memory_robots": 2,
+}
+
+
+@pytest.fixture(scope="module")
+def results() -> dict[str, list[Any]]:
+    """One benchmark on sizes that take no time, but for the compiling of everything from nothing."""
+    todo = [part for part in parts(BenchmarkSettings(**TINY)) if part[0] != "startup"]
+    seen: list[tuple[int, int]] = []
+    results = run_parts(todo, lambda what, done, total: seen.append((done, total)))
+    assert seen == [(done, len(todo)) for done in range(len(todo) + 1)]
+    return results
+
+
+def call(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(list(arguments))
+    return int(exit_.value.code or 0)
+
+
+def test_spread_is_the_five_numbers() -> None:
+    spread = Spread.of([5.0, 1.0, 2.0, 4.0, 3.0])
+    assert spread == Spread(3.0, 2.0, 4.0, 1.0, 5.0, 5)
+    assert spread.times(10) == Spread(30.0, 20.0, 40.0, 10.0, 50.0, 5)
+    with pytest.raises(ValueError, match="at least once"):
+        Spread.of([])
+    with pytest.raises(ValueError, match="positive"):
+        spread.times(-1)
+
+
+@pytest.mark.parametrize(("ticks", "count"), [([1.0, 1.0, 1.0, 1.0], 3), ([2.0, 3.0, 9.0, 9.0], 2)])
+def test_measure_leaves_the_first_call_out_and_stops(
+    monkeypatch: pytest.MonkeyPatch, ticks: list[float], count: int
+) -> None:
+    clock = [0.0]
+    calls = iter([100.0, *ticks])
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: clock[0])
+
+    def work() -> None:
+        clock[0] += next(calls)
+
+    spread = measure(work, repetitions=3, time_limit=4.0)
+    assert spread.count == count
+    assert spread.largest == max(ticks[:count])
+
+
+def test_every_engine_rule_and_size_is_measured(results: dict[str, list[Any]]) -> None:
+    cases = {(row["engine"], row["rules"], row["num_robots"]) for row in results["denoising"]}
+    assert cases == {
+        ("cpu", "default", 2), ("cpu", "paper", 2), ("jax", "paper", 2), ("plain", "paper", 2),
+        ("cpu", "default", 3), ("cpu", "paper", 3),
+    }  # fmt: skip
+    assert set(results) == {"denoising", "environments", "memory", "plans"}
+
+
+def test_the_numbers_hang_together(results: dict[str, list[Any]]) -> None:
+    for row in results["denoising"]:
+        assert row["ns_per_robot_step"] == pytest.approx(row["step"].median * 1e9 / (64 * 10 * row["num_robots"]))
+        assert 0 < row["step"].smallest <= row["step"].median <= row["step"].largest
+    for row in results["environments"]:
+        assert row["steps_per_second"] == pytest.approx(1 / row["seconds_per_step"].median)
+    (memory,) = results["memory"]
+    assert 30 * 2**20 < memory["imported"] <= memory["peak"] < 2**32
+    default, paper = results["plans"]
+    assert (default["rules"], paper["rules"]) == ("default", "paper")
+    assert default["solved"] == default["seeds"] == default["seconds"].count == 2
+
+
+def test_whole_iterations_that_would_take_too_long_are_left_out(results: dict[str, list[Any]]) -> None:
+    assert all(row["iteration"] is not None for row in results["denoising"])
+    settings = BenchmarkSettings(**{**TINY, "engines": ("cpu",), "robots": (2,), "iteration_limit": 1e-6})
+    _, _, work = next(parts(settings))
+    row = work()
+    assert row["iteration"] is None
+    assert report.milliseconds(row["iteration"]) == "-"
+
+
+def test_report_files(results: dict[str, list[Any]], tmp_path: Path) -> None:
+    settings = BenchmarkSettings(**TINY)
+    machine = timing.describe_machine()
+    report.write_report(tmp_path, settings, machine, "d4orm bench", "2026-01-01T00:00:00+00:00", results)
+    assert {path.name for path in tmp_path.iterdir()} == {"bench.json", "bench.md"}
+    document = json.loads((tmp_path / "bench.json").read_text())
+    assert document["format"] == report.FORMAT
+    assert document["settings"]["robots"] == [2, 3]
+    assert document["machine"]["processor"]
+    assert document["machine"]["libraries"]["numba"]
+    step = results["denoising"][0]["step"]
+    assert document["denoising"][0]["step"]["median"] == pytest.approx(step.median)
+    text = (tmp_path / "bench.md").read_text()
+    assert "`d4orm bench`" in text
+    for title in ("Denoising", "Environment steps", "Memory", "First feasible verified plan"):
+        assert title in text
+    tables = [line for line in text.splitlines() if line.startswith("|")]
+    assert len(tables) > 5 * 3
+
+
+def test_the_command_takes_its_lists(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[BenchmarkSettings] = []
+
+    def pretend(settings: BenchmarkSettings) -> list[Any]:
+        seen.append(settings)
+        return [("memory", "one number", lambda: {"num_robots": 1, "imported": 2**20, "peak": 2**21})]
+
+    monkeypatch.setattr(benchmark, "parts", pretend)
+    options = ("--robots", "4,8", "--models", "velocity2d", "--engines", "cpu,jax", "--seeds", "3", "--quick")
+    assert call("bench", "--out", str(tmp_path / "new"), *options) == 0
+    (settings,) = seen
+    assert (settings.robots, settings.models, settings.engines) == ((4, 8), ("velocity2d",), ("cpu", "jax"))
+    assert (settings.seeds, settings.num_steps) == (3, benchmark.QUICK["num_steps"])
+    document = json.loads((tmp_path / "new" / "bench.json").read_text())
+    assert document["settings"]["seeds"] == 3
+    assert document["memory"] == [{"num_robots": 1, "imported": 2**20, "peak": 2**21}]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--robots", "4,x"), "list of whole numbers"),
+        (("--robots", "0"), "robots is 0"),
+        (("--models", "boat"), "boat"),
+        (("--engines", "gpu"), "gpu"),
+        (("--seeds", "0"), "seeds is 0"),
+    ],
+)
+def test_bad_input_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], message: str
+) -> None:
+    assert call("bench", "--out", str(tmp_path / "new"), *options) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.slow
+def test_startup_compiles_once() -> None:
+    startup = measure_startup(num_robots=2, repetitions=1)
+    # The kernels take seconds to compile, and the second process does not compile them again.
+    assert startup["warm"].largest < startup["cold"]
+    assert 0 < startup["compiling"] < startup["cold"]
+
+
+@pytest.mark.slow
+def test_after_a_warm_up_nothing_is_left_to_compile(tmp_path: Path) -> None:
+    def run(*command: str) -> str:
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+        return subprocess.run(
+            [sys.executable, *command], capture_output=True, text=True, check=True, env=environment, cwd=tmp_path
+        ).stdout
+
+    first = run("-m", "d4orm_planners.cli", "warmup")
+    assert str(tmp_path / "cache") in first
+    assert not first.startswith("0 kernels compiled")
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.nb*")}
+    assert before
+    run("-m", "d4orm_planners.cli", "plan", "--robots", "3", "--out", "plan.npz", "--quiet")
+    run("-m", "d4orm_planners.cli", "run", "plan.npz", "--noise", "0.01", "--quiet")
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.nb*")} == before
+    assert run("-m", "d4orm_planners.cli", "warmup").startswith("0 kernels compiled")

@@ -1,0 +1,121 @@
+"""The example programs run as a user runs them, and what they write is true."""
+
+from __future__ import annotations
+
+import csv
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = ROOT / "examples"
+PNG = b"\x89PNG"
+
+
+def run(name: str, out: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run ``examples/NAME.py --quick`` in a process of its own."""
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    return subprocess.run(
+        [sys.executable, str(EXAMPLES / f"{name}.py"), "--quick", "--out", str(out), *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": path},
+        cwd=out.parent,
+    )
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    """The rows of a CSV file, which must have a Markdown twin with as many."""
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(path.with_suffix(".md").read_text().splitlines()) == len(rows) + 2
+    return rows
+
+
+def completed(name: str, out: Path) -> None:
+    result = run(name, out)
+    assert result.returncode == 0, result.stderr
+    assert not [path for path in out.iterdir() if path.name.startswith(".")], "a temporary file was left behind"
+
+
+def test_annealed_noise_beats_constant_noise_in_one_dimension(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("one_dimension", out)
+    rows = {row["method"]: row for row in table(out / "one_dimension.csv")}
+    short = {name: float(row["short of the best reward"]) for name, row in rows.items()}
+    assert 0 <= short["MBD"] < short["MPPI, large noise"] < short["MPPI, small noise"]
+    assert float(rows["MBD"]["movement in the last step"]) < float(
+        rows["MPPI, large noise"]["movement in the last step"]
+    )
+    assert (out / "one_dimension.png").read_bytes().startswith(PNG)
+
+
+@pytest.mark.slow
+def test_robot_credit_does_not_dilute_with_the_team(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("gradient_dilution", out)
+    one, many = table(out / "gradient_dilution.csv")
+    team, robot = "team credit: reward", "robot credit: reward"
+    assert (one["robots"], many["robots"]) == ("1", "64")
+    assert one[team] == one[robot], "for one robot the two credits are the same"
+    assert float(many[robot]) > float(many[team]) + 0.1
+    assert float(many[robot]) == pytest.approx(float(one[robot]), abs=0.02)
+    assert (out / "gradient_dilution.png").read_bytes().startswith(PNG)
+
+
+@pytest.mark.slow
+def test_d4orm_solves_sooner_than_mppi_and_cem(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("rivals", out)
+    rows = {row["method"]: row for row in table(out / "rivals.csv")}
+    assert set(rows) == {"d4orm", "d4orm (default)", "mppi", "cem", "i-mbd", "mbd"}
+    solved = {name: int(row["solved"].split()[0]) for name, row in rows.items()}
+    # Two seeds and 200 steps are too few for medians; whoever solves within them is sooner than who does not.
+    assert min(solved["d4orm"], solved["d4orm (default)"]) > max(solved["mppi"], solved["cem"])
+    assert (out / "rivals.png").read_bytes().startswith(PNG)
+
+
+@pytest.mark.slow
+def test_step_loop_shows_that_the_plan_avoids_what_driving_straight_does_not(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("step_loop", out)
+    rows = {(float(row["noise [m/s^2]"]), row["policy"]): row for row in table(out / "step_loop.csv")}
+    assert rows[0.0, "d4orm"]["success"] == "1 of 1"
+    assert rows[0.0, "goal"]["success"] == "0 of 1"
+    assert rows[0.5, "d4orm"]["success"] == "0 of 1", "a plan executed blindly does not survive much noise"
+
+
+@pytest.mark.slow
+def test_mixed_team_example_solves_a_scenario_and_draws_it(tmp_path: Path) -> None:
+    scenario = tmp_path / "easy.yaml"
+    scenario.write_text(
+        "version: 1\nrobots:\n"
+        "  - {model: differential_drive, start: [-1.5, 0.0], goal: [1.5, 0.0]}\n"
+        "  - {model: velocity2d, start: [0.0, -1.5], goal: [0.0, 1.5]}\n"
+    )
+    out = tmp_path / "out"
+    result = run("mixed_team", out, "--scenario", str(scenario))
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "verified: True" in result.stdout
+    assert {path.name for path in out.iterdir()} == {"mixed_team.npz", "mixed_team.png", "mixed_team.gif"}
+    with Image.open(out / "mixed_team.gif") as animation:
+        assert animation.n_frames > 5
+
+
+@pytest.mark.slow
+def test_gradient_ascent_through_the_dynamics_raises_the_reward(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("jax_functional", out)
+    rewards = [float(row["reward"]) for row in table(out / "jax_functional.csv")]
+    assert rewards[-1] > rewards[0] + 0.05
+
+
+def test_count_of_seeds_below_one_is_refused(tmp_path: Path) -> None:
+    result = run("one_dimension", tmp_path / "out", "--seeds", "0")
+    assert result.returncode == 2
+    assert "0 is too few; give at least 1" in result.stderr

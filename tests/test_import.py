@@ -1,0 +1,91 @@
+"""What importing the package costs, in libraries: nothing that most users do not need."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = ("torch", "ray", "casadi", "plotly", "matplotlib", "jax", "stable_baselines3", "supersuit", "zenoh", "pyrvo")
+CONTRACT = (
+    "navigation_v0",
+    "make_problem",
+    "load_problem",
+    "save_problem",
+    "list_scenarios",
+    "Problem",
+    "Team",
+    "World",
+    "Trajectory",
+    "rollout",
+    "verify",
+)
+
+
+def run_python(code: str) -> str:
+    """Standard output of a fresh interpreter in which warnings are errors."""
+    result = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout.strip()
+
+
+def loaded_by(code: str) -> set[str]:
+    """Which of the heavy libraries are loaded after running ``code``."""
+    report = f"import sys; print(*(name for name in {HEAVY!r} if name in sys.modules))"
+    return set(run_python(f"{code}\n{report}").split())
+
+
+def test_the_package_loads_nothing_heavy() -> None:
+    assert loaded_by("import d4orm_env") == set()
+
+
+def test_making_and_judging_a_problem_loads_nothing_heavy() -> None:
+    code = (
+        "import numpy as np, d4orm_env\n"
+        "problem = d4orm_env.make_problem('circle', num_robots=2, horizon=5)\n"
+        "assert not d4orm_env.verify(problem, np.zeros((5, 2, 2))).ok"
+    )
+    assert loaded_by(code) == set()
+
+
+def test_the_cpu_engine_does_without_jax() -> None:
+    code = "from d4orm_env.engine.base import get_engine\nassert get_engine('cpu').name == 'cpu'"
+    assert loaded_by(code) == set()
+
+
+def test_the_environment_does_without_jax_and_matplotlib() -> None:
+    assert loaded_by("from d4orm_env import navigation_v0\nnavigation_v0.parallel_env(num_robots=2)") == set()
+
+
+@pytest.mark.parametrize("name", CONTRACT)
+def test_the_public_names_are_there(name: str) -> None:
+    import d4orm_env
+
+    assert getattr(d4orm_env, name) is not None
+    assert name in d4orm_env.__all__
+
+
+def test_the_contracts_import_statement_works_in_a_fresh_process() -> None:
+    names = ", ".join(CONTRACT)
+    assert run_python(f"from d4orm_env import {names}\nprint(callable(rollout), navigation_v0.__name__)") == (
+        "True d4orm_env.navigation_v0"
+    )
+
+
+def test_all_names_resolve() -> None:
+    assert run_python("from d4orm_env import *\nprint(functional.__name__)") == "d4orm_env.functional"
+
+
+def test_unknown_names_are_attribute_errors() -> None:
+    import d4orm_env
+
+    with pytest.raises(AttributeError, match="module 'd4orm_env' has no attribute 'teleport'"):
+        _ = d4orm_env.teleport
+
+
+def test_the_planners_are_not_loaded_by_the_environment() -> None:
+    code = "import sys, d4orm_env\nprint(any(name.startswith('d4orm_planners') for name in sys.modules))"
+    assert run_python(code) == "False"
