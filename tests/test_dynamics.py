@@ -61,8 +61,14 @@ def test_an_unknown_model_is_named_with_those_there_are() -> None:
         ("holonomic3d", (1, 2, 3, 4, 5, 6), (7, 8, 9), (4, 5, 6, 7, 8, 9), (4, 5, 6)),
         ("velocity2d", (1, 2), (3, 4), (3, 4), (3, 4)),
         # cos and sin of pi / 6.
-        ("differential_drive", (1, 2, math.pi / 6, 4), (5, 6), (4 * math.sqrt(0.75), 2, 5, 6), (4 * math.sqrt(0.75),
-        2)), ("differential_drive", (1, 2, math.pi, 4), (5, 6), (-4, 0, 5, 6), (-4, 0)),
+        (
+            "differential_drive",
+            (1, 2, math.pi / 6, 4),
+            (5, 6),
+            (4 * math.sqrt(0.75), 2, 5, 6),
+            (4 * math.sqrt(0.75), 2),
+        ),
+        ("differential_drive", (1, 2, math.pi, 4), (5, 6), (-4, 0, 5, 6), (-4, 0)),
     ],
 )
 def test_derivatives_and_velocities(name: str, x: Any, u: Any, derivative: Any, velocity: Any) -> None:
@@ -169,9 +175,7 @@ def test_the_engines_compile_that_very_step(engine: str, name: str) -> None:
     problem = Problem(team, np.zeros((1, team.state_size)), np.full((1, team.dimension), 50.0))
     physics = get_engine(engine)
     for x, u in cases(name):
-        result = physics.step(
-            problem.arrays, x[None].astype(np.float32), np.zeros(1, bool), u[None].astype(np.float32)
-        )
+        result = physics.step(problem.arrays, x[None].astype(np.float32), np.zeros(1, bool), u[None].astype(np.float32))
         functions = MODELS[name].functions
         np.testing.assert_allclose(result.states[0], next_state(name, x, u, PYTHON_OPS, float), rtol=1e-6, atol=2e-6)
         np.testing.assert_allclose(

@@ -28,8 +28,13 @@ def million() -> np.ndarray:
 
 def test_moments(million: np.ndarray) -> None:
     # Standard errors of the first six moments of a normal: sqrt(E[x^2k] - E[x^k]^2) / sqrt(n).
-    for order, expected, deviation in ((1, 0, 1), (2, 1, 2**0.5), (3, 0, 15**0.5), (4, 3, 96**0.5), (6, 15,
-    10170**0.5)):
+    for order, expected, deviation in (
+        (1, 0, 1),
+        (2, 1, 2**0.5),
+        (3, 0, 15**0.5),
+        (4, 3, 96**0.5),
+        (6, 15, 10170**0.5),
+    ):
         bound = 4 * deviation / NUM_DRAWS**0.5
         assert np.mean(million**order) == pytest.approx(expected, abs=bound), f"moment {order}"
 
@@ -47,7 +52,8 @@ def test_every_stream_is_normal(names: dict[str, int]) -> None:
 
 def test_streams_across_indices_are_normal_too() -> None:
     """One sample of many streams, as a robot sees them along time: the keys must be as good as the counter."""
-    values = [draws(4, first=7, seed=3, step=s, robot=k, time=t) for s in range(5) for k in range(20) for t in range(50)]
+    indices = [(s, k, t) for s in range(5) for k in range(20) for t in range(50)]
+    values = [draws(4, first=7, seed=3, step=s, robot=k, time=t) for s, k, t in indices]
     assert stats.kstest(np.concatenate(values, axis=None), "norm").pvalue > 0.01
 
 

@@ -119,8 +119,9 @@ def test_mean_squared_jerk_of_a_single_step_is_zero() -> None:
     assert mean_squared_jerk(np.ones((1, 2, 2)), np.zeros((2, 2), bool), 0.1) == 0.0
 
 
-def plain_trajectory(arrived: np.ndarray, collided: np.ndarray, violated: np.ndarray, rewards: np.ndarray) ->
-Trajectory:
+def plain_trajectory(
+    arrived: np.ndarray, collided: np.ndarray, violated: np.ndarray, rewards: np.ndarray
+) -> Trajectory:
     steps, num_robots = rewards.shape
     states = np.zeros((steps + 1, num_robots, 2), np.float32)
     controls = np.zeros((steps, num_robots, 2), np.float32)

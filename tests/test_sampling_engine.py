@@ -35,9 +35,12 @@ def crowd(model: str = "holonomic2d", num_robots: int = 5) -> SamplingTask:
 
 
 def among_obstacles() -> SamplingTask:
-    world = World(2, circles=[[0, 0, 0.4], [0, 1.2, 0.1]], boxes=[[-0.6, -1.5, 0.6, -0.9]], lower=[-3, -2], upper=[3,
-    2]) start = [[-2, -0.4, 0, 0], [-2, 0.4, 0.5, 0], [-2, -1.4, 0, 0]] problem = Problem(Team(("holonomic2d",) * 3),
-    start, [[2, 0.4], [2, -0.4], [2, -1.4]], world, **PLANNED) return SamplingTask(problem, 0.5 * toward_goals(problem))
+    box = [-0.6, -1.5, 0.6, -0.9]
+    world = World(2, circles=[[0, 0, 0.4], [0, 1.2, 0.1]], boxes=[box], lower=[-3, -2], upper=[3, 2])
+    start = [[-2, -0.4, 0, 0], [-2, 0.4, 0.5, 0], [-2, -1.4, 0, 0]]
+    goal = [[2, 0.4], [2, -0.4], [2, -1.4]]
+    problem = Problem(Team(("holonomic2d",) * 3), start, goal, world, **PLANNED)
+    return SamplingTask(problem, 0.5 * toward_goals(problem))
 
 
 def in_space() -> SamplingTask:

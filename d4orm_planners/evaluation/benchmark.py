@@ -91,7 +91,7 @@ QUICK: dict[str, Any] = {
     "repetitions": 3,
     "time_limit": 0.5,
     "iteration_limit": 2.0,
-    "most_robots_slow": 4,
+    "most_robots_slow": 8,
     "env_steps": 500,
     "num_worlds": 128,
     "plan_robots": (4, 8),
