@@ -128,9 +128,10 @@ def main() -> None:
     """Run every method on every team and seed, and write the table and the plot."""
     parser = argument_parser(__doc__)
     parser.add_argument("--seeds", type=count, default=20, help="seeds per team and method")
+    parser.add_argument("--teams", nargs="+", choices=TEAMS, default=list(TEAMS))
     parser.add_argument("--engine", default="auto")
     arguments = parser.parse_args()
-    teams, seeds = TEAMS, arguments.seeds
+    teams, seeds = {team: TEAMS[team] for team in arguments.teams}, arguments.seeds
     if arguments.quick:
         teams, seeds = {"8 holonomic": ({"num_robots": 8}, 2)}, 2
     results: dict[str, dict[str, list[Run]]] = {}
