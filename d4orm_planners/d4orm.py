@@ -20,13 +20,14 @@ class D4ormConfig(SamplingConfig):
     Attributes:
         num_samples: ``M``.
         num_steps: ``N``.
-        credit: Per-robot weights by default; see :class:`SamplingConfig`.
+        credit: ``"alternate"`` by default: per-robot weights find their way soonest, and where robots must yield to each
+            other, which no robot's own reward asks of it, the next iteration's team weights do.
         random_start: Start every deformation from ``U_N ~ N(0, I)``, as Algorithm 1 is written, rather than from zero.
     """
 
     num_samples: int = 512
     num_steps: int = 50
-    credit: str = "robot"
+    credit: str = "alternate"
     random_start: bool = False
 
     def __post_init__(self) -> None:

@@ -74,8 +74,8 @@ def test_obstacles_in_space(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_obstacles_in_the_plane_with_team_credit(seed: int) -> None:
-    assert_solves({"scenario": "four_obstacles", "num_robots": 4}, seed, 30, credit="team")
+def test_obstacles_in_the_plane(seed: int) -> None:
+    assert_solves({"scenario": "four_obstacles", "num_robots": 4}, seed, 30)
 
 
 def test_the_papers_algorithm_solves_too() -> None:

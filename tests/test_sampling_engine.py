@@ -363,7 +363,6 @@ def test_samples_that_blow_up_are_excluded_and_counted_and_change_no_other(credi
     np.testing.assert_allclose(result.rewards, other.rewards, rtol=1e-4, atol=2e-5)
 
 
-@pytest.mark.xfail(strict=True, reason="the CPU engine's boxes around a tile lose samples that share it with a NaN")
 def test_samples_that_blow_up_do_not_hide_where_the_others_are() -> None:
     """Half the samples of every tile overflow early on, and the rest spread out for long after that."""
     task = replace(TASKS["obstacles"](), credit="robot")

@@ -75,7 +75,7 @@ class SamplingRules(NamedTuple):
     """The rules that tell one sampling method from another: pure functions of arrays, in NumPy or JAX alike.
 
     Attributes:
-        weights: ``(rewards, array library) -> weights``: from ``(M,)`` or ``(K, M)`` rewards to weights that sum to
+        weights: ``(rewards, array library) -> weights``: from ``(1, M)`` or ``(K, M)`` rewards to weights that sum to
             one over the last axis. Rewards that are not finite arrive as minus infinity and must get weight zero.
         adapt: ``(noise, mean square deviation, array library) -> noise``: the noise of the next step, ``(H, K, m)``
             factors on the schedule; ``None`` leaves the schedule alone and saves the second moment.

@@ -141,12 +141,14 @@ def _extent(row: Any, scratch: Any) -> Any:
 
 @inlined
 def _smaller(a: Any, b: Any) -> Any:
-    return a if a < b else b
+    """The smaller, and NaN if either is."""
+    return a if (a < b) | (a != a) else b
 
 
 @inlined
 def _larger(a: Any, b: Any) -> Any:
-    return a if a > b else b
+    """The larger, and NaN if either is."""
+    return a if (a > b) | (a != a) else b
 
 
 @inlined
@@ -155,8 +157,9 @@ def _bound(k: Any, w: Any, box: Any) -> None:
     robot = robot_rows(w, k)
     for axis in range(box.shape[2]):
         lower, upper = _extent(robot[axis * TILE : (axis + 1) * TILE], robot[SCRATCH * TILE : ROWS * TILE])
-        box[k, 0, axis] = lower
-        box[k, 1, axis] = upper
+        # A sample that blew up may be anywhere, and must not hide where the others are.
+        box[k, 0, axis] = lower if lower == lower else -np.inf
+        box[k, 1, axis] = upper if upper == upper else np.inf
 
 
 @inlined

@@ -60,7 +60,9 @@ def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:
         with replaced_when_done(target) as temporary:
             temporary.write_text(_format(describe(problem)), encoding="utf-8")
     except OSError as error:
-        raise ValueError(f"{target}: cannot be written ({error}); choose a file in a folder you own") from error
+        raise ValueError(
+            f"{target}: cannot be written ({error.strerror or error}); choose a file in a folder you own"
+        ) from error
 
 
 def _read_text(path: Path) -> str:

@@ -19,7 +19,7 @@ from d4orm_env.engine.base import SamplingRules, SamplingTask
 from d4orm_planners.base import Iteration, Planner, PlannerConfig, Search
 from d4orm_planners.sampling.weights import SoftmaxWeights
 
-CREDITS = ("team", "robot")
+CREDITS = ("team", "robot", "alternate")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +34,8 @@ class SamplingConfig(PlannerConfig):
         beta_start: First variance of the diffusion schedule.
         beta_end: Last variance of the diffusion schedule.
         credit: ``"team"`` weights samples by the team's mean reward, as in the paper; ``"robot"`` weights each robot's
-            part of a sample by the robot's own reward, which keeps the signal from diluting with the number of robots.
+            part of a sample by the robot's own reward, which keeps the signal from diluting with the number of robots;
+            ``"alternate"`` does the second in the first iteration, the first in the next, and so on.
     """
 
     num_samples: int = 1024
@@ -85,7 +86,10 @@ class SamplingPlanner(Planner):
 
     def task(self, search: Search, base: FloatArray) -> SamplingTask:
         """What this iteration samples and scores."""
-        return SamplingTask(search.problem, base, credit=self.config.credit)
+        credit = self.config.credit
+        if credit == "alternate":
+            credit = "team" if search.iteration % 2 else "robot"
+        return SamplingTask(search.problem, base, credit=credit)
 
     def iterate(self, search: Search) -> Iteration:
         """See :meth:`Planner.iterate`."""
