@@ -20,7 +20,7 @@ class D4ormConfig(SamplingConfig):
     Attributes:
         num_samples: ``M``.
         num_steps: ``N``.
-        credit: ``"alternate"`` by default: per-robot weights find their way soonest, and where robots must yield to each
+        credit: ``"alternate"`` by default: per-robot weights find their way soonest. Where robots must yield to each
             other, which no robot's own reward asks of it, the next iteration's team weights do.
         random_start: Start every deformation from ``U_N ~ N(0, I)``, as Algorithm 1 is written, rather than from zero.
     """
