@@ -30,6 +30,8 @@ apidoc_modules = [
     for package in ("d4orm_env", "d4orm_planners")
 ]
 autodoc_member_order = "bysource"
+# Names that a package passes on are described where they are defined.
+autodoc_default_options = {"ignore-module-all": True}
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
