@@ -149,7 +149,7 @@ class Planner(ABC):
         Args:
             problem: What to solve.
             seed: Non-negative seed; the same seed gives the same plan.
-            time_limit: Seconds, compilation not counted; checked after every iteration.
+            time_limit: Seconds, compilation not counted; checked before every iteration.
             max_iterations: Iterations; the configured number by default.
             callback: Called with an :class:`IterationRecord` after every iteration; returning ``True`` stops.
             initial_controls: ``(H, K, m)`` to start from, zeros by default.
@@ -160,12 +160,12 @@ class Planner(ABC):
         Raises:
             ValueError: If an argument makes no sense; the message names it.
         """
-        search = Search(self, problem, seed, initial_controls)
         if time_limit is not None:
             time_limit = positive_number(time_limit, "time_limit")
         limit = (
             self.config.max_iterations if max_iterations is None else whole_number(max_iterations, "max_iterations", 1)
         )
+        search = Search(self, problem, seed, initial_controls)
         status = "iteration_limit"
         try:
             while True:

@@ -40,7 +40,12 @@ class Policy(ABC):
 
         Returns:
             ``{agent: (m,) float32 control}``.
+
+        Raises:
+            RuntimeError: Before the first reset.
         """
+        if not hasattr(self, "problem"):
+            raise RuntimeError("the policy has seen no environment yet; call reset(env) before act()")
         joint = split_state(self.problem, state)
         controls = self._controls(joint)
         return {agent: controls[int(agent.rsplit("_", 1)[1])] for agent in observations}

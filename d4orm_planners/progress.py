@@ -3,36 +3,23 @@
 from __future__ import annotations
 
 from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from d4orm_planners.plan import IterationRecord
 
 
-class SolveProgress:
-    """Shows iteration, reward, robots failing and time; the callback of a solve.
+class LiveProgress:
+    """A progress line on stderr: live on a terminal, and nothing at all elsewhere."""
 
-    On a terminal the line is live; elsewhere nothing is printed.
-    """
-
-    def __init__(self, planner: str, num_robots: int, max_iterations: int, enabled: bool = True) -> None:
+    def __init__(self, *columns: ProgressColumn, enabled: bool) -> None:
         console = Console(stderr=True)
-        self._num_robots = num_robots
-        self._progress = Progress(
-            SpinnerColumn(),
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=24),
-            TextColumn("iteration {task.completed}/{task.total}  {task.fields[detail]}"),
-            TimeElapsedColumn(),
-            console=console,
-            disable=not (enabled and console.is_terminal),
-            transient=True,
-        )
-        self._task = self._progress.add_task(planner, total=max_iterations, detail="compiling and sampling ...")
+        hidden = not (enabled and console.is_terminal)
+        self._progress = Progress(*columns, TimeElapsedColumn(), console=console, disable=hidden, transient=True)
 
-    def __enter__(self) -> SolveProgress:
+    def __enter__(self) -> Self:
         self._progress.start()
         return self
 
@@ -40,6 +27,21 @@ class SolveProgress:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._progress.stop()
+
+
+class SolveProgress(LiveProgress):
+    """Shows iteration, reward, robots failing and time; the callback of a solve."""
+
+    def __init__(self, planner: str, num_robots: int, max_iterations: int, enabled: bool = True) -> None:
+        super().__init__(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            TextColumn("iteration {task.completed}/{task.total}  {task.fields[detail]}"),
+            enabled=enabled,
+        )
+        self._num_robots = num_robots
+        self._task = self._progress.add_task(planner, total=max_iterations, detail="compiling and sampling ...")
 
     def update(self, record: IterationRecord) -> Any:
         """Show one iteration."""

@@ -10,22 +10,12 @@ import numpy as np
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.engine import noise
 from d4orm_planners.base import Planner
 from d4orm_planners.plan import IterationRecord
 from d4orm_planners.registry import PLANNERS, make_planner
 
 CHEAP = {"engine": "cpu", "num_samples": 64, "num_steps": 5, "max_iterations": 2}
 """Settings that plan in no time, and badly."""
-
-BIT_OPS = noise.BitOps(
-    uint32=lambda x: np.asarray(x).astype(np.uint32),
-    int32=lambda x: np.asarray(x).astype(np.int32),
-    to_float=lambda x: np.asarray(x).astype(np.float32),
-    float_bits=lambda x: np.asarray(x).view(np.int32),
-    bits_float=lambda x: np.asarray(x).view(np.float32),
-    sqrt=np.sqrt,
-)
 
 
 def cheap_planner(name: str, **config: Any) -> Planner:
@@ -63,23 +53,6 @@ class Recorder:
         if last and self._error is not None:
             raise self._error
         return last
-
-
-def engine_noise(problem: Problem, seed: int, step: int, num_samples: int) -> np.ndarray:
-    """``(M, H, K, m)`` the standard normals that every engine draws in one step, in float64."""
-    counters, signs = noise.antithetic(np.arange(num_samples, dtype=np.uint32), BIT_OPS)
-    low, high = (np.array([word], np.uint32) for word in noise.seed_words(seed))
-    words = [np.array([value], np.uint32) for value in range(max(problem.horizon, problem.num_robots) + 1)]
-    draws = np.empty((num_samples, problem.horizon, problem.num_robots, problem.control_size))
-    for time in range(problem.horizon):
-        for robot in range(problem.num_robots):
-            for pair in range((problem.control_size + 1) // 2):
-                step_word = np.array([step], np.uint32)
-                key = noise.stream_key(low, high, step_word, words[robot], words[time], words[pair], BIT_OPS)
-                both = np.stack(noise.normal_pair(counters, key, BIT_OPS), axis=-1) * signs[:, None]
-                width = min(2, problem.control_size - 2 * pair)
-                draws[:, time, robot, 2 * pair : 2 * pair + width] = both[:, :width]
-    return draws
 
 
 def softmax(rewards: np.ndarray, temperature: float) -> np.ndarray:

@@ -13,7 +13,7 @@ from env_support import mixed_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from d4orm_env.core.observation import OWN_SCALARS, ObservationLayout, insert_nearest, observe_robot
+from d4orm_env.core.observation import ObservationLayout, insert_nearest, observe_robot
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
@@ -79,7 +79,7 @@ def test_a_robot_sees_itself_and_its_goal() -> None:
             "max_acceleration": 0.5,
         }
     )
-    assert len(own) == OWN_SCALARS + 4
+    assert len(own) == 8 + 4
 
 
 def test_neighbours_come_nearest_first_relative_to_the_robot() -> None:
@@ -197,7 +197,7 @@ def test_space() -> None:
 def test_names_and_bounds_have_the_layouts_size(sizes: tuple[int, int]) -> None:
     for problem, d in ((PLANAR, 2), (make_problem("sphere", num_robots=3), 3)):
         layout = ObservationLayout.for_problem(problem, *sizes)
-        assert layout.size == 2 * d + OWN_SCALARS + sizes[0] * (2 + 2 * d) + sizes[1] * (2 + d)
+        assert layout.size == 2 * d + 8 + sizes[0] * (2 + 2 * d) + sizes[1] * (2 + d)
         assert len(layout.names) == len(set(layout.names)) == len(layout.high) == layout.size
         assert layout.names.index("heading_cos") == d
         assert np.isfinite(layout.low).all()

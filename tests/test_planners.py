@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from engine_support import engine_noise
 from planner_support import (
     Recorder,
     algorithm_1,
     cheap_planner,
-    engine_noise,
     hop_problem,
     softmax,
     walled_in_problem,
@@ -494,7 +494,7 @@ def rewards_of(search: Search, base: np.ndarray) -> Any:
 
 def draws_of(search: Search) -> Any:
     seed = search.iteration_seed()
-    return lambda step: engine_noise(search.problem, seed, step, SAMPLES)
+    return lambda step: engine_noise(search.problem, seed, step, SAMPLES).astype(np.float64)
 
 
 def assert_controls(search: Search, expected: np.ndarray) -> None:

@@ -357,3 +357,9 @@ def test_driving_to_the_goal_goes_on_in_lifelong_mode() -> None:
     assert episode.metrics["goals_per_robot_minute"] == pytest.approx(reached / (3 * 0.5))
     assert not episode.trajectory.arrived.any()
     assert sum(info[agent]["arrived"] for info in episode.infos for agent in info) == reached
+
+
+@pytest.mark.parametrize("name", ["goal", "random"])
+def test_acting_before_the_reset_says_what_to_do(name: str) -> None:
+    with pytest.raises(RuntimeError, match=r"call reset\(env\) before act"):
+        make_policy(name).act({}, np.zeros(1, np.float32))

@@ -15,9 +15,6 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, whole_number
 from d4orm_env.core.problem import Problem
 
-OWN_SCALARS = 8
-"""Heading (cosine, sine), speed, time left, arrived, and the robot's radius, speed limit and acceleration limit."""
-
 
 @dataclass(frozen=True, eq=False)
 class ObservationLayout:

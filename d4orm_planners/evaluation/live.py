@@ -2,35 +2,19 @@
 
 from __future__ import annotations
 
-from types import TracebackType
+from rich.progress import BarColumn, TextColumn
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from d4orm_planners.progress import LiveProgress
 
 
-class PartsProgress:
-    """Shows what is under way, how much is done, and the time. On a terminal only; elsewhere nothing is printed."""
+class PartsProgress(LiveProgress):
+    """Shows what is under way, how much is done, and the time."""
 
     def __init__(self, enabled: bool = True) -> None:
-        console = Console(stderr=True)
-        self._progress = Progress(
-            BarColumn(bar_width=24),
-            TextColumn("{task.completed}/{task.total}  {task.description}"),
-            TimeElapsedColumn(),
-            console=console,
-            disable=not (enabled and console.is_terminal),
-            transient=True,
+        super().__init__(
+            BarColumn(bar_width=24), TextColumn("{task.completed}/{task.total}  {task.description}"), enabled=enabled
         )
         self._task = self._progress.add_task("", total=None)
-
-    def __enter__(self) -> PartsProgress:
-        self._progress.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._progress.stop()
 
     def update(self, what: str, done: int, total: int) -> None:
         """Say what begins now, after how many of how many."""
