@@ -44,15 +44,16 @@ def stream(seed: int = 0, step: int = 0, robot: int = 0, time: int = 0, pair: in
 
 def engine_noise(problem: Problem, seed: int, step: int, num_samples: int) -> np.ndarray:
     """``(M, H, K, m)`` float32: the standard normals that an engine adds in one denoising step."""
-    counters, signs = noise.antithetic(np.arange(num_samples, dtype=np.uint32), NUMPY_BITS)
+    counters, cosine, sine = noise.turned(np.arange(num_samples, dtype=np.uint32), NUMPY_BITS)
     size = problem.control_size
     draws = np.empty((num_samples, problem.horizon, problem.num_robots, size), np.float32)
     for time in range(problem.horizon):
         for robot in range(problem.num_robots):
             for pair in range((size + 1) // 2):
-                both = noise.normal_pair(counters, stream(seed, step, robot, time, pair), NUMPY_BITS)
+                x, y = noise.normal_pair(counters, stream(seed, step, robot, time, pair), NUMPY_BITS)
+                both = cosine * x - sine * y, sine * x + cosine * y
                 for component, draw in zip(range(2 * pair, size), both):
-                    draws[:, time, robot, component] = signs * draw
+                    draws[:, time, robot, component] = draw
     return draws
 
 

@@ -132,12 +132,14 @@ def test_samples_are_uncorrelated(lag: int) -> None:
         assert np.abs(correlations(a[:-lag], b[lag:])).max() < 4.5
 
 
-def test_of_every_sixty_four_samples_the_second_half_mirrors_the_first() -> None:
-    counters, signs = noise.antithetic(np.arange(200, dtype=np.uint32), NUMPY_BITS)
-    assert counters[:128].tolist() == [*range(32), *range(32), *range(32, 64), *range(32, 64)]
-    assert signs[:128].tolist() == [1] * 32 + [-1] * 32 + [1] * 32 + [-1] * 32
-    # No two samples share both.
-    assert len({(int(c), float(s)) for c, s in zip(counters, signs)}) == 200
+def test_of_every_sixty_four_samples_sixteen_draw_and_the_others_turn_their_pairs() -> None:
+    counters, cosine, sine = noise.turned(np.arange(200, dtype=np.uint32), NUMPY_BITS)
+    assert counters[:128].tolist() == [*range(16)] * 4 + [*range(16, 32)] * 4
+    assert cosine[:64].tolist() == [1] * 16 + [-1] * 16 + [0] * 32
+    assert sine[:64].tolist() == [0] * 32 + [1] * 16 + [-1] * 16
+    assert cosine[64:128].tolist() == cosine[:64].tolist() and sine[64:128].tolist() == sine[:64].tolist()
+    # No two samples share all three.
+    assert len({(int(c), float(x), float(y)) for c, x, y in zip(counters, cosine, sine)}) == 200
 
 
 def test_the_hash_is_a_bijection_with_full_avalanche() -> None:

@@ -12,8 +12,7 @@ from d4orm_env.core.problem import Problem, ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine import noise, sampling
 from d4orm_env.engine.base import SamplingResult, SamplingRules, SamplingTask, StepResult, checked_controls
-from d4orm_env.engine.noise import MIRROR
-from d4orm_env.engine.sampling import LANES
+from d4orm_env.engine.noise import DRAWS, TURNS
 from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_env.engine.tiles import TILE
 from d4orm_env.engine.worlds import WorldBatch, advance_worlds, judge_worlds, observe_world, roll_out, step_worlds
@@ -145,7 +144,7 @@ class CpuEngine:
         """See :meth:`d4orm_env.engine.base.Engine.prepare`; one compilation serves every problem."""
         del noise_scale, num_samples
         if not sampling.average_noise.signatures:
-            self.denoise(task, rules, task.base, np.zeros(1, np.float32), LANES, 0)
+            self.denoise(task, rules, task.base, np.zeros(1, np.float32), TILE, 0)
 
     def denoise(
         self,
@@ -163,10 +162,13 @@ class CpuEngine:
         excluded = 0
         for step, sigma in enumerate(noise_scale):
             rewards = run.score(step, mean, factor * sigma)
-            usable = np.isfinite(rewards)
-            excluded += int(usable.size - usable.sum())
-            mean_rewards[step] = np.where(usable, rewards, 0).sum() / max(usable.sum(), 1)
-            weights = rules.weights(np.where(usable, rewards, -np.inf).astype(np.float32), np)
+            mean_rewards[step] = rewards.mean()
+            if not np.isfinite(mean_rewards[step]):
+                usable = np.isfinite(rewards)
+                excluded += int(usable.size - usable.sum())
+                mean_rewards[step] = np.where(usable, rewards, 0).sum() / max(usable.sum(), 1)
+                rewards = np.where(usable, rewards, np.float32(-np.inf))
+            weights = rules.weights(rewards, np)
             first, second = run.moments(step, weights, rules.adapt is not None)
             new_mean = mean + factor * sigma * first
             if rules.adapt is not None:
@@ -194,6 +196,8 @@ class _Sampling:
             self.moving_radius = np.ascontiguousarray(task.moving.radius, np.float32)
         self.seed = np.array(noise.seed_words(seed), np.uint32)
         self.rewards = np.empty((problem.num_robots, num_samples), np.float32)
+        pairs, counters = (problem.control_size + 1) // 2, -(-num_samples // TILE) * DRAWS
+        self.kept = np.empty((problem.num_robots, len(self.base), pairs, 2, counters), np.float32)
 
     def score(self, step: int, mean: FloatArray, scale: FloatArray) -> FloatArray:
         """Rewards of this step's samples, ``(M,)`` for team credit and ``(K, M)`` for robot credit."""
@@ -203,7 +207,7 @@ class _Sampling:
             num_tiles,
             lambda part: sampling.score_tiles(
                 self.arrays, offset, scale, self.docked, self.task.collisions, self.moving, self.moving_radius,
-                self.seed, step, part, self.rewards,
+                self.seed, step, part, self.kept, self.rewards,
             ),
         )  # fmt: skip
         return self.rewards.mean(axis=0, keepdims=True) if self.task.credit == "team" else self.rewards
@@ -211,40 +215,29 @@ class _Sampling:
     def moments(self, step: int, weights: Any, with_second: bool) -> tuple[FloatArray, FloatArray]:
         """``(H, K, m)`` weighted mean of the noise and, if asked for, of its square."""
         num_steps, num_robots, _ = self.base.shape
-        rows = np.asarray(weights, np.float32)
-        counters, odd, even, counts = _by_counter(np.repeat(rows, num_robots, axis=0) if len(rows) == 1 else rows)
-        first = np.zeros_like(self.base)
-        second = np.zeros_like(self.base) if with_second else np.zeros((0, 0, 0), np.float32)
+        odd, even = _by_counter(np.broadcast_to(np.asarray(weights, np.float32), (num_robots, self.rewards.shape[1])))
+        first = np.empty_like(self.base)
+        second = np.empty_like(self.base) if with_second else np.empty((0, 0, 0), np.float32)
         self.threads.over(
-            num_steps,
-            lambda part: sampling.average_noise(self.seed, step, counters, odd, even, counts, part, first, second),
+            num_steps, lambda part: sampling.average_noise(self.kept, odd, even, part, first, second)
         )
         return first, second
 
 
-def _by_counter(weights: FloatArray) -> tuple[Any, FloatArray, FloatArray, Any]:
-    """Weights ``(K, M)`` of samples gathered by the counter of their noise, which a sample shares with its mirror.
+def _by_counter(weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Weights ``(K, M)`` of samples gathered by the counter of their noise (see :func:`noise.turned`).
 
     Returns:
-        ``(K, .)`` counters, their weights in an odd moment (sample minus mirror) and in an even one (sample plus
-        mirror), and ``(K,)`` how many there are. Counters without weight are left out, and the lists are padded to
-        whole blocks of lanes.
+        ``(2, K, .)`` weights in an odd moment, summed over the samples of a counter with the cosine and the sine of
+        their turn, and ``(2, K, .)`` in an even one, with their squares.
     """
     num_rows, num_samples = weights.shape
-    padded = np.zeros((num_rows, -(-num_samples // TILE) * TILE), np.float32)
-    padded[:, :num_samples] = weights
-    halves = padded.reshape(num_rows, -1, 2, MIRROR)
-    odd = (halves[:, :, 0] - halves[:, :, 1]).reshape(num_rows, -1)
-    even = (halves[:, :, 0] + halves[:, :, 1]).reshape(num_rows, -1)
-    rows, columns = np.nonzero(even)
-    counts = np.bincount(rows, minlength=num_rows)
-    width = -(-int(counts.max()) // LANES) * LANES
-    place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-    counters = np.zeros((num_rows, width), np.uint32)
-    counters[rows, place] = columns
-    compact = np.zeros((2, num_rows, width), np.float32)
-    compact[:, rows, place] = odd[rows, columns], even[rows, columns]
-    return counters, compact[0], compact[1], counts
+    if num_samples % TILE:
+        weights = np.pad(weights, ((0, 0), (0, -num_samples % TILE)))
+    # One row for each turn: by 0, 180, 90 and 270 degrees.
+    turns = np.ascontiguousarray(weights.reshape(num_rows, -1, TURNS, DRAWS).transpose(2, 0, 1, 3))
+    turns = turns.reshape(TURNS, num_rows, -1)
+    return turns[0::2] - turns[1::2], turns[0::2] + turns[1::2]
 
 
 _ONE_WORLD = np.array([0, 1])

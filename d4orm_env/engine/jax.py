@@ -185,13 +185,14 @@ class _Inputs(NamedTuple):
 def _deformations(static: _Static, inputs: _Inputs, step: Any, time: Any, mean: Any, scale: Any) -> Any:
     """``(K, m, M)`` samples of the deformation at one time step."""
     num_robots, size = mean.shape
-    counters, signs = noise.antithetic(jnp.arange(static.num_samples, dtype=jnp.uint32)[None, :], BIT_OPS)
+    counters, cosine, sine = noise.turned(jnp.arange(static.num_samples, dtype=jnp.uint32)[None, :], BIT_OPS)
     robots = jnp.arange(num_robots, dtype=jnp.uint32)[:, None]
     low, high = inputs.seed
     draws: list[Any] = []
     for pair in range((size + 1) // 2):
         key = noise.stream_key(low, high, step, robots, time, jnp.uint32(pair), BIT_OPS)
-        draws += [signs * draw for draw in noise.normal_pair(counters, key, BIT_OPS)]
+        x, y = noise.normal_pair(counters, key, BIT_OPS)
+        draws += [cosine * x - sine * y, sine * x + cosine * y]
     return mean[..., None] + scale[..., None] * jnp.stack(draws[:size], axis=1)
 
 

@@ -1,8 +1,8 @@
 """The CPU engine's sampling kernels: perturb, roll out and score a tile of samples in one pass; average in a second.
 
 The first pass makes the noise of a tile where it is used, moves the robots, checks contacts and adds up rewards, with
-everything the tile needs in cache. The second makes the noise of the samples that count again, which is cheaper than
-writing it to memory and reading it back.
+everything the tile needs in cache. It keeps the noise for the second pass: a quarter of a number per sample and control,
+because samples share it, which is a third of the time of making it again.
 """
 
 from __future__ import annotations
@@ -13,35 +13,35 @@ import numpy as np
 from numba.extending import register_jitable
 
 from d4orm_env.core import collision, dynamics, reward, transition
-from d4orm_env.engine import noise, tiles
+from d4orm_env.core.dynamics import MODELS, Model
+from d4orm_env.engine import noise, proximity, tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.noise import MIRROR
+from d4orm_env.engine.noise import DRAWS
+from d4orm_env.engine.proximity import FIRST, STATIC, TOUCHED, mark_robots, measure_strides, near_static
 from d4orm_env.engine.tiles import (
-    CONTROL,
-    DISTANCE2,
     DOCKED,
-    GOAL,
+    HOLONOMIC2D,
+    HOLONOMIC3D,
     INLINED,
     NEAR_OBSTACLE,
     NEAR_ROBOT,
     ONE,
+    OPS,
     OPTIONS,
-    ROWS,
-    SCRATCH,
+    READ,
     STATE,
     STRIDE,
     TILE,
     TOTAL,
+    VELOCITY2D,
+    WRITE,
     ZERO,
     compiled,
     inlined,
-    robot_rows,
+    make_stepper,
 )
 
-SOURCES = fingerprint((dynamics, transition, collision, reward, noise, tiles))
-LANES = 32
-"""Width of blocked sums: fixed, so that results do not depend on the machine's vectors."""
-
+SOURCES = fingerprint((dynamics, transition, collision, reward, noise, tiles, proximity))
 for _function in (
     noise.xor_shift,
     noise.hash32,
@@ -90,213 +90,178 @@ BIT_OPS = noise.BitOps(_uint32, _int32, _to_float, _float_bits, _bits_float, _sq
 
 @compiled
 def _perturb(key: Any, first: Any, offset: Any, scale: Any, rows: Any) -> None:
-    """Fill two rows with ``offset + scale * noise``, mirrored as :func:`noise.antithetic` says."""
-    counter = first // 2
-    for s in range(MIRROR):
-        x, y = noise.normal_pair(np.uint32(counter + s), key, BIT_OPS)
-        x, y = scale[0] * x, scale[1] * y
+    """Fill two rows with ``offset + scale * noise``, turned as :func:`noise.turned` says, and the next half row with the
+    noise itself."""
+    for s in range(DRAWS):
+        x, y = noise.normal_pair(np.uint32(first + s), key, BIT_OPS)
+        rows[2 * TILE + s] = x
+        rows[2 * TILE + DRAWS + s] = y
+        x, y, across, along = scale[0] * x, scale[1] * y, scale[0] * y, scale[1] * x
         rows[s] = offset[0] + x
-        rows[MIRROR + s] = offset[0] - x
+        rows[DRAWS + s] = offset[0] - x
+        rows[2 * DRAWS + s] = offset[0] - across
+        rows[3 * DRAWS + s] = offset[0] + across
         rows[TILE + s] = offset[1] + y
-        rows[TILE + MIRROR + s] = offset[1] - y
+        rows[TILE + DRAWS + s] = offset[1] - y
+        rows[TILE + 2 * DRAWS + s] = offset[1] + along
+        rows[TILE + 3 * DRAWS + s] = offset[1] - along
+
+
+@compiled
+def _keep(draws: Any, kept: Any) -> None:
+    for s in range(DRAWS):
+        kept[s] = draws[s]
 
 
 @inlined
-def _perturb_robot(seed: Any, step: Any, t: Any, first: Any, k: Any, offset: Any, scale: Any, w: Any) -> None:
-    """Fill the control rows of robot ``k`` at time ``t``."""
+def _perturb_robot(
+    seed: Any, step: Any, t: Any, first: Any, k: Any, offset: Any, scale: Any, kept: Any, controls: Any
+) -> None:
+    """Fill ``controls`` with the samples of robot ``k``'s controls at time ``t``, a row a component, and put the noise
+    into ``kept`` ``(P, 2, M / 4)`` from counter number ``first`` on."""
     num_controls = offset.shape[0]
     for pair in range((num_controls + 1) // 2):
         key = noise.stream_key(seed[0], seed[1], np.uint32(step), np.uint32(k), np.uint32(t), np.uint32(pair), BIT_OPS)
         row = 2 * pair
         # Of an odd number of components the last leaves its partner in the spare row.
         last = min(row + 1, num_controls - 1)
-        rows = robot_rows(w, k)[(CONTROL + row) * TILE : (CONTROL + row + 2) * TILE]
+        rows = controls[row * TILE : (row + 3) * TILE]
         _perturb(key, first, (offset[row], offset[last]), (scale[row], scale[last]), rows)
+        for i in range(2):
+            _keep(rows[2 * TILE + i * DRAWS : 2 * TILE + (i + 1) * DRAWS], kept[pair, i, first : first + DRAWS])
 
 
-@inlined
-def _extent(row: Any, scratch: Any) -> Any:
-    """Smallest and largest number of a row, by halving: a running minimum would not vectorise.
+def _runner(model: Model) -> Any:
+    """The compiled step of one robot of this model in every sample of a tile, which adds its reward without
+    violations. The controls are the same few rows for every robot: they stay in cache."""
+    step, limit_control = make_stepper(model), inlined(model.functions.limit_control)
+    read_x, write_x = READ[model.state_size], WRITE[model.state_size]
+    read_u = READ[model.control_size]
+    dimension = model.dimension
 
-    Args:
-        row: ``(TILE,)``.
-        scratch: ``(TILE,)``.
-    """
-    for s in range(32):
-        scratch[s] = _smaller(row[s], row[s + 32])
-        scratch[s + 32] = _larger(row[s], row[s + 32])
-    for s in range(16):
-        scratch[s] = _smaller(scratch[s], scratch[s + 16])
-        scratch[s + 32] = _larger(scratch[s + 32], scratch[s + 48])
-    for s in range(8):
-        scratch[s] = _smaller(scratch[s], scratch[s + 8])
-        scratch[s + 32] = _larger(scratch[s + 32], scratch[s + 40])
-    for s in range(4):
-        scratch[s] = _smaller(scratch[s], scratch[s + 4])
-        scratch[s + 32] = _larger(scratch[s + 32], scratch[s + 36])
-    lower = _smaller(_smaller(scratch[0], scratch[1]), _smaller(scratch[2], scratch[3]))
-    upper = _larger(_larger(scratch[32], scratch[33]), _larger(scratch[34], scratch[35]))
-    return lower, upper
-
-
-@inlined
-def _smaller(a: Any, b: Any) -> Any:
-    """The smaller, and NaN if either is."""
-    return a if (a < b) | (a != a) else b
-
-
-@inlined
-def _larger(a: Any, b: Any) -> Any:
-    """The larger, and NaN if either is."""
-    return a if (a > b) | (a != a) else b
-
-
-@inlined
-def _bound(k: Any, w: Any, box: Any) -> None:
-    """Fill ``box`` ``(K, 2, d)`` with the smallest box around robot ``k``'s places in all samples."""
-    robot = robot_rows(w, k)
-    for axis in range(box.shape[2]):
-        lower, upper = _extent(robot[axis * TILE : (axis + 1) * TILE], robot[SCRATCH * TILE : ROWS * TILE])
-        # A sample that blew up may be anywhere, and must not hide where the others are.
-        box[k, 0, axis] = lower if lower == lower else -np.inf
-        box[k, 1, axis] = upper if upper == upper else np.inf
-
-
-@inlined
-def _gap(low_a: Any, high_a: Any, low_b: Any, high_b: Any) -> Any:
-    return max(max(low_a - high_b, low_b - high_a), ZERO)
-
-
-@inlined
-def _boxes_apart(box: Any, k: Any, other: Any, reach: Any) -> Any:
-    gap2 = ZERO
-    for axis in range(box.shape[2]):
-        gap = _gap(box[k, 0, axis], box[k, 1, axis], box[other, 0, axis], box[other, 1, axis])
-        gap2 += gap * gap
-    return gap2 > reach * reach
-
-
-@inlined
-def _point_apart(box: Any, k: Any, point: Any, axes: Any, reach: Any) -> Any:
-    gap2 = ZERO
-    for axis in range(axes):
-        gap = _gap(box[k, 0, axis], box[k, 1, axis], point[axis], point[axis])
-        gap2 += gap * gap
-    return gap2 > reach * reach
-
-
-@inlined
-def _mark_near_robots(arrays: Any, moving: Any, moving_radius: Any, box: Any, w: Any) -> None:
-    dimension = box.shape[2]
-    for k in range(box.shape[0]):
-        for other in range(k):
-            reach = arrays.radius[k] + arrays.radius[other] + arrays.margin
-            if not _boxes_apart(box, k, other, reach):
-                tiles.mark_pair(reach, k, other, dimension, w)
-        for body in range(moving.shape[0]):
-            reach = arrays.radius[k] + moving_radius[body] + arrays.margin
-            if not _point_apart(box, k, moving[body], dimension, reach):
-                tiles.mark_round(reach, k, moving[body], dimension, NEAR_ROBOT, w)
-
-
-@inlined
-def _near_static(arrays: Any, k: Any, box: Any) -> Any:
-    """Whether any sample of robot ``k`` may be within the margin of an obstacle or the bounds."""
-    dimension = box.shape[2]
-    reach = arrays.radius[k] + arrays.margin
-    for axis in range(dimension):
-        if box[k, 0, axis] - reach <= arrays.bounds[0, axis] or box[k, 1, axis] + reach >= arrays.bounds[1, axis]:
-            return True
-    for i in range(arrays.balls.shape[0]):
-        if not _point_apart(box, k, arrays.balls[i], dimension, reach + arrays.balls[i, dimension]):
-            return True
-    for i in range(arrays.cylinders.shape[0]):
-        if not _point_apart(box, k, arrays.cylinders[i], 2, reach + arrays.cylinders[i, 2]):
-            return True
-    for i in range(arrays.boxes.shape[0]):
-        gap2 = ZERO
-        for axis in range(dimension):
-            lower, upper = arrays.boxes[i, axis], arrays.boxes[i, dimension + axis]
-            gap = _gap(box[k, 0, axis], box[k, 1, axis], lower, upper)
-            gap2 += gap * gap
-        if gap2 <= reach * reach:
-            return True
-    return False
-
-
-@inlined
-def _add_rewards(arrays: Any, count: Any, w: Any) -> None:
-    for k in range(arrays.radius.shape[0]):
-        robot, inverse = robot_rows(w, k), arrays.inverse_initial_distance[k]
+    @compiled
+    def run(limits: Any, h: Any, docking: Any, goal: Any, inverse: Any, controls: Any, w: Any) -> None:
+        goal = goal[:dimension]
         for s in range(TILE):
-            distance = np.sqrt(robot[DISTANCE2 * TILE + s])
-            near_robot, near_obstacle = robot[NEAR_ROBOT * TILE + s], robot[NEAR_OBSTACLE * TILE + s]
-            gain = reward.step_reward(distance, inverse, near_robot, near_obstacle, ONE)
-            robot[TOTAL * TILE + s] += count * gain
+            u = limit_control(read_u(controls, 0, s), limits, OPS)
+            standing = w[DOCKED * TILE + s] > ZERO
+            x, gap2, docked = step(standing, read_x(w, STATE * TILE, s), u, goal, limits, h, docking)
+            write_x(w, STATE * TILE, s, x)
+            w[DOCKED * TILE + s] = ONE if docked else ZERO
+            w[TOTAL * TILE + s] += reward.step_reward(np.sqrt(gap2), inverse, ZERO, ZERO, ONE)
+
+    return run
+
+
+_run_holonomic2d = _runner(MODELS["holonomic2d"])
+_run_holonomic3d = _runner(MODELS["holonomic3d"])
+_run_velocity2d = _runner(MODELS["velocity2d"])
+_run_differential_drive = _runner(MODELS["differential_drive"])
+
+
+@inlined
+def _run_robot(
+    code: Any, limits: Any, h: Any, docking: Any, goal: Any, inverse: Any, k: Any, controls: Any, w: Any
+) -> None:
+    """Move robot ``k`` one step in every sample of the tile and add its reward, violations aside."""
+    robot = w[k * STRIDE : (k + 1) * STRIDE]
+    if code == HOLONOMIC2D:
+        _run_holonomic2d(limits, h, docking, goal, inverse, controls, robot)
+    elif code == HOLONOMIC3D:
+        _run_holonomic3d(limits, h, docking, goal, inverse, controls, robot)
+    elif code == VELOCITY2D:
+        _run_velocity2d(limits, h, docking, goal, inverse, controls, robot)
+    else:
+        _run_differential_drive(limits, h, docking, goal, inverse, controls, robot)
+
+
+@inlined
+def _subtract(row: Any, count: Any, k: Any, w: Any) -> None:
+    """Take ``count`` times a row of flags of robot ``k`` from its reward."""
+    robot = w[k * STRIDE : (k + 1) * STRIDE]
+    for s in range(TILE):
+        robot[TOTAL * TILE + s] -= count * robot[row * TILE + s]
+
+
+@inlined
+def _add_standing(goal: Any, inverse: Any, count: Any, k: Any, w: Any) -> None:
+    """Add the reward, violations aside, of ``count`` steps in which robot ``k`` does not move."""
+    robot = w[k * STRIDE : (k + 1) * STRIDE]
+    for s in range(TILE):
+        gap2 = ZERO
+        for axis in range(goal.shape[1]):
+            gap = robot[(STATE + axis) * TILE + s] - goal[k, axis]
+            gap2 += gap * gap
+        robot[TOTAL * TILE + s] += count * reward.step_reward(np.sqrt(gap2), inverse[k], ZERO, ZERO, ONE)
 
 
 @inlined
 def _all_docked(k: Any, w: Any) -> Any:
-    robot = robot_rows(w, k)
+    robot = w[k * STRIDE : (k + 1) * STRIDE]
     if robot[DOCKED * TILE] == ZERO:
         return False
-    lower, _ = _extent(robot[DOCKED * TILE : (DOCKED + 1) * TILE], robot[SCRATCH * TILE : ROWS * TILE])
-    return lower > ZERO
+    total = ZERO
+    for s in range(TILE):
+        total += robot[DOCKED * TILE + s]
+    return total == np.float32(TILE)
 
 
 @inlined
 def _begin_tile(arrays: Any, docked: Any, w: Any) -> None:
     for k in range(arrays.radius.shape[0]):
-        o = k * STRIDE
-        for s in range(TILE):
-            for i in range(arrays.start.shape[1]):
-                w[o + (STATE + i) * TILE + s] = arrays.start[k, i]
-            w[o + DOCKED * TILE + s] = ONE if docked[k] else ZERO
-            w[o + NEAR_ROBOT * TILE + s] = ZERO
-            w[o + NEAR_OBSTACLE * TILE + s] = ZERO
-            w[o + TOTAL * TILE + s] = ZERO
-            for axis in range(arrays.goal.shape[1]):
-                w[o + (GOAL + axis) * TILE + s] = arrays.goal[k, axis]
-    tiles.measure_goal_distance(arrays.radius.shape[0], arrays.goal.shape[1], w)
+        robot = w[k * STRIDE : (k + 1) * STRIDE]
+        for i in range(arrays.start.shape[1]):
+            robot[(STATE + i) * TILE : (STATE + i + 1) * TILE] = arrays.start[k, i]
+        robot[DOCKED * TILE : (DOCKED + 1) * TILE] = ONE if docked[k] else ZERO
+        robot[TOTAL * TILE : (TOTAL + 1) * TILE] = ZERO
 
 
 @compiled
 def _score_tile(
     arrays: Any, offset: Any, scale: Any, docked: Any, collisions: Any, moving: Any, moving_radius: Any, seed: Any,
-    step: Any, first: Any, w: Any, box: Any,
+    step: Any, first: Any, stride: Any, kept: Any, w: Any, controls: Any, standing: Any, due: Any, box: Any,
 ) -> None:  # fmt: skip
-    """Roll a tile of samples out from number ``first`` and leave their summed rewards in the total rows."""
+    """Roll a tile of samples out whose noise begins with counter ``first`` and leave their summed rewards in the total rows."""
     num_steps, num_robots, _ = offset.shape
-    standing = np.zeros(num_robots, np.bool_)
+    # Taken out of the tuple once: every access counts a reference, which costs as much as several samples.
+    codes, all_limits, goals, inverse = arrays.model_codes, arrays.limits, arrays.goal, arrays.inverse_initial_distance
+    h = transition.TimeStep(arrays.time_step[0], arrays.time_step[1], arrays.time_step[2], arrays.time_step[3])
+    docking, last = (arrays.squared_goal_radius, arrays.squared_goal_speed), goals.shape[1] - 1
+    radius, margin = arrays.radius, arrays.margin
+    standing[:] = False
     _begin_tile(arrays, docked, w)
+    proximity.begin(due)
     for t in range(num_steps):
-        num_standing = 0
         for k in range(num_robots):
+            _perturb_robot(seed, step, t, first, k, offset[t, k], scale[t, k], kept[k, t], controls)
             if standing[k]:
-                num_standing += 1
+                # Its noise counts in the mean all the same.
                 continue
-            _perturb_robot(seed, step, t, first, k, offset[t, k], scale[t, k], w)
-            tiles.move_robot(arrays, k, w)
+            limits = (all_limits[k, 0], all_limits[k, 1], all_limits[k, 2])
+            goal = (goals[k, 0], goals[k, 1], goals[k, last])
+            _run_robot(codes[k], limits, h, docking, goal, inverse[k], k, controls, w)
+            count = ONE
             # Once a robot stands in every sample nothing about it changes any more: neither its place nor its flags
             # towards static obstacles.
-            standing[k] = _all_docked(k, w)
-            _bound(k, w, box)
-            robot_rows(w, k)[NEAR_OBSTACLE * TILE : (NEAR_OBSTACLE + 1) * TILE] = ZERO
-            if _near_static(arrays, k, box):
-                tiles.mark_obstacles(arrays, k, arrays.margin, w)
-        if num_standing == num_robots and moving.shape[1] == 0:
-            _add_rewards(arrays, np.float32(num_steps - t), w)
-            break
+            if _all_docked(k, w):
+                standing[k] = True
+                count = np.float32(num_steps - t)
+                _add_standing(goals, inverse, count - ONE, k, w)
+            if due[k, STATIC] <= t and near_static(arrays, k, t, num_steps, stride, w, due, box):
+                tiles.clear_row(NEAR_OBSTACLE, k, w)
+                tiles.mark_obstacles(arrays, k, margin, w)
+                _subtract(NEAR_OBSTACLE, count, k, w)
         if collisions:
-            tiles.clear_row(NEAR_ROBOT, num_robots, w)
-            _mark_near_robots(arrays, moving[t], moving_radius, box, w)
-        _add_rewards(arrays, ONE, w)
+            mark_robots(radius, margin, moving[t], moving_radius, t, num_steps, stride, w, due, box)
+            for k in range(num_robots):
+                if due[k, TOUCHED] != 0:
+                    _subtract(NEAR_ROBOT, ONE, k, w)
 
 
 @cached_kernel(SOURCES, **OPTIONS)
 def score_tiles(
     arrays: Any, offset: Any, scale: Any, docked: Any, collisions: Any, moving: Any, moving_radius: Any, seed: Any,
-    step: Any, tile_range: Any, rewards: Any,
+    step: Any, tile_range: Any, kept: Any, rewards: Any,
 ) -> None:  # fmt: skip
     """Fill the columns of ``rewards`` ``(K, M)`` that a range of tiles covers with mean rewards over time.
 
@@ -311,15 +276,22 @@ def score_tiles(
         seed: Two uint32 words.
         step: Number of the denoising step.
         tile_range: First tile and the one after the last.
+        kept: ``(K, H, P, 2, M / 4)`` the noise, in ``P`` pairs of components, output; ``M`` rounded up to whole tiles.
         rewards: Output.
     """
     num_robots, num_samples = rewards.shape
     w = np.zeros(num_robots * STRIDE, np.float32)
+    controls = np.zeros(5 * TILE, np.float32)
+    stride = np.empty(num_robots + moving.shape[1], np.float32)
+    measure_strides(arrays.limits, arrays.time_step[0], moving, stride)
+    standing = np.empty(num_robots, np.bool_)
+    due = np.empty((num_robots, FIRST + num_robots + moving.shape[1]), np.int32)
     box = np.empty((num_robots, 2, arrays.goal.shape[1]), np.float32)
     for index in range(tile_range[0], tile_range[1]):
         first = index * TILE
         _score_tile(
-            arrays, offset, scale, docked, collisions, moving, moving_radius, seed, step, first, w, box
+            arrays, offset, scale, docked, collisions, moving, moving_radius, seed, step, index * DRAWS, stride, kept, w,
+            controls, standing, due, box,
         )  # fmt: skip
         for k in range(num_robots):
             # The last tile may reach beyond the last sample.
@@ -328,73 +300,43 @@ def score_tiles(
 
 
 @cached_kernel(SOURCES, **OPTIONS)
-def average_noise(
-    seed: Any,
-    step: Any,
-    counters: Any,
-    odd: Any,
-    even: Any,
-    counts: Any,
-    time_range: Any,
-    first_moment: Any,
-    second_moment: Any,
-) -> None:
-    """Weighted mean of the noise, and of its square, made again for the samples that have any weight.
+def average_noise(kept: Any, odd: Any, even: Any, time_range: Any, first_moment: Any, second_moment: Any) -> None:
+    """Weighted mean of the noise, and of its square.
 
     Args:
-        seed: Two uint32 words.
-        step: Number of the denoising step.
-        counters: ``(K, .)`` uint32, the noise that counts for each robot.
-        odd: ``(K, .)`` weight of the noise: that of its sample minus that of the mirrored one.
-        even: ``(K, .)`` weight of its square: the sum of the two.
-        counts: ``(K,)`` how many counters there are; the lists are padded with weight zero to whole blocks.
+        kept: The noise that :func:`score_tiles` kept.
+        odd: ``(2, K, M / 4)`` weights summed over the samples that share a counter, times the cosine of their turn and
+            times its sine.
+        even: ``(2, K, M / 4)`` the same with the squares of cosine and sine.
         time_range: First time step and the one after the last.
         first_moment: ``(H, K, m)``, output.
         second_moment: ``(H, K, m)``, output, or an empty array to do without.
     """
     num_controls = first_moment.shape[2]
-    with_square = second_moment.size > 0
-    w = np.empty(6 * LANES, np.float32)
     for t in range(time_range[0], time_range[1]):
         for k in range(first_moment.shape[1]):
-            for pair in range((num_controls + 1) // 2):
-                key = noise.stream_key(
-                    seed[0], seed[1], np.uint32(step), np.uint32(k), np.uint32(t), np.uint32(pair), BIT_OPS
-                )
-                _sum_moments(key, counters[k], odd[k], even[k], counts[k], with_square, w)
-                for row in range(min(2, num_controls - 2 * pair)):
-                    first_moment[t, k, 2 * pair + row] = _total(w, 2 + row)
-                    if with_square:
-                        second_moment[t, k, 2 * pair + row] = _total(w, 4 + row)
+            for pair in range(kept.shape[2]):
+                x, y, last = kept[k, t, pair, 0], kept[k, t, pair, 1], 2 * pair + 1
+                first_moment[t, k, last - 1] = _dot(odd[0, k], x) - _dot(odd[1, k], y)
+                if last < num_controls:
+                    first_moment[t, k, last] = _dot(odd[0, k], y) + _dot(odd[1, k], x)
+                if second_moment.size > 0:
+                    second_moment[t, k, last - 1] = _dot_squares(even[0, k], x) + _dot_squares(even[1, k], y)
+                    if last < num_controls:
+                        second_moment[t, k, last] = _dot_squares(even[0, k], y) + _dot_squares(even[1, k], x)
 
 
-@inlined
-def _sum_moments(key: Any, counters: Any, odd: Any, even: Any, count: Any, with_square: Any, w: Any) -> None:
-    """Sums over blocks of :data:`LANES`, lane by lane, so that they vectorise and come out the same everywhere.
-
-    ``w`` ``(6 * LANES,)`` holds one block of the noise's two components, then the running sums: first moments of both,
-    second moments of both.
-    """
-    w[2 * LANES :] = ZERO
-    for first in range(0, count, LANES):
-        counter, weight = counters[first : first + LANES], odd[first : first + LANES]
-        for lane in range(LANES):
-            x, y = noise.normal_pair(counter[lane], key, BIT_OPS)
-            w[lane] = x
-            w[LANES + lane] = y
-        for lane in range(LANES):
-            w[2 * LANES + lane] += weight[lane] * w[lane]
-            w[3 * LANES + lane] += weight[lane] * w[LANES + lane]
-        if with_square:
-            weight = even[first : first + LANES]
-            for lane in range(LANES):
-                w[4 * LANES + lane] += weight[lane] * w[lane] * w[lane]
-                w[5 * LANES + lane] += weight[lane] * w[LANES + lane] * w[LANES + lane]
-
-
-@inlined
-def _total(w: Any, row: Any) -> Any:
+@compiled
+def _dot(weight: Any, x: Any) -> Any:
     total = ZERO
-    for lane in range(LANES):
-        total += w[row * LANES + lane]
+    for i in range(weight.shape[0]):
+        total += weight[i] * x[i]
+    return total
+
+
+@compiled
+def _dot_squares(weight: Any, x: Any) -> Any:
+    total = ZERO
+    for i in range(weight.shape[0]):
+        total += weight[i] * x[i] * x[i]
     return total

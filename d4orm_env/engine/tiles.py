@@ -31,12 +31,17 @@ STATE, CONTROL, GOAL, DOCKED, DISTANCE2, NEAR_ROBOT, NEAR_OBSTACLE, TOTAL = 0, 6
 SCRATCH, ROWS = 18, 19
 STRIDE = ROWS * TILE
 
-OPTIONS: dict[str, Any] = {"fastmath": {"contract", "nsz"}, "error_model": "numpy"}
-"""Contraction lets multiply-adds fuse; nothing that changes the meaning of NaN or infinity is allowed."""
+OPTIONS: dict[str, Any] = {"fastmath": {"contract", "nsz", "reassoc"}, "error_model": "numpy"}
+"""Multiply-adds may fuse and sums be regrouped, which removes half the work of a Runge-Kutta step; nothing that changes
+the meaning of NaN or infinity is allowed."""
 
-compiled = numba.njit(nogil=True, **OPTIONS)
+UNCOUNTED: dict[str, Any] = OPTIONS | {"_nrt": False}
+"""For everything that kernels call: without numba's reference counts, which would cost more than the sums they surround.
+Such functions cannot make arrays."""
 
-INLINED: dict[str, Any] = OPTIONS | {"forceinline": True}
+compiled = numba.njit(nogil=True, **UNCOUNTED)
+
+INLINED: dict[str, Any] = UNCOUNTED | {"forceinline": True}
 """For functions that take functions (a model, ``Ops``): inlining leaves no function pointer behind, so that numba can
 keep the kernels on disk. And for those that take a problem's arrays, which are a long argument to pass by value."""
 
@@ -82,7 +87,8 @@ _S1, _S2, _S3 = np.float32(-1.6666654611e-1), np.float32(8.3321608736e-3), np.fl
 _C1, _C2, _C3 = np.float32(4.166664568298827e-2), np.float32(-1.388731625493765e-3), np.float32(2.443315711809948e-5)
 
 
-@compiled
+# The order of these operations is what makes them accurate.
+@numba.njit(nogil=True, **UNCOUNTED | {"fastmath": {"contract", "nsz"}})
 def _shifted_sine(x: Any, quarters: Any) -> Any:
     """``sin(x + quarters * pi / 2)``."""
     nearest = np.floor(x * _TWO_OVER_PI + _HALF)
@@ -197,49 +203,56 @@ def _squared_gap3(x: Any, y: Any) -> Any:
     return _squared_norm3((x[0] - y[0], x[1] - y[1], x[2] - y[2]))
 
 
-@inlined
-def robot_rows(w: Any, k: Any) -> Any:
-    """The rows of robot ``k``. A view: indices into it are plainly not negative, which the vectoriser needs to know."""
-    return w[k * STRIDE : (k + 1) * STRIDE]
-
-
-_READ = {2: _read2, 3: _read3, 4: _read4, 6: _read6}
-_WRITE = {2: _write2, 3: _write3, 4: _write4, 6: _write6}
+READ = {2: _read2, 3: _read3, 4: _read4, 6: _read6}
+WRITE = {2: _write2, 3: _write3, 4: _write4, 6: _write6}
 _PICK = {2: _pick2, 3: _pick3, 4: _pick4, 6: _pick6}
 _SQUARED_NORM = {2: _squared_norm2, 3: _squared_norm3}
 _SQUARED_GAP = {2: _squared_gap2, 3: _squared_gap3}
 
 
+def make_stepper(model: Model) -> Any:
+    """The compiled step of one robot of this model in one world, ``(standing, x, u, goal, limits, h, docking) -> (x,
+    squared distance to the goal, whether docked)``, for a control that is within its limits."""
+    functions = ModelFunctions(*(inlined(function) for function in model.functions))
+    pick_x = _PICK[model.state_size]
+    squared_norm, squared_gap = _SQUARED_NORM[model.dimension], _SQUARED_GAP[model.dimension]
+
+    @inlined
+    def step(standing: Any, x: Any, u: Any, goal: Any, limits: Any, h: Any, docking: Any) -> Any:
+        y = pick_x(standing, x, transition.advance(functions, x, u, limits, h, OPS))
+        gap2 = squared_gap(y, goal)
+        speed2 = squared_norm(functions.velocity(y, u, OPS))
+        arrives = transition.arrives(gap2, speed2, docking[0], docking[1])
+        return pick_x(arrives, functions.rest(y, ZERO), y), gap2, standing | arrives
+
+    return step
+
+
 def _mover(model: Model) -> Any:
     """The compiled step of one robot of this model in every world of a tile."""
-    functions = ModelFunctions(*(inlined(function) for function in model.functions))
-    read_x, write_x, pick_x = _READ[model.state_size], _WRITE[model.state_size], _PICK[model.state_size]
-    read_u, write_u, pick_u = _READ[model.control_size], _WRITE[model.control_size], _PICK[model.control_size]
-    read_goal = _READ[model.dimension]
-    squared_norm, squared_gap = _SQUARED_NORM[model.dimension], _SQUARED_GAP[model.dimension]
+    step, limit_control = make_stepper(model), inlined(model.functions.limit_control)
+    read_x, write_x = READ[model.state_size], WRITE[model.state_size]
+    read_u, write_u, pick_u = READ[model.control_size], WRITE[model.control_size], _PICK[model.control_size]
+    read_goal = READ[model.dimension]
     no_control = (ZERO,) * model.control_size
 
     @compiled
     def move(limits: Any, h: Any, docking: Any, w: Any) -> None:
         for s in range(TILE):
-            x = read_x(w, STATE * TILE, s)
-            u = functions.limit_control(read_u(w, CONTROL * TILE, s), limits, OPS)
-            y = transition.advance(functions, x, u, limits, h, OPS)
-            gap2 = squared_gap(y, read_goal(w, GOAL * TILE, s))
-            speed2 = squared_norm(functions.velocity(y, u, OPS))
-            arrives = transition.arrives(gap2, speed2, docking[0], docking[1])
-            docked, distance2 = w[DOCKED * TILE + s], w[DISTANCE2 * TILE + s]
-            standing = docked > ZERO
-            write_x(w, STATE * TILE, s, pick_x(standing, x, pick_x(arrives, functions.rest(y, ZERO), y)))
+            u = limit_control(read_u(w, CONTROL * TILE, s), limits, OPS)
+            standing = w[DOCKED * TILE + s] > ZERO
+            goal = read_goal(w, GOAL * TILE, s)
+            x, gap2, docked = step(standing, read_x(w, STATE * TILE, s), u, goal, limits, h, docking)
+            write_x(w, STATE * TILE, s, x)
             write_u(w, CONTROL * TILE, s, pick_u(standing, no_control, u))
-            w[DOCKED * TILE + s] = ONE if standing | arrives else ZERO
-            w[DISTANCE2 * TILE + s] = distance2 if standing else gap2
+            w[DOCKED * TILE + s] = ONE if docked else ZERO
+            w[DISTANCE2 * TILE + s] = gap2
 
     return move
 
 
-_HOLONOMIC2D, _HOLONOMIC3D = MODEL_CODES["holonomic2d"], MODEL_CODES["holonomic3d"]
-_VELOCITY2D = MODEL_CODES["velocity2d"]
+HOLONOMIC2D, HOLONOMIC3D = MODEL_CODES["holonomic2d"], MODEL_CODES["holonomic3d"]
+VELOCITY2D = MODEL_CODES["velocity2d"]
 _move_holonomic2d = _mover(MODELS["holonomic2d"])
 _move_holonomic3d = _mover(MODELS["holonomic3d"])
 _move_velocity2d = _mover(MODELS["velocity2d"])
@@ -253,30 +266,29 @@ def move_robot(arrays: Any, k: Any, w: Any) -> None:
     limits = (arrays.limits[k, 0], arrays.limits[k, 1], arrays.limits[k, 2])
     docking = (arrays.squared_goal_radius, arrays.squared_goal_speed)
     code = arrays.model_codes[k]
-    if code == _HOLONOMIC2D:
-        _move_holonomic2d(limits, h, docking, robot_rows(w, k))
-    elif code == _HOLONOMIC3D:
-        _move_holonomic3d(limits, h, docking, robot_rows(w, k))
-    elif code == _VELOCITY2D:
-        _move_velocity2d(limits, h, docking, robot_rows(w, k))
+    if code == HOLONOMIC2D:
+        _move_holonomic2d(limits, h, docking, w[k * STRIDE : (k + 1) * STRIDE])
+    elif code == HOLONOMIC3D:
+        _move_holonomic3d(limits, h, docking, w[k * STRIDE : (k + 1) * STRIDE])
+    elif code == VELOCITY2D:
+        _move_velocity2d(limits, h, docking, w[k * STRIDE : (k + 1) * STRIDE])
     else:
-        _move_differential_drive(limits, h, docking, robot_rows(w, k))
+        _move_differential_drive(limits, h, docking, w[k * STRIDE : (k + 1) * STRIDE])
 
 
 @inlined
-def clear_row(row: Any, num_robots: Any, w: Any) -> None:
-    """Set a row of every robot to zero."""
-    for k in range(num_robots):
-        robot = robot_rows(w, k)
-        for s in range(TILE):
-            robot[row * TILE + s] = ZERO
+def clear_row(row: Any, k: Any, w: Any) -> None:
+    """Set a row of robot ``k`` to zero."""
+    robot = w[k * STRIDE : (k + 1) * STRIDE]
+    for s in range(TILE):
+        robot[row * TILE + s] = ZERO
 
 
 @inlined
 def measure_goal_distance(num_robots: Any, dimension: Any, w: Any) -> None:
     """Fill the squared distance to the goal from places."""
     for k in range(num_robots):
-        robot = robot_rows(w, k)
+        robot = w[k * STRIDE : (k + 1) * STRIDE]
         for s in range(TILE):
             total = ZERO
             for axis in range(dimension):
@@ -317,7 +329,7 @@ def mark_pairs(arrays: Any, extra: Any, w: Any) -> None:
 def mark_round(reach: Any, k: Any, centre: Any, axes: Any, row: Any, w: Any) -> None:
     """Flag robot ``k`` where it is within ``reach`` of a centre, over the first two or three axes."""
     reach2 = reach * reach
-    robot = robot_rows(w, k)
+    robot = w[k * STRIDE : (k + 1) * STRIDE]
     flag = row * TILE
     if axes == 2:
         point = (centre[0], centre[1])
@@ -334,7 +346,7 @@ def mark_round(reach: Any, k: Any, centre: Any, axes: Any, row: Any, w: Any) -> 
 @inlined
 def _mark_box(reach: Any, k: Any, box: Any, dimension: Any, w: Any) -> None:
     reach2 = reach * reach
-    robot = robot_rows(w, k)
+    robot = w[k * STRIDE : (k + 1) * STRIDE]
     for s in range(TILE):
         gap2 = ZERO
         for axis in range(dimension):
@@ -358,7 +370,7 @@ def mark_obstacles(arrays: Any, k: Any, extra: Any, w: Any) -> None:
     for axis in range(dimension):
         lower, upper = arrays.bounds[0, axis], arrays.bounds[1, axis]
         if lower > -np.inf or upper < np.inf:
-            robot = robot_rows(w, k)
+            robot = w[k * STRIDE : (k + 1) * STRIDE]
             for s in range(TILE):
                 outside = ONE if collision.leaves(robot[axis * TILE + s], reach, lower, upper) else ZERO
                 robot[NEAR_OBSTACLE * TILE + s] = _maximum(robot[NEAR_OBSTACLE * TILE + s], outside)
@@ -366,7 +378,7 @@ def mark_obstacles(arrays: Any, k: Any, extra: Any, w: Any) -> None:
 
 def _motion_reader(model: Model) -> Any:
     velocity_of = inlined(model.functions.velocity)
-    read_x, read_u = _READ[model.state_size], _READ[model.control_size]
+    read_x, read_u = READ[model.state_size], READ[model.control_size]
     dimension = model.dimension
 
     @compiled
@@ -389,11 +401,11 @@ _HEADING = np.array([-1 if model.heading_index is None else model.heading_index 
 def read_motion(arrays: Any, k: Any, s: Any, w: Any, velocity: Any, heading: Any) -> None:
     """Fill the velocity ``(d,)`` and the heading's cosine and sine ``(2,)`` of robot ``k`` in world ``s``."""
     code = arrays.model_codes[k]
-    if code == _HOLONOMIC2D:
+    if code == HOLONOMIC2D:
         _velocity_holonomic2d(k * STRIDE, s, w, velocity)
-    elif code == _HOLONOMIC3D:
+    elif code == HOLONOMIC3D:
         _velocity_holonomic3d(k * STRIDE, s, w, velocity)
-    elif code == _VELOCITY2D:
+    elif code == VELOCITY2D:
         _velocity_velocity2d(k * STRIDE, s, w, velocity)
     else:
         _velocity_differential_drive(k * STRIDE, s, w, velocity)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 from numba.extending import register_jitable
 
@@ -19,6 +20,7 @@ from d4orm_env.engine.tiles import (
     DISTANCE2,
     DOCKED,
     GOAL,
+    INLINED,
     NEAR_OBSTACLE,
     NEAR_ROBOT,
     ONE,
@@ -40,7 +42,7 @@ for _function in (
     observation._find_nearest_obstacles,
     observation._insert_round,
 ):
-    register_jitable(**OPTIONS)(_function)
+    register_jitable(**INLINED)(_function)
 
 
 @compiled
@@ -87,8 +89,9 @@ def _store(state: Any, control: Any, docked: Any, first: Any, w: Any) -> None:
 def _judge(arrays: Any, inverse: Any, first: Any, w: Any, collided: Any, violated: Any, rewards: Any) -> None:
     """Flag contacts and margin violations and compute rewards; all outputs ``(B, K)``."""
     num_robots = arrays.radius.shape[0]
-    tiles.clear_row(NEAR_ROBOT, num_robots, w)
-    tiles.clear_row(NEAR_OBSTACLE, num_robots, w)
+    for k in range(num_robots):
+        tiles.clear_row(NEAR_ROBOT, k, w)
+        tiles.clear_row(NEAR_OBSTACLE, k, w)
     # Whatever is in contact is within the margin too, so the second level adds to the flags of the first.
     for level in range(2):
         extra = ZERO if level == 0 else arrays.margin
@@ -193,7 +196,7 @@ class Eyes(NamedTuple):
     nearest_obstacles: Any
 
 
-@compiled
+@numba.njit(nogil=True, **OPTIONS)
 def _open_eyes(num_robots: Any, dimension: Any, num_neighbors: Any, num_obstacles: Any) -> Any:
     return Eyes(
         np.empty((num_robots, dimension), np.float32), np.empty((num_robots, dimension), np.float32),

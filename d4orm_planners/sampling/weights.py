@@ -24,16 +24,16 @@ class SoftmaxWeights:
     def __call__(self, rewards: Any, xp: Any) -> Any:
         """Weights of ``rewards`` ``(..., M)``; a sample at minus infinity gets none."""
         usable = rewards > -xp.inf
-        count = xp.maximum(usable.sum(-1, keepdims=True), 1)
+        count = xp.maximum(usable.sum(-1, keepdims=True), 1).astype(rewards.dtype)
         mean = xp.where(usable, rewards, 0).sum(-1, keepdims=True) / count
         deviation = xp.where(usable, rewards - mean, 0)
         # Below this spread all samples are as good as equal, and amplifying rounding would be noise.
         spread = xp.maximum(xp.sqrt((deviation * deviation).sum(-1, keepdims=True) / count), 1e-6)
-        score = xp.where(usable, deviation / spread, -xp.inf)
-        best = score.max(-1, keepdims=True)
-        weight = xp.where(usable, xp.exp((score - xp.where(best > -xp.inf, best, 0)) / self.temperature), 0)
-        weight = xp.where(weight >= self.cutoff, weight, 0)
-        return weight / xp.maximum(weight.sum(-1, keepdims=True), 1e-30)
+        best = rewards.max(-1, keepdims=True)
+        weight = xp.exp((rewards - xp.where(best > -xp.inf, best, 0)) * (1 / (self.temperature * spread)))
+        if self.cutoff > 0:
+            weight = xp.where(weight >= self.cutoff, weight, 0)
+        return weight * (1 / xp.maximum(weight.sum(-1, keepdims=True), 1e-30))
 
 
 @dataclass(frozen=True)
