@@ -50,7 +50,11 @@ class D4orm(SamplingPlanner):
     def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
         """See :meth:`SamplingPlanner.initial`."""
         base = search.current.controls
+        return base, self.start(search, base)
+
+    def start(self, search: Search, base: FloatArray) -> FloatArray:
+        """``U_N`` of a deformation of ``base``, as a mean to draw samples around, in the shape of ``base``."""
         if not self.config.random_start:
-            return base, np.zeros_like(base)
+            return np.zeros_like(base)
         final = alpha_bar(self.config.num_steps, self.config.beta_start, self.config.beta_end)[-1]
-        return base, standard_normal(search, stream=1) / np.float32(np.sqrt(final))
+        return standard_normal(search, base.shape, stream=1) / np.float32(np.sqrt(final))

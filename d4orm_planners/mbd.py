@@ -29,7 +29,7 @@ class _DirectDenoising(SamplingPlanner):
 
     def noisy_controls(self, search: Search) -> FloatArray:
         """``U_N`` of this iteration, ``(H, K, m)``."""
-        return standard_normal(search, stream=1)
+        return standard_normal(search, search.current.controls.shape, stream=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,4 +56,4 @@ class IterativeMBD(_DirectDenoising):
 
     def noisy_controls(self, search: Search) -> FloatArray:
         """The last result, or noise in the first iteration."""
-        return search.current.controls if search.iteration else standard_normal(search, stream=1)
+        return search.current.controls if search.iteration else super().noisy_controls(search)

@@ -12,6 +12,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_planners.base import Planner
 from d4orm_planners.plan import Plan
+from d4orm_planners.steering import drive_to_goal
 
 Actions = dict[str, FloatArray]
 
@@ -109,26 +110,4 @@ class DriveToGoal(Policy):
     name = "goal"
 
     def _controls(self, joint: JointState) -> FloatArray:
-        problem = self.problem
-        controls = np.zeros((problem.num_robots, problem.control_size), np.float32)
-        for robot, model in enumerate(problem.team.robot_models):
-            speed, acceleration, turn_rate = (float(limit) for limit in problem.team.limits[robot])
-            state = joint.states[robot]
-            to_goal = joint.goals[robot] - state[: model.dimension]
-            distance = float(np.linalg.norm(to_goal))
-            # The fastest speed from which the robot can still stop at its goal.
-            wanted_speed = min(speed, float(np.sqrt(2 * acceleration * distance)))
-            wanted = to_goal / max(distance, 1e-6) * wanted_speed
-            if model.name == "velocity2d":
-                controls[robot, :2] = to_goal / max(distance, 1e-6) * min(speed, distance / problem.dt)
-            elif model.heading_index is None:
-                controls[robot, : model.control_size] = (wanted - state[list(model.speed_indices)]) / problem.dt
-            else:
-                turn = np.arctan2(to_goal[1], to_goal[0]) - state[model.heading_index]
-                turn = (turn + np.pi) % (2 * np.pi) - np.pi
-                facing = max(float(np.cos(turn)), 0.0)
-                controls[robot, 0] = np.clip(turn / problem.dt, -turn_rate, turn_rate)
-                controls[robot, 1] = (wanted_speed * facing - state[model.speed_indices[0]]) / problem.dt
-        # What exceeds a robot's limits the environment clips.
-        limit = problem.team.control_limits
-        return np.clip(controls, -limit, limit)
+        return drive_to_goal(self.problem, joint.states, joint.goals)

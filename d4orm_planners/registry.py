@@ -9,12 +9,13 @@ from typing import Any
 from d4orm_planners.base import Planner
 from d4orm_planners.cem import CEM
 from d4orm_planners.d4orm import D4orm
+from d4orm_planners.d4orm_d import D4ormD
 from d4orm_planners.mbd import MBD, IterativeMBD
 from d4orm_planners.mppi import MPPI
 from d4orm_planners.policy import DriveToGoal, OpenLoop, Policy, RandomControls
 
 PLANNERS: Mapping[str, type[Planner]] = MappingProxyType(
-    {planner.name: planner for planner in (D4orm, MPPI, CEM, MBD, IterativeMBD)}
+    {planner.name: planner for planner in (D4orm, D4ormD, MPPI, CEM, MBD, IterativeMBD)}
 )
 """Every planner class by its name."""
 

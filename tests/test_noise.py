@@ -137,7 +137,8 @@ def test_of_every_sixty_four_samples_sixteen_draw_and_the_others_turn_their_pair
     assert counters[:128].tolist() == [*range(16)] * 4 + [*range(16, 32)] * 4
     assert cosine[:64].tolist() == [1] * 16 + [-1] * 16 + [0] * 32
     assert sine[:64].tolist() == [0] * 32 + [1] * 16 + [-1] * 16
-    assert cosine[64:128].tolist() == cosine[:64].tolist() and sine[64:128].tolist() == sine[:64].tolist()
+    assert cosine[64:128].tolist() == cosine[:64].tolist()
+    assert sine[64:128].tolist() == sine[:64].tolist()
     # No two samples share all three.
     assert len({(int(c), float(x), float(y)) for c, x, y in zip(counters, cosine, sine)}) == 200
 

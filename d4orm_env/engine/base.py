@@ -61,6 +61,10 @@ class SamplingTask:
             part of a sample by that robot's own reward.
         moving: Bodies to avoid that are not sampled, or ``None``.
         arrived: ``(K,)`` robots docked from the beginning, or ``None`` for none.
+        penalty: What a violation of the margin costs per step, against a reward of one for standing at the goal.
+        reference_distance: Distances count relative to the initial one (paper, section III-D), or to this if that is
+            less: a robot that starts next to its goal then loses no more by waiting than others do. ``None`` for the
+            paper's.
     """
 
     problem: Problem
@@ -69,6 +73,18 @@ class SamplingTask:
     credit: str = "team"
     moving: MovingObstacles | None = None
     arrived: BoolArray | None = None
+    penalty: float = 1.0
+    reference_distance: float | None = None
+
+    @property
+    def arrays(self) -> ProblemArrays:
+        """The problem as this task scores it."""
+        arrays = self.problem.arrays
+        if self.reference_distance is None:
+            return arrays
+        inverse = np.minimum(arrays.inverse_initial_distance, np.float32(1 / self.reference_distance))
+        inverse.setflags(write=False)
+        return arrays._replace(inverse_initial_distance=inverse)
 
 
 class SamplingRules(NamedTuple):

@@ -184,7 +184,7 @@ class _Sampling:
     def __init__(self, task: SamplingTask, rules: SamplingRules, num_samples: int, seed: int, threads: Any) -> None:
         problem = task.problem
         self.task, self.threads = task, threads
-        self.arrays = _typed(problem.arrays)
+        self.arrays = _typed(task.arrays)
         self.base = np.ascontiguousarray(task.base, np.float32)
         docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
         self.docked = np.ascontiguousarray(docked, bool)
@@ -206,8 +206,8 @@ class _Sampling:
         self.threads.over(
             num_tiles,
             lambda part: sampling.score_tiles(
-                self.arrays, offset, scale, self.docked, self.task.collisions, self.moving, self.moving_radius,
-                self.seed, step, part, self.kept, self.rewards,
+                self.arrays, offset, scale, self.docked, self.task.collisions, np.float32(self.task.penalty),
+                self.moving, self.moving_radius, self.seed, step, part, self.kept, self.rewards,
             ),
         )  # fmt: skip
         return self.rewards.mean(axis=0, keepdims=True) if self.task.credit == "team" else self.rewards
@@ -218,9 +218,7 @@ class _Sampling:
         odd, even = _by_counter(np.broadcast_to(np.asarray(weights, np.float32), (num_robots, self.rewards.shape[1])))
         first = np.empty_like(self.base)
         second = np.empty_like(self.base) if with_second else np.empty((0, 0, 0), np.float32)
-        self.threads.over(
-            num_steps, lambda part: sampling.average_noise(self.kept, odd, even, part, first, second)
-        )
+        self.threads.over(num_steps, lambda part: sampling.average_noise(self.kept, odd, even, part, first, second))
         return first, second
 
 

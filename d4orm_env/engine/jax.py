@@ -127,13 +127,13 @@ def goal_distance(arrays: ProblemArrays, place: Any) -> Any:
     return jnp.where(gap2 <= tiny, jnp.float32(0), jnp.sqrt(jnp.maximum(gap2, tiny)))
 
 
-def rewards_of(arrays: ProblemArrays, place: Any, pair_violation: Any, obstacle_violation: Any) -> Any:
-    """``(K, S)`` reward of one step."""
+def rewards_of(arrays: ProblemArrays, place: Any, pair_violation: Any, obstacle_violation: Any, penalty: Any) -> Any:
+    """``(K, S)`` reward of one step; a violation costs ``penalty``."""
     return reward.step_reward(
         goal_distance(arrays, place),
         arrays.inverse_initial_distance[:, None],
-        pair_violation.astype(jnp.float32),
-        obstacle_violation.astype(jnp.float32),
+        penalty * pair_violation.astype(jnp.float32),
+        penalty * obstacle_violation.astype(jnp.float32),
         jnp.float32(1),
     )
 
@@ -143,7 +143,7 @@ def judge(arrays: ProblemArrays, place: Any) -> tuple[Any, Any, Any]:
     zero = jnp.float32(0)
     contact = robot_contacts(arrays, place, zero) | obstacle_contacts(arrays, place, zero)
     pair, obstacle = robot_contacts(arrays, place, arrays.margin), obstacle_contacts(arrays, place, arrays.margin)
-    return contact, pair | obstacle, rewards_of(arrays, place, pair, obstacle)
+    return contact, pair | obstacle, rewards_of(arrays, place, pair, obstacle, np.float32(1))
 
 
 @partial(jax.jit, static_argnums=0)
@@ -179,6 +179,7 @@ class _Inputs(NamedTuple):
     base: Any
     docked: Any
     moving: MovingObstacles | None
+    penalty: Any
     seed: Any
 
 
@@ -214,7 +215,7 @@ def _score(static: _Static, inputs: _Inputs, step: Any, mean: Any, scale: Any) -
             if inputs.moving is not None:
                 near_robot |= moving_contacts(arrays, place, obstacle, inputs.moving.radius, arrays.margin)
         near_obstacle = obstacle_contacts(arrays, place, arrays.margin)
-        return (worlds, total + rewards_of(arrays, place, near_robot, near_obstacle)), deformation
+        return (worlds, total + rewards_of(arrays, place, near_robot, near_obstacle, inputs.penalty)), deformation
 
     worlds = Worlds(
         jnp.broadcast_to(arrays.start[..., None], (*arrays.start.shape, static.num_samples)),
@@ -314,7 +315,7 @@ class JaxEngine:
     ) -> tuple[Any, tuple[Any, ...]]:
         problem = task.problem
         docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
-        inputs = _Inputs(problem.arrays, task.base, docked, task.moving, noise.seed_words(seed))
+        inputs = _Inputs(task.arrays, task.base, docked, task.moving, np.float32(task.penalty), noise.seed_words(seed))
         static = _Static(problem.team.models, rules, num_samples, task.collisions, task.credit)
         arguments = jax.tree.map(jnp.asarray, (inputs, mean, np.asarray(noise_scale, np.float32)))
         leaves, treedef = jax.tree.flatten(arguments)

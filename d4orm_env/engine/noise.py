@@ -2,9 +2,9 @@
 order, on any number of threads, with nothing stored.
 
 A 64-bit stream key stands for (seed, step, robot, time, pair of components). The sample number is the counter: it is
-shared between samples (see :func:`turned`), mixed with the key by a 32-bit integer hash (three multiplications, xor-shifts
-between them, with full avalanche), and the Box-Muller transform turns the hash into two independent normals. Written in
-scalar style like the models.
+shared between samples (see :func:`turned`), mixed with the key by a 32-bit integer hash (three multiplications,
+xor-shifts between them, with full avalanche), and the Box-Muller transform turns the hash into two independent normals.
+Written in scalar style like the models.
 """
 
 from __future__ import annotations
@@ -106,8 +106,8 @@ def turned(sample: Any, ops: BitOps) -> Any:
     turn them by 180, 90 and 270 degrees.
 
     The pair of a sample is ``(cosine * x - sine * y, sine * x + cosine * y)`` of the normals ``(x, y)`` of its counter,
-    which is as normal as they are. So a sample costs a quarter of the noise; the deformations that share it are mirrored
-    (the odd part of the sampling error cancels) or at right angles to each other.
+    which is as normal as they are. So a sample costs a quarter of the noise; the deformations that share it are
+    mirrored (the odd part of the sampling error cancels) or at right angles to each other.
 
     Args:
         sample: uint32 sample number.

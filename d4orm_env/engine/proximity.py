@@ -24,9 +24,9 @@ _LOWEST = np.int32(-0x80000000)
 _INFINITY = np.float32(np.inf)
 
 
-# Columns of ``due`` ``(K, FIRST + K + O)`` int32, in time steps: when the robot's box was made, when the earliest thing in
-# its row is due, when obstacles and bounds are, and whether its flags of this step have been written to; then when to
-# look again at the robots before it, and at the bodies.
+# Columns of ``due`` ``(K, FIRST + K + O)`` int32, in time steps: when the robot's box was made, when the earliest thing
+# in its row is due, when obstacles and bounds are, and whether its flags of this step have been written to; then when
+# to look again at the robots before it, and at the bodies.
 SEEN, EARLIEST, STATIC, TOUCHED, FIRST = range(5)
 
 
@@ -63,7 +63,8 @@ def begin(due: Any) -> None:
 @inlined
 def _ordered(bits: Any) -> Any:
     """Numbers' bits in an order that integers compare in, and back; a number that is none comes before or after all
-    others, so that it cannot hide them."""
+    others, so that it cannot hide them.
+    """
     return np.int32(bits ^ np.int32(np.int32(bits >> _SIGN) & _MAGNITUDE))
 
 
@@ -203,9 +204,7 @@ def mark_robots(
 
 
 @inlined
-def near_static(
-    arrays: Any, k: Any, t: Any, num_steps: Any, stride: Any, w: Any, due: Any, box: Any
-) -> Any:
+def near_static(arrays: Any, k: Any, t: Any, num_steps: Any, stride: Any, w: Any, due: Any, box: Any) -> Any:
     """Whether any sample of robot ``k`` may be within the margin of an obstacle or the bounds at time ``t``."""
     _look(t, k, w, due, box)
     gap = _static_gap(arrays, k, box) - arrays.radius[k] - arrays.margin - SLACK

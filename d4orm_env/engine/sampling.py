@@ -1,8 +1,8 @@
 """The CPU engine's sampling kernels: perturb, roll out and score a tile of samples in one pass; average in a second.
 
 The first pass makes the noise of a tile where it is used, moves the robots, checks contacts and adds up rewards, with
-everything the tile needs in cache. It keeps the noise for the second pass: a quarter of a number per sample and control,
-because samples share it, which is a third of the time of making it again.
+everything the tile needs in cache. It keeps the noise for the second pass: a quarter of a number per sample and
+control, because samples share it, which is a third of the time of making it again.
 """
 
 from __future__ import annotations
@@ -90,8 +90,7 @@ BIT_OPS = noise.BitOps(_uint32, _int32, _to_float, _float_bits, _bits_float, _sq
 
 @compiled
 def _perturb(key: Any, first: Any, offset: Any, scale: Any, rows: Any) -> None:
-    """Fill two rows with ``offset + scale * noise``, turned as :func:`noise.turned` says, and the next half row with the
-    noise itself."""
+    """Fill two rows with ``offset + scale * noise``, turned as :func:`noise.turned` says; half a row with the noise."""
     for s in range(DRAWS):
         x, y = noise.normal_pair(np.uint32(first + s), key, BIT_OPS)
         rows[2 * TILE + s] = x
@@ -118,7 +117,8 @@ def _perturb_robot(
     seed: Any, step: Any, t: Any, first: Any, k: Any, offset: Any, scale: Any, kept: Any, controls: Any
 ) -> None:
     """Fill ``controls`` with the samples of robot ``k``'s controls at time ``t``, a row a component, and put the noise
-    into ``kept`` ``(P, 2, M / 4)`` from counter number ``first`` on."""
+    into ``kept`` ``(P, 2, M / 4)`` from counter number ``first`` on.
+    """
     num_controls = offset.shape[0]
     for pair in range((num_controls + 1) // 2):
         key = noise.stream_key(seed[0], seed[1], np.uint32(step), np.uint32(k), np.uint32(t), np.uint32(pair), BIT_OPS)
@@ -133,7 +133,8 @@ def _perturb_robot(
 
 def _runner(model: Model) -> Any:
     """The compiled step of one robot of this model in every sample of a tile, which adds its reward without
-    violations. The controls are the same few rows for every robot: they stay in cache."""
+    violations. The controls are the same few rows for every robot: they stay in cache.
+    """
     step, limit_control = make_stepper(model), inlined(model.functions.limit_control)
     read_x, write_x = READ[model.state_size], WRITE[model.state_size]
     read_u = READ[model.control_size]
@@ -218,10 +219,10 @@ def _begin_tile(arrays: Any, docked: Any, w: Any) -> None:
 
 @compiled
 def _score_tile(
-    arrays: Any, offset: Any, scale: Any, docked: Any, collisions: Any, moving: Any, moving_radius: Any, seed: Any,
-    step: Any, first: Any, stride: Any, kept: Any, w: Any, controls: Any, standing: Any, due: Any, box: Any,
+    arrays: Any, offset: Any, scale: Any, docked: Any, collisions: Any, penalty: Any, moving: Any, moving_radius: Any,
+    seed: Any, step: Any, first: Any, stride: Any, kept: Any, w: Any, controls: Any, standing: Any, due: Any, box: Any,
 ) -> None:  # fmt: skip
-    """Roll a tile of samples out whose noise begins with counter ``first`` and leave their summed rewards in the total rows."""
+    """Roll out a tile of samples, noise beginning with counter ``first``; leave summed rewards in rows TOTAL."""
     num_steps, num_robots, _ = offset.shape
     # Taken out of the tuple once: every access counts a reference, which costs as much as several samples.
     codes, all_limits, goals, inverse = arrays.model_codes, arrays.limits, arrays.goal, arrays.inverse_initial_distance
@@ -250,18 +251,18 @@ def _score_tile(
             if due[k, STATIC] <= t and near_static(arrays, k, t, num_steps, stride, w, due, box):
                 tiles.clear_row(NEAR_OBSTACLE, k, w)
                 tiles.mark_obstacles(arrays, k, margin, w)
-                _subtract(NEAR_OBSTACLE, count, k, w)
+                _subtract(NEAR_OBSTACLE, count * penalty, k, w)
         if collisions:
             mark_robots(radius, margin, moving[t], moving_radius, t, num_steps, stride, w, due, box)
             for k in range(num_robots):
                 if due[k, TOUCHED] != 0:
-                    _subtract(NEAR_ROBOT, ONE, k, w)
+                    _subtract(NEAR_ROBOT, penalty, k, w)
 
 
 @cached_kernel(SOURCES, **OPTIONS)
 def score_tiles(
-    arrays: Any, offset: Any, scale: Any, docked: Any, collisions: Any, moving: Any, moving_radius: Any, seed: Any,
-    step: Any, tile_range: Any, kept: Any, rewards: Any,
+    arrays: Any, offset: Any, scale: Any, docked: Any, collisions: Any, penalty: Any, moving: Any, moving_radius: Any,
+    seed: Any, step: Any, tile_range: Any, kept: Any, rewards: Any,
 ) -> None:  # fmt: skip
     """Fill the columns of ``rewards`` ``(K, M)`` that a range of tiles covers with mean rewards over time.
 
@@ -271,6 +272,7 @@ def score_tiles(
         scale: ``(H, K, m)`` standard deviation of the noise.
         docked: ``(K,)`` bool, docked from the beginning.
         collisions: Whether robots count when near each other or near a moving body.
+        penalty: What a violation costs per step.
         moving: ``(H, O, d)`` places of moving bodies after every step.
         moving_radius: ``(O,)``.
         seed: Two uint32 words.
@@ -290,8 +292,8 @@ def score_tiles(
     for index in range(tile_range[0], tile_range[1]):
         first = index * TILE
         _score_tile(
-            arrays, offset, scale, docked, collisions, moving, moving_radius, seed, step, index * DRAWS, stride, kept, w,
-            controls, standing, due, box,
+            arrays, offset, scale, docked, collisions, penalty, moving, moving_radius, seed, step, index * DRAWS,
+            stride, kept, w, controls, standing, due, box,
         )  # fmt: skip
         for k in range(num_robots):
             # The last tile may reach beyond the last sample.

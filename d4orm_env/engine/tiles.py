@@ -36,8 +36,8 @@ OPTIONS: dict[str, Any] = {"fastmath": {"contract", "nsz", "reassoc"}, "error_mo
 the meaning of NaN or infinity is allowed."""
 
 UNCOUNTED: dict[str, Any] = OPTIONS | {"_nrt": False}
-"""For everything that kernels call: without numba's reference counts, which would cost more than the sums they surround.
-Such functions cannot make arrays."""
+"""For everything that kernels call: without numba's reference counts, which would cost more than the sums they
+surround. Such functions cannot make arrays."""
 
 compiled = numba.njit(nogil=True, **UNCOUNTED)
 
@@ -212,7 +212,8 @@ _SQUARED_GAP = {2: _squared_gap2, 3: _squared_gap3}
 
 def make_stepper(model: Model) -> Any:
     """The compiled step of one robot of this model in one world, ``(standing, x, u, goal, limits, h, docking) -> (x,
-    squared distance to the goal, whether docked)``, for a control that is within its limits."""
+    squared distance to the goal, whether docked)``, for a control that is within its limits.
+    """
     functions = ModelFunctions(*(inlined(function) for function in model.functions))
     pick_x = _PICK[model.state_size]
     squared_norm, squared_gap = _SQUARED_NORM[model.dimension], _SQUARED_GAP[model.dimension]

@@ -101,7 +101,7 @@ class SamplingPlanner(Planner):
         return Iteration(base + result.mean, len(noise_scale))
 
 
-def standard_normal(search: Search, stream: int) -> FloatArray:
-    """``(H, K, m)`` standard normal numbers of this iteration."""
+def standard_normal(search: Search, shape: tuple[int, ...], stream: int) -> FloatArray:
+    """Standard normal numbers of this iteration in this shape."""
     generator = np.random.default_rng(search.iteration_seed(stream))
-    return generator.standard_normal(search.current.controls.shape, dtype=np.float32)
+    return generator.standard_normal(shape, dtype=np.float32)

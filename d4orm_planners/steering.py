@@ -1,0 +1,128 @@
+"""Driving straight to the goal, as if nobody else were there: one control law for every model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.dynamics import MODELS, Model, Ops
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.transition import TimeStep, advance, arrives
+
+NUMPY_OPS = Ops(np.cos, np.sin, np.sqrt, np.minimum, np.maximum)
+
+
+def drive_to_goal(problem: Problem, states: FloatArray, goals: FloatArray) -> FloatArray:
+    """``(K, m)`` controls inside the box of each robot's limits; what exceeds their norm the environment clips.
+
+    Args:
+        problem: Whose robots they are.
+        states: ``(K, n)``.
+        goals: ``(K, d)`` [m].
+    """
+    controls = np.zeros((problem.num_robots, problem.control_size), np.float32)
+    for name in set(problem.team.models):
+        robots = [k for k, model in enumerate(problem.team.models) if model == name]
+        model = MODELS[name]
+        controls[robots, : model.control_size] = steer(
+            model, states[robots], goals[robots, : model.dimension], problem.team.limits[robots], problem.dt
+        )
+    limit = problem.team.control_limits
+    return np.clip(controls, -limit, limit)
+
+
+def steer(model: Model, states: FloatArray, goals: FloatArray, limits: FloatArray, dt: float) -> FloatArray:
+    """``(B, m)`` controls of ``B`` robots of one model towards their goals, braking in time to stop there.
+
+    Args:
+        model: The model.
+        states: ``(B, n)``.
+        goals: ``(B, d)`` [m].
+        limits: ``(B, 3)`` speed, acceleration and turn rate.
+        dt: Time step [s].
+    """
+    speed, acceleration, turn_rate = limits.T
+    to_goal = goals - states[:, : model.dimension]
+    distance = np.sqrt((to_goal * to_goal).sum(axis=1))
+    direction = to_goal / np.maximum(distance, 1e-6)[:, None]
+    # The fastest speed from which the robot can still stop at its goal.
+    wanted_speed = np.minimum(speed, np.sqrt(2 * acceleration * distance))
+    if model.name == "velocity2d":
+        return direction * np.minimum(speed, distance / dt)[:, None]
+    if model.heading_index is None:
+        return (direction * wanted_speed[:, None] - states[:, list(model.speed_indices)]) / dt
+    turn = np.arctan2(to_goal[:, 1], to_goal[:, 0]) - states[:, model.heading_index]
+    turn = (turn + np.pi) % (2 * np.pi) - np.pi
+    facing = np.maximum(np.cos(turn), 0)
+    push = (wanted_speed * facing - states[:, model.speed_indices[0]]) / dt
+    return np.stack([np.clip(turn / dt, -turn_rate, turn_rate), push], axis=1)
+
+
+@dataclass(frozen=True)
+class ClosingStretches:
+    """What robots do that follow their controls up to a time and drive straight to their goals from there.
+
+    Attributes:
+        controls: ``(H, R, V, m)`` for ``R`` robots and ``V`` times, zero after arrival.
+        positions: ``(H+1, R, V, d)`` [m].
+        arrived: ``(R, V)`` bool.
+    """
+
+    controls: FloatArray
+    positions: FloatArray
+    arrived: BoolArray
+
+
+def closing_stretches(
+    problem: Problem, states: FloatArray, controls: FloatArray, switch_times: Any
+) -> ClosingStretches:
+    """Every robot of the problem alone, for several times of switching over to :func:`steer`.
+
+    Args:
+        problem: The robots.
+        states: ``(H+1, R, n)`` their states under ``controls``.
+        controls: ``(H, R, m)``.
+        switch_times: ``(R, V)`` time steps.
+    """
+    num_times = np.shape(switch_times)[1]
+    u = np.repeat(np.asarray(controls, np.float32)[:, :, None], num_times, axis=2)
+    x = np.repeat(np.asarray(states, np.float32)[:, :, None], num_times, axis=2)
+    switch = np.asarray(switch_times)
+    arrived = np.zeros(switch.shape, bool)
+    for name in set(problem.team.models):
+        robots = [k for k, model in enumerate(problem.team.models) if model == name]
+        # One lane for every robot and time.
+        x_lanes, u_lanes = (array[:, robots].reshape(len(array), -1, array.shape[-1]) for array in (x, u))
+        goals, limits = (
+            np.repeat(np.asarray(rows)[robots], num_times, axis=0) for rows in (problem.goal, problem.team.limits)
+        )
+        arrivals = _drive(MODELS[name], problem, x_lanes, u_lanes, goals, limits, switch[robots].ravel())
+        x[:, robots] = x_lanes.reshape(len(x), len(robots), num_times, -1)
+        u[:, robots] = u_lanes.reshape(len(u), len(robots), num_times, -1)
+        arrived[robots] = arrivals.reshape(len(robots), num_times)
+    return ClosingStretches(u, x[..., : problem.dimension], arrived)
+
+
+def _drive(
+    model: Model, problem: Problem, x: FloatArray, u: FloatArray, goals: FloatArray, limits: FloatArray, switch: Any
+) -> BoolArray:
+    """Fill in states ``(H+1, B, n)`` and controls ``(H, B, m)`` from the ``switch`` times on; returns who arrives."""
+    n, m, d = model.state_size, model.control_size, model.dimension
+    step = TimeStep(*(np.float32(problem.dt / part) for part in (1, 2, 3, 6)))
+    goal_speed = np.inf if problem.goal_speed is None else problem.goal_speed
+    arrived = np.zeros(len(switch), bool)
+    for t in range(int(switch.min()), problem.horizon):
+        steered = steer(model, x[t, :, :n], goals[:, :d], limits, problem.dt)
+        wanted = np.where((t >= switch)[:, None], steered, u[t, :, :m]).astype(np.float32)
+        clipped = model.functions.limit_control(tuple(wanted.T), tuple(limits.T), NUMPY_OPS)
+        after = advance(model.functions, tuple(x[t, :, :n].T), clipped, tuple(limits.T), step, NUMPY_OPS)
+        velocity = model.functions.velocity(after, clipped, NUMPY_OPS)
+        x[t + 1, :, :n] = np.where(arrived[:, None], x[t, :, :n], np.stack(after, axis=1))
+        u[t, :, :m] = np.where(arrived[:, None], 0, np.stack(clipped, axis=1))
+        gap2 = ((x[t + 1, :, :d] - goals[:, :d]) ** 2).sum(axis=1)
+        speed2 = sum(np.square(part) for part in velocity)
+        arrived |= arrives(gap2, speed2, problem.goal_radius**2, goal_speed**2)
+    return arrived
