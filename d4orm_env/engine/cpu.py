@@ -119,25 +119,26 @@ class CpuEngine:
         Raises:
             ValueError: If the controls have another shape than ``(H, K, m)`` or are not finite.
         """
-        executed = checked_controls(problem, controls).copy()[:, None]
-        steps, num_robots = len(executed), problem.num_robots
-        states = np.empty((steps + 1, 1, num_robots, problem.state_size), np.float32)
+        wanted = checked_controls(problem, controls)
+        moments = len(wanted) + 1
+        executed = np.zeros((moments, *wanted.shape[1:]), np.float32)
+        executed[1:] = wanted
+        states = np.empty((moments, *problem.start.shape), np.float32)
         states[0] = problem.start
-        docked = np.zeros((steps + 1, 1, num_robots), bool)
+        docked = np.zeros((moments, problem.num_robots), bool)
         collided, violated = np.empty_like(docked), np.empty_like(docked)
-        rewards = np.empty((steps, 1, num_robots), np.float32)
+        rewards = np.empty(docked.shape, np.float32)
         arrays = _typed(problem.arrays)
-        roll_out(
-            arrays, *_single(arrays), executed, states, docked, collided, violated, rewards
-        )  # fmt: skip
+        goal, inverse = (np.repeat(array, moments, axis=0) for array in _single(arrays))
+        roll_out(arrays, goal, inverse, executed, states, docked, collided, violated, rewards)
         return Trajectory(
-            states=states[:, 0],
-            positions=np.ascontiguousarray(states[:, 0, :, : problem.dimension]),
-            controls=executed[:, 0],
-            rewards=rewards[:, 0],
-            arrived=docked[:, 0],
-            collided=collided[:, 0],
-            margin_violated=violated[:, 0],
+            states=states,
+            positions=np.ascontiguousarray(states[..., : problem.dimension]),
+            controls=executed[1:],
+            rewards=rewards[1:],
+            arrived=docked,
+            collided=collided,
+            margin_violated=violated,
         )
 
     def prepare(self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int) -> None:

@@ -114,19 +114,14 @@ def _judge(arrays: Any, inverse: Any, first: Any, w: Any, collided: Any, violate
 
 
 @compiled
-def _step_worlds(
+def _judge_all(
     arrays: Any, goal: Any, inverse: Any, state: Any, control: Any, docked: Any, collided: Any, violated: Any,
-    rewards: Any, tile_range: Any, w: Any,
+    rewards: Any, w: Any,
 ) -> None:  # fmt: skip
-    num_robots, dimension = arrays.goal.shape
-    for index in range(tile_range[0], tile_range[1]):
-        first = index * TILE
+    for first in range(0, state.shape[0], TILE):
         _load(goal, state, control, docked, first, w)
-        tiles.measure_goal_distance(num_robots, dimension, w)
-        for k in range(num_robots):
-            tiles.move_robot(arrays, k, w)
+        tiles.measure_goal_distance(arrays.goal.shape[0], arrays.goal.shape[1], w)
         _judge(arrays, inverse, first, w, collided, violated, rewards)
-        _store(state, control, docked, first, w)
 
 
 @cached_kernel(SOURCES, **OPTIONS)
@@ -148,8 +143,16 @@ def step_worlds(
         rewards: ``(B, K)``, output.
         tile_range: First tile of worlds and the one after the last.
     """
-    w = np.zeros(arrays.radius.shape[0] * STRIDE, np.float32)
-    _step_worlds(arrays, goal, inverse, state, control, docked, collided, violated, rewards, tile_range, w)
+    num_robots, dimension = arrays.goal.shape
+    w = np.zeros(num_robots * STRIDE, np.float32)
+    for index in range(tile_range[0], tile_range[1]):
+        first = index * TILE
+        _load(goal, state, control, docked, first, w)
+        tiles.measure_goal_distance(num_robots, dimension, w)
+        for k in range(num_robots):
+            tiles.move_robot(arrays, k, w)
+        _judge(arrays, inverse, first, w, collided, violated, rewards)
+        _store(state, control, docked, first, w)
 
 
 @cached_kernel(SOURCES, **OPTIONS)
@@ -157,19 +160,21 @@ def roll_out(
     arrays: Any, goal: Any, inverse: Any, controls: Any, states: Any, docked: Any, collided: Any, violated: Any,
     rewards: Any,
 ) -> None:  # fmt: skip
-    """Step a single world through ``controls`` ``(H, 1, K, m)``, keeping every step; time comes first everywhere."""
-    w = np.zeros(arrays.radius.shape[0] * STRIDE, np.float32)
-    only = np.array([0, 1])
-    _load(goal, states[0], controls[0], docked[0], 0, w)
-    tiles.measure_goal_distance(arrays.goal.shape[0], arrays.goal.shape[1], w)
-    _judge(arrays, inverse, 0, w, collided[0], violated[0], rewards[0])
-    for t in range(controls.shape[0]):
-        states[t + 1] = states[t]
-        docked[t + 1] = docked[t]
-        _step_worlds(
-            arrays, goal, inverse, states[t + 1], controls[t], docked[t + 1], collided[t + 1], violated[t + 1],
-            rewards[t], only, w,
-        )  # fmt: skip
+    """Step a single world through ``controls`` ``(H+1, K, m)``, the first of which is unused, keeping every step.
+
+    Every output has ``H+1`` rows too, the first for the start. The motion comes first; then 64 moments at a time are
+    judged, as if they were worlds.
+    """
+    num_robots = arrays.radius.shape[0]
+    w = np.zeros(num_robots * STRIDE, np.float32)
+    for t in range(1, controls.shape[0]):
+        states[t] = states[t - 1]
+        docked[t] = docked[t - 1]
+        _load_world(goal, states, controls, docked, t, 0, w)
+        for k in range(num_robots):
+            tiles.move_robot(arrays, k, w)
+        _store_world(states, controls, docked, t, 0, w)
+    _judge_all(arrays, goal, inverse, states, controls, docked, collided, violated, rewards, w)
 
 
 @cached_kernel(SOURCES, **OPTIONS)
@@ -179,10 +184,7 @@ def judge_worlds(
     """Contacts and margin violations of ``B`` worlds as they stand; arguments as in :func:`step_worlds`."""
     w = np.zeros(arrays.radius.shape[0] * STRIDE, np.float32)
     rewards = np.empty(collided.shape, np.float32)
-    for first in range(0, state.shape[0], TILE):
-        _load(goal, state, control, docked, first, w)
-        tiles.measure_goal_distance(arrays.goal.shape[0], arrays.goal.shape[1], w)
-        _judge(arrays, inverse, first, w, collided, violated, rewards)
+    _judge_all(arrays, goal, inverse, state, control, docked, collided, violated, rewards, w)
 
 
 class Eyes(NamedTuple):
