@@ -61,6 +61,14 @@ def steer(model: Model, states: FloatArray, goals: FloatArray, limits: FloatArra
     return np.stack([np.clip(turn / dt, -turn_rate, turn_rate), push], axis=1)
 
 
+def straight_drives(problem: Problem) -> tuple[FloatArray, FloatArray]:
+    """Controls ``(H, K, m)`` that drive every robot straight to its goal, and its positions ``(H+1, K, d)`` [m]."""
+    states = np.repeat(np.asarray(problem.start)[None], problem.horizon + 1, axis=0)
+    controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
+    drives = closing_stretches(problem, states, controls, np.zeros((problem.num_robots, 1), int))
+    return drives.controls[:, :, 0], drives.positions[:, :, 0]
+
+
 @dataclass(frozen=True)
 class ClosingStretches:
     """What robots do that follow their controls up to a time and drive straight to their goals from there.
@@ -115,6 +123,10 @@ def _drive(
     goal_speed = np.inf if problem.goal_speed is None else problem.goal_speed
     arrived = np.zeros(len(switch), bool)
     for t in range(int(switch.min()), problem.horizon):
+        if arrived.all():
+            x[t + 1 :, :, :n] = x[t, :, :n]
+            u[t:, :, :m] = 0
+            break
         steered = steer(model, x[t, :, :n], goals[:, :d], limits, problem.dt)
         wanted = np.where((t >= switch)[:, None], steered, u[t, :, :m]).astype(np.float32)
         clipped = model.functions.limit_control(tuple(wanted.T), tuple(limits.T), NUMPY_OPS)
