@@ -84,7 +84,7 @@ def closing_stretches(
     Args:
         problem: The robots.
         states: ``(H+1, R, n)`` their states under ``controls``.
-        controls: ``(H, R, m)``.
+        controls: ``(H, R, m)`` as executed: clipped, zero for docked robots.
         switch_times: ``(R, V)`` time steps.
     """
     num_times = np.shape(switch_times)[1]
@@ -113,16 +113,22 @@ def _drive(
     n, m, d = model.state_size, model.control_size, model.dimension
     step = TimeStep(*(np.float32(problem.dt / part) for part in (1, 2, 3, 6)))
     goal_speed = np.inf if problem.goal_speed is None else problem.goal_speed
-    arrived = np.zeros(len(switch), bool)
-    for t in range(int(switch.min()), problem.horizon):
+
+    def home(t: int) -> BoolArray:
+        """Who docks, or has docked, with the step that ends at ``t``."""
+        velocity = model.functions.velocity(tuple(x[t, :, :n].T), tuple(u[t - 1, :, :m].T), NUMPY_OPS)
+        gap2 = ((x[t, :, :d] - goals[:, :d]) ** 2).sum(axis=1)
+        speed2 = sum(np.square(part) for part in velocity)
+        return arrives(gap2, speed2, problem.goal_radius**2, goal_speed**2)
+
+    first = int(switch.min())
+    arrived = home(first) if first > 0 else np.zeros(len(switch), bool)
+    for t in range(first, problem.horizon):
         steered = steer(model, x[t, :, :n], goals[:, :d], limits, problem.dt)
         wanted = np.where((t >= switch)[:, None], steered, u[t, :, :m]).astype(np.float32)
         clipped = model.functions.limit_control(tuple(wanted.T), tuple(limits.T), NUMPY_OPS)
         after = advance(model.functions, tuple(x[t, :, :n].T), clipped, tuple(limits.T), step, NUMPY_OPS)
-        velocity = model.functions.velocity(after, clipped, NUMPY_OPS)
         x[t + 1, :, :n] = np.where(arrived[:, None], x[t, :, :n], np.stack(after, axis=1))
         u[t, :, :m] = np.where(arrived[:, None], 0, np.stack(clipped, axis=1))
-        gap2 = ((x[t + 1, :, :d] - goals[:, :d]) ** 2).sum(axis=1)
-        speed2 = sum(np.square(part) for part in velocity)
-        arrived |= arrives(gap2, speed2, problem.goal_radius**2, goal_speed**2)
+        arrived |= home(t + 1)
     return arrived
