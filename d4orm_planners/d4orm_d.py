@@ -14,9 +14,9 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.base import MovingObstacles, SamplingTask
 from d4orm_planners.base import Iteration, Search
 from d4orm_planners.d4orm import D4orm, D4ormConfig
-from d4orm_planners.grouping import conflicts, failure_groups, independent_robots, reconnected
+from d4orm_planners.grouping import components, conflicts, failure_groups, independent_robots, reconnected
 from d4orm_planners.sampling.schedule import annealed
-from d4orm_planners.steering import closing_stretches, straight_drives
+from d4orm_planners.steering import Drives, closing_stretches, detours, straight_drives
 
 DECOUPLINGS = ("independent", "groups")
 STARTS = ("auto", "team", "straight")
@@ -24,7 +24,14 @@ STARTS = ("auto", "team", "straight")
 WIDER = (1.0, 2.0)
 """Factors on the noise of successive repairs: what ordinary noise does not get around, wider noise may."""
 
-STRICTER = (1.0,1.0,10.0,10.0)
+VAIN = 2
+"""Repairs in vain after which a robot may take a detour."""
+
+DETOURS = 32
+"""Random detours that it chooses from."""
+
+JOINTLY, STUCK, STUCK_SIZE = 3, 2, 3
+"""Every so many repairs, a group of robots that were all repaired in vain so often is repaired jointly, if this small."""
 
 SLACK = 40
 """Steps beyond the latest arrival of the robots repaired that their repair looks at."""
@@ -113,12 +120,12 @@ class D4ormD(D4orm):
         """Controls ``(H, K, m)`` that send everybody straight to its goal, or ``None`` to start with the whole team."""
         if self.config.start == "team":
             return None
-        controls, positions = straight_drives(problem)
+        drives = straight_drives(problem)
         if self.config.start == "auto":
-            met = conflicts(positions[1:], problem.team.radius, problem.margin).sum(axis=1).mean()
+            met = conflicts(drives.positions[1:, :, 0], problem.team.radius, problem.margin).sum(axis=1).mean()
             if met >= problem.num_robots / 2:
                 return None
-        return controls
+        return drives.controls[:, :, 0]
 
 
 class _Repair:
@@ -183,7 +190,7 @@ class _Repair:
     def independent(self) -> None:
         """Robots without conflicts among them at once, each by its own reward; whoever gets worse stays as it was."""
         config, problem = self.config, self.problem
-        robots = self.next_robots()
+        robots, credit = self.next_robots()
         # Far beyond everyone's arrival there is nothing to search, and what happens there would dilute the rewards.
         horizon = min(int(self.arrival[list(robots)].max()) + SLACK, problem.horizon)
         scale = annealed(config.repair_steps, config.beta_start, config.beta_end)
@@ -193,8 +200,8 @@ class _Repair:
             horizon,
             config.repair_samples,
             scale * np.float32(WIDER[self.search.iteration % len(WIDER)]),
-            credit="robot",
-            penalty=config.penalty * STRICTER[self.search.iteration % len(STRICTER)],
+            credit=credit,
+            penalty=config.penalty,
             # A robot that starts next to its goal has little to lose by making way, but would lose it many times over.
             reference_distance=float(max(distance.mean(), problem.goal_radius)),
         )
@@ -204,16 +211,29 @@ class _Repair:
             everybody = range(problem.num_robots)
             self.take_over(everybody, problem, self.search.engine.rollout(problem, self.controls))
 
-    def next_robots(self) -> tuple[int, ...]:
-        """Failed robots without conflicts among them, those that were not repaired lately first."""
+    def next_robots(self) -> tuple[tuple[int, ...], str]:
+        """Whom to repair, and by whose reward.
+
+        Failed robots without conflicts among them, those that were not repaired lately first, each by its own reward.
+        Now and then a few robots that only together can get out of each other's way, by their team's.
+        """
         search = self.search
+        vain = search.memory.setdefault("vain", np.zeros(self.problem.num_robots, int))
         tired = search.memory.setdefault("tired", np.zeros(self.problem.num_robots))
         random = np.random.default_rng(search.iteration_seed(0)).random(len(tired))
         order = np.argsort(tired + random - 0.2 * self.graph.sum(axis=1))
+        if search.iteration % JOINTLY == 0:
+            stuck = [
+                group
+                for group in components(self.graph)
+                if 1 < len(group) <= STUCK_SIZE and vain[list(group)].min() >= STUCK
+            ]
+            if stuck:
+                return stuck[search.iteration // JOINTLY % len(stuck)], "team"
         robots = independent_robots([k for k in order if self.failed[k]], self.graph)
         tired[list(robots)] += 0.3
         tired *= 0.7
-        return robots
+        return robots, "robot"
 
     def take_over(self, robots: Sequence[int], part: Problem, trajectory: Trajectory) -> None:
         """Let robots do as in the trajectory, or turn to their goals in time; whoever gets worse stays as it was."""
@@ -230,10 +250,13 @@ class _Repair:
             self.positions[:, robot] = positions[:, i]
             self.arrived[robot] = arrived[i]
         self.graph = self.conflicts(self.positions)
+        still = self.cost(index, self.positions[:, index], self.graph[index], self.arrived[index]) > 0
+        vain = self.search.memory["vain"]
+        vain[index] = np.where(still, vain[index] + 1, 0)
 
     def cost(self, robots: list[int], paths: Any, near: Any, arrived: Any) -> Any:
         """``(R,)`` conflicts, with those added that a missed goal and contact with an obstacle amount to."""
-        return near.sum(axis=1) + MISSING_COST * (~arrived + self.touches_obstacle(robots, paths))
+        return near.sum(axis=1) + MISSING_COST * (~arrived | self.touches_obstacle(robots, paths))
 
     def touches_obstacle(self, robots: list[int], paths: Any) -> Any:
         """``(R, ...)`` which robots come within the margin of an obstacle on paths ``(H+1, R, ..., d)``."""
@@ -246,34 +269,53 @@ class _Repair:
         """The trajectory's ``(controls, positions, arrived)``, with robots turning straight to their goals if better.
 
         A deformation ends metres from where it was aimed at after a long way: arriving is what sampling does worst, and
-        steering does at once.
+        steering does at once. A robot that was repaired in vain some times may take a random detour instead.
         """
+        arrived = trajectory.arrived[-1].copy()
         gap = np.linalg.norm(trajectory.positions - part.goal, axis=2)
         nearest = np.where(trajectory.arrived.any(axis=0), trajectory.arrived.argmax(axis=0), gap.argmin(axis=0))
-        # The last way is the trajectory as it is.
-        switch = np.column_stack(
-            [*(np.maximum(nearest - steps, 0) for steps in EARLIER), [part.horizon] * len(nearest)]
-        )
-        ways = closing_stretches(part, trajectory.states, trajectory.controls, switch)
-        blocked = self.touches_obstacle(list(robots), ways.positions)
-        moves = (ways.positions[1:] != ways.positions[:-1]).any(axis=3)
-        last_move = part.horizon - moves[::-1].argmax(axis=0)
+        switch = np.maximum(nearest[:, None] - np.array(EARLIER), 0)
+        as_it_is = Drives(trajectory.controls[:, :, None], trajectory.positions[:, :, None], arrived[:, None])
+        turning = closing_stretches(part, trajectory.states, trajectory.controls, switch)
+        ways = as_it_is.joined(turning)
+        vain = self.search.memory["vain"]
         paths = self.positions.copy()
         paths[:, robots] = trajectory.positions
-        controls, positions, arrived = (
-            trajectory.controls.copy(),
-            trajectory.positions.copy(),
-            trajectory.arrived[-1].copy(),
-        )
+        controls, positions = trajectory.controls.copy(), trajectory.positions.copy()
         for i in np.argsort(-nearest):
             robot = robots[int(i)]
-            near = self.met(robot, ways.positions[:, i], paths)
-            cost = near + MISSING_COST * (~ways.arrived[i] + blocked[i]) + TIME_COST * last_move[i] / part.horizon
+            own = ways.of(int(i))
+            cost = self.costs(robot, own, paths)
+            if vain[robot] >= VAIN and cost.min() >= 1:
+                own = self.with_detours(part.select([int(i)]), own)
+                cost = self.costs(robot, own, paths)
             best = int(np.argmin(cost))
-            controls[:, i] = ways.controls[:, i, best]
-            positions[:, i] = paths[:, robot] = ways.positions[:, i, best]
-            arrived[i] = ways.arrived[i, best]
+            controls[:, i] = own.controls[:, best]
+            positions[:, i] = paths[:, robot] = own.positions[:, best]
+            arrived[i] = own.arrived[best]
         return controls, positions, arrived
+
+    def with_detours(self, alone: Problem, ways: Drives) -> Drives:
+        """One robot's ways and some more, each by a random point."""
+        start, goal = alone.start[0, : alone.dimension], alone.goal[0]
+        random = np.random.default_rng(self.search.iteration_seed(1000 + self.stream))
+        self.stream += 1
+        spread = 0.5 * np.linalg.norm(goal - start) + 1
+        vias = (
+            start
+            + random.random((DETOURS, 1)) * (goal - start)
+            + spread * random.normal(size=(DETOURS, alone.dimension))
+        )
+        return ways.joined(detours(alone, vias[None].astype(np.float32)).of(0))
+
+    def costs(self, robot: int, ways: Drives, paths: Any) -> Any:
+        """``(V,)`` costs of ways ``(H+1, V, d)`` of a robot among others on ``paths`` ``(H+1, K, d)``."""
+        horizon = self.problem.horizon
+        moves = (ways.positions[1:] != ways.positions[:-1]).any(axis=2)
+        last_move = horizon - moves[::-1].argmax(axis=0)
+        blocked = self.touches_obstacle([robot], ways.positions[:, None])[0]
+        met = self.met(robot, ways.positions, paths)
+        return met + MISSING_COST * (~ways.arrived | blocked) + TIME_COST * last_move / horizon
 
     def met(self, robot: int, ways: Any, paths: Any) -> Any:
         """``(V,)`` robots on ``paths`` ``(H+1, K, d)`` that a robot meets on each of its ``ways`` ``(H+1, V, d)``."""

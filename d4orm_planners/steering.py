@@ -14,6 +14,9 @@ from d4orm_env.core.transition import TimeStep, advance, arrives
 
 NUMPY_OPS = Ops(np.cos, np.sin, np.sqrt, np.minimum, np.maximum)
 
+VIA_RADIUS = 0.5
+"""How near to a point on its way a robot turns to its goal [m]."""
+
 
 def drive_to_goal(problem: Problem, states: FloatArray, goals: FloatArray) -> FloatArray:
     """``(K, m)`` controls inside the box of each robot's limits; what exceeds their norm the environment clips.
@@ -48,8 +51,9 @@ def steer(model: Model, states: FloatArray, goals: FloatArray, limits: FloatArra
     to_goal = goals - states[:, : model.dimension]
     distance = np.sqrt((to_goal * to_goal).sum(axis=1))
     direction = to_goal / np.maximum(distance, 1e-6)[:, None]
-    # The fastest speed from which the robot can still stop at its goal.
-    wanted_speed = np.minimum(speed, np.sqrt(2 * acceleration * distance))
+    # The fastest speed from which the robot can still stop at its goal, braking from the next step on.
+    lost = acceleration * (dt / 2)
+    wanted_speed = np.minimum(speed, np.sqrt(2 * acceleration * distance + lost * lost) - lost)
     if model.name == "velocity2d":
         return direction * np.minimum(speed, distance / dt)[:, None]
     if model.heading_index is None:
@@ -61,20 +65,12 @@ def steer(model: Model, states: FloatArray, goals: FloatArray, limits: FloatArra
     return np.stack([np.clip(turn / dt, -turn_rate, turn_rate), push], axis=1)
 
 
-def straight_drives(problem: Problem) -> tuple[FloatArray, FloatArray]:
-    """Controls ``(H, K, m)`` that drive every robot straight to its goal, and its positions ``(H+1, K, d)`` [m]."""
-    states = np.repeat(np.asarray(problem.start)[None], problem.horizon + 1, axis=0)
-    controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
-    drives = closing_stretches(problem, states, controls, np.zeros((problem.num_robots, 1), int))
-    return drives.controls[:, :, 0], drives.positions[:, :, 0]
-
-
 @dataclass(frozen=True)
-class ClosingStretches:
-    """What robots do that follow their controls up to a time and drive straight to their goals from there.
+class Drives:
+    """Ways that robots could take, each robot alone: ``R`` robots, ``V`` ways each.
 
     Attributes:
-        controls: ``(H, R, V, m)`` for ``R`` robots and ``V`` times, zero after arrival.
+        controls: ``(H, R, V, m)``, zero after arrival.
         positions: ``(H+1, R, V, d)`` [m].
         arrived: ``(R, V)`` bool.
     """
@@ -83,58 +79,106 @@ class ClosingStretches:
     positions: FloatArray
     arrived: BoolArray
 
+    def of(self, robot: int) -> Drives:
+        """The ways of one robot, without the axis of robots."""
+        return Drives(self.controls[:, robot], self.positions[:, robot], self.arrived[robot])
 
-def closing_stretches(
-    problem: Problem, states: FloatArray, controls: FloatArray, switch_times: Any
-) -> ClosingStretches:
-    """Every robot of the problem alone, for several times of switching over to :func:`steer`.
+    def joined(self, other: Drives) -> Drives:
+        """These ways and others of the same robots."""
+        return Drives(
+            np.concatenate([self.controls, other.controls], axis=-2),
+            np.concatenate([self.positions, other.positions], axis=-2),
+            np.concatenate([self.arrived, other.arrived], axis=-1),
+        )
+
+
+def closing_stretches(problem: Problem, states: FloatArray, controls: FloatArray, switch_times: Any) -> Drives:
+    """Follow the controls up to a time and drive straight to the goal from there.
 
     Args:
         problem: The robots.
         states: ``(H+1, R, n)`` their states under ``controls``.
-        controls: ``(H, R, m)``.
+        controls: ``(H, R, m)`` as executed: clipped, zero for docked robots.
         switch_times: ``(R, V)`` time steps.
     """
-    num_times = np.shape(switch_times)[1]
-    u = np.repeat(np.asarray(controls, np.float32)[:, :, None], num_times, axis=2)
-    x = np.repeat(np.asarray(states, np.float32)[:, :, None], num_times, axis=2)
     switch = np.asarray(switch_times)
+    vias = np.repeat(problem.goal[:, None], switch.shape[1], axis=1)
+    return _drive_teams(problem, states, controls, switch, vias)
+
+
+def detours(problem: Problem, vias: FloatArray) -> Drives:
+    """Drive from the start straight towards a point ``(R, V, d)`` [m], and half a metre before it on to the goal."""
+    return _drive_teams(problem, *_standing(problem), np.zeros(vias.shape[:2], int), vias)
+
+
+def straight_drives(problem: Problem) -> Drives:
+    """Drive from the start straight to the goal: a single way for every robot."""
+    return closing_stretches(problem, *_standing(problem), np.zeros((problem.num_robots, 1), int))
+
+
+def _standing(problem: Problem) -> tuple[FloatArray, FloatArray]:
+    """States and controls of robots that stay where they start."""
+    states = np.repeat(np.asarray(problem.start)[None], problem.horizon + 1, axis=0)
+    return states, np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
+
+
+def _drive_teams(problem: Problem, states: FloatArray, controls: FloatArray, switch: Any, vias: FloatArray) -> Drives:
+    """Every robot on each of its ways: as controlled until ``switch`` ``(R, V)``, then by ``vias`` ``(R, V, d)``."""
+    num_ways = switch.shape[1]
+    u = np.repeat(np.asarray(controls, np.float32)[:, :, None], num_ways, axis=2)
+    x = np.repeat(np.asarray(states, np.float32)[:, :, None], num_ways, axis=2)
     arrived = np.zeros(switch.shape, bool)
     for name in set(problem.team.models):
         robots = [k for k, model in enumerate(problem.team.models) if model == name]
-        # One lane for every robot and time.
+        # One lane for every robot and way.
         x_lanes, u_lanes = (array[:, robots].reshape(len(array), -1, array.shape[-1]) for array in (x, u))
         goals, limits = (
-            np.repeat(np.asarray(rows)[robots], num_times, axis=0) for rows in (problem.goal, problem.team.limits)
+            np.repeat(np.asarray(rows)[robots], num_ways, axis=0) for rows in (problem.goal, problem.team.limits)
         )
-        arrivals = _drive(MODELS[name], problem, x_lanes, u_lanes, goals, limits, switch[robots].ravel())
-        x[:, robots] = x_lanes.reshape(len(x), len(robots), num_times, -1)
-        u[:, robots] = u_lanes.reshape(len(u), len(robots), num_times, -1)
-        arrived[robots] = arrivals.reshape(len(robots), num_times)
-    return ClosingStretches(u, x[..., : problem.dimension], arrived)
+        targets = vias[robots].reshape(-1, vias.shape[2])
+        arrivals = _drive(MODELS[name], problem, x_lanes, u_lanes, goals, limits, switch[robots].ravel(), targets)
+        x[:, robots] = x_lanes.reshape(len(x), len(robots), num_ways, -1)
+        u[:, robots] = u_lanes.reshape(len(u), len(robots), num_ways, -1)
+        arrived[robots] = arrivals.reshape(len(robots), num_ways)
+    return Drives(u, x[..., : problem.dimension], arrived)
 
 
 def _drive(
-    model: Model, problem: Problem, x: FloatArray, u: FloatArray, goals: FloatArray, limits: FloatArray, switch: Any
+    model: Model,
+    problem: Problem,
+    x: FloatArray,
+    u: FloatArray,
+    goals: FloatArray,
+    limits: FloatArray,
+    switch: Any,
+    targets: FloatArray,
 ) -> BoolArray:
     """Fill in states ``(H+1, B, n)`` and controls ``(H, B, m)`` from the ``switch`` times on; returns who arrives."""
     n, m, d = model.state_size, model.control_size, model.dimension
     step = TimeStep(*(np.float32(problem.dt / part) for part in (1, 2, 3, 6)))
     goal_speed = np.inf if problem.goal_speed is None else problem.goal_speed
-    arrived = np.zeros(len(switch), bool)
-    for t in range(int(switch.min()), problem.horizon):
+
+    def home(t: int) -> BoolArray:
+        """Who docks, or has docked, with the step that ends at ``t``."""
+        velocity = model.functions.velocity(tuple(x[t, :, :n].T), tuple(u[t - 1, :, :m].T), NUMPY_OPS)
+        gap2 = ((x[t, :, :d] - goals[:, :d]) ** 2).sum(axis=1)
+        speed2 = sum(np.square(part) for part in velocity)
+        return arrives(gap2, speed2, problem.goal_radius**2, goal_speed**2)
+
+    first = int(switch.min())
+    arrived = home(first) if first > 0 else np.zeros(len(switch), bool)
+    for t in range(first, problem.horizon):
         if arrived.all():
             x[t + 1 :, :, :n] = x[t, :, :n]
             u[t:, :, :m] = 0
             break
-        steered = steer(model, x[t, :, :n], goals[:, :d], limits, problem.dt)
+        passed = ((x[t, :, :d] - targets[:, :d]) ** 2).sum(axis=1) < VIA_RADIUS**2
+        targets = np.where(passed[:, None], goals, targets)
+        steered = steer(model, x[t, :, :n], targets[:, :d], limits, problem.dt)
         wanted = np.where((t >= switch)[:, None], steered, u[t, :, :m]).astype(np.float32)
         clipped = model.functions.limit_control(tuple(wanted.T), tuple(limits.T), NUMPY_OPS)
         after = advance(model.functions, tuple(x[t, :, :n].T), clipped, tuple(limits.T), step, NUMPY_OPS)
-        velocity = model.functions.velocity(after, clipped, NUMPY_OPS)
         x[t + 1, :, :n] = np.where(arrived[:, None], x[t, :, :n], np.stack(after, axis=1))
         u[t, :, :m] = np.where(arrived[:, None], 0, np.stack(clipped, axis=1))
-        gap2 = ((x[t + 1, :, :d] - goals[:, :d]) ** 2).sum(axis=1)
-        speed2 = sum(np.square(part) for part in velocity)
-        arrived |= arrives(gap2, speed2, problem.goal_radius**2, goal_speed**2)
+        arrived |= home(t + 1)
     return arrived

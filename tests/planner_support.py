@@ -14,7 +14,15 @@ from d4orm_planners.base import Planner
 from d4orm_planners.plan import IterationRecord
 from d4orm_planners.registry import PLANNERS, make_planner
 
-CHEAP = {"engine": "cpu", "num_samples": 64, "num_steps": 5, "max_iterations": 2}
+CHEAP = {
+    "engine": "cpu",
+    "num_samples": 64,
+    "num_steps": 5,
+    "max_iterations": 2,
+    "start": "team",
+    "repair_samples": 64,
+    "repair_steps": 5,
+}
 """Settings that plan in no time, and badly."""
 
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import os
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -113,6 +116,92 @@ def test_gradient_ascent_through_the_dynamics_raises_the_reward(tmp_path: Path) 
     completed("jax_functional", out)
     rewards = [float(row["reward"]) for row in table(out / "jax_functional.csv")]
     assert rewards[-1] > rewards[0] + 0.05
+
+
+@pytest.mark.slow
+def test_d4orm_finds_several_kinds_of_solution_and_no_robot_weaves(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("multimodality", out)
+    rows = table(out / "multimodality.csv")
+    assert len({row["signs"] for row in rows}) == len(rows) == 8
+    plans = {row["top to bottom"]: int(row["plans"]) for row in rows}
+    assert sum(plans.values()) == 8, "every seed solves so easy a problem"
+    assert sum(number > 0 for number in plans.values()) >= 3
+    assert plans["0 over 1 over O over 0"] == plans["1 over 0 over O over 1"] == 0
+    assert all(5 < float(row["travel time [s]"]) < 8 for row in rows if row["plans"] != "0")
+    assert (out / "multimodality.png").read_bytes().startswith(PNG)
+
+
+@pytest.fixture
+def multimodality(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    return importlib.import_module("multimodality")
+
+
+@pytest.mark.parametrize(
+    ("path", "turns"),
+    [
+        ([(1, 0), (0, 1), (-1, 0)], 0.5),
+        ([(1, 0), (0, -1), (-1, 0)], -0.5),
+        ([(-2, 0), (-2, 3), (2, 3), (2, 0)], -0.5),
+        ([(1, 0), (0, 1), (-1, 0), (0, -1), (1, 0), (0, 1)], 1.25),
+        ([(1, 0), (1, 1), (1, 0), (1, -1)], -0.125),
+        ([(-1, 0.1), (-1, -0.1), (-1, 0.1)], 0.0),
+        ([(3, 4)], 0.0),
+    ],
+    ids=[
+        "over it",
+        "under it",
+        "over it, rightward",
+        "more than once round",
+        "there and back",
+        "across the cut",
+        "still",
+    ],
+)
+def test_winding_is_the_angle_swept_about_the_origin(
+    multimodality: ModuleType, path: list[tuple[float, float]], turns: float
+) -> None:
+    assert multimodality.winding(np.array(path)) == pytest.approx(2 * np.pi * turns, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("signs", "order"), [(signs, order) for order, signs in {
+        "1 over O over 0": (-1, -1, -1),
+        "0 over O over 1": (1, 1, 1),
+        "O over 1 over 0": (-1, 1, -1),
+        "O over 0 over 1": (-1, 1, 1),
+        "1 over 0 over O": (1, -1, -1),
+        "0 over 1 over O": (1, -1, 1),
+    }.items()]
+)  # fmt: skip
+def test_signature_tells_the_order_from_top_to_bottom(
+    multimodality: ModuleType, signs: tuple[int, int, int], order: str
+) -> None:
+    """Robots that pass each other and the obstacle at heights in that order, robot 0 leftward."""
+    height = {name: float(y) for name, y in zip(order.split(" over "), (1, 0, -1))}
+    x = np.linspace(3, -3, 31)
+    bump = np.maximum(1 - np.abs(x) / 3, 0)
+    paths = [np.column_stack([side * x, bump * (height[name] - height["O"])]) for side, name in ((1, "0"), (-1, "1"))]
+    assert multimodality.signature(np.stack(paths, axis=1)) == signs
+    assert multimodality.CLASSES[signs][0] == order
+
+
+def test_robots_that_weave_have_one_of_the_two_other_signatures(multimodality: ModuleType) -> None:
+    """Robot 1 goes over the obstacle and under robot 0, which waits there and then goes under the obstacle."""
+    second = np.array([(-3, 0), (-1, 1), (1, 1), (2, -1), (3, 0), (3, 0), (3, 0), (3, 0)], float)
+    first = np.array([(3, 0), (2.5, 0), (2, 0), (2, 0), (2, 0), (1, -1), (-1, -1), (-3, 0)], float)
+    assert multimodality.signature(np.stack([first, second], axis=1)) == (-1, -1, 1)
+    assert multimodality.CLASSES[-1, -1, 1][0] == "0 over 1 over O over 0"
+
+
+def test_principal_components_are_distances_of_plans(multimodality: ModuleType) -> None:
+    """Two plans whose robots are 3 m apart at every step: 1.5 m on either side of their mean, on one line."""
+    trajectories = [SimpleNamespace(positions=np.full((11, 2, 2), [y, 0])) for y in (0.0, 3.0)]
+    points, shares = multimodality.principal_components(trajectories)
+    assert sorted(points[:, 0]) == pytest.approx([-1.5, 1.5])
+    assert points[:, 1] == pytest.approx([0, 0])
+    assert shares == pytest.approx([1, 0])
 
 
 def test_count_of_seeds_below_one_is_refused(tmp_path: Path) -> None:

@@ -512,7 +512,7 @@ CREDIT = pytest.mark.parametrize(("num_robots", "credit"), [(1, "team"), (2, "te
 def test_d4orm_is_algorithm_1_on_a_deformation(num_robots: int, credit: str) -> None:
     search = start_of("d4orm", tiny_problem(num_robots), credit=credit, random_start=True)
     base = search.current.controls
-    noise = standard_normal(search, stream=1)
+    noise = standard_normal(search, search.current.controls.shape, stream=1)
     assert noise.std() == pytest.approx(1, abs=0.7)
     deformation = algorithm_1(
         noise, list(alpha_bar(STEPS, *BETAS)), draws_of(search), rewards_of(search, base), TEMPERATURE
@@ -533,7 +533,7 @@ def test_d4orm_by_default_starts_its_deformation_at_zero(num_robots: int, credit
 @pytest.mark.parametrize("name", ["mbd", "i-mbd"])
 def test_mbd_is_algorithm_1_on_the_controls_from_pure_noise(name: str) -> None:
     search = start_of(name, tiny_problem(1))
-    noise = standard_normal(search, stream=1)
+    noise = standard_normal(search, search.current.controls.shape, stream=1)
     expected = algorithm_1(
         noise, list(alpha_bar(STEPS, *BETAS)), draws_of(search), rewards_of(search, np.float32(0)), TEMPERATURE
     )
@@ -556,7 +556,7 @@ def test_i_mbd_goes_on_from_its_last_result_as_if_it_were_noise() -> None:
 def test_mbd_goes_on_from_noise_again() -> None:
     search = start_of("mbd", tiny_problem(1))
     search.advance()
-    noise = standard_normal(search, stream=1)
+    noise = standard_normal(search, search.current.controls.shape, stream=1)
     expected = algorithm_1(
         noise, list(alpha_bar(STEPS, *BETAS)), draws_of(search), rewards_of(search, np.float32(0)), TEMPERATURE
     )

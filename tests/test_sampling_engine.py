@@ -84,6 +84,11 @@ def with_docked(task: SamplingTask, *robots: int) -> SamplingTask:
     return replace(task, arrived=arrived)
 
 
+def harder(task: SamplingTask) -> SamplingTask:
+    """Violations cost more, and distances count relative to more than the robots' own."""
+    return replace(task, penalty=3.0, reference_distance=5.0)
+
+
 TASKS: dict[str, Callable[[], SamplingTask]] = {
     "holonomic2d": crowd,
     "velocity2d": lambda: crowd("velocity2d"),
@@ -97,6 +102,8 @@ TASKS: dict[str, Callable[[], SamplingTask]] = {
     "moving": lambda: with_moving(crowd()),
     "moving, no collisions": lambda: replace(with_moving(crowd()), collisions=False),
     "moving in space": lambda: with_moving(in_space()),
+    "harder": lambda: harder(with_moving(crowd())),
+    "harder, obstacles": lambda: harder(among_obstacles()),
     "docked": lambda: with_docked(among_obstacles(), 1),
     "docked, moving": lambda: with_moving(with_docked(crowd(), 0, 3)),
     "all docked": lambda: with_docked(crowd(), 0, 1, 2, 3, 4),
@@ -110,7 +117,9 @@ def plain_rewards(task: SamplingTask, controls: np.ndarray) -> np.ndarray:
     d, radius = problem.dimension, np.asarray(problem.team.radius, np.float64)
     states = problem.start
     arrived = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
-    start_distance = np.linalg.norm(problem.goal - problem.start[:, :d], axis=1).astype(np.float64)
+    reference = np.linalg.norm(problem.goal - problem.start[:, :d], axis=1).astype(np.float64)
+    if task.reference_distance is not None:
+        reference = np.maximum(reference, task.reference_distance)
     total = np.zeros(problem.num_robots)
     for t, control in enumerate(controls):
         states, _, arrived, *_ = CPU.step(problem.arrays, states, arrived, control)
@@ -123,7 +132,8 @@ def plain_rewards(task: SamplingTask, controls: np.ndarray) -> np.ndarray:
                 gaps = np.linalg.norm(place[:, None] - task.moving.positions[t], axis=-1) - radius[:, None]
                 near |= (gaps - task.moving.radius <= problem.margin).any(axis=1)
         hit = problem.world.clearance(place) - radius <= problem.margin
-        total += 1 - np.linalg.norm(problem.goal - place, axis=1) / start_distance - near - hit
+        violations = near.astype(int) + hit
+        total += 1 - np.linalg.norm(problem.goal - place, axis=1) / reference - task.penalty * violations
     return total / len(controls)
 
 
@@ -152,7 +162,7 @@ def test_the_tasks_above_tell_contacts_apart() -> None:
     assert ignored == free
 
 
-@pytest.mark.parametrize("name", ["docked, moving", "space"])
+@pytest.mark.parametrize("name", ["docked, moving", "space", "harder"])
 def test_the_jax_engine_scores_those_samples_too(name: str) -> None:
     task = TASKS[name]()
     result = JAX.denoise(
@@ -179,6 +189,51 @@ def test_the_new_mean_is_the_weighted_mean_of_the_samples(name: str, credit: str
         mean = np.einsum("ks,stkm->tkm", weights.astype(np.float64), samples.astype(np.float64))
     np.testing.assert_allclose(result.mean, mean, atol=1e-5)
     assert result.excluded == 0
+
+
+def passing_by(**scoring: Any) -> SamplingTask:
+    """Ten steps of 0.1 m: robot 0 goes 4 m to a goal and is met on steps 3, 4 and 5; robot 1 has 2 m to go, and waits.
+
+    The circle comes within robot 0's margin on the last four steps.
+    """
+    problem = Problem(
+        Team(("velocity2d",) * 2, radius=0.25),
+        [[0, 0], [0, 5]],
+        [[4, 0], [2, 5]],
+        World(2, circles=[[1.0, 0.45, 0.25]]),
+        horizon=10,
+        dt=0.1,
+        margin=0.05,
+    )
+    base = np.zeros((10, 2, 2), np.float32)
+    base[:, 0, 0] = 1
+    met = np.full((10, 1, 2), 50, np.float32)
+    met[2:5] = [[[0.3, -0.3]], [[0.4, -0.3]], [[0.5, -0.3]]]
+    return SamplingTask(problem, base, credit="robot", moving=MovingObstacles(met, np.float32([0.1])), **scoring)
+
+
+@pytest.mark.parametrize(
+    ("scoring", "expected"),
+    [
+        # Robot 0 is at 0.1, ..., 1.0 m, on average 3.45 m from its goal, and in violation 3 + 4 times.
+        ({}, [1 - 3.45 / 4 - 0.7, 0]),
+        ({"penalty": 3.0}, [1 - 3.45 / 4 - 2.1, 0]),
+        ({"penalty": 3.0, "collisions": False}, [1 - 3.45 / 4 - 1.2, 0]),
+        # Robot 1 never moves: 2 m of a reference of 5 m. What is below both initial distances changes nothing.
+        ({"reference_distance": 5.0}, [1 - 3.45 / 5 - 0.7, 0.6]),
+        ({"reference_distance": 3.0}, [1 - 3.45 / 4 - 0.7, 1 / 3]),
+        ({"reference_distance": 1.5}, [1 - 3.45 / 4 - 0.7, 0]),
+        ({"penalty": 3.0, "reference_distance": 5.0}, [1 - 3.45 / 5 - 2.1, 0.6]),
+    ],
+)
+def test_penalty_and_reference_distance_of_a_task_change_the_rewards(
+    scoring: dict[str, Any], expected: list[float]
+) -> None:
+    task = passing_by(**scoring)
+    np.testing.assert_allclose(cpu_rewards(CPU, task, 0.0, 2, 0).T, [expected] * 2, atol=1e-5)
+    for engine in (CPU, JAX):
+        result = engine.denoise(task, SOFTMAX, 0 * task.base, np.zeros(1, np.float32), 2, 0)
+        assert result.rewards.tolist() == [pytest.approx(np.mean(expected), abs=1e-5)]
 
 
 def test_team_credit_is_the_mean_of_the_robots_rewards() -> None:
@@ -250,6 +305,9 @@ def assert_same_run(task: SamplingTask, steps: int, rules: SamplingRules = SOFTM
         ("no collisions", "robot"),
         ("moving", "team"),
         ("moving in space", "robot"),
+        ("harder", "team"),
+        ("harder", "robot"),
+        ("harder, obstacles", "team"),
         ("docked", "robot"),
         ("docked, moving", "team"),
         ("all docked, moving", "robot"),

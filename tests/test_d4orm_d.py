@@ -1,0 +1,155 @@
+"""D4orm-D solves big and dense teams, touches only robots that fail, and in its paper preset is Algorithm 3."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from planner_support import walled_in_problem
+
+from d4orm_env.core.problem import Problem
+from d4orm_env.scenarios import make_problem
+from d4orm_env.verify import verify
+from d4orm_planners import make_planner
+from d4orm_planners.base import Search
+from d4orm_planners.d4orm_d import D4ormD
+from d4orm_planners.grouping import conflicts, failure_groups, reconnected
+
+CASES = [
+    pytest.param({"scenario": "circle", "num_robots": 16}, id="circle-16"),
+    pytest.param({"scenario": "four_obstacles", "num_robots": 16}, id="four-obstacles-16"),
+    pytest.param({"scenario": "random", "num_robots": 24, "size": 6.0}, id="random-24"),
+    pytest.param({"scenario": "amswarm_5", "num_robots": 10}, id="amswarm-5"),
+    pytest.param({"scenario": "heterogeneous", "num_robots": 8}, id="heterogeneous-8"),
+    pytest.param({"scenario": "circle", "num_robots": 8, "model": "velocity2d"}, id="velocity2d-8"),
+    pytest.param({"scenario": "random", "num_robots": 16, "model": "differential_drive"}, id="differential-drive-16"),
+    pytest.param({"scenario": "swap", "num_robots": 8}, id="swap-8"),
+]
+BIG = [
+    pytest.param({"scenario": "random", "num_robots": 64, "size": 10.0}, id="random-64"),
+    pytest.param({"scenario": "circle", "num_robots": 64, "diameter": 12.0}, id="circle-64"),
+    pytest.param({"scenario": "sphere", "num_robots": 64}, id="sphere-64"),
+]
+
+
+def assert_solves(case: dict[str, Any], seed: int, **config: Any) -> None:
+    """Whatever is claimed to be solved is checked here anew."""
+    problem = make_problem(**case, seed=seed)
+    plan = make_planner("d4orm-d", engine="cpu", **config).solve(problem, seed=seed, max_iterations=100)
+    assert plan.solved, [(record.num_not_arrived, record.num_margin_violated) for record in plan.history]
+    report = verify(problem, plan.controls)
+    assert report.ok, report.violations
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("case", CASES)
+def test_default_settings_solve(case: dict[str, Any], seed: int) -> None:
+    assert_solves(case, seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", BIG)
+def test_default_settings_solve_64_robots(case: dict[str, Any]) -> None:
+    assert_solves(case, seed=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_groups_solve_a_circle(seed: int) -> None:
+    assert_solves({"scenario": "circle", "num_robots": 12}, seed, decoupling="groups")
+
+
+def search_of(problem: Problem, iterations: int = 0, **config: Any) -> Search:
+    """A search after some iterations."""
+    search = Search(make_planner("d4orm-d", engine="cpu", **config), problem, 0, None)
+    for _ in range(iterations):
+        search.advance()
+    return search
+
+
+CROSSING = make_problem("circle", num_robots=12)
+FEW = {"num_samples": 64, "num_steps": 10, "repair_samples": 64, "repair_steps": 10}
+
+
+def test_the_paper_preset_replans_exactly_the_groups_that_fail() -> None:
+    search = search_of(CROSSING, iterations=1, preset="paper", **FEW)
+    assert search.current.failed.any()
+    previous = None
+    for _ in range(4):
+        before = search.current
+        graph = conflicts(before.trajectory.positions[1:], CROSSING.team.radius, CROSSING.margin)
+        groups = failure_groups(before.failed, reconnected(graph, previous))
+        replanned = {robot for group in groups for robot in group}
+        search.advance()
+        changed = {k for k in range(12) if (search.current.controls[:, k] != before.controls[:, k]).any()}
+        assert changed == replanned
+        previous = graph
+
+
+def test_the_first_iteration_of_the_paper_preset_minds_no_collisions() -> None:
+    search = search_of(CROSSING, preset="paper", **FEW)
+    planner = search.planner
+    assert isinstance(planner, D4ormD)
+    assert not planner.task(search, search.current.controls).collisions
+    search.advance()
+    assert planner.task(search, search.current.controls).collisions
+
+
+def test_an_independent_repair_leaves_whoever_does_not_fail_alone() -> None:
+    search = search_of(make_problem("random", num_robots=16, size=6.0, seed=3), iterations=1, start="straight")
+    repairs = 0
+    while search.current.failed.any() and repairs < 8:
+        before = search.current
+        search.advance()
+        repairs += 1
+        if not search.current.failed.any():
+            break  # The last repair shortens everybody's way.
+        same = (search.current.controls == before.controls).all(axis=(0, 2))
+        assert same[~before.failed].all()
+    assert repairs >= 1
+    assert search.best.solved
+
+
+@pytest.mark.parametrize(("scenario", "straight"), [("circle", False), ("random", True)])
+def test_sparse_teams_start_straight(scenario: str, straight: bool) -> None:
+    search = search_of(make_problem(scenario, num_robots=16, seed=0), iterations=1)
+    assert (search.denoising_steps == 0) == straight
+    drives = search_of(make_problem(scenario, num_robots=16, seed=0), iterations=1, start="straight").current
+    assert drives.trajectory.arrived[-1].all()
+    assert np.array_equal(drives.controls, search.current.controls) == straight
+
+
+def test_given_controls_are_repaired_rather_than_thrown_away() -> None:
+    problem = make_problem("random", num_robots=16, seed=0)
+    drives = search_of(problem, iterations=1, start="straight").current
+    assert drives.failed.any()
+    assert not drives.failed.all()
+    planner = make_planner("d4orm-d", engine="cpu", start="team")
+    search = Search(planner, problem, 0, drives.controls)
+    search.advance()
+    assert (search.current.controls == drives.controls).all(axis=(0, 2))[~drives.failed].all()
+
+
+@pytest.mark.parametrize("preset", [None, "paper"])
+def test_a_goal_that_cannot_be_reached_ends_at_the_budget(preset: str | None) -> None:
+    plan = make_planner("d4orm-d", preset=preset, engine="cpu", **FEW).solve(walled_in_problem(), max_iterations=6)
+    assert not plan.solved
+    assert plan.status == "iteration_limit"
+    assert plan.iterations == 6
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "message"),
+    [
+        ("decoupling", "all", "decoupling 'all' is unknown; choose one of independent, groups"),
+        ("start", "zero", "start 'zero' is unknown; choose one of auto, team, straight"),
+        ("first_collisions", 1, "first_collisions must be True or False"),
+        ("repair_samples", 1, "repair_samples is 1.*at least 2"),
+        ("repair_steps", 0, "repair_steps is 0.*at least 1"),
+        ("penalty", 0, "penalty is 0.*positive"),
+    ],
+)
+def test_a_bad_setting_is_refused_by_name(setting: str, value: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_planner("d4orm-d", **{setting: value})
