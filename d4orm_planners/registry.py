@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 from types import MappingProxyType
 from typing import Any
 
@@ -60,10 +61,7 @@ def make_planner(name: str, *, preset: str | None = None, **config: Any) -> Plan
     kind = _find(name, PLANNERS, "planner")
     if preset is not None and preset not in kind.presets:
         raise ValueError(f"preset {preset!r} of planner {name!r} is unknown; choose one of {', '.join(kind.presets)}")
-    known = kind.config_class.setting_names()
-    for setting in config:
-        if setting not in known:
-            raise ValueError(f"{setting!r} is no setting of planner {name!r}; it takes {', '.join(known)}")
+    _check_settings(kind.config_class, config, f"planner {name!r}")
     settings = kind.presets[preset] if preset is not None else {}
     return kind(kind.config_class(**{**settings, **config}))
 
@@ -83,9 +81,19 @@ def make_policy(name: str, **config: Any) -> Policy:
         budget = {key: config.pop(key) for key in ("time_limit",) if key in config}
         return OpenLoop(make_planner(name, **config), **budget)
     kind = _find(name, {**PLANNERS, **POLICIES}, "policy")
-    if config:
-        raise ValueError(f"policy {name!r} takes no settings, but was given {', '.join(config)}")
-    return kind()
+    if kind.config_class is None:
+        if config:
+            raise ValueError(f"policy {name!r} takes no settings, but was given {', '.join(config)}")
+        return kind()
+    _check_settings(kind.config_class, config, f"policy {name!r}")
+    return kind(kind.config_class(**config))
+
+
+def _check_settings(config_class: type, config: Mapping[str, Any], owner: str) -> None:
+    known = [field.name for field in fields(config_class)]
+    for setting in config:
+        if setting not in known:
+            raise ValueError(f"{setting!r} is no setting of {owner}; it takes {', '.join(known)}")
 
 
 def _find(name: str, table: Mapping[str, Any], what: str) -> Any:
