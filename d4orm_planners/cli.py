@@ -383,7 +383,7 @@ def main(arguments: list[str] | None = None) -> None:
         status = app(arguments, standalone_mode=False)
     except ClickException as error:
         status = _complain(error.format_message())
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ImportError) as error:  # ImportError: an extra that is not installed
         status = _complain(_message(error))
     except (KeyboardInterrupt, typer.Abort):
         status = 130

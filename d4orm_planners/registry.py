@@ -13,6 +13,7 @@ from d4orm_planners.d4orm import D4orm
 from d4orm_planners.d4orm_d import D4ormD
 from d4orm_planners.mbd import MBD, IterativeMBD
 from d4orm_planners.mppi import MPPI
+from d4orm_planners.orca import Orca
 from d4orm_planners.policy import DriveToGoal, OpenLoop, Policy, RandomControls
 
 PLANNERS: Mapping[str, type[Planner]] = MappingProxyType(
@@ -21,7 +22,7 @@ PLANNERS: Mapping[str, type[Planner]] = MappingProxyType(
 """Every planner class by its name."""
 
 POLICIES: Mapping[str, type[Policy]] = MappingProxyType(
-    {policy.name: policy for policy in (DriveToGoal, RandomControls)}
+    {policy.name: policy for policy in (DriveToGoal, RandomControls, Orca)}
 )
 """The policies that are no planners; every planner is an open-loop policy too."""
 
