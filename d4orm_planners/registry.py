@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import asdict, fields
 from types import MappingProxyType
 from typing import Any
 
@@ -88,6 +88,23 @@ def make_policy(name: str, **config: Any) -> Policy:
         return kind()
     _check_settings(kind.config_class, config, f"policy {name!r}")
     return kind(kind.config_class(**config))
+
+
+def policy_settings(name: str, **config: Any) -> dict[str, Any]:
+    """All settings of ``make_policy(name, **config)``, defaults filled in; a preset has become its settings.
+
+    Raises:
+        ValueError: As :func:`make_policy`.
+    """
+    if name in PLANNERS:
+        time_limit = config.pop("time_limit", None)
+        return {**asdict(make_planner(name, **config).config), "time_limit": time_limit}
+    kind = _find(name, {**PLANNERS, **POLICIES}, "policy")
+    if kind.config_class is None:
+        make_policy(name, **config)
+        return {}
+    _check_settings(kind.config_class, config, f"policy {name!r}")
+    return asdict(kind.config_class(**config))
 
 
 def _check_settings(config_class: type, config: Mapping[str, Any], owner: str) -> None:
