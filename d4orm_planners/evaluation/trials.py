@@ -153,7 +153,8 @@ class _TimedPolicy(Policy):
         if isinstance(self._policy, OpenLoop) and (plan := self._policy.plan) is not None:
             if plan.status == "interrupted":
                 raise KeyboardInterrupt  # half a solve says nothing about the planner
-            self._policy, self.wall_time = OpenLoop(plan=plan), plan.wall_time
+            self._policy.planner = None  # from now on it executes this plan
+            self.wall_time = plan.wall_time
 
     def act(self, observations: dict[str, Any], state: Any) -> Actions:
         begin = time.perf_counter()
