@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -104,9 +105,7 @@ def robustness(
             run then.
         OSError: If the folder or the store cannot be used, or a worker process dies.
     """
-    settings = {name: dict(given) for name, given in policies.items()} if isinstance(policies, Mapping) else {
-        name: {} for name in policies
-    }  # fmt: skip
+    settings = policies if isinstance(policies, Mapping) else {name: {} for name in policies}
     levels = tuple(dict.fromkeys(positive_number(level, "noise", zero_allowed=True) for level in noise))
     whole_number(trials, "trials", 1)
     workers = available_cores() if workers is None else whole_number(workers, "workers", 1)
@@ -146,9 +145,10 @@ def _run_missing(jobs: list[Job], store: TrialStore, workers: int, progress: Pro
         if left:
             missing.append(replace(job, noise=left))
     progress("starting", done, total)
-    for job in run_jobs(missing, store, workers):
-        done += len(job.noise)
-        progress(job.label, done, total)
+    with closing(run_jobs(missing, store, workers)) as running:
+        for job in running:
+            done += len(job.noise)
+            progress(job.label, done, total)
 
 
 def _silent(what: str, done: int, total: int) -> None:

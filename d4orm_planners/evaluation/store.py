@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
@@ -126,15 +126,12 @@ class TrialStore:
         with self._connection() as connection:
             return connection.execute(_ADD, astuple(trial)).rowcount > 0
 
-    def trials(self, keys: Iterable[TrialKey] | None = None) -> list[Trial]:
-        """The trials with these keys that are stored, in order of key; all of them by default."""
+    def trials(self) -> list[Trial]:
+        """All trials, in order of key."""
         with self._connection() as connection:
             rows = connection.execute(f"SELECT {', '.join(_NAMES)} FROM trials ORDER BY {_KEY}").fetchall()
-        found = [Trial(**dict(zip(_NAMES, row)) | {"success": bool(row[_NAMES.index("success")])}) for row in rows]
-        if keys is None:
-            return found
-        wanted = set(keys)
-        return [trial for trial in found if trial.key in wanted]
+        # SQLite keeps truth values as numbers.
+        return [Trial(**{**dict(zip(_NAMES, row)), "success": bool(row[_NAMES.index("success")])}) for row in rows]
 
     def finished(self) -> set[TrialKey]:
         """Keys of all trials that ran to their end."""

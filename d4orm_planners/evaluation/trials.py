@@ -8,7 +8,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
@@ -56,7 +56,7 @@ class Job:
         return [TrialKey(self.policy, config, self.problem.digest, noise, self.seed) for noise in self.noise]
 
 
-def run_jobs(jobs: Sequence[Job], store: TrialStore, workers: int) -> Iterator[Job]:
+def run_jobs(jobs: Sequence[Job], store: TrialStore, workers: int) -> Generator[Job]:
     """Run jobs and yield each when its trials are stored.
 
     With one worker they run in this process, on all its cores; else in that many processes of one thread each. When the
@@ -85,9 +85,13 @@ def run_jobs(jobs: Sequence[Job], store: TrialStore, workers: int) -> Iterator[J
             "a worker process died, perhaps for lack of memory; what was done is stored, so run again, with fewer "
             "workers"
         ) from error
+    except BaseException:
+        sender.close()  # so that nobody finishes what is no longer wanted
+        raise
     finally:
-        pool.shutdown(wait=False, cancel_futures=True)
+        pool.shutdown(cancel_futures=True)
         sender.close()
+        receiver.close()
 
 
 def _start_worker(receiver: Connection) -> None:
