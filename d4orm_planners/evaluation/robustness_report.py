@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -12,7 +13,7 @@ from d4orm_planners.evaluation.report import table
 from d4orm_planners.evaluation.robustness import SuccessRate
 
 
-def write_robustness(folder: Path, rates: Sequence[SuccessRate]) -> tuple[Path, Path, Path]:
+def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) -> tuple[Path, Path, Path]:
     """Write ``robustness.csv``, ``robustness.md`` and ``robustness.png``.
 
     Args:
@@ -25,7 +26,7 @@ def write_robustness(folder: Path, rates: Sequence[SuccessRate]) -> tuple[Path, 
     Raises:
         OSError: If the folder does not exist or cannot be written to.
     """
-    paths = folder / "robustness.csv", folder / "robustness.md", folder / "robustness.png"
+    paths = Path(folder, "robustness.csv"), Path(folder, "robustness.md"), Path(folder, "robustness.png")
     with replaced_when_done(paths[0]) as path, path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, ["rate", *asdict(rates[0])])
         writer.writeheader()
