@@ -378,6 +378,13 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
     assert not list(tmp_path.rglob("*.sqlite"))
 
 
+def test_a_library_that_is_missing_is_named_before_anything_runs(d4orm, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyrvo", None)
+    status, _, err = d4orm("--policies", "goal,orca")
+    assert status == 2
+    assert err == "d4orm: policy 'orca' needs pyrvo; install it with pip install \"d4orm-env[orca]\"\n"
+
+
 @pytest.mark.parametrize("changes", [{"policies": []}, {"noise": []}, {"scenarios": []}, {"robots": []}])
 def test_nothing_to_do_is_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
     arguments = {"policies": ["goal"], **TINY, **changes}

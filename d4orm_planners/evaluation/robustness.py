@@ -18,7 +18,7 @@ from d4orm_env.scenarios import make_problem
 from d4orm_planners.evaluation.statistics import wilson_interval
 from d4orm_planners.evaluation.store import Trial, TrialStore
 from d4orm_planners.evaluation.trials import Job, run_jobs
-from d4orm_planners.registry import policy_settings
+from d4orm_planners.registry import make_policy
 
 STORE = "trials.sqlite"
 NOISE = (0.0, 0.05, 0.1, 0.2)
@@ -103,6 +103,7 @@ def robustness(
     Raises:
         ValueError: For an unknown name, a number that makes no sense, or a store that is something else. Nothing has
             run then.
+        ImportError: If a policy needs a library that is not installed.
         OSError: If the folder or the store cannot be used, or a worker process dies.
     """
     settings = policies if isinstance(policies, Mapping) else {name: {} for name in policies}
@@ -113,7 +114,7 @@ def robustness(
         if not values:
             raise ValueError(f"{name} is empty; give at least one")
     for policy, given in settings.items():
-        policy_settings(policy, **given)
+        make_policy(policy, **given)
     cells = [
         [make_problem(scenario, num_robots=size, seed=seed, model=model) for seed in range(trials)]
         for scenario in dict.fromkeys(scenarios)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
+import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import astuple, dataclass, fields
@@ -114,8 +115,7 @@ class TrialStore:
         self.path = Path(path)
         with self._connection() as connection:
             self._check(connection)
-            # Readers and a writer then do not wait for each other. It is kept in the file.
-            connection.execute("PRAGMA journal_mode = WAL")
+            _use_wal(connection)
 
     def add(self, trial: Trial) -> bool:
         """Store a trial, durably and at once.
@@ -165,6 +165,20 @@ class TrialStore:
 
     def _foreign(self, reason: str) -> ValueError:
         return ValueError(f"{self.path} is no store of trials ({reason}); choose another folder or remove it")
+
+
+def _use_wal(connection: sqlite3.Connection) -> None:
+    """Let readers and a writer not wait for each other; the file remembers it."""
+    deadline = time.monotonic() + PATIENCE
+    while True:
+        try:
+            connection.execute("PRAGMA journal_mode = WAL")
+            return
+        except sqlite3.OperationalError as error:
+            # SQLite's own patience does not cover this statement.
+            if error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY or time.monotonic() > deadline:
+                raise
+            time.sleep(0.01)
 
 
 def _pragma(connection: sqlite3.Connection, name: str) -> int:
