@@ -81,13 +81,9 @@ def make_policy(name: str, **config: Any) -> Policy:
     if name in PLANNERS:
         budget = {key: config.pop(key) for key in ("time_limit",) if key in config}
         return OpenLoop(make_planner(name, **config), **budget)
-    kind = _find(name, {**PLANNERS, **POLICIES}, "policy")
-    if kind.config_class is None:
-        if config:
-            raise ValueError(f"policy {name!r} takes no settings, but was given {', '.join(config)}")
-        return kind()
-    _check_settings(kind.config_class, config, f"policy {name!r}")
-    return kind(kind.config_class(**config))
+    config_instance = _policy_config(name, config)
+    kind: Any = POLICIES[name]
+    return kind() if config_instance is None else kind(config_instance)
 
 
 def policy_settings(name: str, **config: Any) -> dict[str, Any]:
@@ -99,12 +95,19 @@ def policy_settings(name: str, **config: Any) -> dict[str, Any]:
     if name in PLANNERS:
         time_limit = config.pop("time_limit", None)
         return {**asdict(make_planner(name, **config).config), "time_limit": time_limit}
+    config_instance = _policy_config(name, config)
+    return {} if config_instance is None else asdict(config_instance)
+
+
+def _policy_config(name: str, config: Mapping[str, Any]) -> Any:
+    """The configuration of a policy that is no planner; ``None`` for one without settings."""
     kind = _find(name, {**PLANNERS, **POLICIES}, "policy")
-    if kind.config_class is None:
-        make_policy(name, **config)
-        return {}
-    _check_settings(kind.config_class, config, f"policy {name!r}")
-    return asdict(kind.config_class(**config))
+    if kind.config_class is not None:
+        _check_settings(kind.config_class, config, f"policy {name!r}")
+        return kind.config_class(**config)
+    if config:
+        raise ValueError(f"policy {name!r} takes no settings, but was given {', '.join(config)}")
+    return None
 
 
 def _check_settings(config_class: type, config: Mapping[str, Any], owner: str) -> None:

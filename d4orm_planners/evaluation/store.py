@@ -84,13 +84,16 @@ class Trial:
 
 
 _NAMES = tuple(field.name for field in fields(Trial))
-_TYPES = {"str": "TEXT", "int": "INTEGER", "bool": "INTEGER", "float": "REAL"}
 _KEY = ", ".join(TrialKey._fields)
-_COLUMNS = ", ".join(
-    f"{field.name} {_TYPES[str(field.type).partition(' ')[0]]}{'' if 'None' in str(field.type) else ' NOT NULL'}"
-    for field in fields(Trial)
-)
-_CREATE = f"CREATE TABLE trials ({_COLUMNS}, PRIMARY KEY ({_KEY})) WITHOUT ROWID"
+_CREATE = f"""
+CREATE TABLE trials (
+    policy TEXT NOT NULL, config TEXT NOT NULL, problem TEXT NOT NULL, noise REAL NOT NULL, seed INTEGER NOT NULL,
+    scenario TEXT NOT NULL, robots INTEGER NOT NULL, model TEXT NOT NULL, versions TEXT NOT NULL,
+    success INTEGER NOT NULL, collided INTEGER NOT NULL, arrived INTEGER NOT NULL,
+    travel_time REAL, makespan REAL, steps INTEGER NOT NULL, wall_time REAL, error TEXT NOT NULL,
+    PRIMARY KEY ({_KEY})
+) WITHOUT ROWID
+"""
 # What has run to its end stays as it is; only a trial that failed may be tried again.
 _ADD = (
     f"INSERT INTO trials ({', '.join(_NAMES)}) VALUES ({', '.join('?' * len(_NAMES))}) ON CONFLICT ({_KEY}) "
