@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import os
 import sys
-import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from d4orm_planners.commands.inputs import check_writable, make_folder, names, numbers, parse_settings
+from d4orm_planners.commands.robustness import robustness
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
@@ -29,6 +31,8 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
+
+app.command()(robustness)
 
 Scenario = Annotated[
     str, typer.Option("--scenario", "-s", help="Scenario name (see `d4orm scenarios`) or a YAML file.")
@@ -56,7 +60,7 @@ def demo(
     """Plan robots across a circle, execute the plan in the environment, verify it, and write pictures."""
     from d4orm_env.render import save_animation, save_picture
 
-    _make_folder(out)
+    make_folder(out)
     problem = _problem("circle", robots, None, None, seed)
     plan = _solve(problem, "d4orm", None, None, engine, seed, None, None, quiet=False)
     _print_plan(plan)
@@ -167,13 +171,13 @@ def bench(
     from d4orm_planners.evaluation.timing import describe_machine
 
     given: dict[str, Any] = {
-        "robots": _numbers("--robots", robots),
-        "models": _names(models),
-        "engines": _names(engines),
+        "robots": numbers("--robots", robots),
+        "models": names(models),
+        "engines": names(engines),
     }
     chosen = {name: value for name, value in {**given, "seeds": seeds}.items() if value is not None}
     settings = BenchmarkSettings(**{**(QUICK if quick else {}), **chosen})
-    _make_folder(out)
+    make_folder(out)
     machine, date = describe_machine(), datetime.now(UTC).isoformat(timespec="seconds")
     with PartsProgress(enabled=not quiet) as progress:
         results = run_parts(list(parts(settings)), progress.update)
@@ -242,40 +246,12 @@ def _solve(
     from d4orm_planners.progress import SolveProgress
     from d4orm_planners.registry import make_planner
 
-    chosen = make_planner(planner, preset=preset, **{"engine": engine, **_parse_settings(settings)})
+    chosen = make_planner(planner, preset=preset, **{"engine": engine, **parse_settings(settings)})
     limit = max_iterations if max_iterations is not None else chosen.config.max_iterations
     with SolveProgress(planner, problem.num_robots, limit, enabled=not quiet) as progress:
         return chosen.solve(
             problem, seed=seed, time_limit=time_limit, max_iterations=max_iterations, callback=progress.update
         )
-
-
-def _parse_settings(settings: list[str] | None) -> dict[str, Any]:
-    import yaml
-
-    values = {}
-    for setting in settings or []:
-        name, separator, text = setting.partition("=")
-        if not separator or not name:
-            raise ValueError(f"--set {setting!r} is not of the form name=value, as num_samples=512")
-        try:
-            values[name] = yaml.safe_load(text)
-        except yaml.YAMLError:
-            raise ValueError(f"--set {setting!r}: the value cannot be read") from None
-    return values
-
-
-def _names(text: str | None) -> tuple[str, ...] | None:
-    return None if text is None else tuple(name.strip() for name in text.split(","))
-
-
-def _numbers(option: str, text: str | None) -> tuple[int, ...] | None:
-    if text is None:
-        return None
-    try:
-        return tuple(int(number) for number in text.split(","))
-    except ValueError:
-        raise ValueError(f"{option} {text!r} is not a list of whole numbers, as 4,8,16") from None
 
 
 def _execute(plan: Plan, seed: int) -> Any:
@@ -347,14 +323,6 @@ def _require_solved(plan: Plan) -> None:
         raise typer.Exit(1)
 
 
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"folder {str(folder)!r} cannot be made ({error.strerror}); choose another") from None
-    _check_writable(folder)
-
-
 def _check_target(path: Path | None, suffixes: tuple[str, ...]) -> None:
     """Find out before planning whether a file can be written."""
     if path is None:
@@ -365,16 +333,7 @@ def _check_target(path: Path | None, suffixes: tuple[str, ...]) -> None:
         raise ValueError(f"folder {str(path.parent)!r} does not exist; create it first")
     if path.is_dir():
         raise ValueError(f"output file {str(path)!r} is a folder")
-    _check_writable(path.parent)
-
-
-def _check_writable(folder: Path) -> None:
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        reason = error.strerror or "refused"
-        raise ValueError(f"folder {str(folder)!r} cannot be written to ({reason}); choose another") from None
+    check_writable(path.parent)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -383,7 +342,7 @@ def main(arguments: list[str] | None = None) -> None:
         status = app(arguments, standalone_mode=False)
     except ClickException as error:
         status = _complain(error.format_message())
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ImportError) as error:  # ImportError: an extra that is not installed
         status = _complain(_message(error))
     except (KeyboardInterrupt, typer.Abort):
         status = 130

@@ -31,7 +31,7 @@ DETOURS = 32
 """Random detours that it chooses from."""
 
 JOINTLY, STUCK, STUCK_SIZE = 3, 2, 3
-"""Every so many repairs, a group of robots that were all repaired in vain so often is repaired jointly, if this small."""
+"""Every so many repairs, robots in conflict that were all repaired in vain so often are repaired jointly, if so few."""
 
 SLACK = 40
 """Steps beyond the latest arrival of the robots repaired that their repair looks at."""

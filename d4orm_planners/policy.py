@@ -18,9 +18,16 @@ Actions = dict[str, FloatArray]
 
 
 class Policy(ABC):
-    """Something that chooses every robot's control at every step."""
+    """Something that chooses every robot's control at every step.
+
+    Attributes:
+        name: Registry name.
+        config_class: Frozen dataclass of the policy's settings, of which the constructor takes an instance; ``None``
+            for a policy without settings, whose constructor takes nothing.
+    """
 
     name: ClassVar[str]
+    config_class: ClassVar[type | None] = None
 
     def reset(self, env: Any, seed: int = 0) -> None:
         """Get ready for an episode that ``env.reset()`` has begun.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict, fields
 from types import MappingProxyType
 from typing import Any
 
@@ -12,6 +13,7 @@ from d4orm_planners.d4orm import D4orm
 from d4orm_planners.d4orm_d import D4ormD
 from d4orm_planners.mbd import MBD, IterativeMBD
 from d4orm_planners.mppi import MPPI
+from d4orm_planners.orca import Orca
 from d4orm_planners.policy import DriveToGoal, OpenLoop, Policy, RandomControls
 
 PLANNERS: Mapping[str, type[Planner]] = MappingProxyType(
@@ -20,7 +22,7 @@ PLANNERS: Mapping[str, type[Planner]] = MappingProxyType(
 """Every planner class by its name."""
 
 POLICIES: Mapping[str, type[Policy]] = MappingProxyType(
-    {policy.name: policy for policy in (DriveToGoal, RandomControls)}
+    {policy.name: policy for policy in (DriveToGoal, RandomControls, Orca)}
 )
 """The policies that are no planners; every planner is an open-loop policy too."""
 
@@ -60,10 +62,7 @@ def make_planner(name: str, *, preset: str | None = None, **config: Any) -> Plan
     kind = _find(name, PLANNERS, "planner")
     if preset is not None and preset not in kind.presets:
         raise ValueError(f"preset {preset!r} of planner {name!r} is unknown; choose one of {', '.join(kind.presets)}")
-    known = kind.config_class.setting_names()
-    for setting in config:
-        if setting not in known:
-            raise ValueError(f"{setting!r} is no setting of planner {name!r}; it takes {', '.join(known)}")
+    _check_settings(kind.config_class, config, f"planner {name!r}")
     settings = kind.presets[preset] if preset is not None else {}
     return kind(kind.config_class(**{**settings, **config}))
 
@@ -82,10 +81,40 @@ def make_policy(name: str, **config: Any) -> Policy:
     if name in PLANNERS:
         budget = {key: config.pop(key) for key in ("time_limit",) if key in config}
         return OpenLoop(make_planner(name, **config), **budget)
+    config_instance = _policy_config(name, config)
+    kind: Any = POLICIES[name]
+    return kind() if config_instance is None else kind(config_instance)
+
+
+def policy_settings(name: str, **config: Any) -> dict[str, Any]:
+    """All settings of ``make_policy(name, **config)``, defaults filled in; a preset has become its settings.
+
+    Raises:
+        ValueError: As :func:`make_policy`.
+    """
+    if name in PLANNERS:
+        time_limit = config.pop("time_limit", None)
+        return {**asdict(make_planner(name, **config).config), "time_limit": time_limit}
+    config_instance = _policy_config(name, config)
+    return {} if config_instance is None else asdict(config_instance)
+
+
+def _policy_config(name: str, config: Mapping[str, Any]) -> Any:
+    """The configuration of a policy that is no planner; ``None`` for one without settings."""
     kind = _find(name, {**PLANNERS, **POLICIES}, "policy")
+    if kind.config_class is not None:
+        _check_settings(kind.config_class, config, f"policy {name!r}")
+        return kind.config_class(**config)
     if config:
         raise ValueError(f"policy {name!r} takes no settings, but was given {', '.join(config)}")
-    return kind()
+    return None
+
+
+def _check_settings(config_class: type, config: Mapping[str, Any], owner: str) -> None:
+    known = [field.name for field in fields(config_class)]
+    for setting in config:
+        if setting not in known:
+            raise ValueError(f"{setting!r} is no setting of {owner}; it takes {', '.join(known)}")
 
 
 def _find(name: str, table: Mapping[str, Any], what: str) -> Any:

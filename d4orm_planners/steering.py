@@ -1,14 +1,15 @@
-"""Driving straight to the goal, as if nobody else were there: one control law for every model."""
+"""Tracking a velocity, and driving straight to the goal as if nobody else were there: one law for every model."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
-from d4orm_env.core.dynamics import MODELS, Model, Ops
+from d4orm_env.core.dynamics import MODELS, TURN_RATE, Model, Ops
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.transition import TimeStep, advance, arrives
 
@@ -19,26 +20,53 @@ VIA_RADIUS = 0.5
 
 
 def drive_to_goal(problem: Problem, states: FloatArray, goals: FloatArray) -> FloatArray:
-    """``(K, m)`` controls inside the box of each robot's limits; what exceeds their norm the environment clips.
+    """``(K, m)`` controls inside each robot's limits.
 
     Args:
         problem: Whose robots they are.
         states: ``(K, n)``.
         goals: ``(K, d)`` [m].
     """
+    return track_velocities(problem, states, preferred_velocities(problem, states, goals))
+
+
+def preferred_velocities(problem: Problem, states: FloatArray, goals: FloatArray) -> FloatArray:
+    """``(K, d)`` velocities straight to the goals, from which every robot can still stop there [m/s].
+
+    Args:
+        problem: Whose robots they are.
+        states: ``(K, n)``.
+        goals: ``(K, d)`` [m].
+    """
+    velocities = np.zeros(goals.shape, np.float32)
+    for model, robots in _by_model(problem):
+        velocities[robots] = approach(model, states[robots], goals[robots], problem.team.limits[robots], problem.dt)
+    return velocities
+
+
+def track_velocities(problem: Problem, states: FloatArray, velocities: FloatArray) -> FloatArray:
+    """``(K, m)`` controls inside each robot's limits that bring the team to these velocities as soon as they allow.
+
+    Args:
+        problem: Whose robots they are.
+        states: ``(K, n)``.
+        velocities: ``(K, d)`` wanted [m/s].
+    """
     controls = np.zeros((problem.num_robots, problem.control_size), np.float32)
-    for name in set(problem.team.models):
-        robots = [k for k, model in enumerate(problem.team.models) if model == name]
-        model = MODELS[name]
-        controls[robots, : model.control_size] = steer(
-            model, states[robots], goals[robots, : model.dimension], problem.team.limits[robots], problem.dt
-        )
+    for model, robots in _by_model(problem):
+        limits = problem.team.limits[robots]
+        wanted = track(model, states[robots], velocities[robots], limits, problem.dt)
+        allowed = model.functions.limit_control(tuple(wanted.T), tuple(limits.T), NUMPY_OPS)
+        controls[robots, : model.control_size] = np.stack(allowed, axis=1)
+    # The norm may come out above the limit by a rounding error.
     limit = problem.team.control_limits
     return np.clip(controls, -limit, limit)
 
 
 def steer(model: Model, states: FloatArray, goals: FloatArray, limits: FloatArray, dt: float) -> FloatArray:
     """``(B, m)`` controls of ``B`` robots of one model towards their goals, braking in time to stop there.
+
+    They may exceed the limits.
 
     Args:
         model: The model.
@@ -47,22 +75,57 @@ def steer(model: Model, states: FloatArray, goals: FloatArray, limits: FloatArra
         limits: ``(B, 3)`` speed, acceleration and turn rate.
         dt: Time step [s].
     """
-    speed, acceleration, turn_rate = limits.T
+    return track(model, states, approach(model, states, goals, limits, dt), limits, dt)
+
+
+def approach(model: Model, states: FloatArray, goals: FloatArray, limits: FloatArray, dt: float) -> FloatArray:
+    """``(B, d)`` fastest velocities straight to the goals from which the robots can still stop there [m/s].
+
+    Args: as :func:`steer`.
+    """
+    speed, acceleration, _ = limits.T
     to_goal = goals - states[:, : model.dimension]
     distance = np.sqrt((to_goal * to_goal).sum(axis=1))
     direction = to_goal / np.maximum(distance, 1e-6)[:, None]
-    # The fastest speed from which the robot can still stop at its goal, braking from the next step on.
-    lost = acceleration * (dt / 2)
-    wanted_speed = np.minimum(speed, np.sqrt(2 * acceleration * distance + lost * lost) - lost)
     if model.name == "velocity2d":
+        # A first-order robot stops at once, and need only not overshoot within a step.
         return direction * np.minimum(speed, distance / dt)[:, None]
+    # Braking begins with the next step.
+    lost = acceleration * (dt / 2)
+    stopping = np.sqrt(2 * acceleration * distance + lost * lost) - lost
+    return direction * np.minimum(speed, stopping)[:, None]
+
+
+def track(model: Model, states: FloatArray, velocities: FloatArray, limits: FloatArray, dt: float) -> FloatArray:
+    """``(B, m)`` controls that would bring ``B`` robots of one model to these velocities within a step.
+
+    A robot with a heading turns to the wanted direction, and drives as fast as it faces that way. The controls may
+    exceed the limits.
+
+    Args:
+        model: The model.
+        states: ``(B, n)``.
+        velocities: ``(B, d)`` wanted [m/s].
+        limits: ``(B, 3)`` speed, acceleration and turn rate.
+        dt: Time step [s].
+    """
+    if model.name == "velocity2d":
+        return velocities
     if model.heading_index is None:
-        return (direction * wanted_speed[:, None] - states[:, list(model.speed_indices)]) / dt
-    turn = np.arctan2(to_goal[:, 1], to_goal[:, 0]) - states[:, model.heading_index]
-    turn = (turn + np.pi) % (2 * np.pi) - np.pi
-    facing = np.maximum(np.cos(turn), 0)
-    push = (wanted_speed * facing - states[:, model.speed_indices[0]]) / dt
+        return (velocities - states[:, list(model.speed_indices)]) / dt
+    turn_rate, speed = limits[:, TURN_RATE], np.sqrt((velocities * velocities).sum(axis=1))
+    turn = np.arctan2(velocities[:, 1], velocities[:, 0]) - states[:, model.heading_index]
+    # To stand still no heading is better than the present one.
+    turn = np.where(speed > 0, (turn + np.pi) % (2 * np.pi) - np.pi, 0)
+    push = (speed * np.maximum(np.cos(turn), 0) - states[:, model.speed_indices[0]]) / dt
     return np.stack([np.clip(turn / dt, -turn_rate, turn_rate), push], axis=1)
+
+
+def _by_model(problem: Problem) -> Iterator[tuple[Model, list[int]]]:
+    """The models of the team, each with its robots."""
+    models = problem.team.models
+    for name in dict.fromkeys(models):
+        yield MODELS[name], [robot for robot, model in enumerate(models) if model == name]
 
 
 @dataclass(frozen=True)
@@ -128,15 +191,14 @@ def _drive_teams(problem: Problem, states: FloatArray, controls: FloatArray, swi
     u = np.repeat(np.asarray(controls, np.float32)[:, :, None], num_ways, axis=2)
     x = np.repeat(np.asarray(states, np.float32)[:, :, None], num_ways, axis=2)
     arrived = np.zeros(switch.shape, bool)
-    for name in set(problem.team.models):
-        robots = [k for k, model in enumerate(problem.team.models) if model == name]
+    for model, robots in _by_model(problem):
         # One lane for every robot and way.
         x_lanes, u_lanes = (array[:, robots].reshape(len(array), -1, array.shape[-1]) for array in (x, u))
         goals, limits = (
             np.repeat(np.asarray(rows)[robots], num_ways, axis=0) for rows in (problem.goal, problem.team.limits)
         )
         targets = vias[robots].reshape(-1, vias.shape[2])
-        arrivals = _drive(MODELS[name], problem, x_lanes, u_lanes, goals, limits, switch[robots].ravel(), targets)
+        arrivals = _drive(model, problem, x_lanes, u_lanes, goals, limits, switch[robots].ravel(), targets)
         x[:, robots] = x_lanes.reshape(len(x), len(robots), num_ways, -1)
         u[:, robots] = u_lanes.reshape(len(u), len(robots), num_ways, -1)
         arrived[robots] = arrivals.reshape(len(robots), num_ways)

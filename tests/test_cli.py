@@ -153,7 +153,7 @@ def test_unwritable_folder(d4orm, arguments: Sequence[str]) -> None:
     assert "choose another" in outcome.err
 
 
-@pytest.mark.parametrize("command", [[], ["demo"], ["plan"], ["run"], ["scenarios"], ["planners"]])
+@pytest.mark.parametrize("command", [[], ["demo"], ["plan"], ["run"], ["robustness"], ["scenarios"], ["planners"]])
 def test_help(d4orm, command: list[str]) -> None:
     outcome = d4orm(*command, "--help")
     assert outcome.status == 0
@@ -164,7 +164,7 @@ def test_help_loads_nothing_heavy() -> None:
     code = (
         "import sys\nfrom d4orm_planners import cli\n"
         "try:\n    cli.main(['--help'])\nexcept SystemExit:\n    pass\n"
-        "print([m for m in ('numba', 'jax', 'torch', 'matplotlib', 'pettingzoo') if m in sys.modules])"
+        "print([m for m in ('numba', 'jax', 'torch', 'matplotlib', 'pettingzoo', 'pyrvo') if m in sys.modules])"
     )
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, env={**os.environ, "COLUMNS": "100"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from planner_support import CHEAP, cheap_planner, hop_problem
 from d4orm_env import navigation_v0
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
 from d4orm_env.joint_state import split_state
 from d4orm_env.scenarios import make_problem
 from d4orm_env.wrappers import GaussianControlNoise
@@ -153,6 +155,10 @@ def test_every_planner_is_a_policy() -> None:
         ("gaol", {}, "policy 'gaol' is unknown; choose one of .*goal"),
         ("goal", {"speed": 1}, "policy 'goal' takes no settings, but was given speed"),
         ("random", {"seed": 1}, "policy 'random' takes no settings"),
+        ("orca", {"speed": 1}, "'speed' is no setting of policy 'orca'; it takes time_horizon"),
+        ("orca", {"time_horizon": 0}, "time_horizon is 0"),
+        ("orca", {"max_neighbors": 1.5}, "max_neighbors must be a whole number"),
+        ("orca", {"deviation": -1}, "deviation is -1"),
         ("d4orm", {"num_samples": 1}, "num_samples is 1"),
         ("d4orm", {"samples": 10}, "'samples' is no setting"),
         ("d4orm", {"preset": "none"}, "preset 'none'"),
@@ -263,6 +269,64 @@ def test_a_policy_reads_the_time_from_the_state(plan: Plan) -> None:
             np.testing.assert_array_equal(actions[agent], plan.controls[step, robot])
             np.testing.assert_array_equal(again[agent], plan.controls[step, robot])
         observations = env.step(actions)[0]
+
+
+# ORCA.
+
+
+@pytest.mark.parametrize("model", ["holonomic2d", "velocity2d", "differential_drive"])
+def test_orca_crosses_the_circle_where_driving_straight_collides(model: str) -> None:
+    env = navigation_v0.parallel_env(scenario="circle", num_robots=4, model=model)
+    assert run_episode(env, make_policy("goal"), seed=0).metrics["collided"] == 4
+    episode = run_episode(env, make_policy("orca"), seed=0)
+    assert episode.metrics["success"] == 1
+    assert episode.metrics["makespan"] < 8
+
+
+def test_orca_goes_around_obstacles_and_docked_robots_and_stays_in_bounds() -> None:
+    world = World(circles=[[1.5, -0.1, 0.3]], boxes=[[2.5, -0.6, 3.0, -0.1]], lower=[-0.5, -1.0], upper=[6.0, 1.0])
+    # The second robot stands at its goal from the start, in the way of the first.
+    start = [[0, 0, 0, 0], [4.0, 0, 0, 0]]
+    problem = Problem(Team(("holonomic2d",) * 2), start, [[5.0, 0], [4.0, 0]], world)
+    assert run_episode(navigation_v0.parallel_env(problem=problem), make_policy("goal")).metrics["collided"]
+    episode = run_episode(navigation_v0.parallel_env(problem=problem), make_policy("orca"), seed=0)
+    assert episode.metrics["success"] == 1
+
+
+def test_orca_keeps_two_velocity_controlled_robots_outside_the_margin() -> None:
+    problem = make_problem("circle", num_robots=2, model="velocity2d")
+    for seed in range(3):
+        metrics = run_episode(navigation_v0.parallel_env(problem=problem), make_policy("orca"), seed=seed).metrics
+        assert metrics["success"] == 1
+        assert metrics["margin_violated"] == 0
+
+
+def test_orca_remembers_nothing_between_steps() -> None:
+    env = navigation_v0.parallel_env(scenario="circle", num_robots=5)
+    observations, _ = env.reset(seed=0)
+    policy = make_policy("orca")
+    policy.reset(env, seed=0)
+    first = policy.act(observations, env.state())
+    for _ in range(5):
+        state = env.state()
+        env.step(policy.act(observations, state))
+    policy.reset(env, seed=0)
+    env.reset(seed=0)
+    for agent, action in policy.act(observations, env.state()).items():
+        np.testing.assert_array_equal(action, first[agent])
+
+
+def test_orca_refuses_a_problem_in_space() -> None:
+    env = navigation_v0.parallel_env(scenario="circle", num_robots=2, model="holonomic3d")
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="'orca' works in the plane, and this problem has 3 dimensions"):
+        make_policy("orca").reset(env)
+
+
+def test_without_pyrvo_orca_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyrvo", None)
+    with pytest.raises(ImportError, match=r'pip install "d4orm-env\[orca\]"'):
+        make_policy("orca")
 
 
 # Noise.

@@ -1,0 +1,73 @@
+"""Reading and checking what was given on the command line."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+
+def parse_settings(settings: list[str] | None) -> dict[str, Any]:
+    """``name=value`` texts as a dictionary, the values read as YAML.
+
+    Raises:
+        ValueError: If a text has another form.
+    """
+    import yaml
+
+    values = {}
+    for setting in settings or []:
+        name, separator, text = setting.partition("=")
+        if not separator or not name:
+            raise ValueError(f"--set {setting!r} is not of the form name=value, as num_samples=512")
+        try:
+            values[name] = yaml.safe_load(text)
+        except yaml.YAMLError:
+            raise ValueError(f"--set {setting!r}: the value cannot be read") from None
+    return values
+
+
+def names(text: str | None) -> tuple[str, ...] | None:
+    """A list separated by commas; ``None`` stays."""
+    return None if text is None else tuple(name.strip() for name in text.split(","))
+
+
+def numbers(option: str, text: str | None) -> tuple[int, ...] | None:
+    """A list of whole numbers separated by commas; ``None`` stays.
+
+    Raises:
+        ValueError: If it is something else; the message names the option.
+    """
+    if text is None:
+        return None
+    try:
+        return tuple(int(number) for number in text.split(","))
+    except ValueError:
+        raise ValueError(f"{option} {text!r} is not a list of whole numbers, as 4,8,16") from None
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder, unless it is there, and find out whether it can be written to.
+
+    Raises:
+        ValueError: If not.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"folder {str(folder)!r} cannot be made ({error.strerror}); choose another") from None
+    check_writable(folder)
+
+
+def check_writable(folder: Path) -> None:
+    """Find out whether files can be made in a folder.
+
+    Raises:
+        ValueError: If not.
+    """
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        reason = error.strerror or "refused"
+        raise ValueError(f"folder {str(folder)!r} cannot be written to ({reason}); choose another") from None

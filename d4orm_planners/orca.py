@@ -1,0 +1,158 @@
+"""Optimal reciprocal collision avoidance, through the ``pyrvo`` bindings of the authors' RVO2 library.
+
+J. van den Berg, S. J. Guy, M. Lin and D. Manocha, "Reciprocal n-Body Collision Avoidance", Robotics Research, 2011.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray, positive_number, whole_number
+from d4orm_env.core.problem import Problem
+from d4orm_env.joint_state import JointState
+from d4orm_planners.policy import Policy
+from d4orm_planners.steering import NUMPY_OPS, preferred_velocities, track_velocities
+
+CORNERS = 16
+"""Of the polygons that stand for round obstacles and docked robots."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OrcaConfig:
+    """Settings of :class:`Orca`.
+
+    Attributes:
+        time_horizon: For this long the new velocities keep the robots apart [s].
+        obstacle_time_horizon: The same for obstacles, bounds and docked robots, which do not give way [s].
+        neighbor_distance: Robots farther away than this are not looked at [m].
+        max_neighbors: So many of the nearest robots are looked at.
+        clearance: Added to every robot's radius [m]; by default the problem's margin. Two robots so keep twice that
+            distance, which leaves robots with inertia some room: they cannot take a new velocity at once.
+        deviation: Standard deviation of the angle by which each robot's preferred velocity is turned, drawn once per
+            episode [rad]. Without it robots in a symmetric formation block each other, as the authors note.
+
+    Raises:
+        ValueError: If a value makes no sense; the message names it.
+    """
+
+    time_horizon: float = 1.0
+    obstacle_time_horizon: float = 1.0
+    neighbor_distance: float = 10.0
+    max_neighbors: int = 10
+    clearance: float | None = None
+    deviation: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name in ("time_horizon", "obstacle_time_horizon", "neighbor_distance"):
+            positive_number(getattr(self, name), name)
+        whole_number(self.max_neighbors, "max_neighbors", 0)
+        positive_number(self.deviation, "deviation", zero_allowed=True)
+        if self.clearance is not None:
+            positive_number(self.clearance, "clearance", zero_allowed=True)
+
+
+class Orca(Policy):
+    """ORCA: every robot drives to its goal at the velocity nearest to the one it prefers that avoids all others.
+
+    All robots give way to each other by halves; docked robots, obstacles and bounds do not give way. ORCA speaks of
+    robots that take a new velocity at once. Those of a model with inertia or a heading follow it as well as their
+    limits allow, so that they may come closer than ORCA promises. It works in the plane only.
+    """
+
+    name = "orca"
+    config_class: ClassVar[type | None] = OrcaConfig
+
+    def __init__(self, config: OrcaConfig | None = None) -> None:
+        self.config = config or OrcaConfig()
+        self._rvo = _load_pyrvo()
+
+    def _begin(self, env: Any, seed: int) -> None:
+        problem = self.problem
+        if problem.dimension != 2:
+            raise ValueError(
+                f"policy 'orca' works in the plane, and this problem has {problem.dimension} dimensions; choose "
+                "another policy or a planar model"
+            )
+        angle = np.random.default_rng(seed).normal(0, self.config.deviation, problem.num_robots)
+        self._turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]], np.float32)
+        self._walls = list(_walls(problem))
+
+    def _controls(self, joint: JointState) -> FloatArray:
+        preferred = preferred_velocities(self.problem, joint.states, joint.goals)
+        preferred = np.einsum("ijk,kj->ki", self._turn, preferred)
+        return track_velocities(self.problem, joint.states, self._avoid(joint, preferred))
+
+    def _avoid(self, joint: JointState, preferred: FloatArray) -> FloatArray:
+        """``(K, 2)`` velocities nearest to the preferred ones that avoid everything; zero for docked robots."""
+        problem, config = self.problem, self.config
+        # Made anew at every step, so that an action depends on the present state alone.
+        simulator = self._rvo.RVOSimulator()
+        simulator.set_time_step(problem.dt)
+        clearance = problem.margin if config.clearance is None else config.clearance
+        radius, max_speed = np.asarray(problem.team.radius), np.asarray(problem.team.max_speed)
+        moving = np.flatnonzero(~joint.arrived)
+        velocities = _velocities(problem, joint)
+        for robot in moving:
+            simulator.add_agent(
+                joint.states[robot, :2].tolist(),
+                config.neighbor_distance,
+                config.max_neighbors,
+                config.time_horizon,
+                config.obstacle_time_horizon,
+                float(radius[robot]) + clearance,
+                float(max_speed[robot]),
+                velocities[robot].tolist(),
+            )
+        docked = [_disc(joint.states[k, 0], joint.states[k, 1], radius[k]) for k in np.flatnonzero(joint.arrived)]
+        for corners in [*self._walls, *docked]:
+            simulator.add_obstacle(corners.tolist())
+        simulator.process_obstacles()
+        for agent, robot in enumerate(moving):
+            simulator.set_agent_pref_velocity(agent, preferred[robot].tolist())
+        simulator.do_step()
+        avoiding = np.zeros_like(preferred)
+        for agent, robot in enumerate(moving):
+            avoiding[robot] = simulator.get_agent_velocity(agent).to_tuple()
+        return avoiding
+
+
+def _load_pyrvo() -> Any:
+    try:
+        import pyrvo
+    except ImportError as error:
+        raise ImportError("policy 'orca' needs pyrvo; install it with pip install \"d4orm-env[orca]\"") from error
+    return pyrvo
+
+
+def _velocities(problem: Problem, joint: JointState) -> FloatArray:
+    """``(K, 2)`` present velocities [m/s]; that of a first-order robot is the one it was last told."""
+    velocities = [
+        model.functions.velocity(state, control, NUMPY_OPS)
+        for model, state, control in zip(problem.team.robot_models, joint.states, joint.controls, strict=True)
+    ]
+    return np.array(velocities, np.float32)
+
+
+def _walls(problem: Problem) -> Iterator[FloatArray]:
+    """Obstacles and bounds as polygons: counter-clockwise around what is solid, clockwise around free space."""
+    for circle in problem.world.circles:
+        yield _disc(*circle)
+    for box in problem.world.boxes:
+        yield _rectangle(*box)
+    if problem.world.lower is not None:
+        yield _rectangle(*problem.world.lower, *problem.world.upper)[::-1]
+
+
+def _rectangle(left: float, bottom: float, right: float, top: float) -> FloatArray:
+    return np.array([[left, bottom], [right, bottom], [right, top], [left, top]], np.float32)
+
+
+def _disc(x: float, y: float, radius: float) -> FloatArray:
+    """``(CORNERS, 2)`` polygon around a disc."""
+    angle = np.arange(CORNERS) * (2 * np.pi / CORNERS)
+    outer = radius / np.cos(np.pi / CORNERS)
+    return np.array([x, y] + outer * np.column_stack([np.cos(angle), np.sin(angle)]), np.float32)

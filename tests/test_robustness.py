@@ -1,0 +1,392 @@
+"""Success against noise: the statistics, the store of trials, resuming, and what is written."""
+
+from __future__ import annotations
+
+import csv
+import multiprocessing
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from d4orm_planners import cli, make_policy
+from d4orm_planners.evaluation import robustness as robustness_module
+from d4orm_planners.evaluation import trials as trials_module
+from d4orm_planners.evaluation.robustness import STORE, robustness, success_rate
+from d4orm_planners.evaluation.robustness_report import markdown, write_robustness
+from d4orm_planners.evaluation.statistics import wilson_interval
+from d4orm_planners.evaluation.store import APPLICATION_ID, Trial, TrialStore
+from d4orm_planners.policy import DriveToGoal
+
+TINY: dict[str, Any] = {"robots": [2], "noise": [0.0, 0.3], "trials": 2, "workers": 1}
+
+
+def trial(seed: int = 0, **changes: Any) -> Trial:
+    values = {"policy": "goal", "config": "{}", "problem": "abc", "noise": 0.1, "scenario": "circle", "robots": 2}
+    outcome = {"success": True, "arrived": 2, "travel_time": 5.0, "makespan": 6.0, "steps": 60, "wall_time": 0.5}
+    return Trial(**{**values, "model": "holonomic2d", "versions": "{}", **outcome, "seed": seed, **changes})
+
+
+@pytest.fixture
+def d4orm(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Runs ``d4orm robustness`` inside ``tmp_path``; gives exit status, output and errors."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: str) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as exit_:
+            cli.main(["robustness", *arguments])
+        captured = capsys.readouterr()
+        return int(exit_.value.code or 0), captured.out, captured.err
+
+    return call
+
+
+# Statistics.
+
+
+@pytest.mark.parametrize(
+    ("successes", "count", "lower", "upper"),
+    [
+        (0, 10, 0.0, 0.277533),
+        (10, 10, 0.722467, 1.0),
+        (5, 10, 0.236593, 0.763407),
+        (1, 50, 0.003539, 0.104954),
+        (45, 50, 0.786398, 0.956524),
+        (0, 0, 0.0, 1.0),
+    ],
+)
+def test_wilson_interval(successes: int, count: int, lower: float, upper: float) -> None:
+    assert wilson_interval(successes, count) == pytest.approx((lower, upper), abs=1e-6)
+
+
+@pytest.mark.parametrize(("successes", "count"), [(-1, 5), (6, 5), (1, 0)])
+def test_impossible_counts_are_refused(successes: int, count: int) -> None:
+    with pytest.raises(ValueError, match=f"successes is {successes}"):
+        wilson_interval(successes, count)
+
+
+def test_success_rate_sums_up() -> None:
+    row = success_rate([
+        trial(0, travel_time=4.0, wall_time=1.0),
+        trial(1, travel_time=6.0, wall_time=2.0),
+        trial(2, success=False, collided=2, arrived=1, travel_time=9.0, wall_time=9.0),
+        trial(3, success=False, arrived=0, travel_time=None, wall_time=None, error="ValueError: no"),
+    ])  # fmt: skip
+    assert (row.trials, row.successes, row.contacts, row.late, row.errors) == (4, 2, 1, 1, 1)
+    assert (row.rate, row.travel_time, row.wall_time, row.error) == (0.5, 5.0, 2.0, "ValueError: no")
+    assert (row.lower, row.upper) == wilson_interval(2, 4)
+
+
+# The store.
+
+
+def test_the_store_gives_back_what_was_added(tmp_path: Path) -> None:
+    store = TrialStore(tmp_path / "trials.sqlite")
+    rows = [trial(0), trial(1, noise=1 / 3, success=False), trial(2, error="ValueError: no", travel_time=None)]
+    assert all(store.add(row) for row in rows)
+    again = TrialStore(tmp_path / "trials.sqlite")
+    assert sorted(again.trials(), key=lambda row: row.seed) == rows
+    assert again.finished() == {rows[0].key, rows[1].key}
+
+
+def test_a_finished_trial_stays_and_a_failed_one_is_replaced(tmp_path: Path) -> None:
+    store = TrialStore(tmp_path / "trials.sqlite")
+    assert store.add(trial())
+    assert not store.add(trial(steps=7))
+    assert store.add(trial(1, error="boom"))
+    assert store.add(trial(1))
+    assert store.trials() == [trial(), trial(1)]
+
+
+def fill(path: Path, first: int, last: int) -> None:
+    store = TrialStore(path)
+    for seed in range(first, last):
+        store.add(trial(seed))
+
+
+def test_two_writers_lose_nothing_and_count_nothing_twice(tmp_path: Path) -> None:
+    context, path = multiprocessing.get_context("spawn"), tmp_path / "trials.sqlite"
+    # They make the file at the same time, and half of their trials are the same.
+    writers = [context.Process(target=fill, args=(path, first, first + 100)) for first in (0, 50)]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+        assert writer.exitcode == 0
+    assert [row.seed for row in TrialStore(path).trials()] == list(range(150))
+
+
+def not_a_database(path: Path) -> None:
+    path.write_text("these are my notes, " * 100)
+
+
+def other_database(path: Path) -> None:
+    connection = sqlite3.connect(path)
+    connection.execute("CREATE TABLE notes (text)")
+    connection.commit()
+    connection.close()
+
+
+def later_version(path: Path) -> None:
+    connection = sqlite3.connect(path)
+    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+    connection.execute("PRAGMA user_version = 99")
+    connection.close()
+
+
+@pytest.mark.parametrize("make", [not_a_database, other_database, later_version])
+def test_a_file_that_is_not_ours_is_refused_and_left_alone(d4orm, tmp_path: Path, make: Callable[..., None]) -> None:
+    make(tmp_path / STORE)
+    before = (tmp_path / STORE).read_bytes()
+    status, _, err = d4orm("--out", ".", "--policies", "goal")
+    assert status == 2
+    assert err.count("\n") == 1
+    assert "is no store of trials" in err
+    assert (tmp_path / STORE).read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == [STORE]
+
+
+# Trials.
+
+
+def test_success_and_failure_are_counted(tmp_path: Path) -> None:
+    rates = robustness(["goal", "orca"], tmp_path, **TINY)
+    assert [(row.policy, row.noise, row.trials, row.successes, row.contacts) for row in rates] == [
+        ("goal", 0.0, 2, 0, 2),
+        ("goal", 0.3, 2, 0, 2),
+        ("orca", 0.0, 2, 2, 0),
+        ("orca", 0.3, 2, 2, 0),
+    ]
+    stored = TrialStore(tmp_path / STORE).trials()
+    assert len(stored) == len({row.key for row in stored}) == 8
+    assert {(row.scenario, row.robots, row.model) for row in stored} == {("circle", 2, "holonomic2d")}
+    assert all(row.steps and row.wall_time and '"numpy"' in row.versions for row in stored)
+
+
+def test_random_problems_differ_by_seed_and_noise_too(tmp_path: Path) -> None:
+    robustness(["goal"], tmp_path, scenarios=["random"], **TINY)
+    stored = TrialStore(tmp_path / STORE).trials()
+    assert len({row.problem for row in stored}) == 2
+    assert len({row.travel_time for row in stored}) == 4
+
+
+def test_a_plan_is_made_once_for_all_levels_of_noise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[int] = []
+    solve = type(make_policy("d4orm").planner).solve  # type: ignore[attr-defined]
+
+    def counted(self: Any, problem: Any, seed: int = 0, **budget: Any) -> Any:
+        made.append(seed)
+        return solve(self, problem, seed=seed, **budget)
+
+    monkeypatch.setattr("d4orm_planners.d4orm.D4orm.solve", counted)
+    settings = {"engine": "cpu", "num_samples": 64, "num_steps": 5, "max_iterations": 1}
+    rates = robustness({"d4orm": settings}, tmp_path, **TINY)
+    assert made == [0, 1]
+    assert all(row.errors == 0 for row in rates)
+    times = {(row.seed, row.wall_time) for row in TrialStore(tmp_path / STORE).trials()}
+    assert len(times) == 2
+
+
+def test_resuming_runs_only_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    robustness(["goal"], tmp_path, **TINY)
+    ran: list[tuple[int, tuple[float, ...]]] = []
+    run_job = trials_module.run_job
+    monkeypatch.setattr(
+        trials_module, "run_job", lambda job, store: (ran.append((job.seed, job.noise)), run_job(job, store))
+    )
+    before = robustness(["goal"], tmp_path, **TINY)
+    assert ran == []
+    counts: list[tuple[int, int]] = []
+    more = {**TINY, "noise": [0.0, 0.3, 0.5], "trials": 3}
+    rates = robustness(["goal"], tmp_path, **more, progress=lambda what, done, total: counts.append((done, total)))
+    assert ran == [(0, (0.5,)), (1, (0.5,)), (2, (0.0, 0.3, 0.5))]
+    assert counts == [(4, 9), (5, 9), (6, 9), (9, 9)]
+    assert [row.trials for row in rates] == [3, 3, 3]
+    # Trials beyond those asked for are in the store and not in the rates.
+    again = robustness(["goal"], tmp_path, **TINY)
+    assert again == before
+    # Other settings are other trials.
+    ran.clear()
+    robustness({"orca": {"time_horizon": 2.0}}, tmp_path, **TINY)
+    robustness({"orca": {"time_horizon": 3.0}}, tmp_path, **TINY)
+    assert len(ran) == 4
+
+
+class Unlucky(DriveToGoal):
+    """Fails in the first episode."""
+
+    def _begin(self, env: Any, seed: int) -> None:
+        if seed == 0:
+            raise RuntimeError("out of\nluck")
+
+
+def test_an_error_is_a_row_and_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trials_module, "make_policy", lambda name, **settings: Unlucky())
+    rates = robustness(["goal"], tmp_path, **TINY)
+    assert [(row.trials, row.errors, row.error) for row in rates] == [(2, 1, "RuntimeError: out of luck")] * 2
+    assert "- `goal`: RuntimeError: out of luck" in markdown(rates)
+    monkeypatch.undo()
+    rates = robustness(["goal"], tmp_path, **TINY)
+    assert [(row.trials, row.errors) for row in rates] == [(2, 0)] * 2
+
+
+def test_ctrl_c_keeps_what_was_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, d4orm) -> None:
+    run_job = trials_module.run_job
+
+    def interrupted(job: Any, store: Any) -> None:
+        if job.seed == 1:
+            raise KeyboardInterrupt
+        run_job(job, store)
+
+    monkeypatch.setattr(trials_module, "run_job", interrupted)
+    arguments = ("--policies", "goal", "--robots", "2", "--trials", "3", "--noise", "0,0.3", "--workers", "1")
+    status, _, err = d4orm(*arguments)
+    assert status == 130
+    assert "the same command goes on from there" in err
+    assert len(TrialStore(tmp_path / "robustness" / STORE).trials()) == 2
+
+
+@pytest.mark.slow
+def test_the_number_of_workers_makes_no_difference(tmp_path: Path) -> None:
+    alone, together = (
+        robustness(["goal", "orca"], tmp_path / str(workers), **{**TINY, "workers": workers}) for workers in (1, 2)
+    )
+    assert [replace(row, wall_time=None) for row in alone] == [replace(row, wall_time=None) for row in together]
+    outcomes = [
+        [replace(row, wall_time=None) for row in TrialStore(tmp_path / folder / STORE).trials()] for folder in "12"
+    ]
+    assert outcomes[0] == outcomes[1]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, workers: int) -> None:
+    arguments = ["--policies", "goal", "--robots", "8", "--trials", "60", "--noise", "0,0.1", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "d4orm_planners.cli", "robustness", *arguments, "--workers", str(workers), "-q"]
+    process = subprocess.Popen(command)
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        if (tmp_path / STORE).exists() and TrialStore(tmp_path / STORE).trials():
+            break
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+    time.sleep(1)  # workers may finish a trial that they are in the middle of
+    first = TrialStore(tmp_path / STORE).trials()
+    assert 0 < len(first) < 120
+    time.sleep(0.5)
+    assert TrialStore(tmp_path / STORE).trials() == first, "a worker outlived its parent"
+    subprocess.run(command, check=True)
+    rows = TrialStore(tmp_path / STORE).trials()
+    assert [(row.noise, row.seed) for row in rows] == [(noise, seed) for noise in (0.0, 0.1) for seed in range(60)]
+    kept = {row.key: row for row in rows}
+    assert all(kept[row.key] == row for row in first)
+
+
+# What is written.
+
+
+def test_the_files(d4orm, tmp_path: Path) -> None:
+    arguments = ("--policies", "goal,orca", "--scenario", "circle,random", "--robots", "2,3", "--trials", "1")
+    status, out, err = d4orm(*arguments, "--noise", "0,0.1", "--workers", "1", "--out", "here")
+    assert status == 0, err
+    written = {path.name for path in (tmp_path / "here").iterdir()}
+    assert {"robustness.csv", "robustness.md", "robustness.png", STORE} <= written
+    assert (tmp_path / "here" / "robustness.png").read_bytes().startswith(b"\x89PNG")
+    with (tmp_path / "here" / "robustness.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * 2 * 2 * 2
+    assert rows[0]["policy"] == "goal"
+    assert float(rows[0]["rate"]) == 0
+    text = (tmp_path / "here" / "robustness.md").read_text()
+    assert "### random, 3 robots, holonomic2d" in text
+    assert text.strip() in out
+
+
+def test_the_table_row_by_row(tmp_path: Path) -> None:
+    rates = [success_rate([trial(0, wall_time=0.25), trial(1, success=False, collided=2)])]
+    assert markdown(rates).splitlines() == [
+        "### circle, 2 robots, holonomic2d",
+        "",
+        "| policy | noise | success | 95% interval | contact | not in time | errors | travel time, s | planning, s |",
+        "|---|---|---|---|---|---|---|---|---|",
+        "| goal | 0.1 | 1 of 2 (50%) | 9% to 91% | 1 | 0 | 0 | 5.00 | 0.38 |",
+    ]
+    paths = write_robustness(tmp_path, rates)
+    assert sorted(path.name for path in paths) == sorted(path.name for path in tmp_path.iterdir())
+
+
+def test_settings_reach_the_policies_that_have_them(d4orm, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: dict[str, Any] = {}
+
+    def measure(policies: Any, out: Any, **rest: Any) -> Any:
+        seen.update(policies)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(robustness_module, "robustness", measure)
+    settings = ("--set", "num_samples=64", "--set", "orca.time_horizon=2", "--set", "cem.num_samples=32")
+    d4orm("--policies", "d4orm,cem,orca", *settings, "--set", "preset=paper")
+    assert seen == {
+        "d4orm": {"num_samples": 64, "preset": "paper"},
+        "cem": {"num_samples": 32, "preset": "paper"},
+        "orca": {"time_horizon": 2},
+    }
+
+
+# Bad input.
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--policies", "gaol"), "policy 'gaol' is unknown"),
+        (("--scenario", "square"), "scenario 'square' is unknown"),
+        (("--robots", "0"), "num_robots is 0"),
+        (("--robots", "two"), "--robots 'two'"),
+        (("--model", "hovercraft"), "model 'hovercraft' is unknown"),
+        (("--noise", "0,-0.1"), "noise is -0.1"),
+        (("--noise", "0,nan"), "noise is nan"),
+        (("--noise", "none"), "--noise 'none' is not a list of numbers"),
+        (("--trials", "0"), "trials is 0"),
+        (("--workers", "0"), "workers is 0"),
+        (("--set", "speed=1"), "'speed' is a setting of none of the policies goal"),
+        (("--set", "orca.time_horizon=1"), "'orca' is not among the policies"),
+        (("--policies", "orca", "--set", "time_horizon=-1"), "time_horizon is -1"),
+        (("--policies", "orca", "--set", "orca.speed=1"), "'speed' is no setting of policy 'orca'"),
+        (("--out", "file"), "'file' cannot be made"),
+        (("--out", "/proc/robustness"), "choose another"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
+    (tmp_path / "file").write_text("")
+    if arguments[-1].startswith("/proc") and not Path("/proc").is_dir():
+        pytest.skip("needs a folder that not even root can write to")
+    status, _, err = d4orm("--policies", "goal", *arguments)
+    assert status == 2
+    assert err.count("\n") == 1
+    assert err.startswith("d4orm: ")
+    assert message in err
+    assert not list(tmp_path.rglob("*.sqlite"))
+
+
+def test_a_library_that_is_missing_is_named_before_anything_runs(d4orm, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyrvo", None)
+    status, _, err = d4orm("--policies", "goal,orca")
+    assert status == 2
+    assert err == "d4orm: policy 'orca' needs pyrvo; install it with pip install \"d4orm-env[orca]\"\n"
+
+
+@pytest.mark.parametrize("changes", [{"policies": []}, {"noise": []}, {"scenarios": []}, {"robots": []}])
+def test_nothing_to_do_is_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
+    arguments = {"policies": ["goal"], **TINY, **changes}
+    with pytest.raises(ValueError, match=f"{next(iter(changes))}.* empty"):
+        robustness(arguments.pop("policies"), tmp_path, **arguments)
