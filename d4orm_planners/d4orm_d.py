@@ -164,7 +164,7 @@ class _Repair:
             radius = np.asarray(problem.team.radius)[others]
             moving = MovingObstacles(self.positions[1 : horizon + 1, others], radius)
         base = np.ascontiguousarray(self.controls[:horizon, robots, : part.control_size])
-        task = SamplingTask(part.replace(horizon=horizon), base, moving=moving, **scoring)
+        task = SamplingTask(part.moment(part.start, part.goal, horizon=horizon), base, moving=moving, **scoring)
         rules = planner.rules()
         with search.watch.paused():
             search.engine.prepare(task, rules, noise_scale, num_samples)

@@ -10,6 +10,7 @@ from typing import Any
 from d4orm_planners.base import Planner
 from d4orm_planners.cem import CEM
 from d4orm_planners.d4orm import D4orm
+from d4orm_planners.d4orm_c2f import D4ormC2F
 from d4orm_planners.d4orm_d import D4ormD
 from d4orm_planners.mbd import MBD, IterativeMBD
 from d4orm_planners.mppi import MPPI
@@ -22,7 +23,7 @@ PLANNERS: Mapping[str, type[Planner]] = MappingProxyType(
 """Every planner class by its name."""
 
 POLICIES: Mapping[str, type[Policy]] = MappingProxyType(
-    {policy.name: policy for policy in (DriveToGoal, RandomControls, Orca)}
+    {policy.name: policy for policy in (D4ormC2F, DriveToGoal, RandomControls, Orca)}
 )
 """The policies that are no planners; every planner is an open-loop policy too."""
 

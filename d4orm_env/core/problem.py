@@ -220,11 +220,30 @@ class Problem:
         """A copy with some attributes changed, checked again."""
         return Problem(**{attribute.name: getattr(self, attribute.name) for attribute in fields(self)} | changes)
 
+    def moment(self, start: Any, goal: Any, **changes: Any) -> Problem:
+        """The same team in the same world at another moment, for planning on from there.
+
+        Unlike :meth:`replace` it does not check what is changed: under way robots may touch, be faster than they should,
+        or head for places that they cannot all be at.
+
+        Args:
+            start: ``(K, n)`` states.
+            goal: ``(K, d)`` places to go to [m].
+            **changes: Other attributes that differ, of the right type.
+        """
+        start = frozen_array(start, "start", self.start.shape)
+        return self._unchecked(start=start, goal=frozen_array(goal, "goal", self.goal.shape), **changes)
+
     def select(self, robots: Sequence[int]) -> Problem:
         """The problem of these robots only, in the order given."""
         index = list(robots)
         team = self.team.select(index)
-        return self.replace(team=team, start=self.start[index, : team.state_size], goal=self.goal[index])
+        return self._unchecked(team=team, start=self.start[index, : team.state_size], goal=self.goal[index])
+
+    def _unchecked(self, **changes: Any) -> Problem:
+        copy: Problem = object.__new__(Problem)
+        restore_frozen(copy, self.__getstate__() | changes)
+        return copy
 
 
 def inverse_initial_distance(positions: Any, goal: Any, goal_radius: float) -> FloatArray:

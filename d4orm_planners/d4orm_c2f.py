@@ -1,0 +1,409 @@
+"""D4orm-C2F: receding-horizon control along a coarse plan (paper, section VI, Algorithm 4)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray, positive_number, whole_number
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.engine.base import SamplingRules, SamplingTask, get_engine
+from d4orm_env.joint_state import JointState, split_state
+from d4orm_planners.base import Search
+from d4orm_planners.d4orm_d import D4ormD, D4ormDConfig
+from d4orm_planners.guidance import Guidance, coarse_problem, interpolate, mean_index, passes_checks, rest_of
+from d4orm_planners.policy import Policy
+from d4orm_planners.sampling.schedule import annealed
+from d4orm_planners.sampling.weights import SoftmaxWeights
+from d4orm_planners.steering import straight_drives
+
+REFINEMENTS = ("background", "sync", "off")
+
+NOT_AT_SUBGOALS = 1e-6
+"""Goal radius while everyone is on the way: a robot drives through its subgoal [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class D4ormC2FConfig:
+    """Settings of :class:`D4ormC2F`.
+
+    Attributes:
+        engine: ``"auto"``, ``"cpu"`` or ``"jax"``.
+        coarse_factor: ``f``, fine time steps per coarse one.
+        check_interval: ``o``: the coarse plan must keep the margin at every so-manyth coarse step.
+        coarse_samples: ``M`` of the coarse plan.
+        coarse_steps: ``N`` of the coarse plan.
+        coarse_iterations: Iterations after which the coarse plan is taken as it is.
+        predict_horizon: ``H_predict``, steps that a control loop looks ahead.
+        execute_horizon: ``H_execute``, steps executed before the next control loop.
+        subgoal_offset: ``m``, waypoints from where the team is to its subgoal.
+        num_samples: ``M`` of a control loop.
+        num_steps: ``N`` of a control loop.
+        temperature: ``lambda`` of the softmax.
+        beta_start: First variance of the diffusion schedule of a control loop.
+        beta_end: Last variance.
+        credit: ``"robot"`` or ``"team"``: whose reward weights the samples of a control loop.
+        penalty: What a violation costs per step in a control loop, against the paper's one.
+        extra_margin: Added to the problem's margin in control loops, as room for disturbances [m].
+        refine: Whether the guidance is refined while it is followed: in a ``"background"`` thread, ``"sync"`` between
+            control loops, which gives the same controls every time, or ``"off"``.
+        refine_every: Control loops between synchronous refinements.
+        replan_distance: The guidance is planned anew when the robots are this far from it on average [m].
+        deadline: Seconds that a control loop may take; one that takes longer is left behind, and the last plan goes on.
+            ``None`` waits for every loop.
+        control_noise_std: Gaussian noise that the controller adds to its controls, in their units.
+
+    Raises:
+        ValueError: If a value makes no sense; the message names it.
+    """
+
+    engine: str = "auto"
+    coarse_factor: int = 2
+    check_interval: int = 1
+    coarse_samples: int = 256
+    coarse_steps: int = 50
+    coarse_iterations: int = 20
+    predict_horizon: int = 20
+    execute_horizon: int = 1
+    subgoal_offset: int = 20
+    num_samples: int = 128
+    num_steps: int = 20
+    temperature: float = 0.3
+    beta_start: float = 1e-4
+    beta_end: float = 2e-2
+    credit: str = "robot"
+    penalty: float = 3.0
+    extra_margin: float = 0.0
+    refine: str = "background"
+    refine_every: int = 5
+    replan_distance: float = 1.0
+    deadline: float | None = None
+    control_noise_std: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, least in (
+            ("coarse_factor", 1),
+            ("check_interval", 1),
+            ("coarse_samples", 2),
+            ("coarse_steps", 1),
+            ("coarse_iterations", 1),
+            ("predict_horizon", 1),
+            ("execute_horizon", 1),
+            ("subgoal_offset", 1),
+            ("num_samples", 2),
+            ("num_steps", 1),
+            ("refine_every", 1),
+        ):
+            whole_number(getattr(self, name), name, least)
+        for name in ("temperature", "beta_start", "beta_end", "penalty", "replan_distance"):
+            positive_number(getattr(self, name), name)
+        for name in ("extra_margin", "control_noise_std"):
+            positive_number(getattr(self, name), name, zero_allowed=True)
+        if not self.beta_start <= self.beta_end < 1:
+            raise ValueError(f"beta_end is {self.beta_end:g}; it must lie between beta_start {self.beta_start:g} and 1")
+        if self.execute_horizon > self.predict_horizon:
+            raise ValueError(
+                f"execute_horizon is {self.execute_horizon}, more than the {self.predict_horizon} steps predicted; "
+                "raise predict_horizon"
+            )
+        if self.credit not in ("robot", "team"):
+            raise ValueError(f"credit {self.credit!r} is unknown; choose one of robot, team")
+        if self.refine not in REFINEMENTS:
+            raise ValueError(f"refine {self.refine!r} is unknown; choose one of {', '.join(REFINEMENTS)}")
+        if self.deadline is not None:
+            positive_number(self.deadline, "deadline")
+        get_engine(self.engine)
+
+
+@dataclass(frozen=True)
+class LoopRecord:
+    """What one control loop did.
+
+    Attributes:
+        step: The environment's step at which it began.
+        wall_time: Time used [s].
+        subgoal_index: Waypoint of the guidance that the team headed for.
+        predicted_margin: Least gap between the surfaces of any two robots over the prediction [m]; infinite for one
+            robot.
+        missed: Whether it took longer than the deadline, so that the last plan went on.
+        replanned: Whether the guidance was planned anew.
+        refined: Whether a refined guidance was taken over.
+    """
+
+    step: int
+    wall_time: float
+    subgoal_index: int
+    predicted_margin: float
+    missed: bool
+    replanned: bool
+    refined: bool
+
+
+class D4ormC2F(Policy):
+    """Follows a coarse plan of the whole team by short fine plans from wherever the robots are, loop by loop.
+
+    Attributes:
+        config: The settings.
+        loops: A :class:`LoopRecord` per control loop of the present episode.
+        coarse_time: Time that the first coarse plan took [s].
+        guidance: What is followed at present.
+    """
+
+    name = "d4orm-c2f"
+    config_class: ClassVar[type | None] = D4ormC2FConfig
+    guidance: Guidance
+
+    def __init__(self, config: D4ormC2FConfig | None = None) -> None:
+        self.config = config or D4ormC2FConfig()
+        self._engine = get_engine(self.config.engine)
+        self._rules = SamplingRules(SoftmaxWeights(float(self.config.temperature), 1e-3))
+        self._noise_scale = annealed(self.config.num_steps, self.config.beta_start, self.config.beta_end)
+        coarse = {"num_samples": self.config.coarse_samples, "num_steps": self.config.coarse_steps, "improve": True}
+        self._planner = D4ormD(D4ormDConfig(engine=self.config.engine, **coarse))
+        self._refinement = _Background()
+        self._control = _Background()
+
+    @property
+    def missed(self) -> int:
+        """Control loops that missed the deadline."""
+        return sum(loop.missed for loop in self.loops)
+
+    def _begin(self, env: Any, seed: int) -> None:
+        self._seed = seed
+        self._random = np.random.default_rng([seed, 1])
+        self._refinement.forget()
+        self._control.forget()
+        self.loops: list[LoopRecord] = []
+        joint = split_state(self.problem, env.state())
+        self._prepare(joint)
+        begin = time.perf_counter()
+        self._follow(joint, self._coarse_plan(joint, None))
+        self.coarse_time = time.perf_counter() - begin
+
+    def _prepare(self, joint: JointState) -> None:
+        """Compile, so that the first control loop is as quick as the others."""
+        window = self.problem.moment(joint.states, joint.goals, horizon=self.config.predict_horizon)
+        task = SamplingTask(window, self._no_controls(), arrived=joint.arrived)
+        self._engine.prepare(task, self._rules, self._noise_scale, self.config.num_samples)
+
+    def _no_controls(self) -> FloatArray:
+        shape = (self.config.predict_horizon, self.problem.num_robots, self.problem.control_size)
+        return np.zeros(shape, np.float32)
+
+    # The guidance.
+
+    def _follow(self, joint: JointState, guidance: Guidance) -> None:
+        """Begin at the beginning of a guidance."""
+        self.guidance = guidance
+        self._index = 0
+        self._goals = joint.goals
+        self._plan = self._no_controls()
+        factor = self.config.coarse_factor
+        held = np.repeat(guidance.controls, factor, axis=0)[: len(self._plan)]
+        self._plan[: len(held)] = held
+        self._next = 0
+
+    def _coarse_plan(self, joint: JointState, initial: Any) -> Guidance:
+        """Plan for the whole team from where it is, until a plan passes the checks (Algorithm 4, lines 1 to 3)."""
+        present = self.problem.moment(joint.states, joint.goals)
+        coarse = coarse_problem(present, self.config.coarse_factor)
+        search = Search(self._planner, coarse, self._seed + joint.steps, initial)
+        chosen = search.current
+        for _ in range(self.config.coarse_iterations):
+            if passes_checks(chosen.trajectory, self.config.check_interval):
+                break
+            search.advance()
+            chosen = search.current if search.current.rank >= search.best.rank else search.best
+            if passes_checks(search.current.trajectory, self.config.check_interval):
+                chosen = search.current
+        return self._guidance(coarse, chosen.trajectory)
+
+    def _guidance(self, coarse: Problem, trajectory: Trajectory) -> Guidance:
+        path = interpolate(trajectory.positions, self.config.coarse_factor)
+        return Guidance(coarse, trajectory.controls, trajectory.states, path)
+
+    def _refined(self, guidance: Guidance, index: int, seed: int) -> Guidance:
+        """The guidance with what is left of it from a waypoint on made better, if that succeeds (line 4)."""
+        factor = self.config.coarse_factor
+        left, controls = rest_of(guidance, index, factor)
+        if not len(controls):
+            return guidance
+        plan = self._planner.solve(left, seed=seed, initial_controls=controls, max_iterations=1)
+        done = guidance.problem.horizon - left.horizon
+        before, after = guidance.states[: done + 1], plan.trajectory
+        states = np.concatenate([before, after.states[1:]])
+        positions = np.concatenate([before[..., : left.dimension], after.positions[1:]])
+        all_controls = np.concatenate([guidance.controls[:done], after.controls])
+        return Guidance(guidance.problem, all_controls, states, interpolate(positions, factor))
+
+    def _refine(self, step: int) -> bool:
+        """Take over what the refinement has done meanwhile, and give it more to do."""
+        index = self._index + self.config.subgoal_offset
+        if self.config.refine == "off" or index >= len(self.guidance.path) - 1:
+            return False
+        guidance, seed = self.guidance, self._seed + 1_000_003 * (step + 1)
+        if self.config.refine == "sync":
+            if len(self.loops) % self.config.refine_every == 0:
+                self.guidance = self._refined(guidance, index, seed)
+            return self.guidance is not guidance
+        done, refined = self._refinement.result()
+        if done and refined is not None and refined.problem is guidance.problem:
+            self.guidance = guidance = refined
+        if done:
+            self._refinement.start(lambda: self._refined(guidance, index, seed))
+        return self.guidance is refined
+
+    # The control loop.
+
+    def _controls(self, joint: JointState) -> FloatArray:
+        executed = self._next
+        if not self.loops or executed >= self.config.execute_horizon:
+            self._loop(joint)
+        controls = self._plan[min(self._next, len(self._plan) - 1)]
+        self._next += 1
+        if self.config.control_noise_std:
+            noise = self._random.normal(0, self.config.control_noise_std, controls.shape)
+            limit = self.problem.team.control_limits
+            controls = np.clip(controls + noise, -limit, limit).astype(np.float32)
+        return controls
+
+    def _loop(self, joint: JointState) -> None:
+        """One control loop (Algorithm 4, lines 6 to 9)."""
+        begin = time.perf_counter()
+        docked = joint.arrived & self._at_goal(joint)
+        replanned = self._replan_if_needed(joint, docked)
+        refined = not replanned and self._refine(joint.steps)
+        positions = joint.states[:, : self.problem.dimension]
+        window = self.config.subgoal_offset
+        self._index = mean_index(self.guidance.path, positions, ~docked, self._index, window)
+        index = min(self._index + self.config.subgoal_offset, len(self.guidance.path) - 1)
+        base = np.concatenate([self._plan[self._next :], self._no_controls()[: self._next]])
+        subgoals = self.guidance.path[index]
+        seed = self._seed + 7919 * (joint.steps + 1)
+
+        def predict() -> tuple[FloatArray, float]:
+            return self._predict(joint, docked, subgoals, base, seed)
+
+        if self.config.deadline is None:
+            result = predict()
+        else:
+            left = self.config.deadline - (time.perf_counter() - begin)
+            result = self._control.run(predict, left)
+        missed = result is None
+        if result is not None:
+            self._plan, self._next = result[0], 0
+        margin = result[1] if result is not None else float("nan")
+        used = time.perf_counter() - begin
+        self.loops.append(LoopRecord(joint.steps, used, index, margin, missed, replanned, refined))
+
+    def _at_goal(self, joint: JointState) -> Any:
+        gap = joint.goals - joint.states[:, : self.problem.dimension]
+        return np.linalg.norm(gap, axis=1) <= self.problem.goal_radius
+
+    def _replan_if_needed(self, joint: JointState, docked: Any) -> bool:
+        """Plan the guidance anew for robots with new goals, for a team that lost it or has come to its end."""
+        changed = (joint.goals != self._goals).any(axis=1)
+        moving = ~docked
+        if not moving.any():
+            return False
+        waypoint = self.guidance.path[self._index][moving]
+        away = float(np.linalg.norm(joint.states[moving, : self.problem.dimension] - waypoint, axis=1).mean())
+        over = self._index >= len(self.guidance.path) - 1
+        if not changed.any() and away <= self.config.replan_distance and not over:
+            return False
+        present = coarse_problem(self.problem.moment(joint.states, joint.goals), self.config.coarse_factor)
+        initial = straight_drives(present).controls[:, :, 0]
+        keep = moving & ~changed
+        if not over and away <= self.config.replan_distance and keep.any():
+            step = self._index // self.config.coarse_factor
+            rest = self.guidance.controls[step:]
+            initial[:, keep] = 0
+            initial[: len(rest), keep] = rest[:, keep]
+        self._follow(joint, self._coarse_plan(joint, initial))
+        return True
+
+    def _predict(
+        self, joint: JointState, docked: Any, subgoals: FloatArray, base: FloatArray, seed: int
+    ) -> tuple[FloatArray, float]:
+        """Fine controls ``(H_predict, K, m)`` towards the subgoals, and the least gap between robots that they keep."""
+        problem, config = self.problem, self.config
+        near = np.linalg.norm(subgoals - joint.goals, axis=1) <= problem.goal_radius
+        goals = np.where((near | docked)[:, None], joint.goals, subgoals)
+        radius = problem.goal_radius if near.any() else NOT_AT_SUBGOALS
+        window = problem.moment(
+            joint.states,
+            goals,
+            horizon=config.predict_horizon,
+            margin=problem.margin + config.extra_margin,
+            goal_radius=radius,
+        )
+        ahead = problem.dt * config.subgoal_offset * float(np.max(np.asarray(problem.team.max_speed)))
+        task = SamplingTask(
+            window,
+            base,
+            credit=config.credit,
+            arrived=docked,
+            penalty=config.penalty,
+            reference_distance=ahead,
+        )
+        result = self._engine.denoise(
+            task, self._rules, np.zeros_like(base), self._noise_scale, config.num_samples, seed
+        )
+        trajectory = self._engine.rollout(window, base + result.mean)
+        controls, positions = trajectory.controls, trajectory.positions
+        return controls, least_gap(problem, positions)
+
+
+def least_gap(problem: Problem, positions: FloatArray) -> float:
+    """Least gap between the surfaces of any two robots on ``(T, K, d)`` after the first moment [m]."""
+    radius = np.asarray(problem.team.radius)
+    first, second = np.triu_indices(problem.num_robots, 1)
+    if not len(first):
+        return float("inf")
+    gap2 = ((positions[1:, first] - positions[1:, second]) ** 2).sum(axis=2)
+    return float((np.sqrt(gap2.min(axis=0)) - radius[first] - radius[second]).min())
+
+
+class _Background:
+    """A job at a time in a thread of its own."""
+
+    def __init__(self) -> None:
+        self._pool: ThreadPoolExecutor | None = None
+        self._job: Future[Any] | None = None
+
+    def start(self, work: Callable[[], Any]) -> None:
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(1, thread_name_prefix="d4orm-c2f")
+        self._job = self._pool.submit(work)
+
+    def result(self) -> tuple[bool, Any]:
+        """Whether nothing is under way, and what the last job gave, once."""
+        if self._job is None:
+            return True, None
+        if not self._job.done():
+            return False, None
+        job, self._job = self._job, None
+        return True, job.result()
+
+    def run(self, work: Callable[[], Any], timeout: float) -> Any:
+        """What the work gives within the time, or ``None``. What is late goes on, and is thrown away."""
+        if self._job is not None and not self._job.done():
+            return None
+        self.start(work)
+        assert self._job is not None
+        try:
+            return self._job.result(max(timeout, 0))
+        except TimeoutError:
+            return None
+
+    def forget(self) -> None:
+        """Wait for what is under way and throw it away."""
+        if self._job is not None:
+            self._job.exception()
+            self._job = None
