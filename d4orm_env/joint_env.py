@@ -69,6 +69,11 @@ class JointNavigationEnv(gymnasium.Env[FloatArray, FloatArray]):
         """The problem being run; with ``randomize_instance`` that of the present episode."""
         return self._simulation.problem
 
+    @property
+    def lifelong(self) -> bool:
+        """Whether robots that arrive get fresh goals instead of docking."""
+        return self._simulation.lifelong
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[FloatArray, dict[str, Any]]:

@@ -106,6 +106,11 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
         return self._simulation.problem
 
     @property
+    def lifelong(self) -> bool:
+        """Whether robots that arrive get fresh goals instead of docking."""
+        return self._simulation.lifelong
+
+    @property
     def max_cycles(self) -> int:
         """Steps until truncation; assigning it also makes a new ``state_space``, which counts steps."""
         return self._simulation.max_cycles

@@ -21,7 +21,7 @@ from d4orm_planners.guidance import Guidance, coarse_problem, interpolate, mean_
 from d4orm_planners.policy import Policy
 from d4orm_planners.sampling.schedule import annealed
 from d4orm_planners.sampling.weights import SoftmaxWeights
-from d4orm_planners.steering import straight_drives
+from d4orm_planners.steering import straight_drives, track_velocities
 
 REFINEMENTS = ("background", "sync", "off")
 
@@ -40,6 +40,7 @@ class D4ormC2FConfig:
         coarse_samples: ``M`` of the coarse plan.
         coarse_steps: ``N`` of the coarse plan.
         coarse_iterations: Iterations after which the coarse plan is taken as it is.
+        replan_iterations: The same when the guidance is planned anew under way.
         predict_horizon: ``H_predict``, steps that a control loop looks ahead.
         execute_horizon: ``H_execute``, steps executed before the next control loop.
         subgoal_offset: ``m``, waypoints from where the team is to its subgoal.
@@ -69,16 +70,17 @@ class D4ormC2FConfig:
     coarse_samples: int = 256
     coarse_steps: int = 50
     coarse_iterations: int = 20
+    replan_iterations: int = 2
     predict_horizon: int = 20
     execute_horizon: int = 1
-    subgoal_offset: int = 20
+    subgoal_offset: int = 15
     num_samples: int = 128
     num_steps: int = 20
     temperature: float = 0.3
     beta_start: float = 1e-4
     beta_end: float = 2e-2
     credit: str = "robot"
-    penalty: float = 3.0
+    penalty: float = 10.0
     extra_margin: float = 0.0
     refine: str = "background"
     refine_every: int = 5
@@ -93,6 +95,7 @@ class D4ormC2FConfig:
             ("coarse_samples", 2),
             ("coarse_steps", 1),
             ("coarse_iterations", 1),
+            ("replan_iterations", 1),
             ("predict_horizon", 1),
             ("execute_horizon", 1),
             ("subgoal_offset", 1),
@@ -164,8 +167,14 @@ class D4ormC2F(Policy):
         self._engine = get_engine(self.config.engine)
         self._rules = SamplingRules(SoftmaxWeights(float(self.config.temperature), 1e-3))
         self._noise_scale = annealed(self.config.num_steps, self.config.beta_start, self.config.beta_end)
-        coarse = {"num_samples": self.config.coarse_samples, "num_steps": self.config.coarse_steps, "improve": True}
-        self._planner = D4ormD(D4ormDConfig(engine=self.config.engine, **coarse))
+        self._planner = D4ormD(
+            D4ormDConfig(
+                engine=self.config.engine,
+                num_samples=self.config.coarse_samples,
+                num_steps=self.config.coarse_steps,
+                improve=True,
+            )
+        )
         self._refinement = _Background()
         self._control = _Background()
 
@@ -181,9 +190,13 @@ class D4ormC2F(Policy):
         self._control.forget()
         self.loops: list[LoopRecord] = []
         joint = split_state(self.problem, env.state())
+        self._docks = not env.unwrapped.lifelong
         self._prepare(joint)
+        limits = self.problem.team.limits
+        self._stop_steps = int(np.ceil(np.max(limits[:, 0] / (limits[:, 1] * self.problem.dt))))
+        self._plan, self._next = self._no_controls(), 0
         begin = time.perf_counter()
-        self._follow(joint, self._coarse_plan(joint, None))
+        self._follow(joint, self._coarse_plan(joint, None, self.config.coarse_iterations))
         self.coarse_time = time.perf_counter() - begin
 
     def _prepare(self, joint: JointState) -> None:
@@ -203,19 +216,14 @@ class D4ormC2F(Policy):
         self.guidance = guidance
         self._index = 0
         self._goals = joint.goals
-        self._plan = self._no_controls()
-        factor = self.config.coarse_factor
-        held = np.repeat(guidance.controls, factor, axis=0)[: len(self._plan)]
-        self._plan[: len(held)] = held
-        self._next = 0
 
-    def _coarse_plan(self, joint: JointState, initial: Any) -> Guidance:
+    def _coarse_plan(self, joint: JointState, initial: Any, iterations: int) -> Guidance:
         """Plan for the whole team from where it is, until a plan passes the checks (Algorithm 4, lines 1 to 3)."""
         present = self.problem.moment(joint.states, joint.goals)
         coarse = coarse_problem(present, self.config.coarse_factor)
         search = Search(self._planner, coarse, self._seed + joint.steps, initial)
         chosen = search.current
-        for _ in range(self.config.coarse_iterations):
+        for _ in range(iterations):
             if passes_checks(chosen.trajectory, self.config.check_interval):
                 break
             search.advance()
@@ -283,7 +291,7 @@ class D4ormC2F(Policy):
         window = self.config.subgoal_offset
         self._index = mean_index(self.guidance.path, positions, ~docked, self._index, window)
         index = min(self._index + self.config.subgoal_offset, len(self.guidance.path) - 1)
-        base = np.concatenate([self._plan[self._next :], self._no_controls()[: self._next]])
+        base = self._base()
         subgoals = self.guidance.path[index]
         seed = self._seed + 7919 * (joint.steps + 1)
 
@@ -301,6 +309,17 @@ class D4ormC2F(Policy):
         margin = result[1] if result is not None else float("nan")
         used = time.perf_counter() - begin
         self.loops.append(LoopRecord(joint.steps, used, index, margin, missed, replanned, refined))
+
+    def _base(self) -> FloatArray:
+        """``(H_predict, K, m)`` controls to deform: the last plan's, moved on in time."""
+        base = self._no_controls()
+        horizon = self.config.predict_horizon
+        ahead = self._plan[self._next : horizon]
+        if not self.loops:
+            # At first the coarse plan's, each held for as many steps as it stands for.
+            ahead = np.repeat(self.guidance.controls, self.config.coarse_factor, axis=0)[:horizon]
+        base[: len(ahead)] = ahead
+        return base
 
     def _at_goal(self, joint: JointState) -> Any:
         gap = joint.goals - joint.states[:, : self.problem.dimension]
@@ -325,7 +344,7 @@ class D4ormC2F(Policy):
             rest = self.guidance.controls[step:]
             initial[:, keep] = 0
             initial[: len(rest), keep] = rest[:, keep]
-        self._follow(joint, self._coarse_plan(joint, initial))
+        self._follow(joint, self._coarse_plan(joint, initial, self.config.replan_iterations))
         return True
 
     def _predict(
@@ -335,7 +354,7 @@ class D4ormC2F(Policy):
         problem, config = self.problem, self.config
         near = np.linalg.norm(subgoals - joint.goals, axis=1) <= problem.goal_radius
         goals = np.where((near | docked)[:, None], joint.goals, subgoals)
-        radius = problem.goal_radius if near.any() else NOT_AT_SUBGOALS
+        radius = problem.goal_radius if near.any() and self._docks else NOT_AT_SUBGOALS
         window = problem.moment(
             joint.states,
             goals,
@@ -355,9 +374,40 @@ class D4ormC2F(Policy):
         result = self._engine.denoise(
             task, self._rules, np.zeros_like(base), self._noise_scale, config.num_samples, seed
         )
-        trajectory = self._engine.rollout(window, base + result.mean)
-        controls, positions = trajectory.controls, trajectory.positions
-        return controls, least_gap(problem, positions)
+        radius = problem.goal_radius if self._docks else NOT_AT_SUBGOALS
+        truth = problem.moment(joint.states, joint.goals, horizon=config.predict_horizon, goal_radius=radius)
+        return self._safe_mix(truth, self._with_stop(truth, base + result.mean, docked))
+
+    def _with_stop(self, window: Problem, controls: FloatArray, docked: Any) -> FloatArray:
+        """The controls, and after them those that bring everyone to rest as soon as can be."""
+        states = self._engine.rollout(window, controls).states[-1]
+        tail = np.zeros((self._stop_steps, *controls.shape[1:]), np.float32)
+        still = np.zeros(window.goal.shape, np.float32)
+        for t in range(len(tail)):
+            tail[t] = track_velocities(window, states, still)
+            states = self._engine.step(window.arrays, states, docked, tail[t]).states
+        return np.concatenate([controls, tail])
+
+    def _safe_mix(self, window: Problem, fresh: FloatArray) -> tuple[FloatArray, float]:
+        """Fresh controls where they keep everyone apart; where not, robots keep to what they had in mind before.
+
+        What they had in mind was free of violations, and ends at rest. So without disturbances there always is a mix
+        that is free of them too: in the last resort everybody does as before.
+        """
+        before = self._plan[self._next :]
+        before = np.concatenate([before, np.zeros((len(fresh) - len(before), *fresh.shape[1:]), np.float32)])
+        window = window.moment(window.start, window.goal, horizon=len(fresh))
+        controls = fresh
+        fresh_robots = np.ones(window.num_robots, bool)
+        trajectory = self._engine.rollout(window, controls)
+        for _ in range(window.num_robots):
+            violating = trajectory.margin_violated[1:].any(axis=0) & fresh_robots
+            if not violating.any():
+                break
+            fresh_robots &= ~violating
+            controls = np.where(fresh_robots[:, None], fresh, before)
+            trajectory = self._engine.rollout(window, controls)
+        return controls, least_gap(window, trajectory.positions)
 
 
 def least_gap(problem: Problem, positions: FloatArray) -> float:

@@ -223,8 +223,8 @@ class Problem:
     def moment(self, start: Any, goal: Any, **changes: Any) -> Problem:
         """The same team in the same world at another moment, for planning on from there.
 
-        Unlike :meth:`replace` it does not check what is changed: under way robots may touch, be faster than they should,
-        or head for places that they cannot all be at.
+        Unlike :meth:`replace` it does not check what is changed: under way robots may touch, be faster than they
+        should, or head for places that they cannot all be at.
 
         Args:
             start: ``(K, n)`` states.
