@@ -17,7 +17,15 @@ from d4orm_env.engine.base import SamplingRules, SamplingTask, get_engine
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_planners.base import Search
 from d4orm_planners.d4orm_d import D4ormD, D4ormDConfig
-from d4orm_planners.guidance import Guidance, coarse_problem, interpolate, mean_index, passes_checks, rest_of
+from d4orm_planners.guidance import (
+    Guidance,
+    coarse_problem,
+    interpolate,
+    nearest_indices,
+    passes_checks,
+    rest_of,
+    subgoal_indices,
+)
 from d4orm_planners.policy import Policy
 from d4orm_planners.sampling.schedule import annealed
 from d4orm_planners.sampling.weights import SoftmaxWeights
@@ -27,6 +35,12 @@ REFINEMENTS = ("background", "sync", "off")
 
 NOT_AT_SUBGOALS = 1e-6
 """Goal radius while everyone is on the way: a robot drives through its subgoal [m]."""
+
+LAG = 5
+"""Waypoints that a robot may be behind the others without its subgoal staying behind too."""
+
+NEARER = 0.05
+"""What counts as coming nearer to the goals, all robots together [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,8 +53,9 @@ class D4ormC2FConfig:
         check_interval: ``o``: the coarse plan must keep the margin at every so-manyth coarse step.
         coarse_samples: ``M`` of the coarse plan.
         coarse_steps: ``N`` of the coarse plan.
+        coarse_repair_steps: The same of repairs of the coarse plan.
         coarse_iterations: Iterations after which the coarse plan is taken as it is.
-        replan_iterations: The same when the guidance is planned anew under way.
+        replan_iterations: The same when only some robots have new goals.
         predict_horizon: ``H_predict``, steps that a control loop looks ahead.
         execute_horizon: ``H_execute``, steps executed before the next control loop.
         subgoal_offset: ``m``, waypoints from where the team is to its subgoal.
@@ -54,8 +69,9 @@ class D4ormC2FConfig:
         extra_margin: Added to the problem's margin in control loops, as room for disturbances [m].
         refine: Whether the guidance is refined while it is followed: in a ``"background"`` thread, ``"sync"`` between
             control loops, which gives the same controls every time, or ``"off"``.
-        refine_every: Control loops between synchronous refinements.
+        refine_every: At most every so-manyth control loop a refinement begins: it takes time from control loops.
         replan_distance: The guidance is planned anew when the robots are this far from it on average [m].
+        patience: Or when they have come no nearer to their goals for so many steps.
         deadline: Seconds that a control loop may take; one that takes longer is left behind, and the last plan goes on.
             ``None`` waits for every loop.
         control_noise_std: Gaussian noise that the controller adds to its controls, in their units.
@@ -69,6 +85,7 @@ class D4ormC2FConfig:
     check_interval: int = 1
     coarse_samples: int = 256
     coarse_steps: int = 50
+    coarse_repair_steps: int = 20
     coarse_iterations: int = 20
     replan_iterations: int = 2
     predict_horizon: int = 20
@@ -85,6 +102,7 @@ class D4ormC2FConfig:
     refine: str = "background"
     refine_every: int = 5
     replan_distance: float = 1.0
+    patience: int = 15
     deadline: float | None = None
     control_noise_std: float = 0.0
 
@@ -94,6 +112,7 @@ class D4ormC2FConfig:
             ("check_interval", 1),
             ("coarse_samples", 2),
             ("coarse_steps", 1),
+            ("coarse_repair_steps", 1),
             ("coarse_iterations", 1),
             ("replan_iterations", 1),
             ("predict_horizon", 1),
@@ -102,6 +121,7 @@ class D4ormC2FConfig:
             ("num_samples", 2),
             ("num_steps", 1),
             ("refine_every", 1),
+            ("patience", 1),
         ):
             whole_number(getattr(self, name), name, least)
         for name in ("temperature", "beta_start", "beta_end", "penalty", "replan_distance"):
@@ -172,6 +192,7 @@ class D4ormC2F(Policy):
                 engine=self.config.engine,
                 num_samples=self.config.coarse_samples,
                 num_steps=self.config.coarse_steps,
+                repair_steps=self.config.coarse_repair_steps,
                 improve=True,
             )
         )
@@ -196,7 +217,9 @@ class D4ormC2F(Policy):
         self._stop_steps = int(np.ceil(np.max(limits[:, 0] / (limits[:, 1] * self.problem.dt))))
         self._plan, self._next = self._no_controls(), 0
         begin = time.perf_counter()
-        self._follow(joint, self._coarse_plan(joint, None, self.config.coarse_iterations))
+        self._follow(
+            joint, self._coarse_plan(joint, None, self.config.coarse_iterations), np.ones(self.problem.num_robots, bool)
+        )
         self.coarse_time = time.perf_counter() - begin
 
     def _prepare(self, joint: JointState) -> None:
@@ -211,11 +234,13 @@ class D4ormC2F(Policy):
 
     # The guidance.
 
-    def _follow(self, joint: JointState, guidance: Guidance) -> None:
-        """Begin at the beginning of a guidance."""
+    def _follow(self, joint: JointState, guidance: Guidance, anew: Any) -> None:
+        """Begin at the beginning of a guidance, which sends the robots ``anew`` ``(K,)`` another way than before."""
+        self._anew = anew
         self.guidance = guidance
-        self._index = 0
+        self._index, self._indices = 0, np.zeros(len(joint.goals), int)
         self._goals = joint.goals
+        self._nearest, self._nearest_at = float("inf"), joint.steps
 
     def _coarse_plan(self, joint: JointState, initial: Any, iterations: int) -> Guidance:
         """Plan for the whole team from where it is, until a plan passes the checks (Algorithm 4, lines 1 to 3)."""
@@ -256,14 +281,16 @@ class D4ormC2F(Policy):
         if self.config.refine == "off" or index >= len(self.guidance.path) - 1:
             return False
         guidance, seed = self.guidance, self._seed + 1_000_003 * (step + 1)
+        due = len(self.loops) % self.config.refine_every == 0
         if self.config.refine == "sync":
-            if len(self.loops) % self.config.refine_every == 0:
+            if due:
                 self.guidance = self._refined(guidance, index, seed)
             return self.guidance is not guidance
         done, refined = self._refinement.result()
-        if done and refined is not None and refined.problem is guidance.problem:
+        # What was refined may have been replanned since.
+        if refined is not None and refined.problem is guidance.problem:
             self.guidance = guidance = refined
-        if done:
+        if done and due:
             self._refinement.start(lambda: self._refined(guidance, index, seed))
         return self.guidance is refined
 
@@ -287,12 +314,9 @@ class D4ormC2F(Policy):
         docked = joint.arrived & self._at_goal(joint)
         replanned = self._replan_if_needed(joint, docked)
         refined = not replanned and self._refine(joint.steps)
-        positions = joint.states[:, : self.problem.dimension]
-        window = self.config.subgoal_offset
-        self._index = mean_index(self.guidance.path, positions, ~docked, self._index, window)
-        index = min(self._index + self.config.subgoal_offset, len(self.guidance.path) - 1)
+        targets = self._targets(joint, docked)
+        subgoals = self.guidance.path[targets, np.arange(len(targets))]
         base = self._base()
-        subgoals = self.guidance.path[index]
         seed = self._seed + 7919 * (joint.steps + 1)
 
         def predict() -> tuple[FloatArray, float]:
@@ -308,17 +332,29 @@ class D4ormC2F(Policy):
             self._plan, self._next = result[0], 0
         margin = result[1] if result is not None else float("nan")
         used = time.perf_counter() - begin
-        self.loops.append(LoopRecord(joint.steps, used, index, margin, missed, replanned, refined))
+        self.loops.append(LoopRecord(joint.steps, used, int(targets.max()), margin, missed, replanned, refined))
+
+    def _targets(self, joint: JointState, docked: Any) -> Any:
+        """``(K,)`` waypoints that the robots head for; finds out where on the path they are (Algorithm 4, line 6)."""
+        path, offset = self.guidance.path, self.config.subgoal_offset
+        positions = joint.states[:, : self.problem.dimension]
+        self._indices = nearest_indices(path, positions, self._indices, offset)
+        if not docked.all():
+            self._index = round(float(self._indices[~docked].mean()))
+        return subgoal_indices(self._indices, self._index, offset, LAG, len(path) - 1)
 
     def _base(self) -> FloatArray:
         """``(H_predict, K, m)`` controls to deform: the last plan's, moved on in time."""
         base = self._no_controls()
         horizon = self.config.predict_horizon
         ahead = self._plan[self._next : horizon]
-        if not self.loops:
-            # At first the coarse plan's, each held for as many steps as it stands for.
-            ahead = np.repeat(self.guidance.controls, self.config.coarse_factor, axis=0)[:horizon]
         base[: len(ahead)] = ahead
+        if self._anew.any():
+            # Those that are sent another way begin with the coarse plan's, each held for as long as it stands for.
+            held = np.repeat(self.guidance.controls, self.config.coarse_factor, axis=0)[:horizon]
+            base[:, self._anew] = 0
+            base[: len(held), self._anew] = held[:, self._anew]
+            self._anew = np.zeros_like(self._anew)
         return base
 
     def _at_goal(self, joint: JointState) -> Any:
@@ -331,21 +367,31 @@ class D4ormC2F(Policy):
         moving = ~docked
         if not moving.any():
             return False
-        waypoint = self.guidance.path[self._index][moving]
-        away = float(np.linalg.norm(joint.states[moving, : self.problem.dimension] - waypoint, axis=1).mean())
-        over = self._index >= len(self.guidance.path) - 1
-        if not changed.any() and away <= self.config.replan_distance and not over:
+        waypoints = self.guidance.path[self._indices, np.arange(len(moving))]
+        away = np.linalg.norm(joint.states[:, : self.problem.dimension] - waypoints, axis=1)[moving].mean()
+        lost = away > self.config.replan_distance or self._index >= len(self.guidance.path) - 1
+        lost = self._is_stuck(joint, moving) or lost
+        if not changed.any() and not lost:
             return False
         present = coarse_problem(self.problem.moment(joint.states, joint.goals), self.config.coarse_factor)
         initial = straight_drives(present).controls[:, :, 0]
         keep = moving & ~changed
-        if not over and away <= self.config.replan_distance and keep.any():
+        if not lost and keep.any():
             step = self._index // self.config.coarse_factor
             rest = self.guidance.controls[step:]
             initial[:, keep] = 0
             initial[: len(rest), keep] = rest[:, keep]
-        self._follow(joint, self._coarse_plan(joint, initial, self.config.replan_iterations))
+        iterations = self.config.coarse_iterations if lost else self.config.replan_iterations
+        self._follow(joint, self._coarse_plan(joint, initial, iterations), ~keep | lost)
         return True
+
+    def _is_stuck(self, joint: JointState, moving: Any) -> bool:
+        """Whether the robots under way have not come nearer to their goals for a while."""
+        gap = joint.goals[moving] - joint.states[moving, : self.problem.dimension]
+        distance = float(np.linalg.norm(gap, axis=1).sum())
+        if distance < self._nearest - NEARER:
+            self._nearest, self._nearest_at = distance, joint.steps
+        return joint.steps - self._nearest_at > self.config.patience
 
     def _predict(
         self, joint: JointState, docked: Any, subgoals: FloatArray, base: FloatArray, seed: int

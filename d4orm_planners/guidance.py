@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 
@@ -57,24 +57,40 @@ def passes_checks(trajectory: Trajectory, interval: int) -> bool:
     return arrives and not trajectory.margin_violated[interval::interval].any()
 
 
-def mean_index(path: FloatArray, positions: FloatArray, moving: BoolArray, last: int, window: int) -> int:
-    """Where the team is on its path: the mean of the indices of the waypoints nearest to the robots, rounded.
+def nearest_indices(path: FloatArray, positions: FloatArray, last: Any, window: int) -> Any:
+    """Where on its path every robot is: the index of its nearest waypoint.
 
     Args:
         path: ``(H+1, K, d)`` [m].
         positions: ``(K, d)`` [m].
-        moving: ``(K,)`` robots that count; those that have arrived are near their last waypoints for ever.
-        last: Index found before. The search goes on from there, because a path may cross itself.
-        window: Waypoints after ``last`` that are looked at.
+        last: ``(K,)`` indices found before. The search goes on from there, because a path may cross itself.
+        window: Waypoints after those that are looked at.
 
     Returns:
-        At least ``last``, at most ``H``.
+        ``(K,)`` indices, at least ``last``, at most ``H``.
     """
-    if not moving.any():
-        return last
-    ahead = path[last : last + window + 1, moving]
-    gap2 = ((ahead - positions[moving]) ** 2).sum(axis=2)
-    return last + round(float(gap2.argmin(axis=0).mean()))
+    index = np.minimum(np.asarray(last)[:, None] + np.arange(window + 1), len(path) - 1)
+    ahead = path[index, np.arange(len(index))[:, None]]
+    return index[:, 0] + ((ahead - positions[:, None]) ** 2).sum(axis=2).argmin(axis=1)
+
+
+def subgoal_indices(indices: Any, mean: int, offset: int, lag: int, last: int) -> Any:
+    """The waypoint that every robot heads for (paper, Algorithm 4, line 7).
+
+    The paper's is the same for all robots: the mean of their indices and an offset. A robot that was held up would then
+    leave its path, straight into whatever the path leads around; it keeps to its own instead.
+
+    Args:
+        indices: ``(K,)`` where the robots are.
+        mean: Their mean over the robots under way.
+        offset: ``m``, waypoints from the mean to the subgoal.
+        lag: Waypoints that a robot may be behind the mean and still head for the same subgoal.
+        last: ``H``, the last waypoint.
+
+    Returns:
+        ``(K,)`` indices, at most ``last``.
+    """
+    return np.minimum(np.minimum(mean, indices + lag) + offset, last)
 
 
 def rest_of(guidance: Guidance, index: int, factor: int) -> tuple[Problem, Any]:
