@@ -36,6 +36,9 @@ JOINTLY, STUCK, STUCK_SIZE = 3, 2, 3
 SLACK = 40
 """Steps beyond the latest arrival of the robots repaired that their repair looks at."""
 
+SHORTENINGS = 2
+"""How many times in turn robots look for shorter ways home."""
+
 EARLIER = (0, 8, 16, 32, 64)
 """Steps before a robot's arrival, or its nearest approach, at which it may turn straight to its goal."""
 
@@ -53,6 +56,8 @@ class D4ormDConfig(D4ormConfig):
     Attributes:
         num_samples: ``M`` of an iteration over the whole team or a group.
         num_steps: ``N`` of such an iteration.
+        big_team: Teams of more robots than this are sampled half as often in iterations over all of them, whose time
+            grows with the team while repairs make up for their errors; ``None`` for no such team.
         decoupling: ``"groups"`` replans every group of robots that conflict, the team's reward within it (the paper).
             ``"independent"`` replans robots that have no conflict with each other at once, each by its own reward,
             around all others, and takes over only what is no worse.
@@ -68,6 +73,7 @@ class D4ormDConfig(D4ormConfig):
 
     num_samples: int = 256
     num_steps: int = 100
+    big_team: int | None = 32
     decoupling: str = "independent"
     start: str = "auto"
     first_collisions: bool = True
@@ -82,6 +88,8 @@ class D4ormDConfig(D4ormConfig):
                 raise ValueError(f"{name} {getattr(self, name)!r} is unknown; choose one of {', '.join(choices)}")
         if not isinstance(self.first_collisions, bool):
             raise ValueError(f"first_collisions must be True or False, not {self.first_collisions!r}")
+        if self.big_team is not None:
+            whole_number(self.big_team, "big_team", 1)
         whole_number(self.repair_samples, "repair_samples", 2)
         whole_number(self.repair_steps, "repair_steps", 1)
         positive_number(self.penalty, "penalty")
@@ -93,23 +101,43 @@ class D4ormD(D4orm):
     name: ClassVar[str] = "d4orm-d"
     config_class = D4ormDConfig
     presets: ClassVar[dict[str, dict[str, Any]]] = {
-        "paper": {**D4orm.presets["paper"], "decoupling": "groups", "start": "team", "first_collisions": False}
+        "paper": {
+            **D4orm.presets["paper"],
+            "decoupling": "groups",
+            "start": "team",
+            "first_collisions": False,
+            "big_team": None,
+        }
     }
 
     def iterate(self, search: Search) -> Iteration:
         """See :meth:`Planner.iterate`: the whole team at first and once nobody fails, the failed robots in between."""
         if search.iteration == 0 and not search.current.controls.any():
             drives = self.straight_start(search.problem)
-            return super().iterate(search) if drives is None else Iteration(drives, 0)
+            return self.whole_team(search) if drives is None else Iteration(drives, 0)
         in_groups = self.config.decoupling == "groups"
         if not search.current.failed.any() or (in_groups and search.best.solved):
-            return super().iterate(search)
-        repair = _Repair(self, search)
+            return self.whole_team(search)
+        repair = _Repair(self, search, search.current.trajectory)
         if in_groups:
             repair.groups()
         else:
             repair.independent()
         return Iteration(repair.controls, repair.denoising_steps)
+
+    def whole_team(self, search: Search) -> Iteration:
+        """Deform everybody's controls at once; unless in groups, then straight home from wherever that is as good."""
+        iteration = super().iterate(search)
+        if self.config.decoupling == "groups":
+            return iteration
+        repair = _Repair(self, search, search.engine.rollout(search.problem, iteration.controls))
+        repair.shorten()
+        return Iteration(repair.controls, iteration.denoising_steps)
+
+    def num_samples(self, search: Search) -> int:
+        """See :meth:`SamplingPlanner.num_samples`."""
+        big = self.config.big_team is not None and search.problem.num_robots > self.config.big_team
+        return max(self.config.num_samples // 2, 2) if big else self.config.num_samples
 
     def task(self, search: Search, base: Any) -> SamplingTask:
         """See :meth:`SamplingPlanner.task`."""
@@ -131,12 +159,12 @@ class D4ormD(D4orm):
 class _Repair:
     """One iteration over failed robots: the team's controls and what they lead to, changed robot by robot."""
 
-    def __init__(self, planner: D4ormD, search: Search) -> None:
+    def __init__(self, planner: D4ormD, search: Search, trajectory: Trajectory) -> None:
         self.planner, self.config = planner, planner.config
         self.search, self.problem = search, search.problem
-        trajectory = search.current.trajectory
         self.failed = search.current.failed
-        self.controls = search.current.controls.copy()
+        self.controls = trajectory.controls.copy()
+        search.memory.setdefault("vain", np.zeros(self.problem.num_robots, int))
         self.positions = trajectory.positions.copy()
         self.arrived = trajectory.arrived[-1].copy()
         self.arrival = np.where(self.arrived, trajectory.arrived.argmax(axis=0), self.problem.horizon)
@@ -208,8 +236,13 @@ class _Repair:
         self.take_over(robots, part, trajectory)
         if not self.graph.any() and self.arrived.all():
             # The detours that got robots out of each other's way are longer than they need be.
-            everybody = range(problem.num_robots)
-            self.take_over(everybody, problem, self.search.engine.rollout(problem, self.controls))
+            self.shorten()
+
+    def shorten(self) -> None:
+        """Let everybody turn home as soon as that is no worse."""
+        for _ in range(SHORTENINGS):
+            trajectory = self.search.engine.rollout(self.problem, self.controls)
+            self.take_over(range(self.problem.num_robots), self.problem, trajectory)
 
     def next_robots(self) -> tuple[tuple[int, ...], str]:
         """Whom to repair, and by whose reward.
@@ -218,7 +251,7 @@ class _Repair:
         Now and then a few robots that only together can get out of each other's way, by their team's.
         """
         search = self.search
-        vain = search.memory.setdefault("vain", np.zeros(self.problem.num_robots, int))
+        vain = search.memory["vain"]
         tired = search.memory.setdefault("tired", np.zeros(self.problem.num_robots))
         random = np.random.default_rng(search.iteration_seed(0)).random(len(tired))
         order = np.argsort(tired + random - 0.2 * self.graph.sum(axis=1))

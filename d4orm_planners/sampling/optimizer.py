@@ -91,13 +91,19 @@ class SamplingPlanner(Planner):
             credit = "team" if search.iteration % 2 else "robot"
         return SamplingTask(search.problem, base, credit=credit)
 
+    def num_samples(self, search: Search) -> int:
+        """``M`` of this iteration."""
+        del search
+        return int(self.config.num_samples)
+
     def iterate(self, search: Search) -> Iteration:
         """See :meth:`Planner.iterate`."""
         base, mean = self.initial(search)
         task, rules, noise_scale = self.task(search, base), self.rules(), self.noise_scale()
+        num_samples = self.num_samples(search)
         with search.watch.paused():
-            search.engine.prepare(task, rules, noise_scale, self.config.num_samples)
-        result = search.engine.denoise(task, rules, mean, noise_scale, self.config.num_samples, search.iteration_seed())
+            search.engine.prepare(task, rules, noise_scale, num_samples)
+        result = search.engine.denoise(task, rules, mean, noise_scale, num_samples, search.iteration_seed())
         return Iteration(base + result.mean, len(noise_scale))
 
 
