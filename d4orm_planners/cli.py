@@ -320,6 +320,8 @@ def _draw(problem: Problem, trajectory: Any, picture: Path | None, animation: Pa
 def _require_solved(plan: Plan) -> None:
     if not plan.solved:
         typer.echo(f"no solution found ({plan.status.replace('_', ' ')} after {plan.iterations} iterations)", err=True)
+        for robot, reason in plan.failures.items():
+            typer.echo(f"  {robot} {reason}", err=True)
         raise typer.Exit(1)
 
 

@@ -15,6 +15,7 @@ from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.scenarios.schema import describe, parse
+from d4orm_planners.grouping import conflicts
 
 FORMAT = "d4orm-plan-1"
 
@@ -80,6 +81,27 @@ class Plan:
     history: tuple[IterationRecord, ...]
     trajectory: Trajectory
     metrics: dict[str, float]
+
+    @property
+    def failures(self) -> dict[str, str]:
+        """Which robots the plan leaves unsolved, and why: a sentence for each, by agent name; empty if it is solved."""
+        problem, trajectory = self.problem, self.trajectory
+        near = conflicts(trajectory.positions[1:], problem.team.radius, problem.margin)
+        reasons = {}
+        for robot in range(problem.num_robots):
+            faults = []
+            if not trajectory.arrived[-1, robot]:
+                gap = np.linalg.norm(trajectory.positions[-1, robot] - problem.goal[robot])
+                faults.append(f"ends {gap:.2f} m from its goal")
+            others = [f"robot_{other}" for other in np.flatnonzero(near[robot])]
+            if others:
+                faults.append(f"comes within the margin of {', '.join(others)}")
+            clearance = problem.world.clearance(trajectory.positions[1:, robot]).min()
+            if clearance <= np.asarray(problem.team.radius)[robot] + problem.margin:
+                faults.append("comes within the margin of an obstacle or the bounds")
+            if faults:
+                reasons[f"robot_{robot}"] = "; ".join(faults)
+        return reasons
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the plan, its problem and its trajectory to an ``.npz`` file.

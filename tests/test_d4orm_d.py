@@ -137,6 +137,21 @@ def test_a_goal_that_cannot_be_reached_ends_at_the_budget(preset: str | None) ->
     assert not plan.solved
     assert plan.status == "iteration_limit"
     assert plan.iterations == 6
+    assert list(plan.failures) == ["robot_0"]
+    assert "m from its goal" in plan.failures["robot_0"] or "an obstacle" in plan.failures["robot_0"]
+
+
+def test_failures_name_robots_and_reasons() -> None:
+    problem = make_problem("circle", num_robots=4)
+    plan = make_planner("d4orm-d", start="straight", engine="cpu").solve(problem, max_iterations=1)
+    assert not plan.solved
+    assert plan.failures == {
+        f"robot_{k}": "comes within the margin of " + ", ".join(f"robot_{i}" for i in range(4) if i != k)
+        for k in range(4)
+    }
+    still = make_planner("d4orm-d", engine="cpu").solve(problem, max_iterations=10)
+    assert still.solved
+    assert still.failures == {}
 
 
 @pytest.mark.parametrize(
