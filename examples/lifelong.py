@@ -16,6 +16,7 @@ from outputs import argument_parser, count, save_gif, save_table
 
 from d4orm_env import Problem, navigation_v0
 from d4orm_env.joint_state import JointState, split_state
+from d4orm_env.lifelong import goal_region
 from d4orm_env.render import FrameRenderer
 from d4orm_planners import make_policy
 
@@ -55,7 +56,8 @@ def main() -> None:
     joint = split_state(problem, env.state())
     bounds = list(least_times(problem, joint))
     trail, frames, act_times, touched = [joint.states[:, :2]], [], [], np.zeros(num_robots, bool)
-    renderer = FrameRenderer(problem, (520, 540))
+    # With a view of all places that a goal may come to lie.
+    renderer = FrameRenderer(problem, (520, 540), goal_region(problem))
     while env.agents:
         begin = time.perf_counter()
         actions = policy.act(observations, env.state())

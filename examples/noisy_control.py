@@ -63,13 +63,13 @@ def execute(name: str, num_robots: int, noise: float, seed: int) -> Execution:
 
 
 def draw(problem: Problem, executions: dict[str, Execution], noise: float, out: Any) -> None:
-    """The executions side by side: paths, where each robot is at the end, its goal, and where robots touch."""
+    """The executions side by side: paths, where each robot is at the end, its goal, and where contacts begin."""
     figure, axes = plt.subplots(
         1, len(executions), figsize=(4.6 * len(executions), 5), sharey=True, layout="constrained"
     )
     colours = plt.get_cmap("turbo")(np.linspace(0.05, 0.95, problem.num_robots))
     points = np.concatenate([problem.goal, *(run.positions.reshape(-1, 2) for run in executions.values())])
-    reach = min(float(np.abs(points).max()), 4.5) + 0.3
+    reach = min(float(np.abs(points).max()), 6.0) + 0.4
     for ax, (name, run) in zip(axes, executions.items()):
         for robot, colour in enumerate(colours):
             radius = float(problem.team.radius[robot])
@@ -77,8 +77,8 @@ def draw(problem: Problem, executions: dict[str, Execution], noise: float, out: 
             ax.plot(*problem.goal[robot], "D", color=colour, fillstyle="none", markersize=9)
             face = colour if run.arrived[robot] else "white"
             ax.add_patch(plt.Circle(run.positions[-1, robot], radius, facecolor=face, edgecolor=colour, zorder=3))
-        touching = run.positions[run.collided]
-        ax.plot(*touching.T, "*", color=COLOURS["mppi"], markersize=9, markeredgecolor="black", zorder=4)
+        touching = run.positions[1:][run.collided[1:] & ~run.collided[:-1]]
+        ax.plot(*touching.T, "*", color=COLOURS["mppi"], markersize=10, markeredgecolor="black", zorder=4)
         arrived, contacts = int(run.arrived.sum()), int(run.collided.any(axis=0).sum())
         ax.set_title(f"{POLICIES[name]}\n{arrived} of {problem.num_robots} arrive, {contacts} touch something")
         ax.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xlabel="x [m]")
@@ -87,7 +87,7 @@ def draw(problem: Problem, executions: dict[str, Execution], noise: float, out: 
         ("goal", {"marker": "D", "mfc": "none", "mec": "0.3", "ms": 8}),
         ("end, arrived", {"marker": "o", "mfc": "0.5", "mec": "0.3", "ms": 9}),
         ("end, not arrived", {"marker": "o", "mfc": "white", "mec": "0.3", "ms": 9}),
-        ("contact", {"marker": "*", "mfc": COLOURS["mppi"], "mec": "black", "ms": 9}),
+        ("contact begins", {"marker": "*", "mfc": COLOURS["mppi"], "mec": "black", "ms": 10}),
     ]
     handles = [plt.Line2D([], [], linestyle="none", label=label, **style) for label, style in marks]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))

@@ -26,18 +26,18 @@ NOISE = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0, 8.0)
 
 
 def draw(rates: Sequence[SuccessRate], out: Any) -> None:
-    """Success rates with their 95% confidence intervals, on an axis that has a place for zero noise."""
+    """Success rates with their 95% confidence intervals; the levels of noise are evenly spaced."""
     figure, axes = plt.subplots(figsize=(5.6, 3.6), layout="constrained")
     levels = sorted({rate.noise for rate in rates})
-    for policy, colour in COLOUR.items():
+    for number, (policy, colour) in enumerate(COLOUR.items()):
         line = [rate for rate in rates if rate.policy == policy]
         if not line:
             continue
-        places = [levels.index(rate.noise) for rate in line]
+        # Side by side, or intervals would hide each other.
+        places = [levels.index(rate.noise) + 0.07 * (number - 1.5) for rate in line]
+        reach = [[rate.rate - rate.lower for rate in line], [rate.upper - rate.rate for rate in line]]
         style = {"color": colour, "marker": MARKER[policy], "label": LABEL[policy]}
-        axes.plot(places, [rate.rate for rate in line], **style, clip_on=False)
-        lower, upper = [rate.lower for rate in line], [rate.upper for rate in line]
-        axes.fill_between(places, lower, upper, color=colour, alpha=0.13, linewidth=0)
+        axes.errorbar(places, [rate.rate for rate in line], reach, **style, elinewidth=0.8, capsize=2, clip_on=False)
     axes.set_xticks(range(len(levels)), [f"{level:g}" for level in levels])
     axes.set(xlabel="standard deviation of the control noise [m/s²]", ylabel="success rate", ylim=(0, 1))
     figure.legend(loc="outside upper center", ncols=2)
