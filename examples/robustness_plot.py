@@ -21,6 +21,9 @@ COLOUR = {"d4orm-c2f": COLOURS["d4orm"], "d4orm-d": COLOURS["mppi"], "orca": COL
 LABEL = {"d4orm-c2f": "D4orm-C2F", "d4orm-d": "D4orm-D, open loop", "orca": "ORCA", "goal": "straight to the goal"}
 MARKER = {"d4orm-c2f": "o", "d4orm-d": "s", "orca": "^", "goal": "x"}
 
+SETTINGS = {"d4orm-c2f": {"refine": "sync"}}
+"""Refinement in the background would make the result depend on how busy the machine is."""
+
 NOISE = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0, 8.0)
 """Standard deviations [m/s^2] of the noise on accelerations of at most 1 m/s^2."""
 
@@ -55,7 +58,9 @@ def main() -> None:
     noise, trials, robots = arguments.noise, arguments.trials, arguments.robots
     if arguments.quick:
         noise, trials, robots = (0.0, 0.5), 2, 4
-    policies = [policy for policy in COLOUR if policy != "orca" or find_spec("pyrvo")]
+    policies: dict[str, dict[str, Any]] = {
+        policy: SETTINGS.get(policy, {}) for policy in COLOUR if policy != "orca" or find_spec("pyrvo")
+    }
     rates = robustness(
         policies,
         arguments.out / "robustness_trials",
