@@ -2,8 +2,9 @@
 
     python examples/lifelong.py --minutes 1
 
-The throughput is compared with a bound that no robot can beat: if nobody were in its way, it would accelerate straight
-to each of the goals that it was given, from the velocity that it had then, up to its top speed, and pass through.
+The throughput is compared with a bound that robots cannot beat in the long run: if nobody were in its way, it would
+accelerate straight to each of the goals that it was given, from the velocity that it had then, up to its top speed, and
+pass through.
 """
 
 from __future__ import annotations
