@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+import numpy as np
+from PIL import Image
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -44,6 +46,20 @@ def save_figure(figure: Any, path: Path) -> None:
     with replaced_when_done(path) as temporary:
         figure.savefig(temporary)
     plt.close(figure)
+    print(f"wrote {path}")
+
+
+def save_gif(frames: Sequence[Any], path: Path, interval: float) -> None:
+    """Write ``(height, width, 3)`` images as an animation that plays without end, ``interval`` seconds a frame."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # One palette for all, from several of them, so that what stands still keeps its colours.
+    chosen = frames[:: max(len(frames) // 8, 1)]
+    palette = Image.fromarray(np.concatenate(chosen)).quantize(256)
+    images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    with replaced_when_done(path) as temporary:
+        images[0].save(
+            temporary, format="GIF", save_all=True, append_images=images[1:], duration=round(1000 * interval), loop=0
+        )
     print(f"wrote {path}")
 
 

@@ -14,6 +14,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from d4orm_env import make_problem
+from d4orm_env.joint_state import JointState
+from d4orm_planners import Plan
+
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
 PNG = b"\x89PNG"
@@ -130,6 +134,100 @@ def test_d4orm_finds_several_kinds_of_solution_and_no_robot_weaves(tmp_path: Pat
     assert plans["0 over 1 over O over 0"] == plans["1 over 0 over O over 1"] == 0
     assert all(5 < float(row["travel time [s]"]) < 8 for row in rows if row["plans"] != "0")
     assert (out / "multimodality.png").read_bytes().startswith(PNG)
+
+
+@pytest.mark.slow
+def test_big_team_example_ends_without_failures_and_draws_the_plan(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("sixty_four_robots", out)
+    rows = table(out / "sixty_four_robots.csv")
+    assert [int(row["iteration"]) for row in rows] == list(range(1, len(rows) + 1))
+    assert int(rows[0]["failed"]) > int(rows[-1]["failed"]) == 0
+    plan = Plan.load(out / "sixty_four_robots.npz")
+    assert plan.solved
+    assert plan.problem.num_robots == 12
+    assert (out / "sixty_four_robots.png").read_bytes().startswith(PNG)
+    with Image.open(out / "sixty_four_robots.gif") as animation:
+        assert animation.n_frames > 5
+
+
+@pytest.mark.slow
+def test_closed_loop_survives_the_noise_that_the_open_loop_does_not(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("noisy_control", out)
+    rows = {row["policy"]: row for row in table(out / "noisy_control.csv")}
+    assert rows["d4orm-c2f"]["success"] == "True"
+    assert rows["d4orm-c2f"]["arrived"] == "4 of 4"
+    assert rows["d4orm-d"]["success"] == "False"
+    assert all(0 < float(row["loop, median [ms]"]) <= float(row["loop, 95th percentile [ms]"]) for row in rows.values())
+    assert (out / "noisy_control.png").read_bytes().startswith(PNG)
+
+
+@pytest.mark.slow
+def test_robustness_example_tells_closed_loop_from_open_loop_and_keeps_its_trials(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("robustness_plot", out)
+    rows = {(row["policy"], row["noise [m/s^2]"]): row for row in table(out / "robustness_plot.csv")}
+    assert {policy for policy, _ in rows} >= {"d4orm-c2f", "d4orm-d", "goal"}
+    assert rows["d4orm-d", "0"]["success"] == rows["d4orm-c2f", "0.5"]["success"] == "2 of 2"
+    assert rows["d4orm-d", "0.5"]["success"] == "0 of 2"
+    assert rows["goal", "0"]["contact"] == "2"
+    assert (out / "robustness_plot.png").read_bytes().startswith(PNG)
+    again = run("robustness_plot", out)
+    done, total = (int(number) for number in again.stdout.split(" trials", 1)[0].split(" of "))
+    assert done == total, "the trials of the first call were run again"
+
+
+@pytest.mark.slow
+def test_lifelong_example_stays_below_its_bound(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("lifelong", out)
+    (row,) = table(out / "lifelong.csv")
+    assert row["simulated [s]"] == "6.0"
+    goals, rate = int(row["goals reached"]), float(row["goals per robot-minute"])
+    assert goals >= 2
+    assert rate == pytest.approx(goals / (4 * 0.1), abs=0.01)
+    assert rate < float(row["straight-line bound"])
+    assert row["robots that touched"] == row["robot-steps in contact"] == "0"
+    with Image.open(out / "lifelong.gif") as animation:
+        assert animation.n_frames > 5
+        assert animation.info["duration"] == 100
+
+
+@pytest.mark.slow
+def test_coarse_to_fine_example_arrives_however_coarse_the_guidance(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("coarse_to_fine", out)
+    rows = table(out / "coarse_to_fine.csv")
+    assert [(row["f"], row["o"], row["refine"]) for row in rows] == [
+        (f, "1", refine) for f in ("1", "4") for refine in ("off", "background")
+    ]
+    assert all(row["success"] == "1 of 1" for row in rows)
+    assert all(4.5 < float(row["average travel time [s]"]) <= float(row["makespan [s]"]) < 10 for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("position", "velocity", "seconds"),
+    [
+        (0.0, 0.0, 1 + (4 - 0.5)),  # half a metre to reach 1 m/s
+        (0.0, 1.0, 4.0),
+        (0.0, -1.0, 2 + 4.0),  # two seconds to stop and come back at top speed
+        (3.92, 0.0, np.sqrt(2 * 0.08)),
+        (4.05, 0.0, 0.0),
+    ],
+    ids=["from rest", "at top speed", "backwards", "near", "there already"],
+)
+def test_lifelong_bound_is_the_time_of_a_straight_drive(
+    monkeypatch: pytest.MonkeyPatch, position: float, velocity: float, seconds: float
+) -> None:
+    """A single robot on a line, limits of 1 m/s and 1 m/s^2, and the goal's disc begins at 4 m."""
+    monkeypatch.syspath_prepend(EXAMPLES)
+    lifelong = importlib.import_module("lifelong")
+    problem = make_problem("circle", num_robots=1)
+    goal = np.array([[4 + problem.goal_radius, 0]], np.float32)
+    states = np.array([[position, 0, velocity, 0]], np.float32)
+    joint = JointState(states, goal, np.zeros((1, 2), np.float32), np.zeros(1, bool), 0)
+    assert lifelong.least_times(problem, joint) == pytest.approx([seconds], abs=1e-5)
 
 
 @pytest.fixture

@@ -1,0 +1,103 @@
+"""Robots that get a new goal whenever they arrive, under D4orm-C2F, for some minutes of simulated time.
+
+    python examples/lifelong.py --minutes 1
+
+The throughput is compared with a bound that robots cannot beat in the long run: if nobody were in its way, it would
+accelerate straight to each of the goals that it was given, from the velocity that it had then, up to its top speed, and
+pass through.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from outputs import argument_parser, count, save_gif, save_table
+
+from d4orm_env import Problem, navigation_v0
+from d4orm_env.joint_state import JointState, split_state
+from d4orm_env.lifelong import goal_region
+from d4orm_env.render import FrameRenderer
+from d4orm_planners import make_policy
+
+
+def least_times(problem: Problem, joint: JointState) -> np.ndarray:
+    """``(K,)`` seconds within which no double integrator gets from a joint state to its goal."""
+    d = problem.dimension
+    speed, acceleration, _ = np.asarray(problem.team.limits, np.float64).T
+    to_goal = joint.goals.astype(np.float64) - joint.states[:, :d]
+    distance = np.linalg.norm(to_goal, axis=1)
+    way = np.maximum(distance - problem.goal_radius, 0)
+    towards = (joint.states[:, d : 2 * d] * to_goal).sum(axis=1) / np.maximum(distance, 1e-9)
+    to_top_speed = (speed**2 - towards**2) / (2 * acceleration)
+    accelerating = (np.sqrt(towards**2 + 2 * acceleration * np.minimum(way, to_top_speed)) - towards) / acceleration
+    return accelerating + np.maximum(way - to_top_speed, 0) / speed
+
+
+def main() -> None:
+    """Run the loop, print the throughput and write the table and the animation."""
+    parser = argument_parser(__doc__)
+    parser.add_argument("--minutes", type=float, default=1.0, help="simulated time")
+    parser.add_argument("--robots", type=count, default=16)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--film", type=float, default=20.0, help="seconds of the animation")
+    arguments = parser.parse_args()
+    num_robots, minutes, film = arguments.robots, arguments.minutes, arguments.film
+    if arguments.quick:
+        num_robots, minutes, film = 4, 0.1, 2.0
+
+    env = navigation_v0.parallel_env(scenario="random", num_robots=num_robots, seed=arguments.seed, lifelong=True)
+    problem = env.problem
+    env.max_cycles = max(round(60 * minutes / problem.dt), 1)
+    observations, _ = env.reset(seed=arguments.seed)
+    policy: Any = make_policy("d4orm-c2f")
+    policy.reset(env, seed=arguments.seed)
+
+    joint = split_state(problem, env.state())
+    bounds = list(least_times(problem, joint))
+    trail, frames, act_times, touched = [joint.states[:, :2]], [], [], np.zeros(num_robots, bool)
+    # With a view of all places that a goal may come to lie.
+    renderer = FrameRenderer(problem, (520, 540), goal_region(problem))
+    while env.agents:
+        begin = time.perf_counter()
+        actions = policy.act(observations, env.state())
+        act_times.append(time.perf_counter() - begin)
+        observations, _, _, _, infos = env.step(actions)
+        before, joint = joint, split_state(problem, env.state())
+        new = (joint.goals != before.goals).any(axis=1)
+        bounds.extend(least_times(problem, joint)[new])
+        collided = np.array([infos[agent]["collided"] for agent in env.possible_agents])
+        touched |= collided
+        trail = [*trail[-30:], joint.states[:, :2]]
+        seconds = joint.steps * problem.dt
+        if seconds <= film:
+            caption = f"{seconds:.1f} s    {len(bounds) - num_robots} goals reached"
+            arrived = np.zeros(num_robots, bool)
+            frames.append(renderer.draw(joint.states, arrived, collided, joint.goals, np.stack(trail), caption=caption))
+    renderer.close()
+
+    metrics = env.unwrapped.metrics()
+    rate, bound = metrics["goals_per_robot_minute"], 60 / float(np.mean(bounds))
+    loops = 1000 * np.array(act_times)
+    row = {
+        "robots": num_robots,
+        "simulated [s]": f"{joint.steps * problem.dt:.1f}",
+        "goals reached": int(metrics["goals_reached"]),
+        "goals per robot-minute": f"{rate:.2f}",
+        "straight-line bound": f"{bound:.2f}",
+        "share of the bound": f"{rate / bound:.0%}",
+        "robots that touched": int(touched.sum()),
+        "robot-steps in contact": int(metrics["collisions"]),
+        "loop, median [ms]": f"{np.median(loops):.0f}",
+        "loop, 95th percentile [ms]": f"{np.percentile(loops, 95):.0f}",
+        "loop, slowest [ms]": f"{loops.max():.0f}",
+        "guidance planned anew": sum(loop.replanned for loop in policy.loops),
+    }
+    save_table([row], arguments.out / "lifelong.csv")
+    save_gif(frames, arguments.out / "lifelong.gif", problem.dt)
+    env.close()
+
+
+if __name__ == "__main__":
+    main()
