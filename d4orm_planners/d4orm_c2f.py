@@ -420,9 +420,11 @@ class D4ormC2F(Policy):
         result = self._engine.denoise(
             task, self._rules, np.zeros_like(base), self._noise_scale, config.num_samples, seed
         )
+        limit = problem.team.control_limits
+        controls = np.clip(base + result.mean, -limit, limit).astype(np.float32)
         radius = problem.goal_radius if self._docks else NOT_AT_SUBGOALS
         truth = problem.moment(joint.states, joint.goals, horizon=config.predict_horizon, goal_radius=radius)
-        return self._safe_mix(truth, self._with_stop(truth, base + result.mean, docked))
+        return self._safe_mix(truth, self._with_stop(truth, controls, docked))
 
     def _with_stop(self, window: Problem, controls: FloatArray, docked: Any) -> FloatArray:
         """The controls, and after them those that bring everyone to rest as soon as can be."""

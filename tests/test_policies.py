@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -18,16 +19,17 @@ from d4orm_env.joint_state import split_state
 from d4orm_env.scenarios import make_problem
 from d4orm_env.wrappers import GaussianControlNoise
 from d4orm_planners import OpenLoop, Plan, Policy, list_planners, list_policies, make_policy, run_episode
-from d4orm_planners.registry import PLANNERS, describe_policy
+from d4orm_planners.registry import PLANNERS, POLICIES, describe_policy
 
 ALL = pytest.mark.parametrize("name", list_policies())
 
 
 def cheap_policy(name: str) -> Policy:
-    if name not in PLANNERS:
-        return make_policy(name)
-    known = PLANNERS[name].config_class.setting_names()
-    return make_policy(name, **{key: value for key, value in CHEAP.items() if key in known} | {"max_iterations": 1})
+    """A policy with those of the cheap settings that it has."""
+    config = (PLANNERS.get(name) or POLICIES[name]).config_class
+    known = {field.name for field in fields(config)} if config else set()
+    settings = {key: value for key, value in (CHEAP | {"max_iterations": 1}).items() if key in known}
+    return make_policy(name, **settings)
 
 
 def noisy(**arguments: Any) -> Any:
