@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -490,13 +490,16 @@ class _Background:
         return True, job.result()
 
     def run(self, work: Callable[[], Any], timeout: float) -> Any:
-        """What the work gives within the time, or ``None``. What is late goes on, and is thrown away."""
-        if self._job is not None and not self._job.done():
-            return None
+        """What the work gives within the time [s], or ``None``. What is late goes on, and is thrown away."""
+        end = time.perf_counter() + timeout
+        if self._job is not None:
+            wait([self._job], max(timeout, 0))
+            if not self._job.done():
+                return None
         self.start(work)
         assert self._job is not None
         try:
-            return self._job.result(max(timeout, 0))
+            return self._job.result(max(end - time.perf_counter(), 0))
         except TimeoutError:
             return None
 

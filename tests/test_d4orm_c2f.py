@@ -1,0 +1,244 @@
+"""D4orm-C2F brings everyone home without contact, disturbed or not, keeps to its deadlines and says what it did."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from d4orm_env import navigation_v0
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
+from d4orm_env.scenarios import make_problem
+from d4orm_env.verify import verify
+from d4orm_planners import Episode, make_policy, run_episode
+from d4orm_planners.d4orm_c2f import D4ormC2F
+
+CASES = [
+    pytest.param({"scenario": "circle", "num_robots": 16}, id="circle-16"),
+    pytest.param({"scenario": "four_obstacles", "num_robots": 12}, id="four-obstacles-12"),
+    pytest.param({"scenario": "random", "num_robots": 16}, id="random-16"),
+    pytest.param({"scenario": "swap", "num_robots": 8}, id="swap-8"),
+    pytest.param({"scenario": "circle", "num_robots": 8, "model": "differential_drive"}, id="differential-drive-8"),
+    pytest.param({"scenario": "circle", "num_robots": 8, "model": "velocity2d"}, id="velocity2d-8"),
+    pytest.param({"scenario": "sphere", "num_robots": 12}, id="sphere-12"),
+    pytest.param({"scenario": "heterogeneous", "num_robots": 6}, id="heterogeneous-6"),
+    pytest.param({"scenario": "circle", "num_robots": 1}, id="circle-1"),
+]
+
+
+def controller(**config: Any) -> D4ormC2F:
+    """On the CPU engine, without refinement: quick, and the same every time."""
+    policy = make_policy("d4orm-c2f", **{"engine": "cpu", "refine": "off", **config})
+    assert isinstance(policy, D4ormC2F)
+    return policy
+
+
+def episode(policy: D4ormC2F, problem: Problem, *, seed: int = 0, **env: Any) -> Episode:
+    """One episode in the single environment."""
+    return run_episode(navigation_v0.parallel_env(problem=problem, **env), policy, seed=seed)
+
+
+def circle(num_robots: int = 4, **changes: Any) -> Problem:
+    return make_problem("circle", num_robots=num_robots, **changes)
+
+
+def assert_verified(problem: Problem, executed: Episode) -> None:
+    """What was executed is a plan of its own, and is judged as one."""
+    controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
+    controls[: len(executed.trajectory.controls)] = executed.trajectory.controls
+    report = verify(problem, controls)
+    assert report.ok, report.violations
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_everyone_arrives_and_keeps_the_margin(case: dict[str, Any]) -> None:
+    problem = make_problem(**case, seed=0)
+    executed = episode(controller(), problem)
+    assert executed.metrics["success"], executed.metrics
+    assert_verified(problem, executed)
+
+
+@pytest.mark.parametrize("refine", ["sync", "background"])
+def test_refined_guidance_leads_home_too(refine: str) -> None:
+    problem = circle(8)
+    policy = controller(refine=refine, refine_every=2)
+    executed = episode(policy, problem)
+    assert_verified(problem, executed)
+    assert any(loop.refined for loop in policy.loops)
+
+
+@pytest.mark.parametrize("config", [{"coarse_factor": 4}, {"coarse_factor": 1}, {"check_interval": 10}], ids=str)
+def test_how_coarse_the_guidance_is_may_be_chosen(config: dict[str, int]) -> None:
+    problem = circle(8)
+    policy = controller(**config)
+    executed = episode(policy, problem)
+    assert_verified(problem, executed)
+    assert policy.guidance.problem.dt == pytest.approx(problem.dt * config.get("coarse_factor", 2))
+
+
+@pytest.mark.parametrize("model", ["holonomic2d", "differential_drive"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_noise_that_ruins_a_plan_is_made_up_for(model: str, seed: int) -> None:
+    problem = circle(8, model=model)
+    assert episode(controller(), problem, seed=seed, control_noise_std=0.3).metrics["success"]
+    plan = make_policy("d4orm-d", engine="cpu")
+    assert not run_episode(
+        navigation_v0.parallel_env(problem=problem, control_noise_std=0.3), plan, seed=seed
+    ).metrics["success"]
+
+
+def test_noise_may_be_added_by_the_controller() -> None:
+    problem = circle(4)
+    quiet, noisy = (episode(controller(control_noise_std=noise), problem) for noise in (0.0, 0.3))
+    assert noisy.metrics["success"]
+    assert noisy.trajectory.controls.std() > 0
+    limits = problem.team.control_limits
+    assert (np.abs(noisy.trajectory.controls) <= limits * (1 + 1e-6)).all()
+    steps = min(len(quiet.trajectory.controls), len(noisy.trajectory.controls), 5)
+    assert not np.allclose(quiet.trajectory.controls[:steps], noisy.trajectory.controls[:steps], atol=0.05)
+
+
+def test_synchronous_refinement_gives_the_same_episode_again() -> None:
+    problem = circle(6)
+    first, again = (
+        episode(controller(refine="sync", refine_every=2), problem, seed=3, control_noise_std=0.2) for _ in range(2)
+    )
+    np.testing.assert_array_equal(first.trajectory.states, again.trajectory.states)
+    np.testing.assert_array_equal(first.trajectory.controls, again.trajectory.controls)
+
+
+def test_every_loop_is_recorded() -> None:
+    problem = circle(4)
+    policy = controller()
+    executed = episode(policy, problem)
+    steps = len(executed.trajectory.controls)
+    assert [loop.step for loop in policy.loops] == list(range(steps))
+    assert all(loop.wall_time > 0 and not loop.missed and not loop.replanned for loop in policy.loops)
+    indices = [loop.subgoal_index for loop in policy.loops]
+    assert indices == sorted(indices)
+    assert policy.config.subgoal_offset <= indices[0] and indices[-1] < len(policy.guidance.path)
+    # Without disturbances what was predicted to be kept apart stays apart.
+    assert min(loop.predicted_margin for loop in policy.loops) >= problem.margin - 1e-4
+    assert policy.missed == 0
+    assert 0 < policy.coarse_time < 60
+
+
+def test_a_lone_robot_has_nobody_to_keep_a_margin_to() -> None:
+    policy = controller()
+    episode(policy, circle(1))
+    assert all(loop.predicted_margin == float("inf") for loop in policy.loops)
+
+
+@pytest.mark.parametrize("execute", [1, 3])
+def test_a_plan_may_be_executed_for_some_steps(execute: int) -> None:
+    problem = circle(4)
+    policy = controller(execute_horizon=execute)
+    executed = episode(policy, problem)
+    assert_verified(problem, executed)
+    assert [loop.step for loop in policy.loops] == list(range(0, len(executed.trajectory.controls), execute))
+
+
+def test_loops_that_miss_their_deadline_are_counted_and_the_last_plan_goes_on() -> None:
+    policy = controller(deadline=1e-6)
+    executed = episode(policy, circle(4, horizon=10))
+    # No plan was ever in time, so nobody moves.
+    assert policy.missed == len(policy.loops) == 10
+    assert not executed.trajectory.controls.any()
+    assert not executed.trajectory.collided.any()
+
+
+def test_a_loop_that_is_late_goes_on_with_the_last_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = circle(4)
+    policy = controller(deadline=1.0)
+    in_time = D4ormC2F._predict
+
+    def predict(self: D4ormC2F, joint: Any, *arguments: Any) -> Any:
+        if joint.steps == 10:
+            time.sleep(1.3)
+        return in_time(self, joint, *arguments)
+
+    monkeypatch.setattr(D4ormC2F, "_predict", predict)
+    executed = episode(policy, problem)
+    assert policy.loops[10].missed
+    assert np.isnan(policy.loops[10].predicted_margin)
+    assert executed.trajectory.controls[10].any()
+    assert not policy.loops[20].missed
+    assert_verified(problem, executed)
+
+
+def test_ample_deadlines_change_nothing() -> None:
+    problem = circle(4)
+    waiting, pressed = (episode(controller(deadline=deadline), problem) for deadline in (None, 60.0))
+    np.testing.assert_array_equal(waiting.trajectory.states, pressed.trajectory.states)
+
+
+def test_others_stay_safe_where_one_goal_is_walled_in() -> None:
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    ring = np.column_stack([3 + 0.9 * np.cos(angle), 0.9 * np.sin(angle), np.full(12, 0.25)])
+    start = np.zeros((3, 4))
+    start[:, :2] = [[0, 0], [0, 2.5], [0, -2.5]]
+    team = Team(("holonomic2d",) * 3)
+    problem = Problem(team, start, [[3, 0], [0, -2.5], [0, 2.5]], World(circles=ring), horizon=120)
+    executed = episode(controller(coarse_iterations=3), problem)
+    assert not executed.metrics["success"]
+    assert not executed.trajectory.collided.any()
+    np.testing.assert_array_equal(executed.trajectory.arrived[-1], [False, True, True])
+
+
+def test_the_guidance_is_planned_anew_for_robots_pushed_away() -> None:
+    env = navigation_v0.parallel_env(problem=circle(4))
+    policy = controller(replan_distance=0.2)
+    observations, _ = env.reset(seed=0)
+    policy.reset(env, seed=0)
+    while env.agents:
+        actions = policy.act({agent: observations[agent] for agent in env.agents}, env.state())
+        if 10 <= len(policy.loops) < 25:
+            # Somebody else has the robots' controls.
+            actions = {agent: -action for agent, action in actions.items()}
+        observations = env.step(actions)[0]
+    assert any(loop.replanned for loop in policy.loops[10:])
+
+
+@pytest.mark.slow
+def test_robots_with_ever_new_goals_never_touch() -> None:
+    problem = make_problem("random", num_robots=12, seed=1)
+    env = navigation_v0.parallel_env(problem=problem, lifelong=True, max_cycles=300)
+    policy = controller()
+    executed = run_episode(env, policy, seed=1)
+    assert not executed.trajectory.collided.any()
+    assert executed.metrics["goals_reached"] >= 3 * problem.num_robots
+    assert any(loop.replanned for loop in policy.loops)
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"coarse_factor": 0}, "coarse_factor"),
+        ({"check_interval": 0}, "check_interval"),
+        ({"num_samples": 1}, "num_samples"),
+        ({"coarse_samples": 1}, "coarse_samples"),
+        ({"predict_horizon": 0}, "predict_horizon"),
+        ({"execute_horizon": 30}, "predict_horizon"),
+        ({"subgoal_offset": 0}, "subgoal_offset"),
+        ({"temperature": 0}, "temperature"),
+        ({"beta_end": 1e-5}, "beta_start"),
+        ({"beta_end": 1.0}, "beta_end"),
+        ({"penalty": -1}, "penalty"),
+        ({"extra_margin": -0.1}, "extra_margin"),
+        ({"control_noise_std": -1}, "control_noise_std"),
+        ({"control_noise_std": float("nan")}, "control_noise_std"),
+        ({"credit": "nobody"}, "robot, team"),
+        ({"refine": "always"}, "background, sync, off"),
+        ({"deadline": 0}, "deadline"),
+        ({"engine": "abacus"}, "abacus"),
+        ({"num_sample": 10}, "num_sample"),
+    ],
+    ids=str,
+)
+def test_settings_that_make_no_sense_are_named(config: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_policy("d4orm-c2f", **config)
