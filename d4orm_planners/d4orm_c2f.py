@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -492,13 +492,11 @@ class _Background:
     def run(self, work: Callable[[], Any], timeout: float) -> Any:
         """What the work gives within the time [s], or ``None``. What is late goes on, and is thrown away."""
         end = time.perf_counter() + timeout
-        if self._job is not None:
-            wait([self._job], max(timeout, 0))
-            if not self._job.done():
-                return None
-        self.start(work)
-        assert self._job is not None
         try:
+            if self._job is not None:
+                self._job.result(max(timeout, 0))
+            self.start(work)
+            assert self._job is not None
             return self._job.result(max(end - time.perf_counter(), 0))
         except TimeoutError:
             return None

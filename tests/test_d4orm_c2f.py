@@ -86,9 +86,9 @@ def test_noise_that_ruins_a_plan_is_made_up_for(model: str, seed: int) -> None:
     problem = circle(8, model=model)
     assert episode(controller(), problem, seed=seed, control_noise_std=0.3).metrics["success"]
     plan = make_policy("d4orm-d", engine="cpu")
-    assert not run_episode(
-        navigation_v0.parallel_env(problem=problem, control_noise_std=0.3), plan, seed=seed
-    ).metrics["success"]
+    assert not run_episode(navigation_v0.parallel_env(problem=problem, control_noise_std=0.3), plan, seed=seed).metrics[
+        "success"
+    ]
 
 
 def test_noise_may_be_added_by_the_controller() -> None:
