@@ -120,7 +120,8 @@ def test_every_loop_is_recorded() -> None:
     assert all(loop.wall_time > 0 and not loop.missed and not loop.replanned for loop in policy.loops)
     indices = [loop.subgoal_index for loop in policy.loops]
     assert indices == sorted(indices)
-    assert policy.config.subgoal_offset <= indices[0] and indices[-1] < len(policy.guidance.path)
+    assert policy.config.subgoal_offset <= indices[0]
+    assert indices[-1] < len(policy.guidance.path)
     # Without disturbances what was predicted to be kept apart stays apart.
     assert min(loop.predicted_margin for loop in policy.loops) >= problem.margin - 1e-4
     assert policy.missed == 0
