@@ -23,10 +23,13 @@ _MAGNITUDE = np.int32(0x7FFFFFFF)
 _LOWEST = np.int32(-0x80000000)
 _INFINITY = np.float32(np.inf)
 
+NEAR = np.int32(4)
+"""Steps for which two boxes that touch are taken to go on touching: looking costs as much as checking some samples."""
+
 
 # Columns of ``due`` ``(K, FIRST + K + O)`` int32, in time steps: when the robot's box was made, when the earliest thing
 # in its row is due, when obstacles and bounds are, and whether its flags of this step have been written to; then when
-# to look again at the robots before it, and at the bodies.
+# to look again at the robots before it, and at the bodies: negative for those to check at every step until then.
 SEEN, EARLIEST, STATIC, TOUCHED, FIRST = range(5)
 
 
@@ -173,32 +176,36 @@ def mark_robots(
         for other in range(k):
             when = due[k, FIRST + other]
             if when <= t:
-                _look(t, k, w, due, box)
-                _look(t, other, w, due, box)
                 reach = radius[k] + radius[other] + margin
-                gap = _pair_gap(box, k, other) - reach - SLACK
-                when = np.int32(t + 1)
-                if gap > ZERO:
-                    when = _next_look(t, gap, stride[k] + stride[other], num_steps)
-                else:
+                if when >= -t:
+                    _look(t, k, w, due, box)
+                    _look(t, other, w, due, box)
+                    gap = _pair_gap(box, k, other) - reach - SLACK
+                    if gap > ZERO:
+                        when = _next_look(t, gap, stride[k] + stride[other], num_steps)
+                    else:
+                        when = np.int32(-t - NEAR)
+                    due[k, FIRST + other] = when
+                if when < 0:
                     _touch(k, w, due)
                     _touch(other, w, due)
                     tiles.mark_pair(reach, k, other, dimension, w)
-                due[k, FIRST + other] = when
             earliest = min(earliest, when)
         for body in range(moving.shape[0]):
             when = due[k, FIRST + num_robots + body]
             if when <= t:
-                _look(t, k, w, due, box)
                 reach = radius[k] + moving_radius[body] + margin
-                gap = _point_gap(box, k, moving[body], dimension) - reach - SLACK
-                when = np.int32(t + 1)
-                if gap > ZERO:
-                    when = _next_look(t, gap, stride[k] + stride[num_robots + body], num_steps)
-                else:
+                if when >= -t:
+                    _look(t, k, w, due, box)
+                    gap = _point_gap(box, k, moving[body], dimension) - reach - SLACK
+                    if gap > ZERO:
+                        when = _next_look(t, gap, stride[k] + stride[num_robots + body], num_steps)
+                    else:
+                        when = np.int32(-t - NEAR)
+                    due[k, FIRST + num_robots + body] = when
+                if when < 0:
                     _touch(k, w, due)
                     tiles.mark_round(reach, k, moving[body], dimension, NEAR_ROBOT, w)
-                due[k, FIRST + num_robots + body] = when
             earliest = min(earliest, when)
         due[k, EARLIEST] = earliest
 

@@ -135,18 +135,24 @@ def _runner(model: Model) -> Any:
     """The compiled step of one robot of this model in every sample of a tile, which adds its reward without
     violations. The controls are the same few rows for every robot: they stay in cache.
     """
-    step, limit_control = make_stepper(model), inlined(model.functions.limit_control)
+    move, dock = make_stepper(model)
+    limit_control = inlined(model.functions.limit_control)
     read_x, write_x = READ[model.state_size], WRITE[model.state_size]
-    read_u = READ[model.control_size]
+    read_u, write_u = READ[model.control_size], WRITE[model.control_size]
     dimension = model.dimension
 
     @compiled
     def run(limits: Any, h: Any, docking: Any, goal: Any, inverse: Any, controls: Any, w: Any) -> None:
         goal = goal[:dimension]
+        # Three loops for the same reason as in tiles.
         for s in range(TILE):
-            u = limit_control(read_u(controls, 0, s), limits, OPS)
+            write_u(controls, 0, s, limit_control(read_u(controls, 0, s), limits, OPS))
+        for s in range(TILE):
             standing = w[DOCKED * TILE + s] > ZERO
-            x, gap2, docked = step(standing, read_x(w, STATE * TILE, s), u, goal, limits, h, docking)
+            write_x(w, STATE * TILE, s, move(standing, read_x(w, STATE * TILE, s), read_u(controls, 0, s), limits, h))
+        for s in range(TILE):
+            standing = w[DOCKED * TILE + s] > ZERO
+            x, gap2, docked = dock(standing, read_x(w, STATE * TILE, s), read_u(controls, 0, s), goal, docking)
             write_x(w, STATE * TILE, s, x)
             w[DOCKED * TILE + s] = ONE if docked else ZERO
             w[TOTAL * TILE + s] += reward.step_reward(np.sqrt(gap2), inverse, ZERO, ZERO, ONE)

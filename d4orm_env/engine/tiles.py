@@ -210,46 +210,61 @@ _SQUARED_NORM = {2: _squared_norm2, 3: _squared_norm3}
 _SQUARED_GAP = {2: _squared_gap2, 3: _squared_gap3}
 
 
-def make_stepper(model: Model) -> Any:
-    """The compiled step of one robot of this model in one world, ``(standing, x, u, goal, limits, h, docking) -> (x,
-    squared distance to the goal, whether docked)``, for a control that is within its limits.
+def make_stepper(model: Model) -> tuple[Any, Any]:
+    """The two halves of the compiled step of one robot of this model in one world, for a control within its limits.
+
+    ``move(standing, x, u, limits, h) -> x`` and ``dock(standing, x, u, goal, docking) -> (x, squared distance to the
+    goal, whether docked)``.
     """
     functions = ModelFunctions(*(inlined(function) for function in model.functions))
     pick_x = _PICK[model.state_size]
     squared_norm, squared_gap = _SQUARED_NORM[model.dimension], _SQUARED_GAP[model.dimension]
 
     @inlined
-    def step(standing: Any, x: Any, u: Any, goal: Any, limits: Any, h: Any, docking: Any) -> Any:
-        y = pick_x(standing, x, transition.advance(functions, x, u, limits, h, OPS))
-        gap2 = squared_gap(y, goal)
-        speed2 = squared_norm(functions.velocity(y, u, OPS))
-        arrives = transition.arrives(gap2, speed2, docking[0], docking[1])
-        return pick_x(arrives, functions.rest(y, ZERO), y), gap2, standing | arrives
+    def move(standing: Any, x: Any, u: Any, limits: Any, h: Any) -> Any:
+        return pick_x(standing, x, transition.advance(functions, x, u, limits, h, OPS))
 
-    return step
+    @inlined
+    def dock(standing: Any, x: Any, u: Any, goal: Any, docking: Any) -> Any:
+        gap2 = squared_gap(x, goal)
+        speed2 = squared_norm(functions.velocity(x, u, OPS))
+        arrives = transition.arrives(gap2, speed2, docking[0], docking[1])
+        return pick_x(arrives, functions.rest(x, ZERO), x), gap2, standing | arrives
+
+    return move, dock
 
 
 def _mover(model: Model) -> Any:
-    """The compiled step of one robot of this model in every world of a tile."""
-    step, limit_control = make_stepper(model), inlined(model.functions.limit_control)
+    """The compiled step of one robot of this model in every world of a tile.
+
+    It is one long chain of dependent operations. Cut into loops, a core works on more worlds at the same time.
+    """
+    move, dock = make_stepper(model)
+    limit_control = inlined(model.functions.limit_control)
     read_x, write_x = READ[model.state_size], WRITE[model.state_size]
     read_u, write_u, pick_u = READ[model.control_size], WRITE[model.control_size], _PICK[model.control_size]
     read_goal = READ[model.dimension]
     no_control = (ZERO,) * model.control_size
 
     @compiled
-    def move(limits: Any, h: Any, docking: Any, w: Any) -> None:
+    def run(limits: Any, h: Any, docking: Any, w: Any) -> None:
         for s in range(TILE):
-            u = limit_control(read_u(w, CONTROL * TILE, s), limits, OPS)
             standing = w[DOCKED * TILE + s] > ZERO
-            goal = read_goal(w, GOAL * TILE, s)
-            x, gap2, docked = step(standing, read_x(w, STATE * TILE, s), u, goal, limits, h, docking)
-            write_x(w, STATE * TILE, s, x)
+            u = limit_control(read_u(w, CONTROL * TILE, s), limits, OPS)
             write_u(w, CONTROL * TILE, s, pick_u(standing, no_control, u))
+        for s in range(TILE):
+            standing = w[DOCKED * TILE + s] > ZERO
+            u = read_u(w, CONTROL * TILE, s)
+            write_x(w, STATE * TILE, s, move(standing, read_x(w, STATE * TILE, s), u, limits, h))
+        for s in range(TILE):
+            standing = w[DOCKED * TILE + s] > ZERO
+            x, u = read_x(w, STATE * TILE, s), read_u(w, CONTROL * TILE, s)
+            x, gap2, docked = dock(standing, x, u, read_goal(w, GOAL * TILE, s), docking)
+            write_x(w, STATE * TILE, s, x)
             w[DOCKED * TILE + s] = ONE if docked else ZERO
             w[DISTANCE2 * TILE + s] = gap2
 
-    return move
+    return run
 
 
 HOLONOMIC2D, HOLONOMIC3D = MODEL_CODES["holonomic2d"], MODEL_CODES["holonomic3d"]
