@@ -25,8 +25,8 @@ class D4ormConfig(SamplingConfig):
         random_start: Start every deformation from ``U_N ~ N(0, I)``, as Algorithm 1 is written, rather than from zero.
     """
 
-    num_samples: int = 512
-    num_steps: int = 50
+    num_samples: int = 256
+    num_steps: int = 100
     credit: str = "alternate"
     random_start: bool = False
 

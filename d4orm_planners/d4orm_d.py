@@ -71,8 +71,6 @@ class D4ormDConfig(D4ormConfig):
             past a robot than to wait for it.
     """
 
-    num_samples: int = 256
-    num_steps: int = 100
     big_team: int | None = 32
     decoupling: str = "independent"
     start: str = "auto"
