@@ -110,10 +110,12 @@ class Iteration:
     Attributes:
         controls: ``(H, K, m)`` the new candidate.
         denoising_steps: Sample-score-update steps spent.
+        excluded: Samples left out because their reward was not finite.
     """
 
     controls: FloatArray
     denoising_steps: int
+    excluded: int = 0
 
 
 class Planner(ABC):
@@ -251,6 +253,7 @@ class Search:
             num_not_arrived=int((~trajectory.arrived[-1]).sum()),
             best_reward=float(self.best.trajectory.rewards.mean()),
             best_solved=self.best.solved,
+            excluded=iteration.excluded,
         )
         self.history.append(record)
         return record

@@ -121,7 +121,7 @@ class D4ormD(D4orm):
             repair.groups()
         else:
             repair.independent()
-        return Iteration(repair.controls, repair.denoising_steps)
+        return Iteration(repair.controls, repair.denoising_steps, repair.excluded)
 
     def whole_team(self, search: Search) -> Iteration:
         """Deform everybody's controls at once; unless in groups, then straight home from wherever that is as good."""
@@ -130,7 +130,7 @@ class D4ormD(D4orm):
             return iteration
         repair = _Repair(self, search, search.engine.rollout(search.problem, iteration.controls))
         repair.shorten()
-        return Iteration(repair.controls, iteration.denoising_steps)
+        return Iteration(repair.controls, iteration.denoising_steps, iteration.excluded)
 
     def num_samples(self, search: Search) -> int:
         """See :meth:`SamplingPlanner.num_samples`."""
@@ -168,6 +168,7 @@ class _Repair:
         self.arrival = np.where(self.arrived, trajectory.arrived.argmax(axis=0), self.problem.horizon)
         self.graph = self.conflicts(self.positions)
         self.denoising_steps = 0
+        self.excluded = 0
         self.stream = 0
 
     def conflicts(self, positions: Any) -> Any:
@@ -198,6 +199,7 @@ class _Repair:
         seed = search.iteration_seed(self.stream)
         result = search.engine.denoise(task, rules, planner.start(search, base), noise_scale, num_samples, seed)
         self.denoising_steps += len(noise_scale)
+        self.excluded += result.excluded
         controls = np.zeros((problem.horizon, len(robots), part.control_size), np.float32)
         controls[:horizon] = base + result.mean
         return part, search.engine.rollout(part, controls)

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, positive_number
+from d4orm_env.engine.base import SamplingRules
 from d4orm_planners.base import Search
 from d4orm_planners.sampling.optimizer import PAPER, SamplingConfig, SamplingPlanner
 from d4orm_planners.sampling.schedule import constant
@@ -19,24 +20,34 @@ class MPPIConfig(SamplingConfig):
 
     Attributes:
         sigma: Standard deviation of the samples, the same at every step.
+        importance: Share, from 0 to 1, of the importance-sampling term: a sample weighs the less the more it adds to
+            the controls that it was drawn around. In the high dimensions of a team the whole term leaves next to
+            nothing of most samples (the paper calls it unstable and does without).
     """
 
     sigma: float = 1.0
+    importance: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         positive_number(self.sigma, "sigma")
+        if positive_number(self.importance, "importance", zero_allowed=True) > 1:
+            raise ValueError(f"importance is {self.importance:g}; it must be at most 1")
 
 
 class MPPI(SamplingPlanner):
     """Model predictive path integral control: softmax updates under a fixed covariance (paper, Eq. 11).
 
-    The importance-sampling term is left out, as in the paper's comparison.
+    The importance-sampling term is left out unless asked for, as in the paper's comparison.
     """
 
     name: ClassVar[str] = "mppi"
     config_class = MPPIConfig
     presets: ClassVar[dict[str, dict[str, Any]]] = {"paper": PAPER}
+
+    def rules(self) -> SamplingRules:
+        """See :meth:`SamplingPlanner.rules`."""
+        return super().rules()._replace(importance=float(self.config.importance))
 
     def noise_scale(self) -> FloatArray:
         """See :meth:`SamplingPlanner.noise_scale`."""

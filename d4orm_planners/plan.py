@@ -35,6 +35,7 @@ class IterationRecord:
         num_not_arrived: Robots that are not at their goal at the horizon.
         best_reward: Mean reward of the best candidate so far.
         best_solved: Whether that one is a solution.
+        excluded: Samples of this iteration that were left out because their reward was not finite.
     """
 
     iteration: int
@@ -47,6 +48,7 @@ class IterationRecord:
     num_not_arrived: int
     best_reward: float
     best_solved: bool
+    excluded: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,7 @@ from planner_support import (
 from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import IterationRecord, Plan, list_planners, make_planner
@@ -275,6 +276,14 @@ def test_the_best_of_start_and_search_is_returned(name: str) -> None:
     assert plan.metrics["reward"] >= start.rewards.mean() - 1e-6
 
 
+@pytest.mark.parametrize("name", list_planners())
+def test_samples_that_were_left_out_are_in_the_history(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    denoise = CpuEngine.denoise
+    monkeypatch.setattr(CpuEngine, "denoise", lambda *a, **k: denoise(*a, **k)._replace(excluded=3))
+    plan = cheap_planner(name).solve(walled_in_problem(), max_iterations=2)
+    assert [record.excluded for record in plan.history] == [3, 3]
+
+
 @pytest.mark.parametrize("name", ["d4orm", "mppi", "cem"])
 def test_the_search_starts_from_the_controls_given(name: str) -> None:
     problem = walled_in_problem()
@@ -386,6 +395,8 @@ def test_keeping_contact_free_but_not_the_margin_is_no_solution() -> None:
         ("sigma", 0, "sigma is 0"),
         ("sigma", float("nan"), "sigma is nan"),
         ("sigma_floor", -1, "sigma_floor is -1"),
+        ("importance", -0.1, "importance is -0.1"),
+        ("importance", 1.5, "importance is 1.5.*at most 1"),
         ("elite_fraction", 0, "elite_fraction is 0"),
         ("elite_fraction", 1.5, "elite_fraction is 1.5.*at most 1"),
         ("adapt_variance", 1, "adapt_variance must be True or False"),

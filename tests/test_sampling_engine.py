@@ -274,6 +274,32 @@ def test_adapted_noise_follows_the_spread_of_the_samples(credit: str) -> None:
         factor = Spread(0.05)(spread2, np)
 
 
+@pytest.mark.parametrize("credit", CREDITS)
+@pytest.mark.parametrize("name", ["holonomic2d", "holonomic3d"])
+def test_importance_weighs_by_how_likely_a_sample_is_around_zero(name: str, credit: str) -> None:
+    """The term is the logarithm of a ratio of densities, written out here from the samples themselves."""
+    task = replace(TASKS[name](), credit=credit)
+    mean = np.random.default_rng(0).normal(size=task.base.shape).astype(np.float32)
+    ratios = []
+
+    def weights(rewards: Any, xp: Any, log_ratio: Any) -> Any:
+        ratios.append(log_ratio)
+        return SOFTMAX.weights(rewards, xp, log_ratio)
+
+    rules = SamplingRules(weights, importance=0.5)
+    CPU.denoise(task, rules, mean, np.array([0.7], np.float32), NUM_SAMPLES, seed=5)
+    centre, sigma = (task.base + mean).astype(np.float64), 0.7
+    samples = centre + sigma * engine_noise(task.problem, 5, 0, NUM_SAMPLES)
+
+    def log_density(around: Any) -> Any:
+        return -0.5 * (((samples - around) / sigma) ** 2).sum(axis=(1, 3))
+
+    expected = 0.5 * (log_density(0) - log_density(centre) + 0.5 * ((centre / sigma) ** 2).sum(axis=(0, 2))).T
+    if credit == "team":
+        expected = expected.sum(axis=0, keepdims=True)
+    np.testing.assert_allclose(ratios[0], expected, rtol=1e-4, atol=1e-3)
+
+
 def run(engine: Any, task: SamplingTask, steps: int, rules: SamplingRules = SOFTMAX, **options: Any) -> SamplingResult:
     arguments = {"num_samples": NUM_SAMPLES, "seed": 11} | options
     return engine.denoise(task, rules, np.zeros_like(task.base), annealed(steps, 1e-4, 2e-2), **arguments)
@@ -327,6 +353,12 @@ def test_engines_denoise_every_scenario_alike(scenario: str) -> None:
 @pytest.mark.parametrize("num_samples", [2, 65])
 def test_engines_denoise_alike_with_any_number_of_samples(num_samples: int) -> None:
     assert_same_run(TASKS["obstacles"](), steps=3, num_samples=num_samples)
+
+
+@pytest.mark.parametrize("credit", CREDITS)
+def test_engines_weigh_by_importance_alike(credit: str) -> None:
+    task = replace(TASKS["holonomic2d"](), credit=credit)
+    assert_same_run(task, 10, SOFTMAX._replace(importance=0.05))
 
 
 def test_engines_adapt_the_noise_alike() -> None:

@@ -108,6 +108,17 @@ def test_softmax_by_hand(xp: Any) -> None:
 
 
 @pytest.mark.parametrize("xp", LIBRARIES)
+def test_softmax_times_ratios_by_hand(xp: Any) -> None:
+    # As above, times 1, 4 and 1/2; far from one the ratios must not overflow.
+    ratios = np.log([1, 4, 0.5])
+    expected = np.array([0.006815, 4 * 0.078934, 0.5 * 0.914251])
+    for shift in (0, 200, -200):
+        rewards, log_ratio = xp.asarray([[1.0, 2, 3, -np.inf]]), xp.asarray([[*(ratios + shift), 500.0]])
+        weights = np.asarray(SoftmaxWeights(0.5)(rewards, xp, log_ratio))[0]
+        np.testing.assert_allclose(weights, [*(expected / expected.sum()), 0], rtol=1e-4)
+
+
+@pytest.mark.parametrize("xp", LIBRARIES)
 def test_softmax_knows_neither_scale_nor_offset(xp: Any) -> None:
     rewards = np.array([0.1, 0.5, 0.2, 0.9], np.float32)
     plain = weigh(SoftmaxWeights(0.3), rewards, xp)

@@ -95,10 +95,15 @@ class SamplingRules(NamedTuple):
             one over the last axis. Rewards that are not finite arrive as minus infinity and must get weight zero.
         adapt: ``(noise, mean square deviation, array library) -> noise``: the noise of the next step, ``(H, K, m)``
             factors on the schedule; ``None`` leaves the schedule alone and saves the second moment.
+        importance: Share of the importance-sampling term of MPPI (paper, Eq. 11) in the weights: ``weights`` then gets
+            it as ``log_ratio``, like the rewards in shape. It is the logarithm of how much likelier a sample ``U``
+            would be around zero than around ``U_hat``, the mean that it was drawn around, but for a constant:
+            ``-U_hat / sigma^2 * (U - U_hat)``, summed over time and components, and over robots for team credit.
     """
 
     weights: Callable[..., Any]
     adapt: Callable[..., Any] | None = None
+    importance: float = 0.0
 
 
 class SamplingResult(NamedTuple):

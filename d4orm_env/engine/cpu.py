@@ -169,7 +169,8 @@ class CpuEngine:
                 excluded += int(usable.size - usable.sum())
                 mean_rewards[step] = np.where(usable, rewards, 0).sum() / max(usable.sum(), 1)
                 rewards = np.where(usable, rewards, np.float32(-np.inf))
-            weights = rules.weights(rewards, np)
+            extra = (rules.importance * run.log_ratio(mean, factor * sigma),) if rules.importance else ()
+            weights = rules.weights(rewards, np, *extra)
             first, second = run.moments(step, weights, rules.adapt is not None)
             new_mean = mean + factor * sigma * first
             if rules.adapt is not None:
@@ -212,6 +213,18 @@ class _Sampling:
             ),
         )  # fmt: skip
         return self.rewards.mean(axis=0, keepdims=True) if self.task.credit == "team" else self.rewards
+
+    def log_ratio(self, mean: FloatArray, scale: FloatArray) -> FloatArray:
+        """The last samples' :attr:`SamplingRules.importance` terms, ``(1, M)`` or ``(K, M)`` like their rewards."""
+        num_steps, num_robots, pairs = (*self.base.shape[:2], self.kept.shape[2])
+        centre: FloatArray = np.zeros((num_steps, num_robots, 2 * pairs), np.float32)
+        centre[:, :, : mean.shape[2]] = (self.base + mean) / scale
+        centre = centre.reshape(num_steps, num_robots, pairs, 2)
+        along = np.einsum("tkpi,ktpim->km", centre, self.kept)
+        across = np.einsum("tkpi,ktpim->km", np.stack([centre[..., 1], -centre[..., 0]], axis=-1), self.kept)
+        turns = np.stack([along, -along, across, -across], axis=1).reshape(num_robots, TURNS, -1, DRAWS)
+        samples = turns.transpose(0, 2, 1, 3).reshape(num_robots, -1)[:, : self.rewards.shape[1]]
+        return -(samples.sum(axis=0, keepdims=True) if self.task.credit == "team" else samples)
 
     def moments(self, step: int, weights: Any, with_second: bool) -> tuple[FloatArray, FloatArray]:
         """``(H, K, m)`` weighted mean of the noise and, if asked for, of its square."""

@@ -237,10 +237,16 @@ def _denoise(static: _Static, inputs: _Inputs, mean: Any, noise_scale: Any) -> A
         if static.credit == "team":
             rewards = rewards.mean(axis=0, keepdims=True)
         finite = jnp.isfinite(rewards)
-        weights = static.rules.weights(jnp.where(finite, rewards, -jnp.inf), jnp)
-        weights = jnp.broadcast_to(weights, (mean.shape[1], static.num_samples))
         # A sample that blew up has weight zero, and zero times infinity must not reach the mean.
         usable = jnp.where(jnp.isfinite(deformations), deformations, 0)
+        extra: tuple[Any, ...] = ()
+        if static.rules.importance:
+            slope = (inputs.base + mean) / (factor * sigma) ** 2
+            ratio = -jnp.einsum("tkms,tkm->ks", usable - mean[..., None], slope)
+            ratio = ratio.sum(axis=0, keepdims=True) if static.credit == "team" else ratio
+            extra = (static.rules.importance * ratio,)
+        weights = static.rules.weights(jnp.where(finite, rewards, -jnp.inf), jnp, *extra)
+        weights = jnp.broadcast_to(weights, (mean.shape[1], static.num_samples))
         new_mean = jnp.einsum("tkms,ks->tkm", usable, weights)
         # Nothing to go by: every sample was excluded.
         new_mean = jnp.where((weights.sum(axis=-1) > 0)[None, :, None], new_mean, mean)

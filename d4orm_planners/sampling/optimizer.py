@@ -104,7 +104,7 @@ class SamplingPlanner(Planner):
         with search.watch.paused():
             search.engine.prepare(task, rules, noise_scale, num_samples)
         result = search.engine.denoise(task, rules, mean, noise_scale, num_samples, search.iteration_seed())
-        return Iteration(base + result.mean, len(noise_scale))
+        return Iteration(base + result.mean, len(noise_scale), result.excluded)
 
 
 def standard_normal(search: Search, shape: tuple[int, ...], stream: int) -> FloatArray:

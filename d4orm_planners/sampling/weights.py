@@ -21,8 +21,10 @@ class SoftmaxWeights:
     temperature: float
     cutoff: float = 0.0
 
-    def __call__(self, rewards: Any, xp: Any) -> Any:
-        """Weights of ``rewards`` ``(..., M)``; a sample at minus infinity gets none."""
+    def __call__(self, rewards: Any, xp: Any, log_ratio: Any = None) -> Any:
+        """Weights of ``rewards`` ``(..., M)``, times ``exp(log_ratio)`` where given; a sample at minus infinity gets
+        none.
+        """
         usable = rewards > -xp.inf
         count = xp.maximum(usable.sum(-1, keepdims=True), 1).astype(rewards.dtype)
         mean = xp.where(usable, rewards, 0).sum(-1, keepdims=True) / count
@@ -30,7 +32,12 @@ class SoftmaxWeights:
         # Below this spread all samples are as good as equal, and amplifying rounding would be noise.
         spread = xp.maximum(xp.sqrt((deviation * deviation).sum(-1, keepdims=True) / count), 1e-6)
         best = rewards.max(-1, keepdims=True)
-        weight = xp.exp((rewards - xp.where(best > -xp.inf, best, 0)) * (1 / (self.temperature * spread)))
+        logarithm = (rewards - xp.where(best > -xp.inf, best, 0)) * (1 / (self.temperature * spread))
+        if log_ratio is not None:
+            logarithm = xp.where(usable, logarithm + log_ratio, -xp.inf)
+            best = logarithm.max(-1, keepdims=True)
+            logarithm = logarithm - xp.where(best > -xp.inf, best, 0)
+        weight = xp.exp(logarithm)
         if self.cutoff > 0:
             weight = xp.where(weight >= self.cutoff, weight, 0)
         return weight * (1 / xp.maximum(weight.sum(-1, keepdims=True), 1e-30))
