@@ -39,6 +39,9 @@ NOT_AT_SUBGOALS = 1e-6
 LAG = 5
 """Waypoints that a robot may be behind the others without its subgoal staying behind too."""
 
+SHORTER = 3
+"""How many times fewer fresh steps a robot takes before it stops if it would violate the margin otherwise."""
+
 NEARER = 0.05
 """What counts as coming nearer to the goals, all robots together [m]."""
 
@@ -424,37 +427,49 @@ class D4ormC2F(Policy):
         controls = np.clip(base + result.mean, -limit, limit).astype(np.float32)
         radius = problem.goal_radius if self._docks else NOT_AT_SUBGOALS
         truth = problem.moment(joint.states, joint.goals, horizon=config.predict_horizon, goal_radius=radius)
-        return self._safe_mix(truth, self._with_stop(truth, controls, docked))
+        return self._safe_mix(truth, controls, docked)
 
-    def _with_stop(self, window: Problem, controls: FloatArray, docked: Any) -> FloatArray:
-        """The controls, and after them those that bring everyone to rest as soon as can be."""
-        states = self._engine.rollout(window, controls).states[-1]
-        tail = np.zeros((self._stop_steps, *controls.shape[1:]), np.float32)
+    def _with_stop(self, window: Problem, controls: FloatArray, steps: int, docked: Any) -> FloatArray:
+        """The first ``steps`` controls, and after them those that bring everyone to rest as soon as can be.
+
+        Returns:
+            ``(H_predict + S, K, m)`` with the ``S`` steps that a stop may take.
+        """
+        stopping = np.zeros((len(controls) + self._stop_steps, *controls.shape[1:]), np.float32)
+        stopping[:steps] = controls[:steps]
+        states = self._engine.rollout(window, stopping[: len(controls)]).states[steps]
         still = np.zeros(window.goal.shape, np.float32)
-        for t in range(len(tail)):
-            tail[t] = track_velocities(window, states, still)
-            states = self._engine.step(window.arrays, states, docked, tail[t]).states
-        return np.concatenate([controls, tail])
+        for t in range(steps, steps + self._stop_steps):
+            stopping[t] = track_velocities(window, states, still)
+            states = self._engine.step(window.arrays, states, docked, stopping[t]).states
+        return stopping
 
-    def _safe_mix(self, window: Problem, fresh: FloatArray) -> tuple[FloatArray, float]:
-        """Fresh controls where they keep everyone apart; where not, robots keep to what they had in mind before.
+    def _safe_mix(self, window: Problem, fresh: FloatArray, docked: Any) -> tuple[FloatArray, float]:
+        """Fresh controls where they keep everyone apart; where not, robots stop earlier, or do as they had in mind.
 
         What they had in mind was free of violations, and ends at rest. So without disturbances there always is a mix
         that is free of them too: in the last resort everybody does as before.
+
+        Returns:
+            ``(H_predict + S, K, m)`` controls, and the least gap between robots that they keep.
         """
-        before = self._plan[self._next :]
-        before = np.concatenate([before, np.zeros((len(fresh) - len(before), *fresh.shape[1:]), np.float32)])
-        window = window.moment(window.start, window.goal, horizon=len(fresh))
-        controls = fresh
-        fresh_robots = np.ones(window.num_robots, bool)
-        trajectory = self._engine.rollout(window, controls)
-        for _ in range(window.num_robots):
-            violating = trajectory.margin_violated[1:].any(axis=0) & fresh_robots
-            if not violating.any():
-                break
-            fresh_robots &= ~violating
-            controls = np.where(fresh_robots[:, None], fresh, before)
-            trajectory = self._engine.rollout(window, controls)
+        horizon = len(fresh)
+        before = np.zeros((horizon + self._stop_steps, *fresh.shape[1:]), np.float32)
+        left = self._plan[self._next :]
+        before[: len(left)] = left
+        controls = self._with_stop(window, fresh, horizon, docked)
+        window_to_rest = window.moment(window.start, window.goal, horizon=len(controls))
+        # After how many fresh steps each robot stops.
+        steps = np.full(window.num_robots, horizon)
+        trajectory = self._engine.rollout(window_to_rest, controls)
+        while (violating := trajectory.margin_violated[1:].any(axis=0) & (steps > 0)).any():
+            steps[violating] //= SHORTER
+            steps[steps < self.config.execute_horizon] = 0
+            for number in np.unique(steps[violating]):
+                fewer = self._with_stop(window, fresh, int(number), docked) if number else before
+                chosen = violating & (steps == number)
+                controls[:, chosen] = fewer[:, chosen]
+            trajectory = self._engine.rollout(window_to_rest, controls)
         return controls, least_gap(window, trajectory.positions)
 
 
