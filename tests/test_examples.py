@@ -206,6 +206,32 @@ def test_coarse_to_fine_example_arrives_however_coarse_the_guidance(tmp_path: Pa
     assert all(4.5 < float(row["average travel time [s]"]) <= float(row["makespan [s]"]) < 10 for row in rows)
 
 
+@pytest.mark.slow
+def test_scaling_example_solves_every_team(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("scaling", out)
+    rows = table(out / "scaling.csv")
+    assert [(row["robots"], row["side [m]"], row["solved"]) for row in rows] == [
+        ("4", "2.5", "1 of 1"),
+        ("8", "3.5", "1 of 1"),
+    ]
+    assert all(float(row["seconds, median"]) == float(row["seconds, most"]) > 0 for row in rows)
+    assert (out / "scaling.png").read_bytes().startswith(PNG)
+
+
+@pytest.mark.slow
+def test_noise_schedule_example_solves_under_every_schedule(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("noise_schedule", out)
+    rows = table(out / "noise_schedule.csv")
+    assert [(row["model"], row["beta_T"]) for row in rows] == [
+        (model, beta) for model in ("holonomic2d", "differential_drive") for beta in ("0.01", "0.05")
+    ]
+    assert all(row["solved"] == "1 of 1" for row in rows)
+    assert all(5 < float(row["travel time [s]"]) < 10 for row in rows)
+    assert (out / "noise_schedule.png").read_bytes().startswith(PNG)
+
+
 @pytest.mark.parametrize(
     ("position", "velocity", "seconds"),
     [

@@ -1,0 +1,75 @@
+"""How planning time of D4orm-D grows with the team at constant density.
+
+    python examples/scaling.py --seeds 3
+    python examples/scaling.py --seeds 1 --robots 500 --time-limit 600
+
+Random starts and goals on a square with 1.5625 square metres per robot: 10 m x 10 m for 64 of them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from outputs import COLOURS, argument_parser, count, plt, save_figure, save_table
+
+from d4orm_env import make_problem
+from d4orm_planners import make_planner
+
+ROBOTS = (8, 16, 32, 64, 100, 150)
+AREA = 10.0**2 / 64
+"""Square metres per robot."""
+
+
+def draw(rows: list[dict[str, Any]], out: Any) -> None:
+    """Planning time against robots, with the power law that fits it best."""
+    robots = np.array([row["robots"] for row in rows], float)
+    seconds = np.array([float(row["seconds, median"]) for row in rows])
+    figure, ax = plt.subplots(figsize=(4.4, 3.2), layout="constrained")
+    ax.plot(robots, seconds, "o", color=COLOURS["d4orm"], label="median")
+    if len(robots) > 1:
+        power, offset = np.polyfit(np.log(robots), np.log(seconds), 1)
+        ax.plot(robots, np.exp(offset) * robots**power, color="0.5", label=f"robots to the power of {power:.2f}")
+    ax.set(xlabel="robots", ylabel="first solution [s]", xscale="log", yscale="log")
+    ax.set_xticks(robots, [f"{number:g}" for number in robots])
+    ax.minorticks_off()
+    ax.legend()
+    save_figure(figure, out / "scaling.png")
+
+
+def main() -> None:
+    """Plan for every team size, and write the table and the plot."""
+    parser = argument_parser(__doc__)
+    parser.add_argument("--robots", type=count, nargs="+", default=ROBOTS)
+    parser.add_argument("--seeds", type=count, default=3, help="problems per team size")
+    parser.add_argument("--time-limit", type=float, default=120.0, help="seconds per plan")
+    arguments = parser.parse_args()
+    sizes, seeds = arguments.robots, arguments.seeds
+    if arguments.quick:
+        sizes, seeds = (4, 8), 1
+    planner = make_planner("d4orm-d", max_iterations=1000)
+    rows = []
+    for robots in sizes:
+        side = (robots * AREA) ** 0.5
+        problems = [make_problem("random", num_robots=robots, seed=seed, size=side) for seed in range(seeds)]
+        plans = [
+            planner.solve(problem, seed=seed, time_limit=arguments.time_limit) for seed, problem in enumerate(problems)
+        ]
+        rows.append(
+            {
+                "robots": robots,
+                "side [m]": f"{side:.1f}",
+                "solved": f"{sum(plan.solved for plan in plans)} of {seeds}",
+                "iterations, median": f"{np.median([plan.iterations for plan in plans]):g}",
+                "seconds, median": f"{np.median([plan.wall_time for plan in plans]):.2f}",
+                "seconds, most": f"{max(plan.wall_time for plan in plans):.2f}",
+                "ms per robot": f"{1000 * np.median([plan.wall_time for plan in plans]) / robots:.0f}",
+            }
+        )
+        print(rows[-1], flush=True)
+    save_table(rows, arguments.out / "scaling.csv")
+    draw(rows, arguments.out)
+
+
+if __name__ == "__main__":
+    main()
