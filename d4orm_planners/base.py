@@ -205,10 +205,12 @@ class Search:
         memory: What a planner keeps between its own iterations.
     """
 
-    def __init__(self, planner: Planner, problem: Problem, seed: int, initial_controls: Any) -> None:
+    def __init__(
+        self, planner: Planner, problem: Problem, seed: int, initial_controls: Any, engine: Engine | None = None
+    ) -> None:
         self.planner = planner
         self.problem = problem
-        self.engine = get_engine(planner.config.engine)
+        self.engine = engine or get_engine(planner.config.engine)
         self.seed = whole_number(seed, "seed", 0)
         shape = (problem.horizon, problem.num_robots, problem.control_size)
         if initial_controls is None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import sys
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -199,7 +202,9 @@ class D4ormC2F(Policy):
                 improve=True,
             )
         )
-        self._refinement = _Background()
+        # On one thread the refinement leaves the other cores, and their threads, to the control loop.
+        self._refiner = get_engine(self.config.engine, 1 if self.config.refine == "background" else None)
+        self._refinement = _Background(yielding=True)
         self._control = _Background()
 
     @property
@@ -270,9 +275,10 @@ class D4ormC2F(Policy):
         left, controls = rest_of(guidance, index, factor)
         if not len(controls):
             return guidance
-        plan = self._planner.solve(left, seed=seed, initial_controls=controls, max_iterations=1)
+        search = Search(self._planner, left, seed, controls, self._refiner)
+        search.advance()
         done = guidance.problem.horizon - left.horizon
-        before, after = guidance.states[: done + 1], plan.trajectory
+        before, after = guidance.states[: done + 1], search.best.trajectory
         states = np.concatenate([before, after.states[1:]])
         positions = np.concatenate([before[..., : left.dimension], after.positions[1:]])
         all_controls = np.concatenate([guidance.controls[:done], after.controls])
@@ -484,15 +490,20 @@ def least_gap(problem: Problem, positions: FloatArray) -> float:
 
 
 class _Background:
-    """A job at a time in a thread of its own."""
+    """A job at a time in a thread of its own.
 
-    def __init__(self) -> None:
+    Args:
+        yielding: Whether other threads go first, where threads have priorities of their own.
+    """
+
+    def __init__(self, yielding: bool = False) -> None:
+        self._initializer = _yield_to_others if yielding and sys.platform == "linux" else None
         self._pool: ThreadPoolExecutor | None = None
         self._job: Future[Any] | None = None
 
     def start(self, work: Callable[[], Any]) -> None:
         if self._pool is None:
-            self._pool = ThreadPoolExecutor(1, thread_name_prefix="d4orm-c2f")
+            self._pool = ThreadPoolExecutor(1, thread_name_prefix="d4orm-c2f", initializer=self._initializer)
         self._job = self._pool.submit(work)
 
     def result(self) -> tuple[bool, Any]:
@@ -521,3 +532,8 @@ class _Background:
         if self._job is not None:
             self._job.exception()
             self._job = None
+
+
+def _yield_to_others() -> None:
+    """Lower the priority of the calling thread; on Linux that is what a thread's number stands for here."""
+    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)

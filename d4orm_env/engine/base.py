@@ -158,10 +158,12 @@ class Engine(Protocol):
         ...
 
 
-def get_engine(name: str = "auto") -> Engine:
+def get_engine(name: str = "auto", num_threads: int | None = None) -> Engine:
     """The engine of that name.
 
-    ``"auto"`` is JAX where JAX sees an accelerator, and the CPU engine elsewhere.
+    Args:
+        name: ``"auto"`` is JAX where JAX sees an accelerator, and the CPU engine elsewhere.
+        num_threads: Of the CPU engine; as many as there are cores by default.
 
     Raises:
         ValueError: If there is no such engine.
@@ -176,7 +178,7 @@ def get_engine(name: str = "auto") -> Engine:
         return JaxEngine()
     from d4orm_env.engine.cpu import CpuEngine
 
-    return CpuEngine()
+    return CpuEngine(num_threads)
 
 
 def _accelerator_visible() -> bool:
