@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, whole_number
+from d4orm_env.core.observation import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.episode_record import episode_metrics
 from d4orm_env.joint_env import joint_spaces
@@ -46,6 +47,9 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         max_cycles: Steps until truncation; the problem's horizon unless given.
         randomize_instance: Each world draws a new instance of the scenario at every reset. Team and obstacles must be
             the same in all instances.
+        num_instances: With ``randomize_instance``, draw this many instances at the first reset and choose among them at
+            every reset, instead of drawing a new one each time, which takes longer than many steps. Another seed draws
+            others.
         observed_robots: Nearest robots in an observation.
         observed_obstacles: Nearest obstacles in an observation.
         autoreset_mode: When a world whose episode has ended is reset, an :class:`gymnasium.vector.AutoresetMode` or
@@ -74,6 +78,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         lifelong: bool = False,
         max_cycles: int | None = None,
         randomize_instance: bool = False,
+        num_instances: int | None = None,
         observed_robots: int = 4,
         observed_obstacles: int = 4,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
@@ -105,6 +110,12 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._copy = copy
+        if num_instances is not None and not randomize_instance:
+            raise ValueError(
+                f"num_instances is {num_instances!r} without randomize_instance=True; give both or neither"
+            )
+        self._num_instances = None if num_instances is None else whole_number(num_instances, "num_instances", 1)
+        self._pool: list[Problem] = []
         self._make_worlds(num_threads)
 
     def _make_worlds(self, num_threads: int | None) -> None:
@@ -133,6 +144,11 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         """Steps until truncation."""
         return self._template.max_cycles
 
+    @property
+    def layout(self) -> ObservationLayout:
+        """What the components of one robot's observation mean."""
+        return self._template.layout
+
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[FloatArray, dict[str, Any]]:
@@ -158,6 +174,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         super().reset(seed=seeds[0] if isinstance(seed, (int, np.integer)) else None)
         for world in np.flatnonzero(mask):
             if seeds[world] is not None:
+                self._pool = []
                 self._generators[world] = seeding.np_random(seeds[world])[0] if self._is_random else None
         self._begin(np.flatnonzero(mask))
         observations = self._advance(np.where(mask, RESET, LOOK))
@@ -260,9 +277,17 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
                 generator = self._generators[world] = seeding.np_random()[0]
             episode = self._episodes[world] = np.random.default_rng(int(generator.integers(2**63)))
             if self._template.redraws:
-                problem = self._drawn(episode)
+                problem = self._next_instance(episode)
                 self._worlds.start[world], self._worlds.goal[world] = problem.start, problem.goal
                 self._worlds.inverse[world] = problem.arrays.inverse_initial_distance
+
+    def _next_instance(self, random: np.random.Generator) -> Problem:
+        """A new instance, or one of the pool."""
+        if self._num_instances is None:
+            return self._drawn(random)
+        if not self._pool:
+            self._pool = [self._drawn(random) for _ in range(self._num_instances)]
+        return self._pool[int(random.integers(self._num_instances))]
 
     def _drawn(self, random: np.random.Generator) -> Problem:
         """A new instance that differs from the first in starts and goals only."""

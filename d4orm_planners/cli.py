@@ -15,6 +15,7 @@ import typer
 
 from d4orm_planners.commands.inputs import check_writable, make_folder, names, numbers, parse_settings
 from d4orm_planners.commands.robustness import robustness
+from d4orm_planners.commands.train import train
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
@@ -33,6 +34,7 @@ app = typer.Typer(
 )
 
 app.command()(robustness)
+app.command()(train)
 
 Scenario = Annotated[
     str, typer.Option("--scenario", "-s", help="Scenario name (see `d4orm scenarios`) or a YAML file.")

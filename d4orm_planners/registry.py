@@ -16,6 +16,7 @@ from d4orm_planners.mbd import MBD, IterativeMBD
 from d4orm_planners.mppi import MPPI
 from d4orm_planners.orca import Orca
 from d4orm_planners.policy import DriveToGoal, OpenLoop, Policy, RandomControls
+from d4orm_planners.rl.learned import PPO, SAC
 
 PLANNERS: Mapping[str, type[Planner]] = MappingProxyType(
     {planner.name: planner for planner in (D4orm, D4ormD, MPPI, CEM, MBD, IterativeMBD)}
@@ -23,7 +24,7 @@ PLANNERS: Mapping[str, type[Planner]] = MappingProxyType(
 """Every planner class by its name."""
 
 POLICIES: Mapping[str, type[Policy]] = MappingProxyType(
-    {policy.name: policy for policy in (D4ormC2F, DriveToGoal, RandomControls, Orca)}
+    {policy.name: policy for policy in (D4ormC2F, DriveToGoal, RandomControls, Orca, PPO, SAC)}
 )
 """The policies that are no planners; every planner is an open-loop policy too."""
 

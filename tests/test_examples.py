@@ -328,6 +328,28 @@ def test_principal_components_are_distances_of_plans(multimodality: ModuleType) 
     assert shares == pytest.approx([1, 0])
 
 
+@pytest.mark.slow
+def test_supersuit_trains_a_policy_that_acts(tmp_path: Path) -> None:
+    pytest.importorskip("supersuit")
+    out = tmp_path / "out"
+    completed("supersuit_ppo", out)
+    assert [row["seed"] for row in table(out / "supersuit_ppo.csv")] == ["0", "1"]
+
+
+@pytest.mark.slow
+def test_a_trained_policy_is_compared_with_planners_under_noise(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3")
+    out = tmp_path / "out"
+    result = run("train_and_compare", out)
+    assert result.returncode == 0, result.stderr
+    rows = table(out / "train_and_compare.csv")
+    assert [(row["policy"], row["noise"]) for row in rows] == [
+        (policy, noise) for policy in ("ppo", "d4orm-c2f", "orca") for noise in ("0.0", "0.5")
+    ]
+    assert {row["success"] for row in rows if row["policy"] == "d4orm-c2f" and row["noise"] == "0.0"} == {"2 of 2"}
+    assert (out / "comparison" / "robustness.png").read_bytes().startswith(PNG)
+
+
 def test_count_of_seeds_below_one_is_refused(tmp_path: Path) -> None:
     result = run("one_dimension", tmp_path / "out", "--seeds", "0")
     assert result.returncode == 2

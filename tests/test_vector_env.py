@@ -275,3 +275,22 @@ def test_bad_calls() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert env.step(np.full((2, 4), 1e300 / 1e290))[0].shape == env.observation_space.shape
+
+
+def test_a_pool_of_instances_is_drawn_by_the_seed_and_chosen_from() -> None:
+    arguments = {"scenario": "random", "num_robots": 2, "randomize_instance": True, "max_cycles": 2}
+    env = NavigationVectorEnv(8, num_instances=3, **arguments)
+
+    def starts(seed: int | None) -> list[tuple[float, ...]]:
+        env.reset(seed=seed)
+        return [tuple(row[: 2 * 4].tolist()) for row in env.state()]
+
+    first, second, again = starts(4), starts(None), starts(4)
+    assert first == again
+    assert len({*first, *second}) <= 3
+    assert len(set(first)) > 1
+    assert set(starts(5)).isdisjoint(first)
+    with pytest.raises(ValueError, match="without randomize_instance"):
+        NavigationVectorEnv(8, "random", 2, num_instances=3)
+    with pytest.raises(ValueError, match="num_instances"):
+        NavigationVectorEnv(8, num_instances=0, **arguments)

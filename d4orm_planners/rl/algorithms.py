@@ -1,0 +1,103 @@
+"""The algorithms of Stable-Baselines3 that are used here, with the settings that suit many robots at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+import numpy as np
+import stable_baselines3
+from stable_baselines3.common.utils import FloatSchedule, set_random_seed
+from stable_baselines3.common.vec_env import VecNormalize
+
+from d4orm_planners.rl.masking import MaskedReplayBuffer, MaskedRolloutBuffer
+from d4orm_planners.rl.robot_vec_env import RobotVecEnv
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """One of Stable-Baselines3's algorithms.
+
+    Attributes:
+        num_envs: Robots that act at once, unless told otherwise.
+        steps_per_update: Steps that each of them takes between two updates.
+        learning_rate: At the beginning; it falls linearly to a tenth.
+        gamma: Discount per step.
+    """
+
+    num_envs: ClassVar[int]
+    steps_per_update: ClassVar[int]
+    learning_rate: ClassVar[float] = 3e-4
+    gamma: ClassVar[float] = 0.99
+
+    def make(self, env: VecNormalize) -> Any:
+        """A new model, whose first weights are drawn from the global random state."""
+        raise NotImplementedError
+
+    def buffer(self, model: Any) -> Any:
+        """Where a model keeps what it learns from."""
+        raise NotImplementedError
+
+    def prepare(self, model: Any, robots: RobotVecEnv, seed: int) -> None:
+        """Tell the model's buffer which robots act, and seed whatever the model draws."""
+        set_random_seed(seed)
+        model.action_space.seed(seed)
+        buffer = self.buffer(model)
+        buffer.source, buffer.random = robots, np.random.default_rng(seed)
+
+    def set_learning_rate(self, model: Any, remaining: float) -> None:
+        """For the share of the training that remains, 1 to 0."""
+        model.lr_schedule = FloatSchedule(self.learning_rate * (0.1 + 0.9 * remaining))
+
+
+class _PPO(Algorithm):
+    num_envs = 1024
+    steps_per_update = 32
+
+    def make(self, env: VecNormalize) -> Any:
+        return stable_baselines3.PPO(
+            "MlpPolicy",
+            env,
+            learning_rate=self.learning_rate,
+            n_steps=self.steps_per_update,
+            batch_size=min(4096, self.steps_per_update * env.num_envs),
+            n_epochs=4,
+            gamma=self.gamma,
+            gae_lambda=0.95,
+            policy_kwargs={"net_arch": [128, 128], "log_std_init": -0.5},
+            rollout_buffer_class=MaskedRolloutBuffer,
+            device="cpu",
+        )
+
+    def buffer(self, model: Any) -> Any:
+        return model.rollout_buffer
+
+
+class _SAC(Algorithm):
+    num_envs = 64
+    steps_per_update = 1
+
+    def make(self, env: VecNormalize) -> Any:
+        return stable_baselines3.SAC(
+            "MlpPolicy",
+            env,
+            learning_rate=self.learning_rate,
+            buffer_size=300_000,
+            learning_starts=50 * env.num_envs,
+            batch_size=512,
+            train_freq=self.steps_per_update,
+            gradient_steps=4,
+            gamma=self.gamma,
+            policy_kwargs={"net_arch": [128, 128]},
+            replay_buffer_class=MaskedReplayBuffer,
+            device="cpu",
+        )
+
+    def buffer(self, model: Any) -> Any:
+        return model.replay_buffer
+
+
+ALGORITHMS: Mapping[str, Algorithm] = MappingProxyType({"ppo": _PPO(), "sac": _SAC()})
+"""By the names of the policies that come of them."""

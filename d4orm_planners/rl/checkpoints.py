@@ -1,0 +1,145 @@
+"""Checkpoints of a training: whole or not there, and readable without unpickling."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.save_util import load_from_zip_file, recursive_setattr
+from stable_baselines3.common.vec_env import VecNormalize
+
+from d4orm_env.core.files import replaced_when_done
+from d4orm_planners.rl.curve import Evaluation
+from d4orm_planners.rl.network import SUFFIX, Network, load_network
+
+_KEEP = 2
+_COUNTERS = ("num_timesteps", "_n_updates")
+_REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "acted")
+
+
+class Checkpoints:
+    """The checkpoints in a training's folder.
+
+    Args:
+        out: The folder; made if it does not exist.
+        settings: Of the training.
+
+    Raises:
+        ValueError: If the folder holds a training with other settings.
+        OSError: If it cannot be used.
+    """
+
+    def __init__(self, out: Path, settings: Mapping[str, Any]) -> None:
+        self.policy_path = out / f"policy{SUFFIX}"
+        self._folder = out / "checkpoints"
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._check_settings(out / "settings.json", json.loads(json.dumps(settings)))
+
+    @staticmethod
+    def _check_settings(path: Path, settings: dict[str, Any]) -> None:
+        if not path.exists():
+            with replaced_when_done(path) as temporary:
+                temporary.write_text(json.dumps(settings, indent=2) + "\n")
+            return
+        try:
+            before = json.loads(path.read_text())
+        except ValueError:
+            raise ValueError(f"{path} cannot be read; remove it, or train into another folder") from None
+        for name in settings:
+            if not isinstance(before, dict) or before.get(name) != settings[name]:
+                was = before.get(name) if isinstance(before, dict) else before
+                raise ValueError(
+                    f"folder {path.parent} holds a training with {name} {was!r}, not {settings[name]!r}; go on with "
+                    "the same settings, or train into another folder"
+                )
+
+    def policy(self) -> Network:
+        """The policy that did best so far."""
+        return load_network(self.policy_path)
+
+    def latest(self) -> Checkpoint | None:
+        """The last complete checkpoint."""
+        complete = self._complete()
+        return Checkpoint.read(complete[-1]) if complete else None
+
+    def save(self, index: int, model: Any, env: VecNormalize, evaluations: Sequence[Evaluation]) -> Checkpoint:
+        """Write the checkpoint of lesson ``index``, and remove the oldest."""
+        final = self._folder / f"{index + 1:06d}"
+        temporary = final.with_suffix(".partial")
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir()
+        model.save(temporary / "model.zip", exclude=["lr_schedule"])
+        np.savez(temporary / "state.npz", **_numbers(model, env))
+        state = {"evaluations": [asdict(evaluation) for evaluation in evaluations]}
+        (temporary / "state.json").write_text(json.dumps(state, indent=1) + "\n")
+        shutil.rmtree(final, ignore_errors=True)
+        temporary.rename(final)
+        for old in self._complete()[:-_KEEP]:
+            shutil.rmtree(old)
+        return Checkpoint.read(final)
+
+    def _complete(self) -> list[Path]:
+        return sorted(path for path in self._folder.iterdir() if path.name.isdigit())
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A training after some lessons.
+
+    Attributes:
+        folder: Where it is.
+        evaluations: One per lesson so far.
+    """
+
+    folder: Path
+    evaluations: list[Evaluation]
+
+    @classmethod
+    def read(cls, folder: Path) -> Checkpoint:
+        """Read what is small."""
+        state = json.loads((folder / "state.json").read_text())
+        return cls(folder, [Evaluation(**evaluation) for evaluation in state["evaluations"]])
+
+    def restore(self, env: VecNormalize, model: Any | None) -> None:
+        """Put a new environment, and a new model if one is given, into the checkpoint's state."""
+        with np.load(self.folder / "state.npz", allow_pickle=False) as numbers:
+            for name, running in _running(env).items():
+                running.mean, running.var = numbers[f"{name}_mean"], numbers[f"{name}_var"]
+                running.count = float(numbers[f"{name}_count"])
+            if model is None:
+                return
+            for name in _COUNTERS:
+                setattr(model, name, int(numbers[name]))
+            buffer = getattr(model, "replay_buffer", None)
+            if buffer is not None:
+                for name in _REPLAY:
+                    filled = numbers[f"replay_{name}"]
+                    getattr(buffer, name)[: len(filled)] = filled
+                buffer.pos, buffer.full = int(numbers["replay_pos"]), bool(numbers["replay_full"])
+        _, parameters, variables = load_from_zip_file(self.folder / "model.zip", device="cpu", load_data=False)
+        model.set_parameters(parameters, device="cpu")
+        for name, value in (variables or {}).items():
+            recursive_setattr(model, f"{name}.data", value.data)
+
+
+def _running(env: VecNormalize) -> dict[str, Any]:
+    """The running statistics by name."""
+    return {"observation": env.obs_rms, "reward": env.ret_rms}
+
+
+def _numbers(model: Any, env: VecNormalize) -> dict[str, Any]:
+    """What Stable-Baselines3 does not keep in its zip, or keeps pickled."""
+    numbers = {name: np.array(getattr(model, name)) for name in _COUNTERS}
+    for name, running in _running(env).items():
+        numbers |= {f"{name}_{part}": np.array(getattr(running, part)) for part in ("mean", "var", "count")}
+    buffer = getattr(model, "replay_buffer", None)
+    if buffer is not None:
+        count = buffer.buffer_size if buffer.full else buffer.pos
+        numbers |= {f"replay_{name}": getattr(buffer, name)[:count] for name in _REPLAY}
+        numbers |= {"replay_pos": np.array(buffer.pos), "replay_full": np.array(buffer.full)}
+    return numbers

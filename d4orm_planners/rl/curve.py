@@ -1,0 +1,91 @@
+"""How well a policy in training does on instances that it is not trained on."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from d4orm_env.core.files import replaced_when_done
+from d4orm_planners.rl.curriculum import Lesson
+from d4orm_planners.rl.network import Network
+from d4orm_planners.rl.robot_vec_env import RobotVecEnv
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A point of the curve.
+
+    Attributes:
+        steps: Robot-steps trained.
+        robots: Size of the team trained last.
+        scenario: Scenario trained last.
+        success_rate: Share of the validation episodes in which all arrived and none ever touched anything.
+        travel_time: Their mean arrival time [s], with the whole episode for robots that did not arrive.
+        seconds: What the lesson took.
+    """
+
+    steps: int
+    robots: int
+    scenario: str
+    success_rate: float
+    travel_time: float
+    seconds: float
+
+    @property
+    def rank(self) -> tuple[float, float]:
+        """Larger is better."""
+        return self.success_rate, -self.travel_time
+
+
+def evaluate_network(
+    network: Network, worlds: RobotVecEnv, seed: int, steps: int, lesson: Lesson, seconds: float
+) -> Evaluation:
+    """Run one episode in every world, without exploring."""
+    outcomes = run_worlds(network, worlds, seed)
+    success, travel = (float(np.mean(values)) for values in zip(*outcomes))
+    return Evaluation(steps, lesson.robots, lesson.scenario, success, travel, seconds)
+
+
+def run_worlds(network: Network, worlds: RobotVecEnv, seed: int) -> list[tuple[bool, float]]:
+    """``(success, travel time)`` of the first episode of every world, in the order in which they end."""
+    worlds.seed(seed)
+    features = worlds.reset()
+    pending = np.ones(worlds.num_worlds, np.bool_)
+    outcomes = []
+    while pending.any():
+        worlds.step_async(network(features))
+        features, *_ = worlds.step_wait()
+        outcomes += [(success, travel) for world, success, travel in worlds.finished if pending[world]]
+        pending[[world for world, *_ in worlds.finished]] = False
+    return outcomes
+
+
+def write_curve(folder: Path, evaluations: Sequence[Evaluation]) -> None:
+    """Write ``curve.csv`` and ``curve.png``."""
+    with replaced_when_done(folder / "curve.csv") as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [field.name for field in fields(Evaluation)])
+        writer.writeheader()
+        writer.writerows(asdict(evaluation) for evaluation in evaluations)
+    with replaced_when_done(folder / "curve.png") as temporary:
+        _draw(temporary, evaluations)
+
+
+def _draw(path: Path, evaluations: Sequence[Evaluation]) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 3), layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2)
+    steps = [evaluation.steps / 1e6 for evaluation in evaluations]
+    left.plot(steps, [100 * evaluation.success_rate for evaluation in evaluations])
+    left.set(xlabel="robot-steps [million]", ylabel="success [%]", ylim=(0, 100))
+    right.plot(steps, [evaluation.travel_time for evaluation in evaluations], color="tab:orange")
+    right.set(xlabel="robot-steps [million]", ylabel="travel time [s]")
+    for axes in (left, right):
+        axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=120)

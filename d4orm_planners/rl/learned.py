@@ -1,0 +1,151 @@
+"""Policies learned by reinforcement, run without the libraries that trained them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_planners.policy import Actions, Policy
+from d4orm_planners.rl.network import SUFFIX, Network, load_network
+
+SHIPPED = Path(__file__).parent / "policies"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnedConfig:
+    """Settings of a learned policy.
+
+    Attributes:
+        path: A ``.safetensors`` file of ``d4orm train``, or a ``.zip`` that Stable-Baselines3 saved after training on
+            the environment's own observations and actions, as through SuperSuit. A zip holds pickled Python, which can
+            run anything when it is loaded: give only one that you made yourself or trust. By default the policy that
+            comes with the package.
+
+    Raises:
+        ValueError: If the path ends in something else.
+    """
+
+    path: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.path is not None and Path(self.path).suffix not in (SUFFIX, ".zip"):
+            raise ValueError(f"path {str(self.path)!r} must end in {SUFFIX} (of 'd4orm train') or .zip (of SB3)")
+
+
+class LearnedPolicy(Policy):
+    """What PPO and SAC have in common: every robot by itself maps what it observes to its most likely control.
+
+    Raises:
+        ValueError: If the file is no policy, or one of another algorithm.
+        OSError: If it cannot be read.
+        ImportError: For a ``.zip``, if Stable-Baselines3 is not installed.
+    """
+
+    config_class: ClassVar[type | None] = LearnedConfig
+
+    def __init__(self, config: LearnedConfig | None = None) -> None:
+        self.config = config or LearnedConfig()
+        path = Path(self.config.path or SHIPPED / f"{self.name}{SUFFIX}")
+        self._actor: _NetworkActor | _ZipActor
+        if path.suffix == ".zip":
+            self._actor = _ZipActor(self.name, path)
+        else:
+            self._actor = _NetworkActor(self.name, path)
+
+    def _begin(self, env: Any, seed: int) -> None:
+        agent = env.possible_agents[0]
+        self._actor.check(self.problem, env.observation_space(agent).shape, env.action_space(agent).shape)
+
+    def act(self, observations: dict[str, Any], state: Any) -> Actions:
+        if not hasattr(self, "problem"):
+            raise RuntimeError("the policy has seen no environment yet; call reset(env) before act()")
+        if not observations:
+            return {}
+        robots = [int(agent.rsplit("_", 1)[1]) for agent in observations]
+        seen = np.stack([np.asarray(observation, np.float32) for observation in observations.values()])
+        return dict(zip(observations, self._actor.controls(seen, self.problem.team.control_limits[robots])))
+
+    def _controls(self, joint: Any) -> Any:
+        raise NotImplementedError("act() goes by the observations")
+
+
+class PPO(LearnedPolicy):
+    """Proximal policy optimisation (J. Schulman et al., 2017), all robots sharing one network."""
+
+    name = "ppo"
+
+
+class SAC(LearnedPolicy):
+    """Soft actor-critic (T. Haarnoja et al., ICML 2018), all robots sharing one network."""
+
+    name = "sac"
+
+
+class _NetworkActor:
+    """Acts by a policy file."""
+
+    def __init__(self, algorithm: str, path: Path) -> None:
+        self.network: Network = load_network(path)
+        self.path = path
+        if self.network.header.algorithm != algorithm:
+            raise ValueError(
+                f"policy file {path} was trained by {self.network.header.algorithm}; use make_policy("
+                f"{self.network.header.algorithm!r}, path=...)"
+            )
+
+    def check(self, problem: Any, observation_shape: tuple[int, ...], action_shape: tuple[int, ...]) -> None:
+        header, features = self.network.header, self.network.features
+        if set(problem.team.models) != {header.model}:
+            raise ValueError(
+                f"the policy in {self.path.name} was trained for {header.model} robots, and this team has "
+                f"{', '.join(sorted(set(problem.team.models)))}; train one for them with 'd4orm train --model'"
+            )
+        if observation_shape != (features.observation_size,):
+            raise ValueError(
+                f"the policy in {self.path.name} was trained for observations of {features.observation_size} numbers, "
+                f"and this environment's have shape {observation_shape}; make it with observed_robots="
+                f"{header.num_neighbors}, observed_obstacles={header.num_obstacles}, and do not wrap its observations"
+            )
+
+    def controls(self, observations: FloatArray, limits: FloatArray) -> FloatArray:
+        features, frames = self.network.features.encode(observations)
+        return self.network.features.decode(self.network(features), frames, limits)
+
+
+class _ZipActor:
+    """Acts by a Stable-Baselines3 model."""
+
+    def __init__(self, algorithm: str, path: Path) -> None:
+        try:
+            import stable_baselines3
+        except ImportError:
+            raise ImportError(
+                f"a policy in a .zip needs Stable-Baselines3; install it with: pip install 'd4orm-env[rl]' ({path})"
+            ) from None
+        if not path.is_file():
+            raise FileNotFoundError(f"policy file {path} does not exist")
+        try:
+            self.model = getattr(stable_baselines3, algorithm.upper()).load(path, device="cpu")
+        except Exception as error:  # whatever a foreign file makes its reader raise
+            message = " ".join(str(error).split())
+            raise ValueError(f"policy file {path} is no {algorithm.upper()} model of SB3: {message}") from error
+        self.path = path
+
+    def check(self, problem: Any, observation_shape: tuple[int, ...], action_shape: tuple[int, ...]) -> None:
+        for what, mine, theirs in (
+            ("observations", self.model.observation_space.shape, observation_shape),
+            ("actions", self.model.action_space.shape, action_shape),
+        ):
+            if mine != theirs:
+                raise ValueError(
+                    f"the policy in {self.path.name} was trained for {what} of shape {mine}, and this environment's "
+                    f"have shape {theirs}; make the environment as it was in training"
+                )
+
+    def controls(self, observations: FloatArray, limits: FloatArray) -> FloatArray:
+        actions: FloatArray = self.model.predict(observations, deterministic=True)[0]
+        return actions.astype(np.float32)

@@ -1,0 +1,204 @@
+"""A learned policy as numbers: a small network in NumPy, its normalisation, and the files both are kept in.
+
+A policy file is a safetensors file: arrays, and a JSON text in its header. Nothing in it is executed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.files import replaced_when_done
+from d4orm_planners.rl.features import TURNED_MODELS, Features
+
+FORMAT = 1
+EPSILON = 0.1
+"""Added to variances. Features are of order one; what was never seen to vary, as a fourth neighbour in teams of four,
+must not be blown up when it does."""
+CLIP = 10.0
+"""Of normalised features."""
+MAX_BYTES = 64 * 2**20
+SUFFIX = ".safetensors"
+_ACTIVATIONS: Mapping[str, Callable[[Any], Any]] = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, 0)}
+
+
+class Header(BaseModel):
+    """What a policy file says about itself.
+
+    Attributes:
+        format: Version of the file format.
+        algorithm: ``"ppo"`` or ``"sac"``.
+        model: Robot model that it was trained for.
+        dimension: Position dimensions of the observations.
+        num_neighbors: Robots in an observation.
+        num_obstacles: Obstacles in an observation.
+        activation: Between the layers.
+        squashed: Whether the output goes through tanh.
+        layers: Number of layers.
+        training: The command, seed, steps and results, for people.
+    """
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    format: int
+    algorithm: str
+    model: str
+    dimension: int = Field(ge=2, le=3)
+    num_neighbors: int = Field(ge=0, le=1000)
+    num_obstacles: int = Field(ge=0, le=1000)
+    activation: str
+    squashed: bool
+    layers: int = Field(ge=1, le=16)
+    training: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """A policy that needs nothing but NumPy.
+
+    Attributes:
+        header: What it is.
+        arrays: ``weight_i`` ``(out, in)`` and ``bias_i`` ``(out,)`` of each layer, and the normalisation:
+            ``observation_mean`` and ``observation_variance`` ``(F,)``, and ``reward_variance`` ``()``, which only
+            further training needs.
+    """
+
+    header: Header
+    arrays: Mapping[str, FloatArray]
+
+    @property
+    def features(self) -> Features:
+        """What it sees."""
+        head = self.header
+        return Features(head.dimension, head.num_neighbors, head.num_obstacles, head.model in TURNED_MODELS)
+
+    @property
+    def control_size(self) -> int:
+        """Components of a control ``m``."""
+        return len(self.arrays[f"bias_{self.header.layers - 1}"])
+
+    def __call__(self, features: FloatArray) -> FloatArray:
+        """``(N, m)`` most likely actions in ``[-1, 1]`` for ``(N, F)`` features."""
+        mean, variance = self.arrays["observation_mean"], self.arrays["observation_variance"]
+        hidden = np.clip((features - mean) / np.sqrt(variance + EPSILON), -CLIP, CLIP)
+        activation = _ACTIVATIONS[self.header.activation]
+        for layer in range(self.header.layers):
+            hidden = hidden @ self.arrays[f"weight_{layer}"].T + self.arrays[f"bias_{layer}"]
+            if layer < self.header.layers - 1:
+                hidden = activation(hidden)
+        actions: FloatArray = np.tanh(hidden) if self.header.squashed else np.clip(hidden, -1, 1)
+        return actions
+
+    def save(self, path: str | Path) -> None:
+        """Write a policy file.
+
+        Raises:
+            ValueError: If the name does not end in ``.safetensors``.
+            OSError: If it cannot be written.
+        """
+        from safetensors.numpy import save_file
+
+        with replaced_when_done(Path(path), (SUFFIX,)) as temporary:
+            save_file(dict(self.arrays), temporary, metadata={"d4orm": self.header.model_dump_json()})
+
+
+def load_network(path: str | Path) -> Network:
+    """Read a policy file.
+
+    Raises:
+        ValueError: If it is no policy file, too large, of another version, or does not fit together.
+        OSError: If it cannot be read.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"policy file {path} does not exist; train one with 'd4orm train'")
+    if (size := path.stat().st_size) > MAX_BYTES:
+        raise ValueError(f"policy file {path} has {size} bytes; at most {MAX_BYTES} are read")
+    try:
+        with safe_open(path, "numpy") as file:
+            text = (file.metadata() or {}).get("d4orm")
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dictionary
+    except SafetensorError as error:
+        raise ValueError(f"policy file {path} is no safetensors file ({error}); write one with 'd4orm train'") from None
+    if text is None:
+        raise ValueError(f"policy file {path} holds no policy of this program; write one with 'd4orm train'")
+    return Network(_header(path, text), _checked(path, _header(path, text), arrays))
+
+
+def _header(path: Path, text: str) -> Header:
+    try:
+        header = Header.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "header"
+        raise ValueError(f"policy file {path}: {where}: {first['msg']}") from None
+    if header.format != FORMAT:
+        raise ValueError(f"policy file {path} has format {header.format}, and this program reads format {FORMAT}")
+    if header.activation not in _ACTIVATIONS:
+        raise ValueError(
+            f"policy file {path}: activation {header.activation!r} is unknown; known are {', '.join(_ACTIVATIONS)}"
+        )
+    return header
+
+
+def _checked(path: Path, header: Header, arrays: dict[str, Any]) -> dict[str, FloatArray]:
+    """The arrays, if they are those of the header's network."""
+    size = Network(header, {}).features.size
+    shapes: dict[str, tuple[int | None, ...]] = {
+        "observation_mean": (size,),
+        "observation_variance": (size,),
+        "reward_variance": (),
+    }
+    width: int | None = size
+    for layer in range(header.layers):
+        weight = arrays.get(f"weight_{layer}")
+        shapes[f"weight_{layer}"] = (None, width)
+        width = len(weight) if weight is not None and weight.ndim == 2 else None
+        shapes[f"bias_{layer}"] = (width,)
+    if set(arrays) != set(shapes):
+        raise ValueError(f"policy file {path} holds {', '.join(sorted(arrays))}; expected {', '.join(sorted(shapes))}")
+    for name, shape in shapes.items():
+        array = arrays[name]
+        fits = array.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, array.shape))
+        if not fits or array.dtype != np.float32 or not np.isfinite(array).all():
+            raise ValueError(
+                f"policy file {path}: {name} is {array.dtype} {array.shape}; expected finite float32 of shape {shape}"
+            )
+    return arrays
+
+
+def network_of(header: Mapping[str, Any], model: Any, normalization: Any) -> Network:
+    """The deterministic policy of a Stable-Baselines3 model.
+
+    Args:
+        header: Fields of :class:`Header` that the model does not tell.
+        model: A PPO or SAC model with fully connected layers.
+        normalization: Its ``VecNormalize``.
+    """
+    import torch
+
+    policy = model.policy
+    squashed = hasattr(policy, "actor")
+    hidden, last = (
+        (policy.actor.latent_pi, policy.actor.mu) if squashed else (policy.mlp_extractor.policy_net, policy.action_net)
+    )
+    layers = [layer for layer in [*hidden, last] if isinstance(layer, torch.nn.Linear)]
+    arrays = {
+        "observation_mean": normalization.obs_rms.mean,
+        "observation_variance": normalization.obs_rms.var,
+        "reward_variance": normalization.ret_rms.var,
+    }
+    for index, layer in enumerate(layers):
+        arrays[f"weight_{index}"] = layer.weight.detach().numpy()
+        arrays[f"bias_{index}"] = layer.bias.detach().numpy()
+    activation = "relu" if any(isinstance(layer, torch.nn.ReLU) for layer in hidden) else "tanh"
+    full = Header(format=FORMAT, activation=activation, squashed=squashed, layers=len(layers), **header)
+    return Network(full, {name: np.array(value, np.float32) for name, value in arrays.items()})

@@ -1,0 +1,211 @@
+"""The batched environment as Stable-Baselines3 wants it: every robot of every world is one of its environments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box
+from stable_baselines3.common.vec_env import VecEnv
+
+from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.vector_env import NavigationVectorEnv
+from d4orm_planners.rl.features import Features
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingReward:
+    """The reward to learn from, per robot and step.
+
+    The environment's own reward pays a robot for every step that it spends close to its goal, and ends with the
+    arrival: who learns from it does not arrive. This one pays the way made, which is a potential (A. Y. Ng, D. Harada
+    and S. Russell, ICML 1999), and the arrival.
+
+    Attributes:
+        progress: For every step's way at full speed towards the goal.
+        arrival: Once, on arriving.
+        margin: Taken off in every step within the margin of anything.
+        contact: Taken off in every step in contact with anything.
+        time: Taken off in every step.
+    """
+
+    progress: float = 0.3
+    arrival: float = 5.0
+    margin: float = 1.0
+    contact: float = 3.0
+    time: float = 0.05
+
+
+class RobotVecEnv(VecEnv):
+    """``B`` worlds of ``K`` robots as ``B * K`` environments that share one policy; one kernel call per step.
+
+    Environment ``b * K + k`` is robot ``k`` of world ``b``. Observations are the :class:`Features` ``(B * K, F)``,
+    actions ``(B * K, m)`` in ``[-1, 1]``. A robot's episode ends when it arrives (terminated) or its world is out of
+    time (truncated, ``infos[i]["TimeLimit.truncated"]``); ``infos[i]["terminal_observation"]`` is what it saw last, and
+    ``is_success`` says whether it arrived without ever touching anything. An arrived robot then stands in its world
+    until that begins anew, when all have arrived or time is up: meanwhile its observation and reward are zero, its
+    action is ignored, and :attr:`acted` is ``False``. What happens then is nothing to learn from.
+
+    The instances and episodes of world ``b`` are those of ``navigation_v0.parallel_env`` reset with seed ``seed + b``.
+
+    Args:
+        num_worlds: ``B``.
+        num_robots: ``K``.
+        scenario: As for :class:`d4orm_env.navigation_v0.parallel_env`, like ``**kwargs``. One model for all robots.
+        seed: Of the first world.
+        reward: The reward to learn from.
+        **kwargs: Further arguments of :class:`d4orm_env.vector_env.NavigationVectorEnv`.
+
+    Attributes:
+        acted: ``(B * K,)`` bool: which robots acted in the last step.
+        finished: ``(world, success, travel_time)`` of the worlds that ended in the last step.
+
+    Raises:
+        ValueError: For a bad argument, or a team of mixed models.
+    """
+
+    render_mode = None
+
+    def __init__(
+        self,
+        num_worlds: int,
+        num_robots: int,
+        scenario: str = "random",
+        *,
+        seed: int = 0,
+        reward: TrainingReward | None = None,
+        **kwargs: Any,
+    ) -> None:
+        self._env = NavigationVectorEnv(num_worlds, scenario, num_robots, autoreset_mode="SameStep", **kwargs)
+        problem = self.problem = self._env.problem
+        if len(set(problem.team.models)) > 1:
+            raise ValueError(
+                f"the team mixes {', '.join(sorted(set(problem.team.models)))}; one policy is learned for robots of "
+                "one model, so give model="
+            )
+        self.features = Features.of(self._env.layout, problem.team.models[0])
+        self.num_worlds = num_worlds
+        self._shape = (num_worlds, problem.num_robots)
+        count = num_worlds * problem.num_robots
+        self._limits = np.tile(problem.team.control_limits, (num_worlds, 1))
+        self._max_step = np.asarray(problem.team.max_speed * problem.dt)[None]
+        self._reward = reward or TrainingReward()
+        self._seed: int | None = seed
+        self.acted = np.ones(count, np.bool_)
+        self.finished: list[tuple[int, bool, float]] = []
+        bound = np.full(self.features.size, 10, np.float32)
+        m = problem.control_size
+        super().__init__(count, Box(-bound, bound), Box(-np.ones(m, np.float32), np.ones(m, np.float32)))
+
+    def reset(self) -> FloatArray:
+        """Begin an episode in every world; the seed counts once."""
+        observations, infos = self._env.reset(seed=self._seed)
+        self._seed = None
+        self._acting = ~infos["arrived"]
+        self._distance = infos["distance_to_goal"]
+        self._touched = infos["collided"].copy()
+        self._return = np.zeros(self._shape)
+        self._length = np.zeros(self._shape, np.int64)
+        return self._encode(observations)
+
+    def step_async(self, actions: FloatArray) -> None:
+        self._actions = np.asarray(actions, np.float32)
+
+    def step_wait(self) -> tuple[FloatArray, FloatArray, BoolArray, list[dict[str, Any]]]:
+        controls = self.features.decode(self._actions, self._frames, self._limits)
+        observations, _, terminated, truncated, infos = self._env.step(controls.reshape(self._shape[0], -1))
+        ended, acting = terminated | truncated, self._acting
+        now = {name: infos[name] for name in ("arrived", "collided", "margin_violated", "distance_to_goal")}
+        if ended.any():
+            final = infos["final_info"]
+            now = {name: np.where(ended[:, None], final[name], value) for name, value in now.items()}
+        rewards = self._rewards(now) * acting
+        self.acted = acting.ravel()
+        self._touched |= now["collided"] & acting
+        self._return += rewards
+        self._length += acting
+        self._finish_worlds(ended, infos)
+        # The slot of an arrived robot ends with its world, so that the next episode begins afresh.
+        dones = np.where(acting, now["arrived"], False) | ended[:, None]
+        self._acting = (acting & ~now["arrived"]) | ended[:, None]
+        self._distance = infos["distance_to_goal"]
+        features = self._encode(observations)
+        robot_infos = self._robot_infos(dones, acting, now["arrived"], ended, observations, infos)
+        for values in (self._touched, self._return, self._length):
+            values[dones] = 0
+        return features, rewards.ravel().astype(np.float32), dones.ravel(), robot_infos
+
+    def _rewards(self, now: dict[str, Any]) -> FloatArray:
+        """``(B, K)``."""
+        scale = self._reward
+        rewards: FloatArray = (
+            scale.progress * (self._distance - now["distance_to_goal"]) / self._max_step
+            + scale.arrival * now["arrived"]
+            - scale.margin * now["margin_violated"]
+            - scale.contact * now["collided"]
+            - scale.time
+        )
+        return rewards
+
+    def _encode(self, observations: FloatArray) -> FloatArray:
+        features, self._frames = self.features.encode(observations.reshape(self.num_envs, -1))
+        features[~self._acting.ravel()] = 0
+        return features
+
+    def _finish_worlds(self, ended: BoolArray, infos: dict[str, Any]) -> None:
+        self.finished = []
+        if ended.any():
+            metrics = infos["final_info"]["metrics"]
+            self.finished = [
+                (int(world), bool(metrics["success"][world]), float(metrics["travel_time"][world]))
+                for world in np.flatnonzero(ended)
+            ]
+
+    def _robot_infos(
+        self,
+        dones: BoolArray,
+        acting: BoolArray,
+        arrived: BoolArray,
+        ended: BoolArray,
+        observations: FloatArray,
+        infos: dict[str, Any],
+    ) -> list[dict[str, Any]]:
+        """Empty but for robots whose episode has just ended."""
+        robot_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        finishing = np.argwhere(dones & acting)
+        if not len(finishing):
+            return robot_infos
+        count = self._shape[1]
+        last = np.stack(
+            [(infos["final_obs"][b] if ended[b] else observations[b]).reshape(count, -1)[k] for b, k in finishing]
+        )
+        for (b, k), terminal in zip(finishing, self.features.encode(last)[0]):
+            robot_infos[b * count + k] = {
+                "terminal_observation": terminal,
+                "TimeLimit.truncated": not arrived[b, k],
+                "is_success": bool(arrived[b, k] and not self._touched[b, k]),
+                "episode": {"r": float(self._return[b, k]), "l": int(self._length[b, k]), "t": 0.0},
+            }
+        return robot_infos
+
+    def close(self) -> None:
+        self._env.close()
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seed the worlds at the next reset."""
+        self._seed = seed
+        return [seed] * self.num_envs
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        raise AttributeError(f"{attr_name!r} cannot be set: the robots of all worlds share one environment")
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        raise AttributeError(f"{method_name!r} cannot be called: the robots of all worlds share one environment")
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        return [False] * len(list(self._get_indices(indices)))

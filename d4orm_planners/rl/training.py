@@ -1,0 +1,253 @@
+"""Training with Stable-Baselines3: lessons with a checkpoint after each, from which a killed training goes on.
+
+A lesson begins with fresh worlds and a fresh random state, both set by the seed and the lesson's number, and otherwise
+depends on the checkpoint before it only. A training that was killed and goes on therefore ends as if nothing had
+happened.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import VecNormalize
+
+from d4orm_env.core.arrays import whole_number
+from d4orm_env.scenarios import make_problem
+from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm
+from d4orm_planners.rl.checkpoints import Checkpoints
+from d4orm_planners.rl.curriculum import Lesson, common_batch, make_lessons, team_sizes
+from d4orm_planners.rl.curve import Evaluation, evaluate_network, write_curve
+from d4orm_planners.rl.network import CLIP, EPSILON, Network, network_of
+from d4orm_planners.rl.robot_vec_env import RobotVecEnv
+
+Progress = Callable[[str, int, int], Any]
+_VALIDATION_SEED = 0
+_INSTANCES = 256
+"""Drawn for each lesson, at most."""
+_TRAINING_SEED = 1_000_000
+"""Worlds are seeded one by one from these; a million apart, no instance is seen in training and in validation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingSettings:
+    """What to train on, and how long.
+
+    Attributes:
+        algorithm: ``"ppo"`` or ``"sac"``.
+        scenario: What is to be learned. Instances of ``random`` are practised along with any other scenario.
+        robots: Size of the full team.
+        steps: Robot-steps, rounded up to whole updates.
+        seed: Of everything that is drawn.
+        model: Robot model; ``None`` is the scenario's own.
+        num_envs: Robots that act at once; ``None`` is the algorithm's own number.
+        curriculum: Whether smaller teams come first.
+        lessons: Parts of the training, each with a checkpoint and an evaluation at its end.
+        validation_worlds: Episodes per evaluation.
+        scenario_settings: Arguments of the scenario.
+
+    Raises:
+        ValueError: If a value makes no sense; the message names it.
+    """
+
+    algorithm: str = "ppo"
+    scenario: str = "random"
+    robots: int = 4
+    steps: int = 5_000_000
+    seed: int = 0
+    model: str | None = None
+    num_envs: int | None = None
+    curriculum: bool = True
+    lessons: int = 50
+    validation_worlds: int = 100
+    scenario_settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.algorithm not in ALGORITHMS:
+            raise ValueError(f"algorithm {self.algorithm!r} is unknown; choose one of {', '.join(ALGORITHMS)}")
+        for name in ("robots", "steps", "lessons", "validation_worlds"):
+            whole_number(getattr(self, name), name, 1)
+        whole_number(self.seed, "seed", 0)
+        if self.num_envs is not None:
+            whole_number(self.num_envs, "num_envs", 1)
+        make_problem(self.scenario, num_robots=self.robots, model=self.model, **self.scenario_settings)
+
+    @property
+    def batch(self) -> int:
+        """Robots that act at once."""
+        sizes = team_sizes(self.robots) if self.curriculum else (self.robots,)
+        return common_batch(sizes, self.num_envs or ALGORITHMS[self.algorithm].num_envs)
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """What came of a training.
+
+    Attributes:
+        network: The policy with the best validation.
+        curve: One evaluation per lesson.
+        policy_path: Where the policy is.
+    """
+
+    network: Network
+    curve: tuple[Evaluation, ...]
+    policy_path: Path
+
+
+def train(
+    settings: TrainingSettings, out: str | os.PathLike[str], progress: Progress | None = None, command: str = ""
+) -> TrainingResult:
+    """Train, or go on with a training that was broken off.
+
+    ``out`` then holds ``policy.safetensors``, the policy that did best in validation; ``curve.csv`` and ``curve.png``,
+    the evaluations; ``checkpoints/``, the last two, each with ``model.zip``, as Stable-Baselines3 saves it; and
+    ``tensorboard/``, logs.
+
+    Args:
+        settings: What to train on.
+        out: Folder to write to, and to go on from.
+        progress: Called as ``progress(what, steps done, steps in all)``.
+        command: How the training was called, for the policy file.
+
+    Raises:
+        ValueError: For settings that make no sense, or other settings than those of the training in ``out``.
+        OSError: If the folder cannot be used.
+    """
+    out = Path(out)
+    checkpoints = Checkpoints(out, asdict(settings))
+    run = _Run(settings, out, checkpoints, progress or (lambda what, done, total: None), command)
+    for index in range(len(run.evaluations), len(run.lessons)):
+        run.learn(index)
+    best = _best(run.evaluations)
+    assert best is not None
+    return TrainingResult(checkpoints.policy(), tuple(run.evaluations), checkpoints.policy_path)
+
+
+class _Run:
+    """A training under way."""
+
+    def __init__(
+        self, settings: TrainingSettings, out: Path, checkpoints: Checkpoints, progress: Progress, command: str
+    ) -> None:
+        self.settings, self._out, self._checkpoints, self._progress = settings, out, checkpoints, progress
+        self._command = command
+        self._algorithm: Algorithm = ALGORITHMS[settings.algorithm]
+        unit = settings.batch * self._algorithm.steps_per_update
+        self.lessons = make_lessons(
+            settings.robots, settings.scenario, settings.steps, unit, settings.lessons, settings.curriculum
+        )
+        self._total = sum(lesson.steps for lesson in self.lessons)
+        self._model: Any = None
+        self._checkpoint = checkpoints.latest()
+        self.evaluations: list[Evaluation] = [] if self._checkpoint is None else self._checkpoint.evaluations
+        self._validation = self._worlds(
+            Lesson(settings.robots, settings.scenario, 0), _VALIDATION_SEED, validation=True
+        )
+
+    def learn(self, index: int) -> None:
+        """One lesson, its evaluation and its checkpoint."""
+        begin, lesson = time.perf_counter(), self.lessons[index]
+        done = sum(earlier.steps for earlier in self.lessons[:index])
+        self._progress(_describe(lesson, self.evaluations), done, self._total)
+        seed = _TRAINING_SEED * (self.settings.seed + 1) + index * self.settings.batch
+        robots = self._worlds(lesson, seed)
+        normalized = VecNormalize(robots, clip_obs=CLIP, gamma=self._algorithm.gamma, epsilon=EPSILON)
+        self._model = self._restored(normalized)
+        self._algorithm.prepare(self._model, robots, seed)
+        self._algorithm.set_learning_rate(self._model, 1 - done / self._total)
+        watch = _Watch(lambda steps: self._progress(_describe(lesson, self.evaluations), done + steps, self._total))
+        self._model.learn(lesson.steps, callback=watch, reset_num_timesteps=False)
+        evaluation = self._evaluate(index, done + lesson.steps, time.perf_counter() - begin, normalized)
+        self.evaluations = [*self.evaluations, evaluation]
+        self._checkpoint = self._checkpoints.save(index, self._model, normalized, self.evaluations)
+        write_curve(self._out, self.evaluations)
+        robots.close()
+
+    def _worlds(self, lesson: Lesson, seed: int, validation: bool = False) -> RobotVecEnv:
+        settings = self.settings
+        kwargs = dict(settings.scenario_settings) if lesson.scenario == settings.scenario else {}
+        drawn = _differs(lesson, settings.model, kwargs)
+        count = settings.validation_worlds if drawn else 1
+        worlds = count if validation else settings.batch // lesson.robots
+        if drawn:
+            pool = None if validation else min(_INSTANCES, 2 * worlds)
+            kwargs |= {"randomize_instance": True, "num_instances": pool}
+        return RobotVecEnv(worlds, lesson.robots, lesson.scenario, seed=seed, model=settings.model, **kwargs)
+
+    def _restored(self, env: VecNormalize) -> Any:
+        """The model with the state of the last checkpoint, in a new environment."""
+        fresh = self._model is None
+        if fresh:
+            set_random_seed(self.settings.seed)
+            model = self._algorithm.make(env)
+            model.set_logger(configure(str(self._out / "tensorboard"), ["tensorboard"]))
+        else:
+            model = self._model
+            model.set_env(env, force_reset=True)
+        if self._checkpoint is not None:
+            self._checkpoint.restore(env, model if fresh else None)
+        return model
+
+    def _evaluate(self, index: int, steps: int, seconds: float, normalization: VecNormalize) -> Evaluation:
+        """How the policy does now; it is kept if none did better."""
+        network = network_of(self._header(index), self._model, normalization)
+        evaluation = evaluate_network(network, self._validation, _VALIDATION_SEED, steps, self.lessons[index], seconds)
+        best = _best(self.evaluations)
+        if best is None or evaluation.rank >= best.rank:
+            network.save(self._checkpoints.policy_path)
+        return evaluation
+
+    def _header(self, index: int) -> dict[str, Any]:
+        features, problem = self._validation.features, self._validation.problem
+        return {
+            "algorithm": self.settings.algorithm,
+            "model": problem.team.models[0],
+            "dimension": features.dimension,
+            "num_neighbors": features.num_neighbors,
+            "num_obstacles": features.num_obstacles,
+            "training": {"command": self._command, "lesson": index + 1, **asdict(self.settings)},
+        }
+
+
+class _Watch(BaseCallback):
+    """Reports progress, and notes how the worlds end."""
+
+    def __init__(self, report: Callable[[int], Any]) -> None:
+        super().__init__()
+        self._report = report
+
+    def _on_training_start(self) -> None:
+        self._first = self.num_timesteps
+
+    def _on_step(self) -> bool:
+        for _, success, travel_time in self.training_env.get_attr("finished", 0)[0]:
+            self.logger.record_mean("worlds/success_rate", float(success))
+            self.logger.record_mean("worlds/travel_time", travel_time)
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self._report(self.num_timesteps - self._first)
+
+
+def _best(evaluations: list[Evaluation]) -> Evaluation | None:
+    return max(evaluations, key=lambda evaluation: evaluation.rank, default=None)
+
+
+def _describe(lesson: Lesson, evaluations: list[Evaluation]) -> str:
+    last = f"; success {evaluations[-1].success_rate:.0%}" if evaluations else ""
+    return f"{lesson.scenario}, {lesson.robots} robots{last}"
+
+
+def _differs(lesson: Lesson, model: str | None, kwargs: Mapping[str, Any]) -> bool:
+    """Whether instances of the scenario differ."""
+    first, second = (
+        make_problem(lesson.scenario, num_robots=lesson.robots, seed=seed, model=model, **kwargs) for seed in (0, 1)
+    )
+    return first != second
