@@ -56,7 +56,7 @@ def d4orm(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytes
 def program(tmp_path: Path, body: str) -> subprocess.CompletedProcess[str]:
     """Run a program that evaluates with worker processes, as a user would write it."""
     (tmp_path / "program.py").write_text(body)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)])}
     return subprocess.run(
         [sys.executable, "program.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
     )
@@ -587,16 +587,28 @@ def test_a_cluster_gives_the_same_rows(tmp_path: Path) -> None:
 def test_a_worker_lost_on_a_cluster_is_a_row(tmp_path: Path) -> None:
     pytest.importorskip("ray")
     # Workers import the module by name, and with it the trouble.
-    (tmp_path / "trouble.py").write_text(TROUBLE)
-    hook = "{'worker_process_setup_hook': 'trouble.__name__.strip'}"
-    start = f"import ray\nray.init(address='local', num_cpus=2, runtime_env={hook})\n"
+    (tmp_path / "trouble.py").write_text(TROUBLE + "def hook(): pass\n")
+    options = "num_cpus=2, log_to_driver=False, runtime_env={'worker_process_setup_hook': 'trouble.hook'}"
+    start = f"import ray\nray.init(address='local', {options})\n"
     body = start + EVALUATE.format(policies='"goal"', arguments='ray="auto", trial_timeout=5')
     result = program(tmp_path, body)
-    assert result.stdout == "(6, 3) (6, 3)\n", result.stderr
+    assert result.stdout.splitlines()[-1:] == ["(6, 3) (6, 3)"], result.stderr
+    errors = {row.seed: row.error for row in TrialStore(tmp_path / "out" / STORE).trials() if row.error}
+    assert errors[1] == "RuntimeError: out of luck"
+    assert errors[2].startswith("ChildProcessError: the worker was lost (WorkerCrashedError: ")
+    assert errors[3] == "TimeoutError: took longer than 5 s"
 
 
-def test_an_unreachable_cluster_is_one_line(d4orm, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        ("auto", "Ray cluster 'auto' cannot be reached"),
+        ("127.0.0.1:1", "Ray cluster '127.0.0.1:1' cannot be reached (ConnectionRefusedError: "),
+        ("nowhere", "Ray address 'nowhere' is neither auto, nor local, nor of the form host:port"),
+    ],
+)
+def test_an_unreachable_cluster_is_one_line(d4orm, address: str, message: str) -> None:
     pytest.importorskip("ray")
-    status, _, err = d4orm("evaluate", "-p", "goal", "-k", "2", "-n", "1", "--ray", "auto")
+    status, _, err = d4orm("evaluate", "-p", "goal", "-k", "2", "-n", "1", "--ray", address)
     assert (status, err.count("\n")) == (2, 1)
-    assert "Ray cluster 'auto' cannot be reached" in err
+    assert message in err

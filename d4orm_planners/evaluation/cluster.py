@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 from collections.abc import Iterator
 from itertools import count
 from typing import Any
@@ -14,6 +15,9 @@ from d4orm_planners.evaluation.trials import Job, describe_error, run_job
 QUEUED = 2
 """Jobs under way per core of the cluster: one that runs, and one that need not be waited for."""
 
+PATIENCE = 10.0
+"""Seconds to wait for the head of a cluster to answer."""
+
 
 class RayCrew:
     """Tasks on a Ray cluster, one per job and core, never tried again by Ray itself.
@@ -24,6 +28,7 @@ class RayCrew:
         size: Jobs under way at most; by default twice as many as the cluster has cores.
 
     Raises:
+        ValueError: If the address is none.
         ImportError: If Ray is not installed.
         ConnectionError: If there is no cluster.
     """
@@ -31,7 +36,11 @@ class RayCrew:
     def __init__(self, address: str, size: int | None = None) -> None:
         self._ray: Any = _import_ray()
         self._owner = not self._ray.is_initialized()
+        host, port = _host_and_port(address)
         try:
+            if host:
+                # Ray itself tries for minutes.
+                socket.create_connection((host, port), PATIENCE).close()
             if self._owner:
                 self._ray.init(address=address, log_to_driver=False, include_dashboard=False)
             cores = int(self._ray.cluster_resources().get("CPU", 1))
@@ -87,6 +96,16 @@ def _work(job: Job) -> Iterator[Trial | Sign]:
     yield Sign.BEGUN
     yield from run_job(job)
     yield Sign.ENDED
+
+
+def _host_and_port(address: str) -> tuple[str, int]:
+    """What an address names; nothing for one that is no ``host:port``, with ``ray://`` before it or without."""
+    if address in ("auto", "local"):
+        return "", 0
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not host or not port.isdigit():
+        raise ValueError(f"Ray address {address!r} is neither auto, nor local, nor of the form host:port")
+    return host.strip("[]"), int(port)
 
 
 def _import_ray() -> Any:
