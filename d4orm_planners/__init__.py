@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from d4orm_planners.base import Planner, PlannerConfig
     from d4orm_planners.episode import Episode, run_episode
+    from d4orm_planners.evaluation.harness import evaluate
     from d4orm_planners.plan import IterationRecord, Plan
     from d4orm_planners.policy import OpenLoop, Policy
     from d4orm_planners.registry import list_planners, list_policies, make_planner, make_policy
@@ -20,6 +21,7 @@ __all__ = [
     "Planner",
     "PlannerConfig",
     "Policy",
+    "evaluate",
     "list_planners",
     "list_policies",
     "make_planner",
@@ -30,6 +32,7 @@ __all__ = [
 _HOMES = {
     "base": ("Planner", "PlannerConfig"),
     "episode": ("Episode", "run_episode"),
+    "evaluation.harness": ("evaluate",),
     "plan": ("IterationRecord", "Plan"),
     "policy": ("OpenLoop", "Policy"),
     "registry": ("list_planners", "list_policies", "make_planner", "make_policy"),

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from d4orm_planners.commands.evaluate import evaluate, leaderboard
 from d4orm_planners.commands.inputs import check_writable, make_folder, names, numbers, parse_settings
 from d4orm_planners.commands.robustness import robustness
 from d4orm_planners.commands.train import train
@@ -33,8 +34,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-app.command()(robustness)
-app.command()(train)
+for command in (evaluate, leaderboard, robustness, train):
+    app.command()(command)
 
 Scenario = Annotated[
     str, typer.Option("--scenario", "-s", help="Scenario name (see `d4orm scenarios`) or a YAML file.")

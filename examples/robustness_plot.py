@@ -15,7 +15,8 @@ from typing import Any
 
 from outputs import COLOURS, argument_parser, count, plt, save_figure, save_table
 
-from d4orm_planners.evaluation.robustness import SuccessRate, robustness
+from d4orm_planners.evaluation.robustness import robustness
+from d4orm_planners.evaluation.summary import SuccessRate
 
 COLOUR = {"d4orm-c2f": COLOURS["d4orm"], "d4orm-d": COLOURS["mppi"], "orca": COLOURS["cem"], "goal": "#7F7F7F"}
 LABEL = {"d4orm-c2f": "D4orm-C2F", "d4orm-d": "D4orm-D, open loop", "orca": "ORCA", "goal": "straight to the goal"}

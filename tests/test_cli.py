@@ -153,7 +153,10 @@ def test_unwritable_folder(d4orm, arguments: Sequence[str]) -> None:
     assert "choose another" in outcome.err
 
 
-@pytest.mark.parametrize("command", [[], ["demo"], ["plan"], ["run"], ["robustness"], ["scenarios"], ["planners"]])
+COMMANDS = ("demo", "plan", "run", "evaluate", "leaderboard", "robustness", "scenarios", "planners")
+
+
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
 def test_help(d4orm, command: list[str]) -> None:
     outcome = d4orm(*command, "--help")
     assert outcome.status == 0
@@ -164,7 +167,8 @@ def test_help_loads_nothing_heavy() -> None:
     code = (
         "import sys\nfrom d4orm_planners import cli\n"
         "try:\n    cli.main(['--help'])\nexcept SystemExit:\n    pass\n"
-        "print([m for m in ('numba', 'jax', 'torch', 'matplotlib', 'pettingzoo', 'pyrvo') if m in sys.modules])"
+        "heavy = ('numba', 'jax', 'torch', 'matplotlib', 'pettingzoo', 'pyarrow', 'pyrvo', 'ray')\n"
+        "print([m for m in heavy if m in sys.modules])"
     )
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, env={**os.environ, "COLUMNS": "100"}

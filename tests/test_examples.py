@@ -179,6 +179,27 @@ def test_robustness_example_tells_closed_loop_from_open_loop_and_keeps_its_trial
 
 
 @pytest.mark.slow
+def test_results_are_read_alike_from_all_three_files(tmp_path: Path) -> None:
+    pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    out = tmp_path / "out"
+    completed("read_results", out)
+    rows = table(out / "read_results.csv")
+    assert [(row["policy"], row["scenario"], row["trials"]) for row in rows] == [
+        (policy, scenario, "2")
+        for policy in ("d4orm", "d4orm, few samples", "orca")
+        for scenario in ("circle", "random")
+    ]
+    assert all(0 <= float(row["success"]) <= 1 and float(row["computing per s of motion"]) > 0 for row in rows)
+    assert (out / "read_results.png").read_bytes().startswith(PNG)
+    before = (out / "read_results.csv").read_text()
+    for kind in ("parquet", "csv", "sqlite"):
+        result = run("read_results", out, "--results", str(out / "evaluation"), "--format", kind)
+        assert result.returncode == 0, result.stderr
+        assert (out / "read_results.csv").read_text() == before
+
+
+@pytest.mark.slow
 def test_lifelong_example_stays_below_its_bound(tmp_path: Path) -> None:
     out = tmp_path / "out"
     completed("lifelong", out)

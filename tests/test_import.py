@@ -7,7 +7,8 @@ import sys
 
 import pytest
 
-HEAVY = ("torch", "ray", "casadi", "plotly", "matplotlib", "jax", "stable_baselines3", "supersuit", "zenoh", "pyrvo")
+HEAVY = ("torch", "ray", "casadi", "plotly", "matplotlib", "jax", "stable_baselines3", "supersuit", "zenoh", "pyrvo",
+         "pandas", "pyarrow")  # fmt: skip
 CONTRACT = (
     "navigation_v0",
     "make_problem",

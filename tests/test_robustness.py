@@ -20,10 +20,12 @@ import pytest
 from d4orm_planners import cli, make_policy
 from d4orm_planners.evaluation import robustness as robustness_module
 from d4orm_planners.evaluation import trials as trials_module
-from d4orm_planners.evaluation.robustness import STORE, robustness, success_rate
+from d4orm_planners.evaluation import workers as workers_module
+from d4orm_planners.evaluation.robustness import robustness
 from d4orm_planners.evaluation.robustness_report import markdown, write_robustness
 from d4orm_planners.evaluation.statistics import wilson_interval
-from d4orm_planners.evaluation.store import APPLICATION_ID, Trial, TrialStore
+from d4orm_planners.evaluation.store import APPLICATION_ID, STORE, Trial, TrialStore
+from d4orm_planners.evaluation.summary import success_rate
 from d4orm_planners.policy import DriveToGoal
 
 TINY: dict[str, Any] = {"robots": [2], "noise": [0.0, 0.3], "trials": 2, "workers": 1}
@@ -31,6 +33,7 @@ TINY: dict[str, Any] = {"robots": [2], "noise": [0.0, 0.3], "trials": 2, "worker
 
 def trial(seed: int = 0, **changes: Any) -> Trial:
     values = {"policy": "goal", "config": "{}", "problem": "abc", "noise": 0.1, "scenario": "circle", "robots": 2}
+    values |= {"label": "goal", "dt": 0.1}
     outcome = {"success": True, "arrived": 2, "travel_time": 5.0, "makespan": 6.0, "steps": 60, "wall_time": 0.5}
     return Trial(**{**values, "model": "holonomic2d", "versions": "{}", **outcome, "seed": seed, **changes})
 
@@ -135,14 +138,22 @@ def other_database(path: Path) -> None:
     connection.close()
 
 
-def later_version(path: Path) -> None:
+def other_version(path: Path, version: int) -> None:
     connection = sqlite3.connect(path)
     connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-    connection.execute("PRAGMA user_version = 99")
+    connection.execute(f"PRAGMA user_version = {version}")
     connection.close()
 
 
-@pytest.mark.parametrize("make", [not_a_database, other_database, later_version])
+def former_version(path: Path) -> None:
+    other_version(path, 1)
+
+
+def later_version(path: Path) -> None:
+    other_version(path, 99)
+
+
+@pytest.mark.parametrize("make", [not_a_database, other_database, former_version, later_version])
 def test_a_file_that_is_not_ours_is_refused_and_left_alone(d4orm, tmp_path: Path, make: Callable[..., None]) -> None:
     make(tmp_path / STORE)
     before = (tmp_path / STORE).read_bytes()
@@ -198,17 +209,15 @@ def test_a_plan_is_made_once_for_all_levels_of_noise(tmp_path: Path, monkeypatch
 def test_resuming_runs_only_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     robustness(["goal"], tmp_path, **TINY)
     ran: list[tuple[int, tuple[float, ...]]] = []
-    run_job = trials_module.run_job
-    monkeypatch.setattr(
-        trials_module, "run_job", lambda job, store: (ran.append((job.seed, job.noise)), run_job(job, store))
-    )
+    run_job = workers_module.run_job
+    monkeypatch.setattr(workers_module, "run_job", lambda job: (ran.append((job.seed, job.noise)), run_job(job))[1])
     before = robustness(["goal"], tmp_path, **TINY)
     assert ran == []
     counts: list[tuple[int, int]] = []
     more = {**TINY, "noise": [0.0, 0.3, 0.5], "trials": 3}
     rates = robustness(["goal"], tmp_path, **more, progress=lambda what, done, total: counts.append((done, total)))
     assert ran == [(0, (0.5,)), (1, (0.5,)), (2, (0.0, 0.3, 0.5))]
-    assert counts == [(4, 9), (5, 9), (6, 9), (9, 9)]
+    assert counts == [(4, 9), (5, 9), (6, 9), (7, 9), (8, 9), (9, 9)]
     assert [row.trials for row in rates] == [3, 3, 3]
     # Trials beyond those asked for are in the store and not in the rates.
     again = robustness(["goal"], tmp_path, **TINY)
@@ -239,14 +248,14 @@ def test_an_error_is_a_row_and_is_tried_again(tmp_path: Path, monkeypatch: pytes
 
 
 def test_ctrl_c_keeps_what_was_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, d4orm) -> None:
-    run_job = trials_module.run_job
+    run_job = workers_module.run_job
 
-    def interrupted(job: Any, store: Any) -> None:
+    def interrupted(job: Any) -> Any:
         if job.seed == 1:
             raise KeyboardInterrupt
-        run_job(job, store)
+        return run_job(job)
 
-    monkeypatch.setattr(trials_module, "run_job", interrupted)
+    monkeypatch.setattr(workers_module, "run_job", interrupted)
     arguments = ("--policies", "goal", "--robots", "2", "--trials", "3", "--noise", "0,0.3", "--workers", "1")
     status, _, err = d4orm(*arguments)
     assert status == 130
@@ -259,10 +268,11 @@ def test_the_number_of_workers_makes_no_difference(tmp_path: Path) -> None:
     alone, together = (
         robustness(["goal", "orca"], tmp_path / str(workers), **{**TINY, "workers": workers}) for workers in (1, 2)
     )
-    assert [replace(row, wall_time=None) for row in alone] == [replace(row, wall_time=None) for row in together]
-    outcomes = [
-        [replace(row, wall_time=None) for row in TrialStore(tmp_path / folder / STORE).trials()] for folder in "12"
-    ]
+    untimed: dict[str, Any] = {"wall_time": None, "compute": None, "compute_lower": None, "compute_upper": None}
+    assert [replace(row, **untimed) for row in alone] == [replace(row, **untimed) for row in together]
+    # Workers of several have one thread each, which the description of the machine says.
+    untimed = {"wall_time": None, "elapsed": None, "date": "", "machine": ""}
+    outcomes = [[replace(row, **untimed) for row in TrialStore(tmp_path / folder / STORE).trials()] for folder in "12"]
     assert outcomes[0] == outcomes[1]
 
 

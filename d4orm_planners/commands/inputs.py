@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 
-def parse_settings(settings: list[str] | None) -> dict[str, Any]:
-    """``name=value`` texts as a dictionary, the values read as YAML.
+def parse_settings(settings: list[str] | None, option: str = "--set") -> dict[str, Any]:
+    """``name=value`` texts, given to an option, as a dictionary, the values read as YAML.
 
     Raises:
         ValueError: If a text has another form.
@@ -19,11 +19,11 @@ def parse_settings(settings: list[str] | None) -> dict[str, Any]:
     for setting in settings or []:
         name, separator, text = setting.partition("=")
         if not separator or not name:
-            raise ValueError(f"--set {setting!r} is not of the form name=value, as num_samples=512")
+            raise ValueError(f"{option} {setting!r} is not of the form name=value, as num_samples=512")
         try:
             values[name] = yaml.safe_load(text)
         except yaml.YAMLError:
-            raise ValueError(f"--set {setting!r}: the value cannot be read") from None
+            raise ValueError(f"{option} {setting!r}: the value cannot be read") from None
     return values
 
 
@@ -44,6 +44,18 @@ def numbers(option: str, text: str | None) -> tuple[int, ...] | None:
         return tuple(int(number) for number in text.split(","))
     except ValueError:
         raise ValueError(f"{option} {text!r} is not a list of whole numbers, as 4,8,16") from None
+
+
+def decimals(option: str, text: str) -> tuple[float, ...]:
+    """A list of numbers separated by commas.
+
+    Raises:
+        ValueError: If it is something else; the message names the option.
+    """
+    try:
+        return tuple(float(number) for number in text.split(","))
+    except ValueError:
+        raise ValueError(f"{option} {text!r} is not a list of numbers, as 0,0.05,0.1") from None
 
 
 def make_folder(folder: Path) -> None:

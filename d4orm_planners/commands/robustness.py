@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from d4orm_planners.commands.inputs import make_folder, names, numbers, parse_settings
+from d4orm_planners.commands.inputs import decimals, make_folder, names, numbers, parse_settings
 
 
 def robustness(
@@ -42,7 +42,7 @@ def robustness(
     from d4orm_planners.evaluation.robustness_report import markdown, write_robustness
 
     chosen = _settings_by_policy(names(policies) or (), parse_settings(settings))
-    levels, sizes = _levels(noise), numbers("--robots", robots) or (None,)
+    levels, sizes = decimals("--noise", noise), numbers("--robots", robots) or (None,)
     make_folder(out)
     try:
         with PartsProgress(enabled=not quiet) as progress:
@@ -65,13 +65,6 @@ def robustness(
         typer.echo(markdown(rates))
         for path in written:
             typer.echo(f"wrote {path}")
-
-
-def _levels(text: str) -> tuple[float, ...]:
-    try:
-        return tuple(float(level) for level in text.split(","))
-    except ValueError:
-        raise ValueError(f"--noise {text!r} is not a list of numbers, as 0,0.05,0.1") from None
 
 
 def _settings_by_policy(policies: Sequence[str], settings: dict[str, Any]) -> dict[str, dict[str, Any]]:

@@ -1,1 +1,1 @@
-"""How fast the engines, environments and planners are, and the plain formulation they are held against."""
+"""Comparing policies, and how fast the engines, environments and planners are."""

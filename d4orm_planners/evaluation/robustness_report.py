@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 import os
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 from d4orm_env.core.files import replaced_when_done
+from d4orm_planners.evaluation.exports import write_rates
 from d4orm_planners.evaluation.report import table
-from d4orm_planners.evaluation.robustness import SuccessRate
+from d4orm_planners.evaluation.summary import SuccessRate
+from d4orm_planners.evaluation.tables import errors, panels
 
 
 def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) -> tuple[Path, Path, Path]:
@@ -27,10 +27,7 @@ def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate
         OSError: If the folder does not exist or cannot be written to.
     """
     paths = Path(folder, "robustness.csv"), Path(folder, "robustness.md"), Path(folder, "robustness.png")
-    with replaced_when_done(paths[0]) as path, path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, ["rate", *asdict(rates[0])])
-        writer.writeheader()
-        writer.writerows({"rate": rate.rate, **asdict(rate)} for rate in rates)
+    write_rates(paths[0], rates)
     with replaced_when_done(paths[1]) as path:
         path.write_text(markdown(rates), encoding="utf-8")
     with replaced_when_done(paths[2]) as path:
@@ -43,10 +40,10 @@ def markdown(rates: Sequence[SuccessRate]) -> str:
     header = ("policy", "noise", "success", "95% interval", "contact", "not in time", "errors", "travel time, s",
               "planning, s")  # fmt: skip
     blocks = []
-    for (scenario, robots, model), group in _panels(rates).items():
+    for (scenario, robots, model), group in panels(rates).items():
         rows = [
             (
-                rate.policy,
+                rate.label,
                 f"{rate.noise:g}",
                 f"{rate.successes} of {rate.trials} ({rate.rate:.0%})",
                 f"{rate.lower:.0%} to {rate.upper:.0%}",
@@ -56,17 +53,7 @@ def markdown(rates: Sequence[SuccessRate]) -> str:
             for rate in group
         ]
         blocks.append(table(f"{scenario}, {robots} robots, {model}", header, rows))
-    errors = dict.fromkeys(f"- `{rate.policy}`: {rate.error}" for rate in rates if rate.error)
-    if errors:
-        blocks.append("\n".join(["### Errors", "", *errors]))
-    return "\n\n".join(blocks) + "\n"
-
-
-def _panels(rates: Sequence[SuccessRate]) -> dict[tuple[str, int, str], list[SuccessRate]]:
-    panels: dict[tuple[str, int, str], list[SuccessRate]] = {}
-    for rate in rates:
-        panels.setdefault((rate.scenario, rate.robots, rate.model), []).append(rate)
-    return panels
+    return "\n\n".join([*blocks, *errors(rates)]) + "\n"
 
 
 def _draw(path: Path, rates: Sequence[SuccessRate]) -> None:
@@ -74,16 +61,16 @@ def _draw(path: Path, rates: Sequence[SuccessRate]) -> None:
     # The figure is made without pyplot, which would keep state and want a display.
     from matplotlib.figure import Figure
 
-    panels = _panels(rates)
-    columns = min(len(panels), 3)
-    rows = -(-len(panels) // columns)
+    groups = panels(rates)
+    columns = min(len(groups), 3)
+    rows = -(-len(groups) // columns)
     figure = Figure(figsize=(4.8 * columns, 3.6 * rows), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
-    for ax in axes[len(panels) :]:
+    for ax in axes[len(groups) :]:
         ax.set_visible(False)
-    for ax, ((scenario, robots, model), group) in zip(axes, panels.items()):
-        for policy in dict.fromkeys(rate.policy for rate in group):
-            line = sorted((rate for rate in group if rate.policy == policy), key=lambda rate: rate.noise)
+    for ax, ((scenario, robots, model), group) in zip(axes, groups.items()):
+        for policy in dict.fromkeys(rate.label for rate in group):
+            line = sorted((rate for rate in group if rate.label == policy), key=lambda rate: rate.noise)
             noise = [rate.noise for rate in line]
             (drawn,) = ax.plot(noise, [rate.rate for rate in line], marker="o", label=policy, clip_on=False)
             lower, upper = [rate.lower for rate in line], [rate.upper for rate in line]

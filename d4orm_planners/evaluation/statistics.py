@@ -2,10 +2,51 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import sqrt
+
+import numpy as np
 
 Z_95 = 1.959963984540054
 """The 97.5% quantile of the standard normal distribution."""
+
+
+_T_95 = (12.706204736, 4.302652730, 3.182446305, 2.776445105, 2.570581836, 2.446911851, 2.364624252, 2.306004135)
+"""The 97.5% quantiles of Student's t distribution with 1, 2, ... degrees of freedom."""
+
+
+def t_quantile(degrees: int) -> float:
+    """The 97.5% quantile of Student's t distribution, exact to four digits or more.
+
+    Args:
+        degrees: Of freedom, at least one.
+    """
+    if degrees <= len(_T_95):
+        return _T_95[degrees - 1]
+    # Abramowitz and Stegun, 26.7.5.
+    z, v = Z_95, float(degrees)
+    terms = (
+        (z**3 + z) / 4,
+        (5 * z**5 + 16 * z**3 + 3 * z) / 96,
+        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384,
+        (79 * z**9 + 776 * z**7 + 1482 * z**5 - 1920 * z**3 - 945 * z) / 92160,
+    )
+    return z + sum(term / v**power for power, term in enumerate(terms, 1))
+
+
+def mean_interval(values: Sequence[float]) -> tuple[float | None, float | None, float | None]:
+    """Mean of a sample, and its 95% confidence interval by Student's t.
+
+    Returns:
+        Mean, lower and upper end; the ends are ``None`` for fewer than two values, and the mean for none.
+    """
+    if not values:
+        return None, None, None
+    mean = float(np.mean(values))
+    if len(values) == 1:
+        return mean, None, None
+    reach = t_quantile(len(values) - 1) * float(np.std(values, ddof=1)) / sqrt(len(values))
+    return mean, mean - reach, mean + reach
 
 
 def wilson_interval(successes: int, trials: int, z: float = Z_95) -> tuple[float, float]:

@@ -13,7 +13,9 @@ from typing import NamedTuple
 
 APPLICATION_ID = 0x64346F72
 """Marks the file as one of ours, in its header ("d4or")."""
-VERSION = 1
+VERSION = 2
+STORE = "trials.sqlite"
+"""Name of the file in a folder of results."""
 PATIENCE = 60.0
 """Seconds to wait for another writer."""
 
@@ -46,17 +48,30 @@ class Trial:
         problem: See :class:`TrialKey`.
         noise: See :class:`TrialKey`.
         seed: See :class:`TrialKey`.
+        label: What the policy with these settings was called.
         scenario: Name of the scenario.
         robots: Team size.
         model: Model names of the team, each once, joined by ``+``.
-        versions: Versions of the libraries, as JSON.
+        dt: Time step [s].
+        versions: Versions of the libraries, as JSON; ``{}`` where the process was lost.
+        machine: Processor, cores and system, as JSON, likewise.
+        date: When the trial ended, UTC, ISO 8601.
         success: Everyone arrived in time, and none was ever in contact.
+        verified: Whether :func:`d4orm_env.verify` found no fault with the executed controls; ``None`` if not judged.
+        violation: The first fault that it found.
         collided: Robots that were ever in contact.
         arrived: Robots that arrived.
         travel_time: Mean arrival time [s], with the time of the whole episode for a robot that did not arrive.
         makespan: Latest arrival time [s], likewise.
+        reward: Mean over steps and robots.
+        mean_squared_jerk: See :func:`d4orm_env.core.metrics.mean_squared_jerk` [m^2/s^6].
         steps: Steps of the episode.
+        iterations: Iterations of the planner; ``None`` for a policy that executes no plan.
+        status: How its solve ended, see :class:`d4orm_planners.plan.Plan`.
         wall_time: Seconds spent planning, or choosing actions.
+        elapsed: Seconds that the trial took, with the environment and the judge.
+        history: Moments of the solve at which the best plan so far changed, as JSON: a list of
+            ``[seconds, solved (0 or 1), mean reward]``; empty for a policy that executes no plan.
         error: Why there is no outcome; empty for a trial that ran to its end.
     """
 
@@ -65,17 +80,29 @@ class Trial:
     problem: str
     noise: float
     seed: int
+    label: str
     scenario: str
     robots: int
     model: str
-    versions: str
+    dt: float
+    versions: str = "{}"
+    machine: str = "{}"
+    date: str = ""
     success: bool = False
+    verified: bool | None = None
+    violation: str = ""
     collided: int = 0
     arrived: int = 0
     travel_time: float | None = None
     makespan: float | None = None
+    reward: float | None = None
+    mean_squared_jerk: float | None = None
     steps: int = 0
+    iterations: int | None = None
+    status: str = ""
     wall_time: float | None = None
+    elapsed: float | None = None
+    history: str = "[]"
     error: str = ""
 
     @property
@@ -85,12 +112,17 @@ class Trial:
 
 _NAMES = tuple(field.name for field in fields(Trial))
 _KEY = ", ".join(TrialKey._fields)
+_TRUTHS = ("success", "verified")
 _CREATE = f"""
 CREATE TABLE trials (
     policy TEXT NOT NULL, config TEXT NOT NULL, problem TEXT NOT NULL, noise REAL NOT NULL, seed INTEGER NOT NULL,
-    scenario TEXT NOT NULL, robots INTEGER NOT NULL, model TEXT NOT NULL, versions TEXT NOT NULL,
-    success INTEGER NOT NULL, collided INTEGER NOT NULL, arrived INTEGER NOT NULL,
-    travel_time REAL, makespan REAL, steps INTEGER NOT NULL, wall_time REAL, error TEXT NOT NULL,
+    label TEXT NOT NULL, scenario TEXT NOT NULL, robots INTEGER NOT NULL, model TEXT NOT NULL, dt REAL NOT NULL,
+    versions TEXT NOT NULL, machine TEXT NOT NULL, date TEXT NOT NULL,
+    success INTEGER NOT NULL, verified INTEGER, violation TEXT NOT NULL,
+    collided INTEGER NOT NULL, arrived INTEGER NOT NULL,
+    travel_time REAL, makespan REAL, reward REAL, mean_squared_jerk REAL,
+    steps INTEGER NOT NULL, iterations INTEGER, status TEXT NOT NULL,
+    wall_time REAL, elapsed REAL, history TEXT NOT NULL, error TEXT NOT NULL,
     PRIMARY KEY ({_KEY})
 ) WITHOUT ROWID
 """
@@ -120,21 +152,42 @@ class TrialStore:
             self._check(connection)
             _use_wal(connection)
 
-    def add(self, trial: Trial) -> bool:
-        """Store a trial, durably and at once.
+    @classmethod
+    def existing(cls, path: str | os.PathLike[str]) -> TrialStore:
+        """The store in a file, or in a folder under its usual name, which must be there.
+
+        Raises:
+            FileNotFoundError: If there is none.
+            ValueError: If the file is something else, or of another version.
+        """
+        file = Path(path) / STORE if Path(path).is_dir() else Path(path)
+        if not file.is_file():
+            raise FileNotFoundError(f"there is no store of trials at {file}; `d4orm evaluate` makes one")
+        return cls(file)
+
+    def add(self, *trials: Trial) -> int:
+        """Store trials, durably and at once: all of them or, after an error, none.
 
         Returns:
-            Whether it was new, or took the place of one that had failed; a finished trial is never overwritten.
+            How many were new, or took the place of one that had failed; a finished trial is never overwritten.
         """
         with self._connection() as connection:
-            return connection.execute(_ADD, astuple(trial)).rowcount > 0
+            connection.execute("BEGIN IMMEDIATE")
+            added = connection.executemany(_ADD, [astuple(trial) for trial in trials]).rowcount
+            connection.execute("COMMIT")
+        return int(added)
 
     def trials(self) -> list[Trial]:
         """All trials, in order of key."""
         with self._connection() as connection:
             rows = connection.execute(f"SELECT {', '.join(_NAMES)} FROM trials ORDER BY {_KEY}").fetchall()
-        # SQLite keeps truth values as numbers.
-        return [Trial(**{**dict(zip(_NAMES, row)), "success": bool(row[_NAMES.index("success")])}) for row in rows]
+        trials = []
+        for row in rows:
+            values = dict(zip(_NAMES, row))
+            for name in _TRUTHS:  # SQLite keeps truth values as numbers
+                values[name] = None if values[name] is None else bool(values[name])
+            trials.append(Trial(**values))
+        return trials
 
     def finished(self) -> set[TrialKey]:
         """Keys of all trials that ran to their end."""
@@ -147,7 +200,9 @@ class TrialStore:
             with closing(sqlite3.connect(self.path, timeout=PATIENCE, isolation_level=None)) as connection:
                 yield connection
         except sqlite3.OperationalError as error:
-            raise OSError(f"trial store {self.path} cannot be used: {error}") from error
+            raise OSError(
+                f"trial store {self.path} cannot be used: {error}; free some space or choose another folder"
+            ) from error
         except sqlite3.DatabaseError as error:
             raise self._foreign(str(error)) from error
 

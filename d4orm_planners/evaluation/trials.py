@@ -1,25 +1,24 @@
-"""Running trials, in this process or in several, each stored as soon as it is done."""
+"""Running trials: an episode of a policy, timed, judged and put into a row."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import json
-import os
-import signal
-import threading
 import time
-from collections.abc import Generator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
-from multiprocessing.connection import Connection
+from datetime import UTC, datetime
+from functools import cache, cached_property
 from typing import Any
 
-from d4orm_env import navigation_v0
+import numpy as np
+
+from d4orm_env import navigation_v0, verify
 from d4orm_env.core.problem import Problem
 from d4orm_planners.episode import run_episode
-from d4orm_planners.evaluation.store import Trial, TrialKey, TrialStore
+from d4orm_planners.evaluation.store import Trial, TrialKey
+from d4orm_planners.evaluation.timing import describe_machine
+from d4orm_planners.plan import IterationRecord, Plan
 from d4orm_planners.policy import Actions, OpenLoop, Policy
 from d4orm_planners.registry import make_policy, policy_settings
 
@@ -27,118 +26,123 @@ LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "pyrvo")
 
 
 @dataclass(frozen=True)
+class Configuration:
+    """A policy with its settings.
+
+    Attributes:
+        label: What it is called in the results.
+        policy: Registry name.
+        settings: Those that differ from the defaults.
+    """
+
+    label: str
+    policy: str
+    settings: Mapping[str, Any]
+
+    @cached_property
+    def config(self) -> str:
+        """All settings, as JSON with sorted keys."""
+        return json.dumps(policy_settings(self.policy, **self.settings), sort_keys=True)
+
+
+@dataclass(frozen=True)
 class Job:
     """A policy on a problem with one seed, at several levels of noise.
 
     Attributes:
-        policy: Registry name.
-        settings: Those that differ from the defaults.
+        policy: The policy with its settings.
         problem: The problem.
         seed: Of the policy and of the noise.
         noise: Standard deviations of the execution noise, in the controls' units.
     """
 
-    policy: str
-    settings: Mapping[str, Any]
+    policy: Configuration
     problem: Problem
     seed: int
     noise: tuple[float, ...]
 
     @property
-    def label(self) -> str:
+    def name(self) -> str:
         """For people who watch."""
-        return f"{self.policy}, {self.problem.name}, {self.problem.num_robots} robots"
+        return f"{self.policy.label}, {self.problem.name}, {self.problem.num_robots} robots"
 
-    @property
-    def keys(self) -> list[TrialKey]:
-        """Of its trials, one per level of noise."""
-        config = json.dumps(policy_settings(self.policy, **self.settings), sort_keys=True)
-        return [TrialKey(self.policy, config, self.problem.digest, noise, self.seed) for noise in self.noise]
+    def key(self, noise: float) -> TrialKey:
+        """Of the trial at one level of noise."""
+        return TrialKey(self.policy.policy, self.policy.config, self.problem.digest, noise, self.seed)
+
+    def failed(self, noise: float, error: str) -> Trial:
+        """The trial at one level of noise, which has no outcome."""
+        return Trial(
+            **self.key(noise)._asdict(),
+            label=self.policy.label,
+            scenario=self.problem.name,
+            robots=self.problem.num_robots,
+            model="+".join(sorted(set(self.problem.team.models))),
+            dt=self.problem.dt,
+            date=datetime.now(UTC).isoformat(timespec="seconds"),
+            error=error,
+        )
 
 
-def run_jobs(jobs: Sequence[Job], store: TrialStore, workers: int) -> Generator[Job]:
-    """Run jobs and yield each when its trials are stored.
+def run_job(job: Job) -> Iterator[Trial]:
+    """Run the trials of a job one after another; a plan is made once and executed at every level of noise.
 
-    With one worker they run in this process, on all its cores; else in that many processes of one thread each. When the
-    iteration is broken off, or this process dies, the workers stop at once.
+    Whatever a policy raises is the result of its trial.
 
     Raises:
-        ChildProcessError: If a worker dies.
+        KeyboardInterrupt: If Ctrl-C was pressed meanwhile.
     """
-    workers = min(workers, len(jobs))
-    if workers <= 1:
-        for job in jobs:
-            run_job(job, store)
-            yield job
-        return
-    context = get_context("spawn")
-    # Nobody else holds the sending end: when this process closes it or dies, the workers notice.
-    receiver, sender = context.Pipe(duplex=False)
-    pool = ProcessPoolExecutor(workers, context, _start_worker, (receiver,))
-    try:
-        futures = {pool.submit(run_job, job, store): job for job in jobs}
-        for future in as_completed(futures):
-            future.result()
-            yield futures[future]
-    except BrokenProcessPool as error:
-        raise ChildProcessError(
-            "a worker process died, perhaps for lack of memory; what was done is stored, so run again, with fewer "
-            "workers"
-        ) from error
-    except BaseException:
-        sender.close()  # so that nobody finishes what is no longer wanted
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-        sender.close()
-        receiver.close()
-
-
-def _start_worker(receiver: Connection) -> None:
-    """One thread, no Ctrl-C (the parent gets it and decides), and an end together with the parent."""
-    os.environ.update(D4ORM_NUM_THREADS="1", OMP_NUM_THREADS="1")
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    def follow_parent() -> None:
-        receiver.poll(None)
-        os._exit(1)
-
-    threading.Thread(target=follow_parent, daemon=True).start()
-
-
-def run_job(job: Job, store: TrialStore) -> None:
-    """Run the trials of a job one after another; a plan is made once and executed at every level of noise."""
     timed: _TimedPolicy | None = None
-    for key in job.keys:
-        trial = Trial(
-            **key._asdict(),
-            scenario=job.problem.name,
-            robots=job.problem.num_robots,
-            model="+".join(sorted(set(job.problem.team.models))),
-            versions=_versions(),
-        )
+    for noise in job.noise:
+        begin = time.perf_counter()
+        error, outcome = "", {}
         try:
-            timed = timed or _TimedPolicy(make_policy(job.policy, **job.settings))
-            trial = _run_trial(trial, timed, job.problem)
-        except Exception as error:  # whatever a policy raises is the result of its trial
-            trial = replace(trial, error=f"{type(error).__name__}: {' '.join(str(error).split())}")
-        store.add(trial)
+            timed = timed or _TimedPolicy(make_policy(job.policy.policy, **job.policy.settings))
+            outcome = _outcome(timed, job, noise)
+        except Exception as problem:
+            error = describe_error(problem)
+        versions, machine = _origin()
+        trial = replace(job.failed(noise, error), versions=versions, machine=machine, **outcome)
+        yield replace(trial, elapsed=time.perf_counter() - begin)
 
 
-def _run_trial(trial: Trial, policy: _TimedPolicy, problem: Problem) -> Trial:
-    env = navigation_v0.parallel_env(problem=problem, control_noise_std=trial.noise)
-    metrics = run_episode(env, policy, seed=trial.seed).metrics
+def describe_error(error: BaseException) -> str:
+    """Kind and message on one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+def _outcome(policy: _TimedPolicy, job: Job, noise: float) -> dict[str, Any]:
+    """Columns of a trial that runs to its end."""
+    problem = job.problem
+    env = navigation_v0.parallel_env(problem=problem, control_noise_std=noise)
+    episode = run_episode(env, policy, seed=job.seed)
     env.close()
-    return replace(
-        trial,
-        success=bool(metrics["success"]),
-        collided=int(metrics["collided"]),
-        arrived=int(metrics["arrived"]),
-        travel_time=metrics["travel_time"],
-        makespan=metrics["makespan"],
-        steps=int(metrics["steps"]),
-        wall_time=policy.wall_time,
-    )
+    # The judge looks at the whole horizon; an episode ends earlier when everyone has docked.
+    executed = episode.trajectory.controls
+    rest = np.zeros((problem.horizon - len(executed), *executed.shape[1:]), executed.dtype)
+    report = verify(problem, np.concatenate([executed, rest]))
+    metrics, plan = episode.metrics, policy.plan
+    return {
+        "success": bool(metrics["success"]),
+        "verified": report.ok,
+        "violation": "" if report.ok else str(report.violations[0]),
+        **{name: int(metrics[name]) for name in ("collided", "arrived", "steps")},
+        **{name: float(metrics[name]) for name in ("travel_time", "makespan", "reward", "mean_squared_jerk")},
+        "iterations": None if plan is None else plan.iterations,
+        "status": "" if plan is None else plan.status,
+        "history": "[]" if plan is None else compact_history(plan.history),
+        "wall_time": policy.wall_time,
+    }
+
+
+def compact_history(history: tuple[IterationRecord, ...]) -> str:
+    """The iterations of a solve after which the best plan was another, as :attr:`Trial.history` keeps them."""
+    moments: list[list[float]] = []
+    for record in history:
+        moment = [round(record.wall_time, 6), int(record.best_solved), float(f"{record.best_reward:.6g}")]
+        if not moments or moments[-1][1:] != moment[1:]:
+            moments.append(moment)
+    return json.dumps(moments, separators=(",", ":"))
 
 
 class _TimedPolicy(Policy):
@@ -149,6 +153,7 @@ class _TimedPolicy(Policy):
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
         self.wall_time = 0.0
+        self.plan: Plan | None = None
 
     def reset(self, env: Any, seed: int = 0) -> None:
         begin = time.perf_counter()
@@ -158,12 +163,12 @@ class _TimedPolicy(Policy):
             if plan.status == "interrupted":
                 raise KeyboardInterrupt  # half a solve says nothing about the planner
             self._policy.planner = None  # from now on it executes this plan
-            self.wall_time = plan.wall_time
+            self.plan, self.wall_time = plan, plan.wall_time
 
     def act(self, observations: dict[str, Any], state: Any) -> Actions:
         begin = time.perf_counter()
         actions = self._policy.act(observations, state)
-        if not isinstance(self._policy, OpenLoop):
+        if self.plan is None:
             self.wall_time += time.perf_counter() - begin
         return actions
 
@@ -171,11 +176,15 @@ class _TimedPolicy(Policy):
         raise NotImplementedError("act() asks the policy itself")
 
 
-def _versions() -> str:
+@cache
+def _origin() -> tuple[str, str]:
+    """Versions of the libraries, and the machine, as JSON."""
     installed = {}
     for name in LIBRARIES:
         try:
             installed[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             continue
-    return json.dumps(installed, sort_keys=True)
+    machine = describe_machine()
+    kept = {name: machine[name] for name in ("processor", "cores", "cores_used", "system", "python")}
+    return json.dumps(installed, sort_keys=True), json.dumps(kept, sort_keys=True)

@@ -1,0 +1,116 @@
+"""What to evaluate: configurations of policies, and problems by scenario, team size and seed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from d4orm_env.core.arrays import positive_number, whole_number
+from d4orm_env.core.problem import Problem
+from d4orm_env.scenarios import load_problem, make_problem
+from d4orm_planners.evaluation.trials import Configuration
+from d4orm_planners.registry import PLANNERS, make_policy
+
+Policies = str | Iterable[str] | Mapping[str, Mapping[str, Any]]
+
+
+def configurations(policies: Policies, time_limit: float | None = None) -> list[Configuration]:
+    """Policies with their settings, checked.
+
+    Args:
+        policies: A name, names, or settings by label. A label is the policy's name, unless the settings name another as
+            ``policy``.
+        time_limit: Seconds for planning, for every planner that has no ``time_limit`` among its settings.
+
+    Raises:
+        ValueError: For an unknown name or setting, no policy, or a time limit that concerns none of them.
+        ImportError: If a policy needs a library that is not installed.
+    """
+    if not isinstance(policies, Mapping):
+        policies = {name: {} for name in several(policies)}
+    chosen = []
+    for label, given in policies.items():
+        settings = dict(given)
+        policy = settings.pop("policy", label)
+        if time_limit is not None and policy in PLANNERS:
+            settings.setdefault("time_limit", positive_number(time_limit, "time_limit"))
+        make_policy(policy, **settings)
+        chosen.append(Configuration(label, policy, settings))
+    if not chosen:
+        raise ValueError("policies is empty; give at least one")
+    if time_limit is not None and not any(choice.policy in PLANNERS for choice in chosen):
+        raise ValueError(f"time_limit {time_limit:g} is for planners, and none of the policies is one; leave it out")
+    _check_distinct(chosen)
+    return chosen
+
+
+def _check_distinct(chosen: Sequence[Configuration]) -> None:
+    labels: dict[tuple[str, str], str] = {}
+    for choice in chosen:
+        other = labels.setdefault((choice.policy, choice.config), choice.label)
+        if other != choice.label:
+            raise ValueError(f"{other!r} and {choice.label!r} are one policy with the same settings; leave one out")
+
+
+def problems(
+    scenarios: str | os.PathLike[str] | Iterable[str | os.PathLike[str] | Problem],
+    sizes: Sequence[int | None],
+    seeds: Sequence[int],
+    model: str | None,
+) -> list[list[Problem]]:
+    """One list per scenario and team size, with a problem for every seed.
+
+    Args:
+        scenarios: Scenario names, YAML files (``.yaml``, ``.yml``) or problems; the latter two have a team of their own
+            and are the same for all seeds.
+        sizes: Team sizes for the names; ``None`` is the scenario's own.
+        seeds: Seeds of the scenarios.
+        model: Robot model for the names; ``None`` is the scenario's own.
+
+    Raises:
+        ValueError: For a scenario that cannot be made.
+    """
+    cells = []
+    named = False
+    for scenario in dict.fromkeys(several(scenarios)):
+        if isinstance(scenario, Problem):
+            cells.append([scenario] * len(seeds))
+        elif Path(scenario).suffix in (".yaml", ".yml"):
+            cells.append([_load(Path(scenario))] * len(seeds))
+        else:
+            named = True
+            for size in sizes:
+                cells.append([make_problem(str(scenario), num_robots=size, seed=seed, model=model) for seed in seeds])
+    if not cells:
+        raise ValueError("scenarios or num_robots is empty; give at least one of each")
+    if not named and (model is not None or any(size is not None for size in sizes)):
+        raise ValueError("num_robots and model do not go with scenario files; change them in the files")
+    return cells
+
+
+def _load(path: Path) -> Problem:
+    problem = load_problem(path)
+    # Two files that give no name are still told apart.
+    return problem.replace(name=path.stem) if problem.name == "custom" else problem
+
+
+def checked_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
+    """Seeds, each once.
+
+    Raises:
+        ValueError: If there are none, or they are no whole numbers from 0 up.
+    """
+    if not isinstance(seeds, Iterable):
+        raise ValueError(f"seeds is {seeds!r}; give the seeds themselves, as range(50)")
+    checked = tuple(dict.fromkeys(whole_number(seed, "seed", 0) for seed in seeds))
+    if not checked:
+        raise ValueError("seeds is empty; give at least one")
+    return checked
+
+
+def several(values: Any) -> tuple[Any, ...]:
+    """One value, or several."""
+    alone = isinstance(values, str | os.PathLike) or not isinstance(values, Iterable)
+    return (values,) if alone else tuple(values)

@@ -1,0 +1,166 @@
+"""Many trials in a few numbers: success rates, times, and success within a deadline."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from d4orm_env.core.arrays import positive_number
+from d4orm_planners.evaluation.statistics import mean_interval, wilson_interval
+from d4orm_planners.evaluation.store import Trial
+
+
+@dataclass(frozen=True)
+class SuccessRate:
+    """How often a policy succeeded at one level of noise, and how long it took. Intervals are those of 95% confidence.
+
+    Attributes:
+        label: What the policy with its settings was called.
+        policy: Registry name.
+        scenario: Scenario name.
+        robots: Team size.
+        model: Models of the team.
+        noise: Standard deviation of the execution noise, in the controls' units.
+        trials: Trials, those with an error included.
+        successes: Those in which everyone arrived in time and none was ever in contact.
+        verified: Those with whose executed controls :func:`d4orm_env.verify` found no fault.
+        contacts: Those in which robots touched something.
+        late: Those in which somebody did not arrive in time.
+        errors: Those that raised an error; they count as failures.
+        lower: Lower end of the interval of the success rate (Wilson).
+        upper: Upper end.
+        travel_time: Mean over the successes of the mean arrival time [s]; ``None`` without any.
+        travel_time_lower: Lower end of its interval (Student's t); ``None`` with fewer than two successes.
+        travel_time_upper: Upper end.
+        wall_time: Median seconds of planning, or of choosing all actions, in a trial; ``None`` if all raised errors.
+        compute: Mean seconds of planning, or of choosing actions, per second of motion, likewise.
+        compute_lower: Lower end of its interval (Student's t); ``None`` with fewer than two trials.
+        compute_upper: Upper end.
+        error: The first error.
+    """
+
+    label: str
+    policy: str
+    scenario: str
+    robots: int
+    model: str
+    noise: float
+    trials: int
+    successes: int
+    verified: int
+    contacts: int
+    late: int
+    errors: int
+    lower: float
+    upper: float
+    travel_time: float | None
+    travel_time_lower: float | None
+    travel_time_upper: float | None
+    wall_time: float | None
+    compute: float | None
+    compute_lower: float | None
+    compute_upper: float | None
+    error: str
+
+    @property
+    def rate(self) -> float:
+        return self.successes / self.trials
+
+
+@dataclass(frozen=True)
+class SuccessWithin:
+    """How many trials would have succeeded with so much time for planning.
+
+    Attributes:
+        deadline: The time [s].
+        trials: Trials, those with an error included.
+        successes: Those that succeeded within it.
+        lower: Lower end of the 95% confidence interval of the success rate (Wilson).
+        upper: Upper end.
+    """
+
+    deadline: float
+    trials: int
+    successes: int
+    lower: float
+    upper: float
+
+    @property
+    def rate(self) -> float:
+        return self.successes / self.trials
+
+
+def success_rate(trials: Sequence[Trial], label: str | None = None) -> SuccessRate:
+    """Sum up the trials, at least one, of one policy on one scenario, team size and level of noise.
+
+    Args:
+        trials: The trials.
+        label: What to call the policy; by default what the first trial calls it.
+    """
+    first, count = trials[0], len(trials)
+    successes = [trial for trial in trials if trial.success]
+    errors = [trial.error for trial in trials if trial.error]
+    lower, upper = wilson_interval(len(successes), count)
+    travel = mean_interval([trial.travel_time for trial in successes if trial.travel_time is not None])
+    timed = [(trial.wall_time, trial.steps * trial.dt) for trial in trials if trial.wall_time is not None]
+    compute = mean_interval([seconds / motion for seconds, motion in timed if motion > 0])
+    return SuccessRate(
+        label=first.label if label is None else label,
+        policy=first.policy,
+        scenario=first.scenario,
+        robots=first.robots,
+        model=first.model,
+        noise=first.noise,
+        trials=count,
+        successes=len(successes),
+        verified=sum(trial.verified is True for trial in trials),
+        contacts=sum(trial.collided > 0 for trial in trials),
+        late=sum(not trial.error and trial.arrived < trial.robots for trial in trials),
+        errors=len(errors),
+        lower=lower,
+        upper=upper,
+        travel_time=travel[0],
+        travel_time_lower=travel[1],
+        travel_time_upper=travel[2],
+        wall_time=float(np.median([seconds for seconds, _ in timed])) if timed else None,
+        compute=compute[0],
+        compute_lower=compute[1],
+        compute_upper=compute[2],
+        error=errors[0] if errors else "",
+    )
+
+
+def solved_after(trial: Trial) -> float | None:
+    """Seconds of planning after which the success of a trial was certain; ``None`` for a trial that failed.
+
+    For a plan that is the moment of the first solution. A policy that plans under way, and a plan that succeeded
+    although it was no solution (it came within the margin and touched nothing), need all the time that they took.
+    """
+    if not trial.success:
+        return None
+    solutions = (seconds for seconds, solved, _ in json.loads(trial.history) if solved)
+    return next(solutions, trial.wall_time)
+
+
+def success_by(trials: Iterable[Trial], deadline: float) -> SuccessWithin:
+    """How many trials would have succeeded, had planning been cut short; computed, not run again.
+
+    A trial with execution noise counts by the plan that was executed: exact unless the planner went on improving
+    (``improve=True``) after its first solution, which might have met the noise otherwise.
+
+    Args:
+        trials: Trials of one policy; those with an error count as failures.
+        deadline: Seconds for planning.
+
+    Raises:
+        ValueError: If there are no trials, or the deadline is not positive.
+    """
+    deadline = positive_number(deadline, "deadline")
+    moments = [solved_after(trial) for trial in trials]
+    if not moments:
+        raise ValueError("there are no trials; run some with evaluate()")
+    successes = sum(moment is not None and moment <= deadline for moment in moments)
+    return SuccessWithin(deadline, len(moments), successes, *wilson_interval(successes, len(moments)))
