@@ -7,8 +7,11 @@ Programming, 2006.
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import chain
+from threading import Event, current_thread, main_thread
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -92,6 +95,9 @@ class TeamProgram:
 
         Returns:
             The motion that IPOPT ended with, feasible or not, and its word for how it ended.
+
+        Raises:
+            KeyboardInterrupt: On Ctrl-C, which ends IPOPT's iteration.
         """
         ca = self.casadi
         rows = [*self._motion_rows(), *self._goal_rows(docks), *self._contact_rows(contacts, docks)]
@@ -104,16 +110,18 @@ class TeamProgram:
         options = {"print_level": 0, "sb": "yes", "constr_viol_tol": FEASIBILITY, **options}
         if time_limit is not None:
             options["max_wall_time"] = max(time_limit, 1e-3)
-        settings = {"ipopt": options, "print_time": False, "show_eval_warnings": False}
-        solver = ca.nlpsol("team", "ipopt", program, settings)
         lowest, highest = self._variable_bounds()
-        solution = solver(
-            x0=self._packed(guess),
-            lbx=lowest,
-            ubx=highest,
-            lbg=np.repeat([lower for _, lower, _ in rows], sizes),
-            ubg=np.repeat([upper for _, _, upper in rows], sizes),
-        )
+        with _ctrl_c_kept() as ctrl_c:
+            stopper = _stopper(ca, {name: part.numel() for name, part in program.items()}, ctrl_c)
+            settings = {"print_time": False, "show_eval_warnings": False, "iteration_callback": stopper}
+            solver = ca.nlpsol("team", "ipopt", program, {"ipopt": options, **settings})
+            solution = solver(
+                x0=self._packed(guess),
+                lbx=lowest,
+                ubx=highest,
+                lbg=np.repeat([lower for _, lower, _ in rows], sizes),
+                ubg=np.repeat([upper for _, _, upper in rows], sizes),
+            )
         values = np.asarray(solution["x"]).ravel()
         # IPOPT gives up where a function has no value; the guess is then the best there is.
         motion = self._unpacked(values) if np.isfinite(values).all() else guess
@@ -124,7 +132,8 @@ class TeamProgram:
         steps = np.arange(1, self.problem.horizon + 1)
         if lookout is None:
             return dict.fromkeys(self._encounters(), steps)
-        points = motion.states[1:, :, : self.problem.dimension].transpose(1, 2, 0)
+        states = motion.states[1:, :, : self.problem.dimension].transpose(1, 2, 0)
+        points = [self.casadi.DM(own) for own in states]
         found = {}
         for robot, body in self._encounters():
             near = steps[np.asarray(self._gap(robot, body, points)).ravel() < self._reach(robot, body) + lookout]
@@ -134,8 +143,7 @@ class TeamProgram:
 
     def _encounters(self) -> Iterator[tuple[int, int]]:
         bodies = self.problem.num_robots + len(self.obstacles)
-        return ((robot, body) for robot in range(self.problem.num_robots) for body in range(robot + 1, bodies)
-                if body > robot)  # fmt: skip
+        return ((robot, body) for robot in range(self.problem.num_robots) for body in range(robot + 1, bodies))
 
     def _gap(self, robot: int, body: int, places: Any) -> Any:
         """Distance from a robot's centre to another's, or to an obstacle's surface [m], at every column of places."""
@@ -223,12 +231,10 @@ class TeamProgram:
         problem = self.problem
         radius = problem.goal_radius - min(self.clearance, problem.goal_radius / 2)
         for robot, dock in enumerate(docks):
-            if dock == 0:
-                continue
             yield self._squared_goal_distance(robot)[dock - 1], -np.inf, radius**2
             if problem.goal_speed is not None:
-                x, u = (self.casadi.vertsplit(values[:, dock - 1]) for values in (self.states[robot], self.controls[robot]))  # fmt: skip
-                velocity = self.models[robot].functions.velocity(x, u, self.ops)
+                variables = self.states[robot][:, dock - 1], self.controls[robot][:, dock - 1]
+                velocity = self.models[robot].functions.velocity(*map(self.casadi.vertsplit, variables), self.ops)
                 yield sum(part**2 for part in velocity), -np.inf, problem.goal_speed**2
 
     def _contact_rows(self, contacts: Contacts, docks: Any) -> Iterator[Rows]:
@@ -275,6 +281,47 @@ class TeamProgram:
             own = parts[problem.num_robots + robot].reshape(problem.horizon, -1)
             controls[:, robot, : model.control_size] = own
         return Motion(states, controls)
+
+
+@contextmanager
+def _ctrl_c_kept() -> Iterator[Event]:
+    """Keep Ctrl-C for the end of the block; the event tells that it came.
+
+    CasADi takes the exception of a Ctrl-C for a function that has no value, and goes on.
+    """
+    came, former = Event(), signal.getsignal(signal.SIGINT)
+    if current_thread() is not main_thread() or not callable(former):
+        yield came
+        return
+    signal.signal(signal.SIGINT, lambda *_: came.set())
+    try:
+        yield came
+    finally:
+        signal.signal(signal.SIGINT, former)
+    if came.is_set():
+        former(signal.SIGINT, None)
+
+
+def _stopper(casadi: Any, sizes: dict[str, int], stop: Event) -> Any:
+    """What IPOPT calls after every iteration of a program of these sizes, and what ends it once ``stop`` is set."""
+
+    class Stopper(casadi.Callback):
+        def __init__(self) -> None:
+            casadi.Callback.__init__(self)
+            self.construct("stopper", {})
+
+        def get_n_in(self) -> int:
+            return casadi.nlpsol_n_out()
+
+        def get_sparsity_in(self, index: int) -> Any:
+            size = sizes.get(casadi.nlpsol_out(index).removeprefix("lam_"), 0)
+            return casadi.Sparsity.dense(size, min(size, 1))
+
+        def eval(self, arguments: Any) -> list[int]:
+            del arguments
+            return [int(stop.is_set())]
+
+    return Stopper()
 
 
 def load_casadi() -> Any:

@@ -85,14 +85,13 @@ class Ipopt(Planner):
         program: TeamProgram = search.memory["program"]
         motion = self._perturbed(search)
         contacts = program.contacts(motion, config.lookout)
-        # Robots that start at their goals are docked there.
-        docks = np.where(search.current.trajectory.arrived[0], 0, problem.horizon)
+        docks = np.full(problem.num_robots, problem.horizon)
         best, note, options = None, "", self._options()
         for _ in range(config.rounds):
             if best is not None and search.time_left == 0:
                 break
             motion, note = program.solve(motion, contacts, docks, options, search.time_left)
-            candidate = evaluate_controls(search.engine, problem, motion.controls)
+            candidate = evaluate_controls(search.engine, problem, motion.controls.astype(np.float32))
             if best is None or candidate.rank > best.rank:
                 best = candidate
             former, contacts = contacts, _union(contacts, program.contacts(motion, config.lookout))
