@@ -12,6 +12,9 @@ from d4orm_planners.base import Candidate, Iteration, Planner, PlannerConfig, Se
 from d4orm_planners.collocation import Contacts, Motion, TeamProgram, load_casadi
 from d4orm_planners.steering import straight_drives
 
+FOUND = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+"""IPOPT's words for a solution of the program."""
+
 NEARLY_SOLVED = 1e-2
 """IPOPT's first barrier parameter in a round that begins where the last one ended."""
 
@@ -96,19 +99,16 @@ class Ipopt(Planner):
                 best = candidate
             former, contacts = contacts, _union(contacts, program.contacts(motion, config.lookout))
             standing, docks = docks, _docks(candidate)
-            if best.solved or (_size(contacts) == _size(former) and (docks == standing).all()):
+            # More constraints do not mend what is infeasible as it is; another start may.
+            if best.solved or note not in FOUND or (_size(contacts) == _size(former) and (docks == standing).all()):
                 break
-            options = self._options(barrier=min(NEARLY_SOLVED, config.barrier))
+            options["mu_init"] = min(NEARLY_SOLVED, config.barrier)
         assert best is not None
         return Iteration(best.controls, 0, note=note)
 
-    def _options(self, **changes: Any) -> dict[str, Any]:
+    def _options(self) -> dict[str, Any]:
         config = self.config
-        return {
-            "tol": config.tolerance,
-            "max_iter": config.solver_iterations,
-            "mu_init": changes.get("barrier", config.barrier),
-        }
+        return {"tol": config.tolerance, "max_iter": config.solver_iterations, "mu_init": config.barrier}
 
     def _warm_start(self, search: Search) -> Motion:
         """The controls that the search was given, or else the solution of the program without collisions."""
