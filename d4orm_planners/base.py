@@ -111,11 +111,13 @@ class Iteration:
         controls: ``(H, K, m)`` the new candidate.
         denoising_steps: Sample-score-update steps spent.
         excluded: Samples left out because their reward was not finite.
+        note: What the method itself says of how the iteration ended, where it has a word for it.
     """
 
     controls: FloatArray
     denoising_steps: int
     excluded: int = 0
+    note: str = ""
 
 
 class Planner(ABC):
@@ -151,7 +153,7 @@ class Planner(ABC):
         Args:
             problem: What to solve.
             seed: Non-negative seed; the same seed gives the same plan.
-            time_limit: Seconds, compilation not counted; checked before every iteration.
+            time_limit: Seconds, compilation not counted; checked before every iteration, and by IPOPT within.
             max_iterations: Iterations; the configured number by default.
             callback: Called with an :class:`IterationRecord` after every iteration; returning ``True`` stops.
             initial_controls: ``(H, K, m)`` to start from, zeros by default.
@@ -168,6 +170,7 @@ class Planner(ABC):
             self.config.max_iterations if max_iterations is None else whole_number(max_iterations, "max_iterations", 1)
         )
         search = Search(self, problem, seed, initial_controls)
+        search.time_limit = time_limit
         status = "iteration_limit"
         try:
             while True:
@@ -176,7 +179,7 @@ class Planner(ABC):
                     break
                 if search.iteration >= limit:
                     break
-                if time_limit is not None and search.watch.elapsed >= time_limit:
+                if search.time_left == 0:
                     status = "time_limit"
                     break
                 record = search.advance()
@@ -203,6 +206,7 @@ class Search:
         best: The best candidate so far.
         iteration: Iterations done.
         memory: What a planner keeps between its own iterations.
+        time_limit: Seconds that the solve may take, or ``None``.
     """
 
     def __init__(
@@ -229,6 +233,12 @@ class Search:
         self.denoising_steps = 0
         self.history: list[IterationRecord] = []
         self.memory: dict[str, Any] = {}
+        self.time_limit: float | None = None
+
+    @property
+    def time_left(self) -> float | None:
+        """Seconds left, zero when they are used up; ``None`` without a limit."""
+        return None if self.time_limit is None else max(self.time_limit - self.watch.elapsed, 0.0)
 
     def iteration_seed(self, stream: int = 0) -> int:
         """A seed for one denoising run of the present iteration."""
@@ -256,6 +266,7 @@ class Search:
             best_reward=float(self.best.trajectory.rewards.mean()),
             best_solved=self.best.solved,
             excluded=iteration.excluded,
+            note=iteration.note,
         )
         self.history.append(record)
         return record

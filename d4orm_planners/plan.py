@@ -36,6 +36,7 @@ class IterationRecord:
         best_reward: Mean reward of the best candidate so far.
         best_solved: Whether that one is a solution.
         excluded: Samples of this iteration that were left out because their reward was not finite.
+        note: What the method itself says of how the iteration ended; ``ipopt`` has IPOPT's return status here.
     """
 
     iteration: int
@@ -49,6 +50,7 @@ class IterationRecord:
     best_reward: float
     best_solved: bool
     excluded: int = 0
+    note: str = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,8 @@ CHEAP = {
     "repair_samples": 64,
     "repair_steps": 5,
     "refine": "sync",
+    "rounds": 2,
+    "solver_iterations": 60,
 }
 """Settings that plan in no time, badly, and the same every time."""
 

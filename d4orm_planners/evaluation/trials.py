@@ -22,7 +22,7 @@ from d4orm_planners.plan import IterationRecord, Plan
 from d4orm_planners.policy import Actions, OpenLoop, Policy
 from d4orm_planners.registry import make_policy, policy_settings
 
-LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "pyrvo")
+LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "pyrvo", "casadi")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,144 @@
+"""Numerical optimisation with IPOPT: the rival of the paper's section IV-B."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from d4orm_env.core.arrays import positive_number, whole_number
+from d4orm_planners.base import Candidate, Iteration, Planner, PlannerConfig, Search, evaluate_controls
+from d4orm_planners.collocation import Contacts, Motion, TeamProgram, load_casadi
+from d4orm_planners.steering import straight_drives
+
+FOUND = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+"""IPOPT's words for a solution of the program."""
+
+NEARLY_SOLVED = 1e-2
+"""IPOPT's first barrier parameter in a round that begins where the last one ended."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class IpoptConfig(PlannerConfig):
+    """Settings of :class:`Ipopt`.
+
+    Attributes:
+        max_iterations: Perturbed restarts after which :meth:`Planner.solve` gives up.
+        perturbation: Standard deviation of the noise on the warm start's states and controls, in SI units.
+        lookout: Robots are kept clear of what came nearer than this in the last solution, the margin not counted [m];
+            ``None`` keeps them clear of everything at every step, as in the paper.
+        rounds: Solves per restart. As long as the rollout does not keep the margin, the next one begins where the last
+            one ended; what came near is minded too, and robots stand where they docked. The paper solves once.
+        clearance: Added to every distance to keep, for what rounding and tolerances take away [m].
+        tolerance: IPOPT's, on the scaled optimality error.
+        barrier: IPOPT's first barrier parameter.
+        solver_iterations: IPOPT's own iterations in each solve.
+
+    Raises:
+        ValueError: If a value makes no sense; the message names it.
+    """
+
+    max_iterations: int = 20
+    perturbation: float = 0.1
+    lookout: float | None = 0.5
+    rounds: int = 8
+    clearance: float = 2e-3
+    tolerance: float = 1e-3
+    barrier: float = 1.0
+    solver_iterations: int = 1000
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        positive_number(self.perturbation, "perturbation", zero_allowed=True)
+        positive_number(self.clearance, "clearance", zero_allowed=True)
+        if self.lookout is not None:
+            positive_number(self.lookout, "lookout", zero_allowed=True)
+        for name in ("tolerance", "barrier"):
+            positive_number(getattr(self, name), name)
+        for name in ("rounds", "solver_iterations"):
+            whole_number(getattr(self, name), name, 1)
+
+
+class Ipopt(Planner):
+    """Direct collocation of the whole team, solved by IPOPT: without collisions first, then, perturbed, with them.
+
+    Maximises the other planners' reward (paper, section III-D) under Eq. 1. Every iteration is another perturbation of
+    the same warm start, or of the initial controls where there are any.
+
+    Raises:
+        ImportError: If CasADi is not installed.
+    """
+
+    name: ClassVar[str] = "ipopt"
+    config_class = IpoptConfig
+    presets: ClassVar[dict[str, dict[str, Any]]] = {"paper": {"lookout": None, "rounds": 1}}
+    config: IpoptConfig
+
+    def __init__(self, config: IpoptConfig) -> None:
+        super().__init__(config)
+        load_casadi()
+
+    def iterate(self, search: Search) -> Iteration:
+        """See :meth:`Planner.iterate`: one perturbed restart."""
+        config, problem = self.config, search.problem
+        if search.iteration == 0:
+            search.memory["program"] = TeamProgram(problem, config.clearance)
+            search.memory["warm_start"] = self._warm_start(search)
+        program: TeamProgram = search.memory["program"]
+        motion = self._perturbed(search)
+        contacts = program.contacts(motion, config.lookout)
+        docks = np.full(problem.num_robots, problem.horizon)
+        best, note, options = None, "", self._options()
+        for _ in range(config.rounds):
+            if best is not None and search.time_left == 0:
+                break
+            motion, note = program.solve(motion, contacts, docks, options, search.time_left)
+            candidate = evaluate_controls(search.engine, problem, motion.controls.astype(np.float32))
+            if best is None or candidate.rank > best.rank:
+                best = candidate
+            former, contacts = contacts, _union(contacts, program.contacts(motion, config.lookout))
+            standing, docks = docks, _docks(candidate)
+            # More constraints do not mend what is infeasible as it is; another start may.
+            if best.solved or note not in FOUND or (_size(contacts) == _size(former) and (docks == standing).all()):
+                break
+            options["mu_init"] = min(NEARLY_SOLVED, config.barrier)
+        assert best is not None
+        return Iteration(best.controls, 0, note=note)
+
+    def _options(self) -> dict[str, Any]:
+        config = self.config
+        return {"tol": config.tolerance, "max_iter": config.solver_iterations, "mu_init": config.barrier}
+
+    def _warm_start(self, search: Search) -> Motion:
+        """The controls that the search was given, or else the solution of the program without collisions."""
+        if search.current.controls.any():
+            return _motion(search.current)
+        problem = search.problem
+        straight = evaluate_controls(search.engine, problem, straight_drives(problem).controls[:, :, 0])
+        docks = np.full(problem.num_robots, problem.horizon)
+        program: TeamProgram = search.memory["program"]
+        return program.solve(_motion(straight), {}, docks, self._options(), search.time_left)[0]
+
+    def _perturbed(self, search: Search) -> Motion:
+        random = np.random.default_rng(search.iteration_seed())
+        warm_start: Motion = search.memory["warm_start"]
+        return Motion(*(part + self.config.perturbation * random.standard_normal(part.shape) for part in warm_start))
+
+
+def _motion(candidate: Candidate) -> Motion:
+    return Motion(candidate.trajectory.states.astype(float), candidate.controls.astype(float))
+
+
+def _docks(candidate: Candidate) -> np.ndarray:
+    """``(K,)`` steps at which the robots docked; the horizon for those that did not."""
+    arrived = candidate.trajectory.arrived
+    return np.where(arrived[-1], arrived.argmax(axis=0), len(arrived) - 1)
+
+
+def _union(contacts: Contacts, more: Contacts) -> Contacts:
+    return {key: np.union1d(contacts.get(key, []), more.get(key, [])).astype(int) for key in contacts.keys() | more}
+
+
+def _size(contacts: Contacts) -> int:
+    return sum(map(len, contacts.values()))
