@@ -20,6 +20,7 @@ from d4orm_env.scenarios import make_problem
 from d4orm_env.wrappers import GaussianControlNoise
 from d4orm_planners import OpenLoop, Plan, Policy, list_planners, list_policies, make_policy, run_episode
 from d4orm_planners.registry import PLANNERS, POLICIES, describe_policy
+from d4orm_planners.rl.learned import LearnedPolicy
 
 ALL = pytest.mark.parametrize("name", list_policies())
 
@@ -52,7 +53,9 @@ ENVIRONMENTS = pytest.mark.parametrize(
 @ENVIRONMENTS
 def test_actions_are_those_of_the_live_agents_and_in_their_spaces(name: str, make_env: Any) -> None:
     # Robots that arrive early, and models whose controls are padded to the team's.
-    team = Team(("velocity2d", "differential_drive", "holonomic2d"), max_speed=[1, 1, 2], max_acceleration=[1, 2, 1])
+    learned = isinstance(cheap_policy(name), LearnedPolicy)  # for robots of one model
+    models = ("holonomic2d",) * 3 if learned else ("velocity2d", "differential_drive", "holonomic2d")
+    team = Team(models, max_speed=[1, 1, 2], max_acceleration=[1, 2, 1])
     start = np.zeros((3, 4))
     start[:, 1] = [0, 1, 2]
     env = make_env(problem=Problem(team, start, start[:, :2] + np.array([[0.3], [0.6], [3.0]]) * [1, 0], horizon=25))
@@ -125,13 +128,13 @@ def test_a_policy_acts_in_turns_too(name: str) -> None:
     policy.reset(env, seed=2)
     states, controls = [env.state()], None
     for agent in env.agent_iter():
-        observation, _, terminated, truncated, _ = env.last()
+        _, _, terminated, truncated, _ = env.last()
         if terminated or truncated:
             env.step(None)
             continue
         if agent == env.agents[0]:
             # One round: nobody moves before the last has chosen.
-            controls = policy.act(dict.fromkeys(env.agents, observation), env.state())
+            controls = policy.act({other: env.observe(other) for other in env.agents}, env.state())
         assert controls is not None
         env.step(controls[agent])
         if not np.array_equal(states[-1], env.state()):

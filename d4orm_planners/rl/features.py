@@ -105,10 +105,14 @@ class Features:
             limits: ``(N, m)`` largest controls.
 
         Returns:
-            ``(N, m)`` controls in physical units.
+            ``(N, m)`` controls in physical units, within the limits: as a vector where controls are vectors.
         """
         controls = np.clip(actions, -1, 1) * limits
-        return _out_of(frames, controls) if self.turned else controls
+        if self.turned:
+            norm = np.linalg.norm(controls, axis=1, keepdims=True)
+            controls = _out_of(frames, controls * np.minimum(1, limits / np.maximum(norm, 1e-6)))
+        within: FloatArray = np.clip(controls, -limits, limits)
+        return within
 
     def _neighbors(self, frame: FloatArray, seen: FloatArray, radius: FloatArray, max_speed: FloatArray) -> FloatArray:
         d = self.dimension

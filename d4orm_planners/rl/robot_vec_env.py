@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -61,6 +62,7 @@ class RobotVecEnv(VecEnv):
     Attributes:
         acted: ``(B * K,)`` bool: which robots acted in the last step.
         finished: ``(world, success, travel_time)`` of the worlds that ended in the last step.
+        seconds: Time spent stepping so far.
 
     Raises:
         ValueError: For a bad argument, or a team of mixed models.
@@ -95,6 +97,7 @@ class RobotVecEnv(VecEnv):
         self._seed: int | None = seed
         self.acted = np.ones(count, np.bool_)
         self.finished: list[tuple[int, bool, float]] = []
+        self.seconds = 0.0
         bound = np.full(self.features.size, 10, np.float32)
         m = problem.control_size
         super().__init__(count, Box(-bound, bound), Box(-np.ones(m, np.float32), np.ones(m, np.float32)))
@@ -114,6 +117,7 @@ class RobotVecEnv(VecEnv):
         self._actions = np.asarray(actions, np.float32)
 
     def step_wait(self) -> tuple[FloatArray, FloatArray, BoolArray, list[dict[str, Any]]]:
+        begin = time.perf_counter()
         controls = self.features.decode(self._actions, self._frames, self._limits)
         observations, _, terminated, truncated, infos = self._env.step(controls.reshape(self._shape[0], -1))
         ended, acting = terminated | truncated, self._acting
@@ -135,6 +139,7 @@ class RobotVecEnv(VecEnv):
         robot_infos = self._robot_infos(dones, acting, now["arrived"], ended, observations, infos)
         for values in (self._touched, self._return, self._length):
             values[dones] = 0
+        self.seconds += time.perf_counter() - begin
         return features, rewards.ravel().astype(np.float32), dones.ravel(), robot_infos
 
     def _rewards(self, now: dict[str, Any]) -> FloatArray:

@@ -164,7 +164,15 @@ class _Run:
         self._algorithm.set_learning_rate(self._model, 1 - done / self._total)
         watch = _Watch(lambda steps: self._progress(_describe(lesson, self.evaluations), done + steps, self._total))
         self._model.learn(lesson.steps, callback=watch, reset_num_timesteps=False)
-        evaluation = self._evaluate(index, done + lesson.steps, time.perf_counter() - begin, normalized)
+        seconds = time.perf_counter() - begin
+        network = network_of(self._header(index), self._model, normalized)
+        evaluation = Evaluation(
+            done + lesson.steps, lesson.robots, lesson.scenario,
+            *evaluate_network(network, self._validation, _VALIDATION_SEED), seconds, robots.seconds / seconds,
+        )  # fmt: skip
+        best = _best(self.evaluations)
+        if best is None or evaluation.rank >= best.rank:
+            network.save(self._checkpoints.policy_path)
         self.evaluations = [*self.evaluations, evaluation]
         self._checkpoint = self._checkpoints.save(index, self._model, normalized, self.evaluations)
         write_curve(self._out, self.evaluations)
@@ -194,15 +202,6 @@ class _Run:
         if self._checkpoint is not None:
             self._checkpoint.restore(env, model if fresh else None)
         return model
-
-    def _evaluate(self, index: int, steps: int, seconds: float, normalization: VecNormalize) -> Evaluation:
-        """How the policy does now; it is kept if none did better."""
-        network = network_of(self._header(index), self._model, normalization)
-        evaluation = evaluate_network(network, self._validation, _VALIDATION_SEED, steps, self.lessons[index], seconds)
-        best = _best(self.evaluations)
-        if best is None or evaluation.rank >= best.rank:
-            network.save(self._checkpoints.policy_path)
-        return evaluation
 
     def _header(self, index: int) -> dict[str, Any]:
         features, problem = self._validation.features, self._validation.problem
