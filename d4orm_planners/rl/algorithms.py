@@ -78,15 +78,19 @@ class _PPO(Algorithm):
 class _SAC(Algorithm):
     num_envs = 64
     steps_per_update = 1
+    learning_rate = 1e-3
 
     def make(self, env: VecNormalize) -> Any:
         return stable_baselines3.SAC(
             "MlpPolicy",
             env,
             learning_rate=self.learning_rate,
+            # Little entropy from the beginning: what is paid for at first stays in the values for long.
+            ent_coef="auto_0.05",
+            tau=0.02,
             buffer_size=300_000,
             learning_starts=50 * env.num_envs,
-            batch_size=512,
+            batch_size=256,
             train_freq=self.steps_per_update,
             gradient_steps=4,
             gamma=self.gamma,

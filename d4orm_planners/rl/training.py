@@ -120,24 +120,17 @@ def train(
         ValueError: For settings that make no sense, or other settings than those of the training in ``out``.
         OSError: If the folder cannot be used.
     """
-    out = Path(out)
-    checkpoints = Checkpoints(out, asdict(settings))
-    run = _Run(settings, out, checkpoints, progress or (lambda what, done, total: None), command)
+    run = _Run(settings, Path(out), progress or (lambda what, done, total: None), command)
     for index in range(len(run.evaluations), len(run.lessons)):
         run.learn(index)
-    best = _best(run.evaluations)
-    assert best is not None
-    return TrainingResult(checkpoints.policy(), tuple(run.evaluations), checkpoints.policy_path)
+    return TrainingResult(run.checkpoints.policy(), tuple(run.evaluations), run.checkpoints.policy_path)
 
 
 class _Run:
     """A training under way."""
 
-    def __init__(
-        self, settings: TrainingSettings, out: Path, checkpoints: Checkpoints, progress: Progress, command: str
-    ) -> None:
-        self.settings, self._out, self._checkpoints, self._progress = settings, out, checkpoints, progress
-        self._command = command
+    def __init__(self, settings: TrainingSettings, out: Path, progress: Progress, command: str) -> None:
+        self.settings, self._out, self._progress, self._command = settings, out, progress, command
         self._algorithm: Algorithm = ALGORITHMS[settings.algorithm]
         unit = settings.batch * self._algorithm.steps_per_update
         self.lessons = make_lessons(
@@ -145,11 +138,13 @@ class _Run:
         )
         self._total = sum(lesson.steps for lesson in self.lessons)
         self._model: Any = None
-        self._checkpoint = checkpoints.latest()
-        self.evaluations: list[Evaluation] = [] if self._checkpoint is None else self._checkpoint.evaluations
+        # First of all, because it refuses what cannot be learned, and nothing is to be written then.
         self._validation = self._worlds(
             Lesson(settings.robots, settings.scenario, 0), _VALIDATION_SEED, validation=True
         )
+        self.checkpoints = Checkpoints(out, asdict(settings))
+        self._checkpoint = self.checkpoints.latest()
+        self.evaluations: list[Evaluation] = [] if self._checkpoint is None else self._checkpoint.evaluations
 
     def learn(self, index: int) -> None:
         """One lesson, its evaluation and its checkpoint."""
@@ -172,9 +167,9 @@ class _Run:
         )  # fmt: skip
         best = _best(self.evaluations)
         if best is None or evaluation.rank >= best.rank:
-            network.save(self._checkpoints.policy_path)
+            network.save(self.checkpoints.policy_path)
         self.evaluations = [*self.evaluations, evaluation]
-        self._checkpoint = self._checkpoints.save(index, self._model, normalized, self.evaluations)
+        self._checkpoint = self.checkpoints.save(index, self._model, normalized, self.evaluations)
         write_curve(self._out, self.evaluations)
         robots.close()
 
