@@ -102,10 +102,11 @@ class Network:
             ValueError: If the name does not end in ``.safetensors``.
             OSError: If it cannot be written.
         """
-        from safetensors.numpy import save_file
+        from safetensors.numpy import save
 
         with replaced_when_done(Path(path), (SUFFIX,)) as temporary:
-            save_file(dict(self.arrays), temporary, metadata={"d4orm": self.header.model_dump_json()})
+            # As bytes, because the library's own files are for the owner's eyes only.
+            temporary.write_bytes(save(dict(self.arrays), metadata={"d4orm": self.header.model_dump_json()}))
 
 
 def load_network(path: str | Path) -> Network:
