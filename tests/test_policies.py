@@ -432,3 +432,17 @@ def test_driving_to_the_goal_goes_on_in_lifelong_mode() -> None:
 def test_acting_before_the_reset_says_what_to_do(name: str) -> None:
     with pytest.raises(RuntimeError, match=r"call reset\(env\) before act"):
         make_policy(name).act({}, np.zeros(1, np.float32))
+
+
+# The policies that come with the package.
+
+
+@pytest.mark.parametrize("name", ["ppo", "sac"])
+def test_a_shipped_policy_solves_random_instances_that_driving_straight_does_not(name: str) -> None:
+    env = navigation_v0.parallel_env(scenario="random", num_robots=4, randomize_instance=True)
+    learned, straight = (
+        sum(bool(run_episode(env, make_policy(policy), seed=seed).metrics["success"]) for seed in range(12))
+        for policy in (name, "goal")
+    )
+    assert learned >= 7
+    assert learned > straight

@@ -35,7 +35,7 @@ class TrainingReward:
     progress: float = 0.3
     arrival: float = 5.0
     margin: float = 1.0
-    contact: float = 5.0
+    contact: float = 3.0
     time: float = 0.05
 
 
