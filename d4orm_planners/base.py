@@ -28,19 +28,31 @@ class Stopwatch:
     def __init__(self) -> None:
         self._start = time.perf_counter()
         self._paused = 0.0
+        self._paused_since: float | None = None
 
     @property
     def elapsed(self) -> float:
         """Seconds so far."""
         return time.perf_counter() - self._start - self._paused
 
+    @property
+    def paused_seconds(self) -> float:
+        """Seconds left out so far, those of a pause that lasts included; other threads may look."""
+        since = self._paused_since
+        return self._paused if since is None else self._paused + time.perf_counter() - since
+
+    def leave_out(self, seconds: float) -> None:
+        """Leave out some seconds of the time so far."""
+        self._paused += seconds
+
     @contextmanager
     def paused(self) -> Iterator[None]:
         """Leave the time of the block out."""
-        begin = time.perf_counter()
+        begin = self._paused_since = time.perf_counter()
         try:
             yield
         finally:
+            self._paused_since = None
             self._paused += time.perf_counter() - begin
 
 
@@ -139,6 +151,9 @@ class Planner(ABC):
     def iterate(self, search: Search) -> Iteration:
         """One iteration from the search's current candidate to the next."""
 
+    def finish(self, search: Search) -> None:  # noqa: B027 - a hook that most planners need not fill
+        """Let go of what the iterations left open in ``search.memory``; called however a solve ends."""
+
     def solve(
         self,
         problem: Problem,
@@ -191,6 +206,8 @@ class Planner(ABC):
                         break
         except KeyboardInterrupt:
             status = "interrupted"
+        finally:
+            self.finish(search)
         return search.plan(status)
 
 
