@@ -124,12 +124,14 @@ class Iteration:
         denoising_steps: Sample-score-update steps spent.
         excluded: Samples left out because their reward was not finite.
         note: What the method itself says of how the iteration ended, where it has a word for it.
+        judged: What :func:`evaluate_controls` made of these controls, if the iteration asked; else the loop does.
     """
 
     controls: FloatArray
     denoising_steps: int
     excluded: int = 0
     note: str = ""
+    judged: Candidate | None = None
 
 
 class Planner(ABC):
@@ -265,7 +267,7 @@ class Search:
     def advance(self) -> IterationRecord:
         """Run one iteration, judge it and remember the best."""
         iteration = self.planner.iterate(self)
-        self.current = evaluate_controls(self.engine, self.problem, iteration.controls)
+        self.current = iteration.judged or evaluate_controls(self.engine, self.problem, iteration.controls)
         self.iteration += 1
         self.denoising_steps += iteration.denoising_steps
         if self.current.rank > self.best.rank:

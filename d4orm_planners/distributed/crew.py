@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -19,13 +20,17 @@ GLANCE = 0.05
 """Seconds between looks at whether the nodes still live, while nothing arrives."""
 
 
+LAST_WAIT = 30.0
+"""Seconds that the end of the process waits for a thread that nobody else waited for: native code must not be cut."""
+
+
 class _Job:
     """Work of a node in a thread of its own; an exception is kept instead of lost."""
 
     def __init__(self, node: Node, work: Callable[[Node], None]) -> None:
         self.node = node
         self.error: Exception | None = None
-        # A node that hangs must not keep the process from ending.
+        # A node that hangs must not keep the process from ending for ever.
         self.thread = threading.Thread(target=self._run, args=(work,), daemon=True, name=f"d-d4orm-{node.number}")
         self.thread.start()
 
@@ -34,6 +39,11 @@ class _Job:
             work(self.node)
         except Exception as error:  # whatever it is, it concerns this node only
             self.error = error
+
+    def leave(self) -> None:
+        """Wait for it no longer."""
+        if self.thread.is_alive():
+            atexit.register(self.thread.join, LAST_WAIT)
 
 
 class Crew(ABC):
@@ -50,6 +60,7 @@ class Crew(ABC):
         self.patience = patience
         self._nodes = tuple(nodes)
         self._transports = tuple(transports)
+        self._jobs: list[_Job] = []
         self._notes: list[str] = []
         self._error: Exception | None = None
         self._told: Counter[str] = Counter()
@@ -73,7 +84,7 @@ class Crew(ABC):
                 return None
             return search.time_limit - search.watch.elapsed + compiling()
 
-        candidates = self._round(time_left)
+        candidates = self._round(time_left, search.planner.config.improve)
         search.watch.leave_out(compiling())
         if not candidates and not self.alive:
             self._check_alive()
@@ -81,13 +92,23 @@ class Crew(ABC):
         return self._iteration(best)
 
     def close(self) -> None:
-        """Part the nodes; what a thread is at it may end, but nobody waits long for it."""
+        """Part the nodes. A thread may end what it is at, but nobody waits longer for it than patience."""
         for transport in self._transports:
             transport.close()
+        deadline = time.perf_counter() + self.patience
+        for job in self._jobs:
+            if job.node in self.alive:
+                job.thread.join(max(deadline - time.perf_counter(), 0))
+            job.leave()
 
     @abstractmethod
-    def _round(self, time_left: Callable[[], float | None]) -> list[Candidate]:
-        """New candidates of the nodes. ``time_left`` tells the seconds left, below zero when overdue."""
+    def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
+        """New candidates of the nodes.
+
+        Args:
+            time_left: Tells the seconds left, below zero when overdue.
+            improve: Whether nodes go on once there is a solution.
+        """
 
     def _lose(self, job: _Job, reason: str) -> None:
         self.alive.remove(job.node)
@@ -113,7 +134,7 @@ class Crew(ABC):
             faults["false claim"] += node.inbox.false_claims
         new = faults - self._told
         notes = self._notes + [f"received {count} x {kind}" for kind, count in sorted(new.items())]
-        iteration = Iteration(best.controls, steps - self._spent, excluded - self._excluded, "; ".join(notes))
+        iteration = Iteration(best.controls, steps - self._spent, excluded - self._excluded, "; ".join(notes), best)
         self._spent, self._excluded, self._told, self._notes = steps, excluded, faults, []
         return iteration
 
@@ -121,21 +142,25 @@ class Crew(ABC):
 class SyncCrew(Crew):
     """Rounds: all nodes refine, then all of them exchange. The same seed gives the same rounds."""
 
-    def _round(self, time_left: Callable[[], float | None]) -> list[Candidate]:
+    def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
         """See :meth:`Crew._round`."""
         self._all(Node.refine, time_left)
         candidates = [node.candidate for node in self.alive]
-        self._all(Node.exchange, time_left)
+        # Judging what others claim to be solutions takes its time, and after the first one nobody goes on from it.
+        if improve or not any(candidate.solved for candidate in candidates):
+            self._all(Node.exchange, time_left)
         return candidates
 
     def _all(self, work: Callable[[Node], None], time_left: Callable[[], float | None]) -> None:
-        for job in [_Job(node, work) for node in self.alive]:
+        self._jobs = [_Job(node, work) for node in self.alive]
+        for job in self._jobs:
             while job.thread.is_alive():
                 left = time_left()
                 if left is not None and left + self.patience <= 0:
                     break
                 job.thread.join(None if left is None else left + self.patience)
             if job.thread.is_alive():
+                job.leave()
                 self._lose(job, "did not finish in time")
             elif job.error is not None:
                 self._lose_failed(job)
@@ -157,20 +182,15 @@ class AsyncCrew(Crew):
         super().__init__(nodes, transports, patience)
         self._observer = observer
         self._stop = threading.Event()
-        self._jobs: list[_Job] = []
 
     def close(self) -> None:
         """See :meth:`Crew.close`."""
         self._stop.set()
         super().close()
-        deadline = time.perf_counter() + self.patience
-        for job in self._jobs:
-            job.thread.join(max(deadline - time.perf_counter(), 0))
 
-    def _round(self, time_left: Callable[[], float | None]) -> list[Candidate]:
+    def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
         """See :meth:`Crew._round`."""
-        if not self._jobs:
-            self._jobs = [_Job(node, lambda node: node.run(self._stop, self.patience)) for node in self.alive]
+        self._run(improve)
         heard: set[int] = set()
         first = None
         while True:
@@ -185,6 +205,15 @@ class AsyncCrew(Crew):
                 or (left is not None and left <= 0)
             ):
                 return [self._observer.newest[number].candidate for number in sorted(heard)]
+
+    def _run(self, improve: bool) -> None:
+        """Start whoever does not run: at first all, later those who stopped at what proved to be no solution here."""
+        running = [job for job in self._jobs if job.thread.is_alive()]
+        failed = [job for job in self._jobs if job.error is not None]
+        idle = [node for node in self.alive if node not in {job.node for job in running + failed}]
+        self._jobs = [
+            *running, *failed, *(_Job(node, lambda node: node.run(self._stop, self.patience, improve)) for node in idle)
+        ]  # fmt: skip
 
     def _lose_dead(self) -> None:
         for job in self._jobs:

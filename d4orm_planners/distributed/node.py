@@ -83,11 +83,18 @@ class Node:
         self._gather()
         self._choose()
 
-    def run(self, stop: threading.Event, patience: float) -> None:
-        """Refine and exchange until told to stop, waiting for the others no longer than ``patience`` [s]."""
-        while not stop.is_set():
+    def run(self, stop: threading.Event, patience: float, improve: bool) -> None:
+        """Refine and exchange until told to stop, or until there is a solution unless it is to be improved.
+
+        It waits for the others no longer than ``patience`` [s].
+        """
+        while True:
             self.refine()
+            if stop.is_set() or (self.search.best.solved and not improve):
+                break
             self._await_others(stop, patience)
+            if self.search.best.solved and not improve:
+                break
             self._choose()
 
     def _await_others(self, stop: threading.Event, patience: float) -> None:
