@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import logging
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -13,6 +14,8 @@ from d4orm_planners.base import Candidate, Iteration, Search
 from d4orm_planners.distributed.inbox import Inbox
 from d4orm_planners.distributed.node import Node
 from d4orm_planners.distributed.transport import Transport
+
+logger = logging.getLogger(__name__)
 
 MODES = ("sync", "async")
 
@@ -62,6 +65,7 @@ class Crew(ABC):
         self._transports = tuple(transports)
         self._jobs: list[_Job] = []
         self._notes: list[str] = []
+        self._losses: list[str] = []
         self._error: Exception | None = None
         self._told: Counter[str] = Counter()
         self._spent = self._excluded = 0
@@ -112,17 +116,20 @@ class Crew(ABC):
 
     def _lose(self, job: _Job, reason: str) -> None:
         self.alive.remove(job.node)
-        self._notes.append(f"node {job.node.number} {reason}")
+        loss = f"node {job.node.number} {reason}"
+        logger.warning("%s", loss, exc_info=job.error)
+        self._notes.append(loss)
+        self._losses.append(loss)
 
     def _lose_failed(self, job: _Job) -> None:
         assert job.error is not None
         self._error = job.error
-        self._lose(job, f"failed ({type(job.error).__name__}: {job.error})")
+        self._lose(job, f"failed ({type(job.error).__name__}: {' '.join(str(job.error).split())})")
 
     def _check_alive(self) -> None:
         if not self.alive and self._error is not None:
             raise RuntimeError(
-                f"all {len(self._nodes)} nodes of d-d4orm are lost: {'; '.join(self._notes)}"
+                f"all {len(self._nodes)} nodes of d-d4orm are lost: {'; '.join(self._losses)}"
             ) from self._error
 
     def _iteration(self, best: Candidate) -> Iteration:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.base import Engine
 from d4orm_planners.base import Candidate, evaluate_controls
-from d4orm_planners.distributed.messages import Message, MessageError, decode
+from d4orm_planners.distributed.messages import KINDS, Message, MessageError, decode
 from d4orm_planners.distributed.selection import merge
 from d4orm_planners.distributed.transport import Transport
 
@@ -51,7 +51,8 @@ class Inbox:
         self._owner = "the observer" if own is None else f"node {own}"
         self._logged: set[str] = set()
         self.newest: dict[int, Report] = {}
-        self.dropped: Counter[str] = Counter()
+        # All kinds from the beginning: other threads look at it, which a growing dictionary does not bear.
+        self.dropped: Counter[str] = Counter(dict.fromkeys(KINDS, 0))
         self.false_claims = 0
 
     def receive(self, timeout: float = 0.0) -> list[Report]:
