@@ -28,19 +28,31 @@ class Stopwatch:
     def __init__(self) -> None:
         self._start = time.perf_counter()
         self._paused = 0.0
+        self._paused_since: float | None = None
 
     @property
     def elapsed(self) -> float:
         """Seconds so far."""
         return time.perf_counter() - self._start - self._paused
 
+    @property
+    def paused_seconds(self) -> float:
+        """Seconds left out so far, those of a pause that lasts included; other threads may look."""
+        since = self._paused_since
+        return self._paused if since is None else self._paused + time.perf_counter() - since
+
+    def leave_out(self, seconds: float) -> None:
+        """Leave out some seconds of the time so far."""
+        self._paused += seconds
+
     @contextmanager
     def paused(self) -> Iterator[None]:
         """Leave the time of the block out."""
-        begin = time.perf_counter()
+        begin = self._paused_since = time.perf_counter()
         try:
             yield
         finally:
+            self._paused_since = None
             self._paused += time.perf_counter() - begin
 
 
@@ -112,12 +124,14 @@ class Iteration:
         denoising_steps: Sample-score-update steps spent.
         excluded: Samples left out because their reward was not finite.
         note: What the method itself says of how the iteration ended, where it has a word for it.
+        judged: What :func:`evaluate_controls` made of these controls, if the iteration asked; else the loop does.
     """
 
     controls: FloatArray
     denoising_steps: int
     excluded: int = 0
     note: str = ""
+    judged: Candidate | None = None
 
 
 class Planner(ABC):
@@ -138,6 +152,9 @@ class Planner(ABC):
     @abstractmethod
     def iterate(self, search: Search) -> Iteration:
         """One iteration from the search's current candidate to the next."""
+
+    def finish(self, search: Search) -> None:  # noqa: B027 - a hook that most planners need not fill
+        """Let go of what the iterations left open in ``search.memory``; called however a solve ends."""
 
     def solve(
         self,
@@ -191,6 +208,8 @@ class Planner(ABC):
                         break
         except KeyboardInterrupt:
             status = "interrupted"
+        finally:
+            self.finish(search)
         return search.plan(status)
 
 
@@ -248,7 +267,7 @@ class Search:
     def advance(self) -> IterationRecord:
         """Run one iteration, judge it and remember the best."""
         iteration = self.planner.iterate(self)
-        self.current = evaluate_controls(self.engine, self.problem, iteration.controls)
+        self.current = iteration.judged or evaluate_controls(self.engine, self.problem, iteration.controls)
         self.iteration += 1
         self.denoising_steps += iteration.denoising_steps
         if self.current.rank > self.best.rank:

@@ -36,7 +36,8 @@ class IterationRecord:
         best_reward: Mean reward of the best candidate so far.
         best_solved: Whether that one is a solution.
         excluded: Samples of this iteration that were left out because their reward was not finite.
-        note: What the method itself says of how the iteration ended; ``ipopt`` has IPOPT's return status here.
+        note: What the method itself says of how the iteration ended; ``ipopt`` has IPOPT's return status here,
+            ``d-d4orm`` the nodes that were lost and the messages that were dropped.
     """
 
     iteration: int

@@ -12,6 +12,7 @@ from d4orm_planners.cem import CEM
 from d4orm_planners.d4orm import D4orm
 from d4orm_planners.d4orm_c2f import D4ormC2F
 from d4orm_planners.d4orm_d import D4ormD
+from d4orm_planners.d_d4orm import DD4orm
 from d4orm_planners.ipopt import Ipopt
 from d4orm_planners.mbd import MBD, IterativeMBD
 from d4orm_planners.mppi import MPPI
@@ -20,7 +21,7 @@ from d4orm_planners.policy import DriveToGoal, OpenLoop, Policy, RandomControls
 from d4orm_planners.rl.learned import PPO, SAC
 
 PLANNERS: Mapping[str, type[Planner]] = MappingProxyType(
-    {planner.name: planner for planner in (D4orm, D4ormD, MPPI, CEM, MBD, IterativeMBD, Ipopt)}
+    {planner.name: planner for planner in (D4orm, D4ormD, DD4orm, MPPI, CEM, MBD, IterativeMBD, Ipopt)}
 )
 """Every planner class by its name."""
 

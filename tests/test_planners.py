@@ -420,7 +420,7 @@ def test_an_unknown_preset_is_refused(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["d4rom", "", "D4ORM", None, 4])
 def test_an_unknown_planner_is_refused(name: Any) -> None:
-    with pytest.raises(ValueError, match="is unknown; choose one of d4orm, d4orm-d, mppi"):
+    with pytest.raises(ValueError, match="is unknown; choose one of d4orm, d4orm-d, d-d4orm, mppi"):
         make_planner(name)
 
 

@@ -48,7 +48,8 @@ class Threads:
         if parts == 1:
             work(edges)
             return
-        pool = _pool(self.num_threads - 1, os.getpid())
+        # Engines that share the cores, each in a thread of its own, share this pool too.
+        pool = _pool(max(self.num_threads, available_cores()) - 1, os.getpid())
         futures = [pool.submit(work, edges[i : i + 2]) for i in range(1, parts)]
         work(edges[:2])
         for future in futures:

@@ -1,0 +1,133 @@
+"""D-D4orm: planning across nodes that exchange their candidates (paper, section VII, Algorithm 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+from d4orm_env.core.arrays import positive_number, whole_number
+from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.threads import available_cores
+from d4orm_planners.base import Iteration, Planner, Search
+from d4orm_planners.d4orm import D4orm
+from d4orm_planners.d4orm_d import D4ormD, D4ormDConfig
+from d4orm_planners.distributed.crew import MODES, AsyncCrew, Crew, SyncCrew
+from d4orm_planners.distributed.inbox import Inbox
+from d4orm_planners.distributed.node import Node, Selection
+from d4orm_planners.distributed.selection import SELECTIONS, shares
+from d4orm_planners.distributed.transport import TRANSPORTS, LocalNetwork
+
+INNER = MappingProxyType({kind.name: kind for kind in (D4orm, D4ormD)})
+"""The planners that a node can run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DD4ormConfig(D4ormDConfig):
+    """Settings of D-D4orm and of the planner that its nodes run; those of D4orm-D alone count only where they run it.
+
+    Attributes:
+        num_samples: ``M`` of all nodes together; so is ``repair_samples``. Each node gets an equal share.
+        planner: What every node refines its candidate with, ``"d4orm"`` or ``"d4orm-d"``.
+        nodes: How many; ``None`` for one per robot, as where the robots themselves are the nodes.
+        selection: What a node goes on from: one of the ``k`` candidates of most reward (``"top-k"``), the best one
+            (``"max"``), or one of the best of ``k`` clusters (``"k-means"``).
+        k: How many candidates it draws from.
+        mode: ``"sync"``: all nodes refine, then all exchange; the same seed gives the same plan. ``"async"``: each at
+            its own pace; plans then depend on who is sooner.
+        patience: Seconds that are waited for stragglers: in asynchronous mode in every round, else beyond the time
+            limit of the solve, after which a node is given up.
+        transport: How messages travel; ``"local"``, between threads of this process.
+    """
+
+    planner: str = "d4orm"
+    nodes: int | None = 2
+    selection: str = "top-k"
+    k: int = 4
+    mode: str = "sync"
+    patience: float = 1.0
+    transport: str = "local"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, choices in (
+            ("planner", tuple(INNER)),
+            ("selection", SELECTIONS),
+            ("mode", MODES),
+            ("transport", TRANSPORTS),
+        ):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name} {getattr(self, name)!r} is unknown; choose one of {', '.join(choices)}")
+        if self.nodes is not None:
+            whole_number(self.nodes, "nodes", 1)
+            self.node_settings(self.nodes)
+        whole_number(self.k, "k", 1)
+        positive_number(self.patience, "patience", zero_allowed=True)
+
+    def node_settings(self, nodes: int) -> list[dict[str, Any]]:
+        """The settings of each node's planner.
+
+        Raises:
+            ValueError: If there are not two samples for each.
+        """
+        names = INNER[self.planner].config_class.setting_names()
+        settings = [{name: getattr(self, name) for name in names} for _ in range(nodes)]
+        for name in {"num_samples", "repair_samples"}.intersection(names):
+            total = getattr(self, name)
+            if total < 2 * nodes:
+                raise ValueError(
+                    f"{name} is {total} for {nodes} nodes together; give each two at least, {2 * nodes} or more"
+                )
+            for own, share in zip(settings, shares(total, nodes), strict=True):
+                own[name] = share
+        return settings
+
+
+class DD4orm(Planner):
+    """Distributed planning: nodes refine candidates by themselves, broadcast them, and go on from one of the best."""
+
+    name: ClassVar[str] = "d-d4orm"
+    config_class = DD4ormConfig
+    presets: ClassVar[dict[str, dict[str, Any]]] = {
+        "paper": {
+            **D4ormD.presets["paper"],
+            "num_samples": 2048,
+            "planner": "d4orm",
+            "nodes": None,
+            "selection": "top-k",
+            "k": 4,
+            "mode": "sync",
+        }
+    }
+    config: DD4ormConfig
+
+    def iterate(self, search: Search) -> Iteration:
+        """See :meth:`Planner.iterate`: one round of all nodes, and the best candidate that they made in it."""
+        if "crew" not in search.memory:
+            search.memory["crew"] = self._crew(search)
+        crew: Crew = search.memory["crew"]
+        return crew.iterate(search)
+
+    def finish(self, search: Search) -> None:
+        """See :meth:`Planner.finish`."""
+        if "crew" in search.memory:
+            search.memory.pop("crew").close()
+
+    def _crew(self, search: Search) -> Crew:
+        config, problem = self.config, search.problem
+        number = config.nodes or problem.num_robots
+        kind = INNER[config.planner]
+        planners = [kind(kind.config_class(**settings)) for settings in config.node_settings(number)]
+        # Nodes of one machine share its cores.
+        engine = get_engine(config.engine, max(available_cores() // number, 1))
+        network, selection = LocalNetwork(), Selection(config.selection, config.k)
+        ends = [network.join() for _ in planners]
+        base = search.current.controls
+        nodes = [
+            Node(i, number, planner, problem, search.seed, base, engine, end, selection)
+            for i, (planner, end) in enumerate(zip(planners, ends, strict=True))
+        ]
+        if config.mode == "sync":
+            return SyncCrew(nodes, ends, config.patience)
+        observer = network.join()
+        return AsyncCrew(nodes, [*ends, observer], config.patience, Inbox(problem, engine, observer, number))

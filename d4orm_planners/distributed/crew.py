@@ -1,0 +1,228 @@
+"""Nodes in threads of one process: synchronous rounds, or every node at its own pace."""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Sequence
+
+from d4orm_planners.base import Candidate, Iteration, Search
+from d4orm_planners.distributed.inbox import Inbox
+from d4orm_planners.distributed.node import Node
+from d4orm_planners.distributed.transport import Transport
+
+logger = logging.getLogger(__name__)
+
+MODES = ("sync", "async")
+
+GLANCE = 0.05
+"""Seconds between looks at whether the nodes still live, while nothing arrives."""
+
+
+LAST_WAIT = 30.0
+"""Seconds that the end of the process waits for a thread that nobody else waited for: native code must not be cut."""
+
+
+class _Job:
+    """Work of a node in a thread of its own; an exception is kept instead of lost."""
+
+    def __init__(self, node: Node, work: Callable[[Node], None]) -> None:
+        self.node = node
+        self.error: Exception | None = None
+        # A node that hangs must not keep the process from ending for ever.
+        self.thread = threading.Thread(target=self._run, args=(work,), daemon=True, name=f"d-d4orm-{node.number}")
+        self.thread.start()
+
+    def _run(self, work: Callable[[Node], None]) -> None:
+        try:
+            work(self.node)
+        except Exception as error:  # whatever it is, it concerns this node only
+            self.error = error
+
+    def leave(self) -> None:
+        """Wait for it no longer."""
+        if self.thread.is_alive():
+            atexit.register(self.thread.join, LAST_WAIT)
+
+
+class Crew(ABC):
+    """The nodes of one solve.
+
+    Args:
+        nodes: The nodes.
+        transports: All ends to close in the end.
+        patience: Seconds that are waited for stragglers: beyond the time limit, and when asynchronous in every round.
+    """
+
+    def __init__(self, nodes: Sequence[Node], transports: Sequence[Transport], patience: float) -> None:
+        self.alive = list(nodes)
+        self.patience = patience
+        self._nodes = tuple(nodes)
+        self._transports = tuple(transports)
+        self._jobs: list[_Job] = []
+        self._notes: list[str] = []
+        self._losses: list[str] = []
+        self._error: Exception | None = None
+        self._told: Counter[str] = Counter()
+        self._spent = self._excluded = 0
+
+    def iterate(self, search: Search) -> Iteration:
+        """The best new candidate, after a round of all nodes that live.
+
+        Raises:
+            RuntimeError: If every node has failed, from the error of the last one.
+        """
+        self._check_alive()
+        compiled_before = {node: node.search.watch.paused_seconds for node in self.alive}
+
+        def compiling() -> float:
+            paused = (node.search.watch.paused_seconds - before for node, before in compiled_before.items())
+            return min(paused, default=0.0)
+
+        def time_left() -> float | None:
+            if search.time_limit is None:
+                return None
+            return search.time_limit - search.watch.elapsed + compiling()
+
+        candidates = self._round(time_left, search.planner.config.improve)
+        search.watch.leave_out(compiling())
+        if not candidates and not self.alive:
+            self._check_alive()
+        best = max(candidates, key=lambda candidate: candidate.rank, default=search.current)
+        return self._iteration(best)
+
+    def close(self) -> None:
+        """Part the nodes. A thread may end what it is at, but nobody waits longer for it than patience."""
+        for transport in self._transports:
+            transport.close()
+        deadline = time.perf_counter() + self.patience
+        for job in self._jobs:
+            if job.node in self.alive:
+                job.thread.join(max(deadline - time.perf_counter(), 0))
+            job.leave()
+
+    @abstractmethod
+    def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
+        """New candidates of the nodes.
+
+        Args:
+            time_left: Tells the seconds left, below zero when overdue.
+            improve: Whether nodes go on once there is a solution.
+        """
+
+    def _lose(self, job: _Job, reason: str) -> None:
+        self.alive.remove(job.node)
+        loss = f"node {job.node.number} {reason}"
+        logger.warning("%s", loss, exc_info=job.error)
+        self._notes.append(loss)
+        self._losses.append(loss)
+
+    def _lose_failed(self, job: _Job) -> None:
+        assert job.error is not None
+        self._error = job.error
+        self._lose(job, f"failed ({type(job.error).__name__}: {' '.join(str(job.error).split())})")
+
+    def _check_alive(self) -> None:
+        if not self.alive and self._error is not None:
+            raise RuntimeError(
+                f"all {len(self._nodes)} nodes of d-d4orm are lost: {'; '.join(self._losses)}"
+            ) from self._error
+
+    def _iteration(self, best: Candidate) -> Iteration:
+        steps = max(node.search.denoising_steps for node in self._nodes)
+        excluded = sum(node.excluded for node in self._nodes)
+        faults: Counter[str] = Counter()
+        for node in self._nodes:
+            faults += node.inbox.dropped
+            faults["false claim"] += node.inbox.false_claims
+        new = faults - self._told
+        notes = self._notes + [f"received {count} x {kind}" for kind, count in sorted(new.items())]
+        iteration = Iteration(best.controls, steps - self._spent, excluded - self._excluded, "; ".join(notes), best)
+        self._spent, self._excluded, self._told, self._notes = steps, excluded, faults, []
+        return iteration
+
+
+class SyncCrew(Crew):
+    """Rounds: all nodes refine, then all of them exchange. The same seed gives the same rounds."""
+
+    def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
+        """See :meth:`Crew._round`."""
+        self._all(Node.refine, time_left)
+        candidates = [node.candidate for node in self.alive]
+        # Judging what others claim to be solutions takes its time, and after the first one nobody goes on from it.
+        if improve or not any(candidate.solved for candidate in candidates):
+            self._all(Node.exchange, time_left)
+        return candidates
+
+    def _all(self, work: Callable[[Node], None], time_left: Callable[[], float | None]) -> None:
+        self._jobs = [_Job(node, work) for node in self.alive]
+        for job in self._jobs:
+            while job.thread.is_alive():
+                left = time_left()
+                if left is not None and left + self.patience <= 0:
+                    break
+                job.thread.join(None if left is None else left + self.patience)
+            if job.thread.is_alive():
+                job.leave()
+                self._lose(job, "did not finish in time")
+            elif job.error is not None:
+                self._lose_failed(job)
+
+
+class AsyncCrew(Crew):
+    """Every node runs on by itself; a round is over when each was heard from, or patience ended after the first.
+
+    Args:
+        nodes: The nodes.
+        transports: All ends to close in the end.
+        patience: See :class:`Crew`.
+        observer: What the solve itself hears of the nodes.
+    """
+
+    def __init__(
+        self, nodes: Sequence[Node], transports: Sequence[Transport], patience: float, observer: Inbox
+    ) -> None:
+        super().__init__(nodes, transports, patience)
+        self._observer = observer
+        self._stop = threading.Event()
+
+    def close(self) -> None:
+        """See :meth:`Crew.close`."""
+        self._stop.set()
+        super().close()
+
+    def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
+        """See :meth:`Crew._round`."""
+        self._run(improve)
+        heard: set[int] = set()
+        first = None
+        while True:
+            heard |= {report.node for report in self._observer.receive(GLANCE)}
+            self._lose_dead()
+            now = time.perf_counter()
+            first = now if heard and first is None else first
+            left = time_left()
+            if (
+                heard >= {node.number for node in self.alive}
+                or (first is not None and now - first >= self.patience)
+                or (left is not None and left <= 0)
+            ):
+                return [self._observer.newest[number].candidate for number in sorted(heard)]
+
+    def _run(self, improve: bool) -> None:
+        """Start whoever does not run: at first all, later those who stopped at what proved to be no solution here."""
+        running = [job for job in self._jobs if job.thread.is_alive()]
+        failed = [job for job in self._jobs if job.error is not None]
+        idle = [node for node in self.alive if node not in {job.node for job in running + failed}]
+        self._jobs = [
+            *running, *failed, *(_Job(node, lambda node: node.run(self._stop, self.patience, improve)) for node in idle)
+        ]  # fmt: skip
+
+    def _lose_dead(self) -> None:
+        for job in self._jobs:
+            if job.error is not None and job.node in self.alive:
+                self._lose_failed(job)

@@ -1,0 +1,136 @@
+"""Merging what other nodes send and choosing what to go on from: pure functions (paper, Algorithm 5, lines 4 to 6)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+SELECTIONS = ("top-k", "max", "k-means")
+
+ROUNDS = 50
+"""Rounds after which k-means stops, converged or not."""
+
+
+class Numbered(Protocol):
+    """Anything that a node sent, and as its how-manieth."""
+
+    @property
+    def node(self) -> int:
+        """Who sent it."""
+        ...
+
+    @property
+    def sequence(self) -> int:
+        """Its number among what this node sent."""
+        ...
+
+
+Item = TypeVar("Item", bound=Numbered)
+
+
+def shares(total: int, parts: int) -> tuple[int, ...]:
+    """``total`` split as evenly as whole numbers can be; the first parts get what is left over."""
+    return tuple(total // parts + (part < total % parts) for part in range(parts))
+
+
+def merge(newest: Mapping[int, Item], arrivals: Iterable[Item]) -> tuple[dict[int, Item], tuple[Item, ...]]:
+    """The newest item of every node.
+
+    Args:
+        newest: What is held so far, by node.
+        arrivals: What came in, in any order.
+
+    Returns:
+        What is held now, and the stale arrivals: those that are no newer than what was held before.
+    """
+    merged, stale = dict(newest), []
+    for item in arrivals:
+        if item.node in newest and item.sequence <= newest[item.node].sequence:
+            stale.append(item)
+        elif item.node not in merged or item.sequence > merged[item.node].sequence:
+            merged[item.node] = item
+    return merged, tuple(stale)
+
+
+def top_k(rewards: Any, k: int) -> tuple[int, ...]:
+    """Indices of the ``k`` largest of ``(n,)`` rewards, best first; of equal ones the first."""
+    return tuple(int(i) for i in np.argsort(-np.asarray(rewards), kind="stable")[:k])
+
+
+def k_means(points: Any, k: int, generator: np.random.Generator) -> np.ndarray:
+    """Cluster points by Lloyd's rounds from a k-means++ start.
+
+    Args:
+        points: ``(n, D)``.
+        k: Clusters; there are fewer where there are fewer different points.
+        generator: What the start is drawn with.
+
+    Returns:
+        ``(n,)`` the cluster of each point, numbered from 0.
+    """
+    points = np.asarray(points, np.float64)
+    centres = points[[generator.integers(len(points))]]
+    while len(centres) < k:
+        gap2 = _square_distances(points, centres).min(axis=1)
+        if gap2.sum() == 0:
+            break
+        centres = np.vstack([centres, points[generator.choice(len(points), p=gap2 / gap2.sum())]])
+    labels = _square_distances(points, centres).argmin(axis=1)
+    for _ in range(ROUNDS):
+        former = labels
+        # A cluster that has lost all its points stays where it was.
+        full = np.unique(labels)
+        centres[full] = [points[labels == cluster].mean(axis=0) for cluster in full]
+        labels = _square_distances(points, centres).argmin(axis=1)
+        if (labels == former).all():
+            break
+    return labels
+
+
+def diverse(rewards: Any, points: Any, k: int, generator: np.random.Generator) -> tuple[int, ...]:
+    """Indices of the best of each of at most ``k`` clusters of candidates, best first.
+
+    Args:
+        rewards: ``(n,)``.
+        points: ``(n, ...)`` the candidates; their distance is the l2 norm of the difference.
+        k: Clusters.
+        generator: See :func:`k_means`.
+    """
+    rewards = np.asarray(rewards)
+    labels = k_means(np.reshape(points, (len(rewards), -1)), k, generator)
+    first: dict[int, int] = {}
+    for i in top_k(rewards, len(rewards)):
+        first.setdefault(int(labels[i]), i)
+    return tuple(first.values())
+
+
+def choose(selection: str, rewards: Any, points: Any, k: int, generator: np.random.Generator) -> int:
+    """Index of the candidate to go on from.
+
+    Args:
+        selection: ``"top-k"`` draws one of the ``k`` best (Algorithm 5); ``"max"`` takes the best; ``"k-means"`` draws
+            one of the best of ``k`` clusters (section VIII-C).
+        rewards: ``(n,)``.
+        points: ``(n, ...)`` the candidates' controls.
+        k: How many to draw from.
+        generator: What it is drawn with.
+
+    Raises:
+        ValueError: If there is no such rule.
+    """
+    if selection == "max":
+        return top_k(rewards, 1)[0]
+    if selection == "top-k":
+        among = top_k(rewards, k)
+    elif selection == "k-means":
+        among = diverse(rewards, points, k, generator)
+    else:
+        raise ValueError(f"selection {selection!r} is unknown; choose one of {', '.join(SELECTIONS)}")
+    return among[int(generator.integers(len(among)))]
+
+
+def _square_distances(points: Any, centres: Any) -> Any:
+    """``(n, c)``."""
+    return ((points[:, None] - centres[None]) ** 2).sum(axis=2)

@@ -1,0 +1,88 @@
+"""How messages travel: the protocol of a transport, and threads of one process as the simplest one."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from typing import Protocol
+
+TRANSPORTS = ("local",)
+
+WAITING = 64
+"""Messages that wait for a slow node at most; then the oldest are lost, which newer ones replace anyhow."""
+
+
+class Transport(Protocol):
+    """One node's access to the others. Messages are bytes; they may get lost, and come in any order."""
+
+    def publish(self, data: bytes) -> None:
+        """Send to all other nodes, without waiting for them; nothing happens once closed."""
+        ...
+
+    def collect(self, timeout: float = 0.0) -> list[bytes]:
+        """Everything that has arrived since the last call; waits up to ``timeout`` [s] for something to arrive.
+
+        Once closed there is nothing, at once.
+        """
+        ...
+
+    def close(self) -> None:
+        """Leave. Whoever waits in :meth:`collect` is woken; closing again does no harm."""
+        ...
+
+
+class LocalTransport:
+    """The ``"local"`` transport: one end of a :class:`LocalNetwork`."""
+
+    def __init__(self, network: LocalNetwork) -> None:
+        self._network = network
+        self._arrived: deque[bytes] = deque(maxlen=WAITING)
+        self._changed = threading.Condition()
+        self._closed = False
+
+    def publish(self, data: bytes) -> None:
+        """See :meth:`Transport.publish`."""
+        if not self._closed:
+            self._network.deliver(self, bytes(data))
+
+    def collect(self, timeout: float = 0.0) -> list[bytes]:
+        """See :meth:`Transport.collect`."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or self._arrived, timeout)
+            messages = [] if self._closed else list(self._arrived)
+            self._arrived.clear()
+        return messages
+
+    def close(self) -> None:
+        """See :meth:`Transport.close`."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    def receive(self, data: bytes) -> None:
+        """Take what another end has sent."""
+        with self._changed:
+            self._arrived.append(data)
+            self._changed.notify_all()
+
+
+class LocalNetwork:
+    """A fully connected network inside one process."""
+
+    def __init__(self) -> None:
+        self._ends: list[LocalTransport] = []
+        self._lock = threading.Lock()
+
+    def join(self) -> LocalTransport:
+        """A new end of the network; it receives what is sent from now on."""
+        end = LocalTransport(self)
+        with self._lock:
+            self._ends.append(end)
+        return end
+
+    def deliver(self, sender: LocalTransport, data: bytes) -> None:
+        """Give a message to every end but the sender's."""
+        with self._lock:
+            ends = [end for end in self._ends if end is not sender]
+        for end in ends:
+            end.receive(data)
