@@ -80,11 +80,13 @@ def _metric(ax: Any, figure: Figure, shown: Shown, *, value: str, ends: tuple[st
         if ends:
             low, high = ([getattr(row, end) for row in known] for end in ends)
             if numeric:
-                ax.fill_between(places, low, high, color=f"C{i}", alpha=0.15, linewidth=0)
+                ax.fill_between(places, low, high, color=f"C{i}", alpha=0.1, linewidth=0)
             else:
                 ax.vlines(places, low, high, color=f"C{i}", alpha=0.5)
     if not numeric:
         ax.set_xticks(range(len(columns)), columns, rotation=60 if figure.across == "policy" else 20, ha="right")
+    elif figure.across == "robots":
+        ax.set_xticks([int(name) for name in columns])
     ax.set_xlabel({"robots": "robots", "noise": "standard deviation of the noise"}.get(figure.across, ""))
     ax.set_ylabel(label)
     if log:
@@ -124,7 +126,7 @@ def _anytime(ax: Any, figure: Figure, shown: Shown) -> None:
         moments = [moment for history in histories for moment, _, _ in history]
         if not moments:
             continue  # every trial raised an error, or the policy makes no plan
-        seconds = np.geomspace(max(min(moments), 1e-3), max(max(moments), 1e-3), INSTANTS)
+        seconds = np.geomspace(max(min(moments), 1e-3), 1.1 * max(*moments, 1e-3), INSTANTS)
         rewards = np.array([best_reward(trial, seconds) for trial in group.trials])
         seen = 2 * np.isfinite(rewards).sum(axis=0) >= len(rewards)
         low, middle, high = np.nanpercentile(rewards[:, seen], (25, 50, 75), axis=0)
@@ -132,6 +134,7 @@ def _anytime(ax: Any, figure: Figure, shown: Shown) -> None:
         ax.fill_between(seconds[seen], low, high, color=f"C{i}", alpha=0.15, linewidth=0)
         if row.runtime is not None and 2 * row.successes >= row.trials and seen.any():
             ax.plot(row.runtime, np.interp(row.runtime, seconds[seen], middle), marker="o", color=f"C{i}")
+    ax.tick_params(axis="x", which="minor", labelbottom=False)
     ax.set(xlabel=f"planning time, s ({largest} robots)", ylabel="best reward so far", xscale="log")
 
 
