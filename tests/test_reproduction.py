@@ -229,7 +229,8 @@ def test_without_a_name_the_figures_are_listed(d4orm, tmp_path: Path) -> None:
     ("arguments", "complaint"),
     [
         (("fig4",), f"'fig4' is unknown; choose one of {', '.join(FIGURES)}"),
-        (("big-teams", "--section", "Nowhere"), "no section 'Nowhere'; choose of Differential Drive, 2D Holonomic"),
+        (("big-teams", "--section", "Nowhere"), "no section 'Nowhere'; choose of Differential Drive; 2D Holonomic"),
+        (("ipopt", "--policy", "cobyla"), "no policy 'cobyla'; choose of ipopt; d4orm; d4orm, defaults"),
         (("amswarm", "--quick", "--seeds", "0"), "seeds"),
         (("amswarm", "--quick", "--workers", "0"), "workers"),
     ],
@@ -249,9 +250,12 @@ def test_a_planner_that_is_not_there_is_named_before_anything_runs(tmp_path: Pat
     assert not list(tmp_path.iterdir())
 
 
-def test_a_part_of_a_figure(tmp_path: Path) -> None:
-    part = find_figure("big-teams").only(["2D Holo Random"])
-    assert [section.robots for section in part.sections] == [(16, 32, 64, 100)]
+def test_a_part_of_a_figure() -> None:
+    part = find_figure("big-teams").only(["2D Holo Random"], ["d4orm-d, defaults", "d4orm-c2f"])
+    assert [(section.robots, list(section.policies)) for section in part.sections] == [
+        ((16, 32, 64, 100), ["d4orm-d, defaults", "d4orm-c2f"]),
+    ]
+    assert find_figure("big-teams").only() == FIGURES["big-teams"]
 
 
 # The store.

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from d4orm_planners.commands.inputs import make_folder, names
+from d4orm_planners.commands.inputs import make_folder
 
 
 def reproduce(
@@ -15,7 +15,11 @@ def reproduce(
     list_: Annotated[bool, typer.Option("--list", help="List the figures.")] = False,
     quick: Annotated[bool, typer.Option("--quick", help="Tiny sizes, to see that it works: under a minute.")] = False,
     sections: Annotated[
-        str | None, typer.Option("--section", help="Only these panels, separated by commas; all by default.")
+        list[str] | None, typer.Option("--section", "-s", help="Only this panel; repeatable, all by default.")
+    ] = None,
+    policies: Annotated[
+        list[str] | None,
+        typer.Option("--policy", "-p", help="Only this row, by its label; repeatable, all by default."),
     ] = None,
     seeds: Annotated[
         int | None, typer.Option("--seeds", "-n", help="Trials per row; the paper's 50 by default, 1 with --quick.")
@@ -40,9 +44,7 @@ def reproduce(
     from d4orm_planners.evaluation.reproduction_report import markdown, write_reproduction
     from d4orm_planners.evaluation.warmup import warm_up
 
-    chosen = find_figure(figure)
-    if sections is not None:
-        chosen = chosen.only(names(sections) or ())
+    chosen = find_figure(figure).only(sections or (), policies or ())
     if quick:
         chosen = chosen.quick()
     folder = out / (f"{chosen.name}-quick" if quick else chosen.name)

@@ -227,7 +227,12 @@ def _amswarm() -> Figure:
         sections=(
             Section(
                 title=title,
-                policies={"d4orm": PAPER, "d4orm-d": PAPER, "d4orm-d, defaults": {"policy": "d4orm-d"}},
+                policies={
+                    "d4orm": PAPER,
+                    "d4orm, defaults": {"policy": "d4orm"},
+                    "d4orm-d": PAPER,
+                    "d4orm-d, defaults": {"policy": "d4orm-d"},
+                },
                 scenarios=scenarios,
                 quick_robots=(None,),
                 time_limit=60.0,

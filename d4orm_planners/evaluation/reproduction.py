@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -108,17 +108,28 @@ class Figure:
         remarks = ("Quick version: tiny teams and few samples, whose numbers say nothing.", *self.remarks)
         return replace(self, sections=tuple(section.quick() for section in self.sections), seeds=1, remarks=remarks)
 
-    def only(self, titles: Iterable[str]) -> Figure:
-        """The figure with some of its sections.
+    def only(self, titles: Sequence[str] = (), labels: Sequence[str] = ()) -> Figure:
+        """A part of the figure.
+
+        Args:
+            titles: The sections to keep; all if empty.
+            labels: The policies to keep; all if empty.
 
         Raises:
-            ValueError: For a title that none of them has.
+            ValueError: For a title or label that it does not have.
         """
-        wanted, known = tuple(titles), [section.title for section in self.sections]
-        for title in wanted:
-            if title not in known:
-                raise ValueError(f"{self.name} has no section {title!r}; choose of {', '.join(known)}")
-        return replace(self, sections=tuple(section for section in self.sections if section.title in wanted))
+        known = [section.title for section in self.sections]
+        policies = list(dict.fromkeys(label for section in self.sections for label in section.policies))
+        for what, wanted, there in (("section", titles, known), ("policy", labels, policies)):
+            for name in wanted:
+                if name not in there:
+                    raise ValueError(f"{self.name} has no {what} {name!r}; choose of {'; '.join(there)}")
+        kept = []
+        for section in self.sections:
+            chosen = {label: section.policies[label] for label in section.policies if label in labels or not labels}
+            if chosen and (section.title in titles or not titles):
+                kept.append(replace(section, policies=chosen))
+        return replace(self, sections=tuple(kept))
 
 
 @dataclass(frozen=True)

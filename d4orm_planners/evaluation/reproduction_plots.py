@@ -38,15 +38,18 @@ def draw(path: Path, figure: Figure, groups: Sequence[Group], rows: Sequence[Mea
     wide = 2 if figure.across == "policy" else 1
     size = (max(3.2 * wide * len(titles), 5.0), (3.4 if wide == 2 else 2.6) * len(figure.plots) + 0.8)
     canvas = Canvas(figsize=size, layout="constrained")
-    axes = canvas.subplots(len(figure.plots), len(titles), squeeze=False, sharey="row")
+    # Only the anytime curves have time from left to right.
+    sharex: Any = False if "anytime" in figure.plots else "col"
+    axes = canvas.subplots(len(figure.plots), len(titles), squeeze=False, sharex=sharex, sharey="row")
     for i, title in enumerate(titles):
         axes[0, i].set_title(title)
         shown = [(group, row) for group, row in zip(groups, rows) if row.section == title]
         for ax, plot in zip(axes[:, i], figure.plots):
             PLOTS[plot](ax, figure, shown)
             ax.grid(alpha=0.3)
-            if i:
-                ax.set_ylabel("")
+            ax.yaxis.label.set_visible(i == 0)
+            if sharex:
+                ax.label_outer()
     handles, labels = axes[0, 0].get_legend_handles_labels()
     if len(labels) > 1:
         canvas.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 2 + 2 * len(titles)))
