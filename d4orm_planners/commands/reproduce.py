@@ -19,7 +19,7 @@ def reproduce(
     ] = None,
     policies: Annotated[
         list[str] | None,
-        typer.Option("--policy", "-p", help="Only this row, by its label; repeatable, all by default."),
+        typer.Option("--policy", "-p", help="Only the policy of this label; repeatable, all by default."),
     ] = None,
     seeds: Annotated[
         int | None, typer.Option("--seeds", "-n", help="Trials per row; the paper's 50 by default, 1 with --quick.")
