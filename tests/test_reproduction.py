@@ -171,6 +171,12 @@ def test_times_are_over_the_successes() -> None:
     assert row.runtime_deviation == pytest.approx(np.std([1, 2, 3, 4, 5], ddof=1))
     assert row.travel_time == 6.0
     assert row.successes == 5
+    assert row.reward == 0.5
+
+
+def test_the_reward_is_that_of_the_last_best_plan_of_every_trial() -> None:
+    trials = [trial(), trial(1, history="[[0.5,0,0.3]]", status="time_limit")]
+    assert measured(Group("Circle", "d4orm", trials)).reward == pytest.approx((0.7 + 0.3) / 2)
 
 
 def test_the_best_reward_is_a_staircase() -> None:

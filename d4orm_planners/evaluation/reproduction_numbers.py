@@ -16,7 +16,7 @@ from d4orm_planners.evaluation.store import Trial
 
 @dataclass(frozen=True, kw_only=True)
 class Measured:
-    """One policy on one scenario, team size and level of noise. All but the counts is over the successes.
+    """One policy on one scenario, team size and level of noise. All but counts and reward is over the successes.
 
     Attributes:
         section: Title of the section.
@@ -37,7 +37,8 @@ class Measured:
         runtime_mean: Mean.
         runtime_deviation: Standard deviation; 0 for one success.
         iterations: Mean over the successes; ``None`` for policies that execute no plan.
-        reward: Mean reward per step and robot of what was executed.
+        reward: Mean over all trials of the last best plan's reward per step of the horizon and robot; ``None`` without
+            plans.
         travel_time: Mean arrival time [s].
         makespan: Mean of the latest arrival time [s].
         jerk: Mean squared jerk [m^2/s^6].
@@ -97,6 +98,7 @@ def measured(group: Group) -> Measured:
     lower, upper = wilson_interval(len(solved), len(trials))
     times = [seconds for _, seconds in solved]
     quartiles = [float(value) for value in np.percentile(times, (25, 50, 75))] if times else [None] * 3
+    rewards = [history[-1][2] for trial in trials if (history := json.loads(trial.history))]
     errors = [trial.error for trial in trials if trial.error]
 
     def mean(name: str) -> float | None:
@@ -122,7 +124,7 @@ def measured(group: Group) -> Measured:
         runtime_mean=float(np.mean(times)) if times else None,
         runtime_deviation=float(np.std(times, ddof=min(len(times) - 1, 1))) if times else None,
         iterations=mean("iterations"),
-        reward=mean("reward"),
+        reward=float(np.mean(rewards)) if rewards else None,
         travel_time=mean("travel_time"),
         makespan=mean("makespan"),
         jerk=mean("mean_squared_jerk"),

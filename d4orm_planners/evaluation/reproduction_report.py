@@ -20,7 +20,8 @@ from d4orm_planners.evaluation.tables import deadline_table
 
 INTRODUCTION = """\
 Success with its 95% interval (Wilson); runtime to the first solution, median and quartiles, or mean ± standard
-deviation. Runtime and all that follows are over the successes."""
+deviation. Runtime, travel time, makespan and jerk are over the successes; the reward is that of the best plan in the
+end, over all trials."""
 
 
 def markdown(figure: Figure, groups: Sequence[Group]) -> str:
