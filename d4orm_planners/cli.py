@@ -15,6 +15,7 @@ import typer
 
 from d4orm_planners.commands.evaluate import evaluate, leaderboard
 from d4orm_planners.commands.inputs import check_writable, make_folder, names, numbers, parse_settings
+from d4orm_planners.commands.reproduce import reproduce
 from d4orm_planners.commands.robustness import robustness
 from d4orm_planners.commands.train import train
 
@@ -34,7 +35,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-for command in (evaluate, leaderboard, robustness, train):
+for command in (evaluate, leaderboard, reproduce, robustness, train):
     app.command()(command)
 
 Scenario = Annotated[

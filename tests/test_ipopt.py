@@ -166,7 +166,7 @@ def test_an_infeasible_problem_ends_cleanly() -> None:
 
 
 def test_ctrl_c_stops_ipopt() -> None:
-    problem = make_problem("circle", num_robots=8)
+    problem = make_problem("circle", num_robots=16)
     timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
     begin = time.perf_counter()
     timer.start()

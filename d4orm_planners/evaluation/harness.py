@@ -110,6 +110,39 @@ def measure(
     progress: Progress | None = None,
 ) -> list[SuccessRate]:
     """What :func:`evaluate` does, but nothing is written apart from the store."""
+    groups = gather(
+        policies,
+        scenarios,
+        out=out,
+        seeds=seeds,
+        control_noise_std=control_noise_std,
+        num_robots=num_robots,
+        model=model,
+        time_limit=time_limit,
+        trial_timeout=trial_timeout,
+        workers=workers,
+        ray=ray,
+        progress=progress,
+    )
+    return [success_rate(trials, label) for label, trials in groups]
+
+
+def gather(
+    policies: Policies,
+    scenarios: Scenarios,
+    *,
+    out: str | os.PathLike[str],
+    seeds: Iterable[int],
+    control_noise_std: float | Iterable[float],
+    num_robots: int | Iterable[int | None] | None = None,
+    model: str | None = None,
+    time_limit: float | None = None,
+    trial_timeout: float | None = None,
+    workers: int | None = None,
+    ray: str | None = None,
+    progress: Progress | None = None,
+) -> list[tuple[str, list[Trial]]]:
+    """What :func:`measure` does, but the trials themselves are returned, one per seed, behind the policy's label."""
     levels = tuple(
         dict.fromkeys(positive_number(level, "noise", zero_allowed=True) for level in several(control_noise_std))
     )
@@ -132,11 +165,7 @@ def measure(
     running = _run(missing, workers, ray, trial_timeout)
     _store(running, store, done, total, progress or _silent)
     stored = {trial.key: trial for trial in store.trials()}
-    return [
-        success_rate([stored[job.key(level)] for job in group], group[0].policy.label)
-        for group in groups
-        for level in levels
-    ]
+    return [(group[0].policy.label, [stored[job.key(level)] for job in group]) for group in groups for level in levels]
 
 
 def _missing(jobs: Sequence[Job], store: TrialStore) -> tuple[list[Job], int, int]:

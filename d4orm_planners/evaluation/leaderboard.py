@@ -45,7 +45,7 @@ def leaderboard(trials: Sequence[Trial], deadlines: Sequence[float] = ()) -> str
         blocks.append(table(f"{scenario}, {robots} robots, {model}", HEADER, [cells(rate) for rate in ranked]))
     if deadlines:
         blocks += ["## Success within a deadline for planning", WITHIN, *_deadlines(groups, deadlines)]
-    return "\n\n".join([*blocks, *errors(rates), _origin(trials)]) + "\n"
+    return "\n\n".join([*blocks, *errors(rates), origin(trials)]) + "\n"
 
 
 def _groups(trials: Sequence[Trial]) -> dict[tuple[str, str, int, str, float], list[Trial]]:
@@ -105,8 +105,8 @@ def _deadlines(
     ]
 
 
-def _origin(trials: Sequence[Trial]) -> str:
-    """Where the numbers come from."""
+def origin(trials: Sequence[Trial]) -> str:
+    """Where the numbers come from: dates, machines and versions of at least one trial, under a heading."""
     dates = sorted(trial.date for trial in trials)
     lines = ["## Where the numbers come from", "", f"- {len(trials)} trials, {dates[0][:10]} to {dates[-1][:10]}"]
     for machine in sorted({trial.machine for trial in trials}):

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 APPLICATION_ID = 0x64346F72
 """Marks the file as one of ours, in its header ("d4or")."""
-VERSION = 2
+VERSION = 3
 STORE = "trials.sqlite"
 """Name of the file in a folder of results."""
 PATIENCE = 60.0
@@ -69,6 +69,8 @@ class Trial:
         iterations: Iterations of the planner; ``None`` for a policy that executes no plan.
         status: How its solve ended, see :class:`d4orm_planners.plan.Plan`.
         wall_time: Seconds spent planning, or choosing actions.
+        preparation: Those of ``wall_time`` before the first action: the whole solve of a plan, the coarse plan of a
+            controller; ``None`` in rows that older versions wrote.
         elapsed: Seconds that the trial took, with the environment and the judge.
         history: Moments of the solve at which the best plan so far changed, as JSON: a list of
             ``[seconds, solved (0 or 1), mean reward]``; empty for a policy that executes no plan.
@@ -101,6 +103,7 @@ class Trial:
     iterations: int | None = None
     status: str = ""
     wall_time: float | None = None
+    preparation: float | None = None
     elapsed: float | None = None
     history: str = "[]"
     error: str = ""
@@ -122,7 +125,7 @@ CREATE TABLE trials (
     collided INTEGER NOT NULL, arrived INTEGER NOT NULL,
     travel_time REAL, makespan REAL, reward REAL, mean_squared_jerk REAL,
     steps INTEGER NOT NULL, iterations INTEGER, status TEXT NOT NULL,
-    wall_time REAL, elapsed REAL, history TEXT NOT NULL, error TEXT NOT NULL,
+    wall_time REAL, preparation REAL, elapsed REAL, history TEXT NOT NULL, error TEXT NOT NULL,
     PRIMARY KEY ({_KEY})
 ) WITHOUT ROWID
 """
@@ -207,13 +210,19 @@ class TrialStore:
             raise self._foreign(str(error)) from error
 
     def _check(self, connection: sqlite3.Connection) -> None:
-        """Make the table in a new file; refuse a file of another kind, which stays untouched."""
+        """Make the table in a new file, bring a file of version 2 up to date, and leave all others untouched."""
         if _pragma(connection, "application_id") != APPLICATION_ID:
             # One transaction, so that of two processes that find no file one makes the table.
             connection.execute("BEGIN IMMEDIATE")
             if _pragma(connection, "application_id") == 0 and _pragma(connection, "schema_version") == 0:
                 connection.execute(_CREATE)
                 connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+                connection.execute(f"PRAGMA user_version = {VERSION}")
+            connection.execute("COMMIT")
+        elif _pragma(connection, "user_version") == 2:
+            connection.execute("BEGIN IMMEDIATE")
+            if _pragma(connection, "user_version") == 2:  # another process may have been quicker
+                connection.execute("ALTER TABLE trials ADD COLUMN preparation REAL")
                 connection.execute(f"PRAGMA user_version = {VERSION}")
             connection.execute("COMMIT")
         if _pragma(connection, "application_id") != APPLICATION_ID:

@@ -132,6 +132,7 @@ def _outcome(policy: _TimedPolicy, job: Job, noise: float) -> dict[str, Any]:
         "status": "" if plan is None else plan.status,
         "history": "[]" if plan is None else compact_history(plan.history),
         "wall_time": policy.wall_time,
+        "preparation": policy.preparation,
     }
 
 
@@ -153,17 +154,19 @@ class _TimedPolicy(Policy):
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
         self.wall_time = 0.0
+        self.preparation = 0.0
         self.plan: Plan | None = None
 
     def reset(self, env: Any, seed: int = 0) -> None:
         begin = time.perf_counter()
         self._policy.reset(env, seed)
-        self.wall_time = time.perf_counter() - begin
+        self.wall_time = self.preparation = time.perf_counter() - begin
         if isinstance(self._policy, OpenLoop) and (plan := self._policy.plan) is not None:
             if plan.status == "interrupted":
                 raise KeyboardInterrupt  # half a solve says nothing about the planner
             self._policy.planner = None  # from now on it executes this plan
             self.plan, self.wall_time = plan, plan.wall_time
+            self.preparation = plan.wall_time
 
     def act(self, observations: dict[str, Any], state: Any) -> Actions:
         begin = time.perf_counter()

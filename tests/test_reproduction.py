@@ -1,0 +1,292 @@
+"""The paper's figures: the quick version of each, what counts as solved, and the paper's numbers beside ours."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sqlite3
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from d4orm_planners import cli, list_planners
+from d4orm_planners.evaluation import harness
+from d4orm_planners.evaluation.cells import configurations
+from d4orm_planners.evaluation.figures import FIGURES, find_figure
+from d4orm_planners.evaluation.reproduction import Figure, Group, Section, reproduce
+from d4orm_planners.evaluation.reproduction_numbers import METRICS, first_solution, measured
+from d4orm_planners.evaluation.reproduction_plots import PLOTS, best_reward
+from d4orm_planners.evaluation.reproduction_report import markdown
+from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def trial(seed: int = 0, **changes: Any) -> Trial:
+    values = {"policy": "d4orm", "config": "{}", "problem": "abc", "noise": 0.0, "scenario": "circle", "robots": 8}
+    values |= {"label": "d4orm", "model": "holonomic2d", "dt": 0.1, "steps": 50, "date": "2026-11-21"}
+    outcome = {"success": True, "status": "solved", "wall_time": 3.0, "preparation": 3.0, "travel_time": 6.0}
+    outcome |= {"history": "[[0.5,0,0.6],[1.5,1,0.5],[2.5,1,0.7]]", "makespan": 7.0, "mean_squared_jerk": 40.0}
+    return Trial(**{**values, **outcome, "seed": seed, **changes})
+
+
+def figure(**changes: Any) -> Figure:
+    section = Section(title="Circle", policies={"d4orm": {}}, scenarios=("circle",), robots=(2,))
+    values = {"name": "test", "title": "A test", "source": "nowhere", "sections": (section,), "across": "robots"}
+    return Figure(**{**values, "metrics": ("success", "runtime"), "plots": ("runtime",), **changes})
+
+
+@pytest.fixture
+def d4orm(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Runs ``d4orm reproduce`` inside ``tmp_path``; gives exit status, output and errors."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: str) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as exit_:
+            cli.main(["reproduce", *arguments])
+        captured = capsys.readouterr()
+        return int(exit_.value.code or 0), captured.out, captured.err
+
+    return call
+
+
+def available(chosen: Figure) -> bool:
+    """Whether all its planners are there; IPOPT's comes with an extra."""
+    return all("ipopt" not in section.policies or "ipopt" in list_planners() for section in chosen.sections)
+
+
+# Every figure, small.
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FIGURES)
+def test_the_quick_version_writes_its_tables_and_picture_and_is_not_run_twice(d4orm, tmp_path: Path, name: str) -> None:
+    chosen = FIGURES[name].quick()
+    if not available(chosen):
+        pytest.skip("there is no planner ipopt")
+    status, out, err = d4orm(name, "--quick")
+    assert status == 0, err
+    folder = tmp_path / "reproduction" / f"{name}-quick"
+    written = {f"{name}.csv", f"{name}.md", f"{name}.png", "trials.csv"}
+    assert written <= {path.name for path in folder.iterdir()}
+    assert all(str(Path("reproduction", folder.name, file)) in out for file in written)
+    with (folder / f"{name}.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["section"], row["scenario"], row["label"], float(row["noise"])) for row in rows] == [
+        (section.title, scenario, label, noise)
+        for section in chosen.sections
+        for scenario in section.scenarios
+        for _ in section.robots
+        for label in section.policies
+        for noise in section.noise
+    ]
+    assert not any(row["error"] for row in rows)
+    assert any(int(row["successes"]) for row in rows)
+    page = (folder / f"{name}.md").read_text(encoding="utf-8")
+    assert chosen.title in page
+    assert "Quick version" in page
+    assert (folder / f"{name}.png").read_bytes().startswith(PNG)
+
+    stored = TrialStore.existing(folder).trials()
+    assert len(stored) == len(rows)
+    assert d4orm(name, "--quick", "--quiet") == (0, "", "")
+    assert TrialStore.existing(folder).trials() == stored, "the same command runs nothing again"
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_what_a_figure_names_exists(name: str) -> None:
+    chosen = FIGURES[name]
+    sections = {section.title: section for section in chosen.sections}
+    assert len(sections) == len(chosen.sections)
+    assert set(chosen.metrics) <= set(METRICS)
+    assert set(chosen.plots) <= set(PLOTS)
+    for title, _, metric in chosen.paper:
+        assert title in sections
+        assert metric in chosen.metrics
+    if available(chosen):
+        for section in (*chosen.sections, *chosen.quick().sections):
+            assert len(configurations(section.policies, section.time_limit)) == len(section.policies)
+
+
+def test_a_call_that_was_broken_off_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    few = {"num_samples": 64, "num_steps": 5, "max_iterations": 1}
+    section = Section(title="Circle", policies={"d4orm": few, "mppi": few}, scenarios=("circle",), robots=(2,))
+    chosen = figure(sections=(section, replace(section, title="Others", robots=(3,))))
+    run_here, ran = harness.run_here, []
+
+    def stopping(jobs: Any) -> Any:
+        for job, trials in zip(jobs, run_here(jobs)):
+            ran.append((job.policy.label, job.problem.num_robots))
+            yield trials
+            if len(ran) == 3:
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr(harness, "run_here", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        reproduce(chosen, tmp_path, seeds=1)
+    groups = reproduce(chosen, tmp_path, seeds=1)
+    assert sorted(ran) == [("d4orm", 2), ("d4orm", 3), ("mppi", 2), ("mppi", 3)]
+    assert [(group.section, group.label) for group in groups] == [
+        ("Circle", "d4orm"), ("Circle", "mppi"), ("Others", "d4orm"), ("Others", "mppi"),
+    ]  # fmt: skip
+
+
+# What counts as solved, and when.
+
+
+def test_a_plan_counts_from_its_first_solution_on() -> None:
+    assert first_solution(trial()) == 1.5
+
+
+def test_a_plan_within_the_margin_is_no_solution_although_nobody_touched() -> None:
+    assert first_solution(trial(history="[[0.5,0,0.6]]", status="time_limit")) is None
+
+
+def test_under_noise_counts_what_happened() -> None:
+    assert first_solution(trial(noise=0.1, success=False)) is None
+    assert first_solution(trial(noise=0.1, success=True)) == 1.5
+    assert first_solution(trial(noise=0.1, history="[[0.5,0,0.6]]", status="time_limit")) == 3.0
+
+
+def test_a_controllers_time_is_that_of_its_first_plan() -> None:
+    acting = {"status": "", "history": "[]", "preparation": 0.2}
+    assert first_solution(trial(**acting)) == 0.2
+    assert first_solution(trial(**acting, success=False)) is None
+    row = measured(Group("Circle", "d4orm-c2f", [trial(**acting)]))
+    assert row.step_time == pytest.approx((3.0 - 0.2) / 50)
+
+
+def test_an_error_is_a_failure() -> None:
+    row = measured(Group("Circle", "d4orm", [trial(), trial(1, error="OSError: no", status="", success=False)]))
+    assert (row.trials, row.successes, row.errors, row.error) == (2, 1, 1, "OSError: no")
+
+
+def test_times_are_over_the_successes() -> None:
+    trials = [trial(seed, history=f"[[{seconds},1,0.5]]") for seed, seconds in enumerate((1, 2, 3, 4, 5))]
+    row = measured(Group("Circle", "d4orm", [*trials, trial(9, history="[]", status="time_limit", travel_time=99.0)]))
+    assert (row.runtime_lower, row.runtime, row.runtime_upper, row.runtime_mean) == (2, 3, 4, 3)
+    assert row.runtime_deviation == pytest.approx(np.std([1, 2, 3, 4, 5], ddof=1))
+    assert row.travel_time == 6.0
+    assert row.successes == 5
+    assert row.reward == 0.5
+
+
+def test_the_reward_is_that_of_the_last_best_plan_of_every_trial() -> None:
+    trials = [trial(), trial(1, history="[[0.5,0,0.3]]", status="time_limit")]
+    assert measured(Group("Circle", "d4orm", trials)).reward == pytest.approx((0.7 + 0.3) / 2)
+
+
+def test_the_best_reward_is_a_staircase() -> None:
+    rewards = best_reward(trial(), np.array([0.1, 0.5, 1.0, 1.5, 9.0]))
+    assert rewards == pytest.approx([np.nan, 0.6, 0.6, 0.5, 0.7], nan_ok=True)
+
+
+# Tables.
+
+
+def test_the_papers_rows_stand_below_ours_and_its_other_methods_too() -> None:
+    paper = {("Circle", "d4orm", "runtime"): {"8": "0.13"}, ("Circle", "rival", "runtime"): {"8": "9.99"}}
+    page = markdown(figure(paper=paper), [Group("Circle", "d4orm", [trial()])])
+    assert "|  | robots | 8 |" in page
+    ours = page.index("| runtime, s | d4orm | 1.50 (1.50-1.50) |")
+    assert ours < page.index("| runtime, s | d4orm (the paper) | 0.13 |")
+    assert "| runtime, s | rival (the paper) | 9.99 |" in page
+    assert "| success | d4orm | 1 of 1 (21% to 100%) |" in page
+
+
+def test_the_papers_numbers_stand_beside_ours_where_policies_are_the_rows() -> None:
+    paper = {("Circle", "d4orm", "runtime"): {"d4orm": "0.13"}}
+    page = markdown(figure(across="policy", paper=paper), [Group("Circle", "d4orm", [trial()])])
+    assert "| policy | success | runtime, s | runtime, s (the paper) |" in page
+    assert "| d4orm | 1 of 1 (21% to 100%) | 1.50 (1.50-1.50) | 0.13 |" in page
+
+
+def test_deadlines_and_errors_have_their_tables() -> None:
+    groups = [Group("Circle", "d4orm", [trial(), trial(1, error="OSError: no", status="", success=False)])]
+    page = markdown(figure(deadlines=(1.0, 2.0)), groups)
+    assert "| d4orm | 0% (0% to 66%) | 50% (9% to 91%) |" in page
+    assert "- `d4orm`: OSError: no" in page
+
+
+def test_the_papers_tables_are_copied_right() -> None:
+    assert FIGURES["ipopt"].paper["2D Holonomic", "ipopt", "mean_runtime"]["16"] == "failed"
+    coarse = {key[1:]: values for key, values in FIGURES["coarseness"].paper.items()}
+    assert coarse["f=4, o=1", "runtime"] == {"f=4, o=1": "0.23"}
+    assert coarse["f=1, o=10", "makespan"] == {"f=1, o=10": "7.58"}
+    jerk = FIGURES["amswarm"].paper["Ten 3D holonomic robots", "d4orm-d", "jerk"]
+    assert jerk["amswarm_5"] == "42.33"
+
+
+# The command line.
+
+
+def test_without_a_name_the_figures_are_listed(d4orm, tmp_path: Path) -> None:
+    status, out, _ = d4orm()
+    assert status == 0
+    assert [line.split()[0] for line in out.splitlines()] == list(FIGURES)
+    assert d4orm("--list") == (0, out, "")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("fig4",), f"'fig4' is unknown; choose one of {', '.join(FIGURES)}"),
+        (("big-teams", "--section", "Nowhere"), "no section 'Nowhere'; choose of Differential Drive; 2D Holonomic"),
+        (("ipopt", "--policy", "cobyla"), "no policy 'cobyla'; choose of ipopt; d4orm; d4orm, defaults"),
+        (("amswarm", "--quick", "--seeds", "0"), "seeds"),
+        (("amswarm", "--quick", "--workers", "0"), "workers"),
+    ],
+)
+def test_bad_input_gets_one_line(d4orm, arguments: tuple[str, ...], complaint: str) -> None:
+    status, out, err = d4orm(*arguments)
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1
+    assert complaint in err
+
+
+def test_a_planner_that_is_not_there_is_named_before_anything_runs(tmp_path: Path) -> None:
+    section = Section(title="Circle", policies={"d4orm": {}}, scenarios=("circle",), robots=(2,))
+    chosen = figure(sections=(section, replace(section, title="Others", policies={"perfect": {}})))
+    with pytest.raises(ValueError, match="policy 'perfect' is unknown"):
+        reproduce(chosen, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_part_of_a_figure() -> None:
+    part = find_figure("big-teams").only(["2D Holo Random"], ["d4orm-d, defaults", "d4orm-c2f"])
+    assert [(section.robots, list(section.policies)) for section in part.sections] == [
+        ((16, 32, 64, 100), ["d4orm-d, defaults", "d4orm-c2f"]),
+    ]
+    assert find_figure("big-teams").only() == FIGURES["big-teams"]
+
+
+# The store.
+
+
+def test_a_store_of_the_former_version_is_brought_up_to_date(tmp_path: Path) -> None:
+    TrialStore(tmp_path / STORE).add(trial())
+    connection = sqlite3.connect(tmp_path / STORE)
+    connection.execute("ALTER TABLE trials DROP COLUMN preparation")
+    connection.execute("PRAGMA user_version = 2")
+    connection.commit()
+    connection.close()
+    (row,) = TrialStore.existing(tmp_path).trials()
+    assert row == replace(trial(), preparation=None)
+    TrialStore.existing(tmp_path).add(trial(1))
+    assert [row.preparation for row in TrialStore.existing(tmp_path).trials()] == [None, 3.0]
+
+
+def test_the_time_before_the_first_action_is_stored(tmp_path: Path) -> None:
+    few = {"num_samples": 64, "num_steps": 5, "max_iterations": 1}
+    policies = {"d4orm": few, "d4orm-c2f": {"refine": "off", "coarse_iterations": 1, "num_steps": 2}}
+    section = Section(title="Circle", policies=policies, scenarios=("circle",), robots=(2,))
+    groups = reproduce(figure(sections=(section,)), tmp_path, seeds=1)
+    (plan,), (acting,) = (group.trials for group in groups)
+    assert plan.preparation == plan.wall_time
+    assert 0 < acting.preparation < acting.wall_time
+    assert json.loads(acting.history) == []
+    assert {field.name for field in fields(Trial)} >= {"preparation"}
