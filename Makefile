@@ -24,7 +24,7 @@ demo: $(CORE_STAMP) ## Plan 16 robots across a circle, execute the plan, write p
 	$(BIN)/d4orm demo --out demo
 
 test: $(DEV_STAMP) ## Run the whole test suite; PYTEST_ARGS='-m "not slow"' for the quick part
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal $(PYTEST_ARGS)
 
 lint: $(DEV_STAMP) ## Check style, formatting, types and the layers
 	$(BIN)/ruff check .
