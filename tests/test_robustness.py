@@ -271,7 +271,7 @@ def test_the_number_of_workers_makes_no_difference(tmp_path: Path) -> None:
     untimed: dict[str, Any] = {"wall_time": None, "compute": None, "compute_lower": None, "compute_upper": None}
     assert [replace(row, **untimed) for row in alone] == [replace(row, **untimed) for row in together]
     # Workers of several have one thread each, which the description of the machine says.
-    untimed = {"wall_time": None, "elapsed": None, "date": "", "machine": ""}
+    untimed = {"wall_time": None, "preparation": None, "elapsed": None, "date": "", "machine": ""}
     outcomes = [[replace(row, **untimed) for row in TrialStore(tmp_path / folder / STORE).trials()] for folder in "12"]
     assert outcomes[0] == outcomes[1]
 
