@@ -76,7 +76,7 @@ class Features:
         # On the goal itself any direction will do.
         frame[(frame == 0).all(axis=1), 0] = 1
         max_speed = observations[:, 2 * d + 6, None]
-        distance = np.linalg.norm(goal, axis=1, keepdims=True)
+        distance = _norm(goal)
         heading = observations[:, d : d + 2]
         parts = [
             _into(frame, observations[:, :d]) / max_speed,
@@ -109,8 +109,7 @@ class Features:
         """
         controls = np.clip(actions, -1, 1) * limits
         if self.turned:
-            norm = np.linalg.norm(controls, axis=1, keepdims=True)
-            controls = _out_of(frames, controls * np.minimum(1, limits / np.maximum(norm, 1e-6)))
+            controls = _out_of(frames, controls * np.minimum(1, limits / np.maximum(_norm(controls), 1e-6)))
         within: FloatArray = np.clip(controls, -limits, limits)
         return within
 
@@ -118,10 +117,10 @@ class Features:
         d = self.dimension
         present, position, velocity = seen[..., :1], seen[..., 1 : 1 + d], seen[..., 1 + d : 1 + 2 * d]
         reach = radius[:, None, None] + seen[..., 1 + 2 * d :]
-        gap = np.maximum(np.linalg.norm(position, axis=2, keepdims=True) - reach, 0)
-        approach = -(position * velocity).sum(axis=2, keepdims=True)
-        time = np.clip(approach / np.maximum((velocity**2).sum(axis=2, keepdims=True), 1e-6), 0, _HORIZON)
-        miss = np.maximum(np.linalg.norm(position + time * velocity, axis=2, keepdims=True) - reach, 0)
+        gap = np.maximum(_norm(position) - reach, 0)
+        approach = -_dot(position, velocity)
+        time = np.clip(approach / np.maximum(_dot(velocity, velocity), 1e-6), 0, _HORIZON)
+        miss = np.maximum(_norm(position + time * velocity) - reach, 0)
         parts = [
             np.ones_like(gap),
             _into(frame[:, None], _unit(position)),
@@ -135,6 +134,8 @@ class Features:
 
     def _obstacles(self, frame: FloatArray, seen: FloatArray) -> FloatArray:
         d = self.dimension
+        if not seen[..., 0].any():
+            return np.zeros((*seen.shape[:2], d + 3), np.float32)
         gap = np.maximum(seen[..., 1 + d :], 0)
         parts = [np.ones_like(gap), _into(frame[:, None], _unit(seen[..., 1 : 1 + d])), *_scales(gap)]
         features: FloatArray = np.concatenate(parts, axis=2) * seen[..., :1]
@@ -146,9 +147,20 @@ def _scales(gap: Any) -> tuple[FloatArray, FloatArray]:
     return 1 / (1 + gap), np.exp(-4 * gap)
 
 
-def _unit(vectors: FloatArray) -> FloatArray:
+def _dot(one: Any, two: Any) -> FloatArray:
+    """``(..., 1)`` products of ``(..., d)``; several times quicker than a sum over the short last axis."""
+    products: FloatArray = np.einsum("...i,...i->...", one, two)[..., None]
+    return products
+
+
+def _norm(vectors: Any) -> FloatArray:
+    """``(..., 1)`` lengths of ``(..., d)``."""
+    return np.sqrt(_dot(vectors, vectors))
+
+
+def _unit(vectors: Any) -> FloatArray:
     """``(..., d)`` of length one; zero stays zero."""
-    units: FloatArray = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-6)
+    units: FloatArray = vectors / np.maximum(_norm(vectors), 1e-6)
     return units
 
 

@@ -111,7 +111,7 @@ class RobotVecEnv(VecEnv):
         self._touched = infos["collided"].copy()
         self._return = np.zeros(self._shape)
         self._length = np.zeros(self._shape, np.int64)
-        return self._encode(observations)
+        return self._encode(observations, [])[0]
 
     def step_async(self, actions: FloatArray) -> None:
         self._actions = np.asarray(actions, np.float32)
@@ -135,8 +135,13 @@ class RobotVecEnv(VecEnv):
         dones = np.where(acting, now["arrived"], False) | ended[:, None]
         self._acting = (acting & ~now["arrived"]) | ended[:, None]
         self._distance = infos["distance_to_goal"]
-        features = self._encode(observations)
-        robot_infos = self._robot_infos(dones, acting, now["arrived"], ended, observations, infos)
+        finishing = np.argwhere(dones & acting)
+        last = [
+            (infos["final_obs"][b] if ended[b] else observations[b]).reshape(self._shape[1], -1)[k]
+            for b, k in finishing
+        ]
+        features, terminal = self._encode(observations, last)
+        robot_infos = self._robot_infos(finishing, terminal, now["arrived"])
         for values in (self._touched, self._return, self._length):
             values[dones] = 0
         self.seconds += time.perf_counter() - begin
@@ -154,10 +159,14 @@ class RobotVecEnv(VecEnv):
         )
         return rewards
 
-    def _encode(self, observations: FloatArray) -> FloatArray:
-        features, self._frames = self.features.encode(observations.reshape(self.num_envs, -1))
-        features[~self._acting.ravel()] = 0
-        return features
+    def _encode(self, observations: FloatArray, last: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Features of what the robots see now, and of what those whose episodes have ended saw last."""
+        count = self.num_envs
+        seen = observations.reshape(count, -1)
+        features, frames = self.features.encode(np.concatenate([seen, last]) if last else seen)
+        self._frames = frames[:count]
+        features[:count][~self._acting.ravel()] = 0
+        return features[:count], features[count:]
 
     def _finish_worlds(self, ended: BoolArray, infos: dict[str, Any]) -> None:
         self.finished = []
@@ -168,27 +177,12 @@ class RobotVecEnv(VecEnv):
                 for world in np.flatnonzero(ended)
             ]
 
-    def _robot_infos(
-        self,
-        dones: BoolArray,
-        acting: BoolArray,
-        arrived: BoolArray,
-        ended: BoolArray,
-        observations: FloatArray,
-        infos: dict[str, Any],
-    ) -> list[dict[str, Any]]:
-        """Empty but for robots whose episode has just ended."""
+    def _robot_infos(self, finishing: Any, terminal: FloatArray, arrived: BoolArray) -> list[dict[str, Any]]:
+        """Empty but for robots whose episode has just ended, ``(N, 2)`` world and robot."""
         robot_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        finishing = np.argwhere(dones & acting)
-        if not len(finishing):
-            return robot_infos
-        count = self._shape[1]
-        last = np.stack(
-            [(infos["final_obs"][b] if ended[b] else observations[b]).reshape(count, -1)[k] for b, k in finishing]
-        )
-        for (b, k), terminal in zip(finishing, self.features.encode(last)[0]):
-            robot_infos[b * count + k] = {
-                "terminal_observation": terminal,
+        for (b, k), features in zip(finishing, terminal):
+            robot_infos[b * self._shape[1] + k] = {
+                "terminal_observation": features,
                 "TimeLimit.truncated": not arrived[b, k],
                 "is_success": bool(arrived[b, k] and not self._touched[b, k]),
                 "episode": {"r": float(self._return[b, k]), "l": int(self._length[b, k]), "t": 0.0},
