@@ -24,7 +24,7 @@ def train(
     num_envs: Annotated[
         int | None, typer.Option("--num-envs", help="Robots that act at once; 1024 for ppo, 64 for sac.")
     ] = None,
-    curriculum: Annotated[bool, typer.Option(help="Begin with smaller teams.")] = True,
+    curriculum: Annotated[bool, typer.Option(help="Begin with smaller teams.")] = False,
     lessons: Annotated[int, typer.Option("--lessons", help="Parts with a checkpoint and an evaluation each.")] = 50,
     settings: Annotated[list[str] | None, typer.Option("--set", help="An argument of the scenario, as size=4.")] = None,
     out: Annotated[

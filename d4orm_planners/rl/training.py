@@ -64,7 +64,7 @@ class TrainingSettings:
     seed: int = 0
     model: str | None = None
     num_envs: int | None = None
-    curriculum: bool = True
+    curriculum: bool = False
     lessons: int = 50
     validation_worlds: int = 100
     scenario_settings: Mapping[str, Any] = field(default_factory=dict)
