@@ -54,7 +54,9 @@ def test_lessons_take_whole_updates_and_all_of_them() -> None:
 pytest.importorskip("stable_baselines3")
 from d4orm_planners.rl.training import TrainingSettings, train  # noqa: E402
 
-TINY = TrainingSettings(robots=2, steps=4 * 16 * 32, num_envs=16, lessons=4, validation_worlds=3, seed=5, curriculum=True)
+TINY = TrainingSettings(
+    robots=2, steps=4 * 16 * 32, num_envs=16, lessons=4, validation_worlds=3, seed=5, curriculum=True
+)
 TINY_SAC = replace(TINY, algorithm="sac", steps=4 * 256)
 
 
