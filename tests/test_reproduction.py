@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import sqlite3
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from d4orm_planners.evaluation.reproduction import Figure, Group, Section, repro
 from d4orm_planners.evaluation.reproduction_numbers import METRICS, first_solution, measured
 from d4orm_planners.evaluation.reproduction_plots import PLOTS, best_reward
 from d4orm_planners.evaluation.reproduction_report import markdown
-from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
+from d4orm_planners.evaluation.store import Trial, TrialStore
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -265,19 +264,6 @@ def test_a_part_of_a_figure() -> None:
 
 
 # The store.
-
-
-def test_a_store_of_the_former_version_is_brought_up_to_date(tmp_path: Path) -> None:
-    TrialStore(tmp_path / STORE).add(trial())
-    connection = sqlite3.connect(tmp_path / STORE)
-    connection.execute("ALTER TABLE trials DROP COLUMN preparation")
-    connection.execute("PRAGMA user_version = 2")
-    connection.commit()
-    connection.close()
-    (row,) = TrialStore.existing(tmp_path).trials()
-    assert row == replace(trial(), preparation=None)
-    TrialStore.existing(tmp_path).add(trial(1))
-    assert [row.preparation for row in TrialStore.existing(tmp_path).trials()] == [None, 3.0]
 
 
 def test_the_time_before_the_first_action_is_stored(tmp_path: Path) -> None:

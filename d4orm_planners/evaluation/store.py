@@ -210,19 +210,13 @@ class TrialStore:
             raise self._foreign(str(error)) from error
 
     def _check(self, connection: sqlite3.Connection) -> None:
-        """Make the table in a new file, bring a file of version 2 up to date, and leave all others untouched."""
+        """Make the table in a new file; refuse a file of another kind or version, which stays untouched."""
         if _pragma(connection, "application_id") != APPLICATION_ID:
             # One transaction, so that of two processes that find no file one makes the table.
             connection.execute("BEGIN IMMEDIATE")
             if _pragma(connection, "application_id") == 0 and _pragma(connection, "schema_version") == 0:
                 connection.execute(_CREATE)
                 connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-                connection.execute(f"PRAGMA user_version = {VERSION}")
-            connection.execute("COMMIT")
-        elif _pragma(connection, "user_version") == 2:
-            connection.execute("BEGIN IMMEDIATE")
-            if _pragma(connection, "user_version") == 2:  # another process may have been quicker
-                connection.execute("ALTER TABLE trials ADD COLUMN preparation REAL")
                 connection.execute(f"PRAGMA user_version = {VERSION}")
             connection.execute("COMMIT")
         if _pragma(connection, "application_id") != APPLICATION_ID:

@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.dynamics import get_model
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.rl.features import TURNED_MODELS, Features
 
@@ -41,7 +42,7 @@ class Header(BaseModel):
         activation: Between the layers.
         squashed: Whether the output goes through tanh.
         layers: Number of layers.
-        training: The command, seed, steps and results, for people.
+        training: The command and its settings, for people.
     """
 
     model_config = ConfigDict(extra="forbid", strict=True)
@@ -77,11 +78,6 @@ class Network:
         """What it sees."""
         head = self.header
         return Features(head.dimension, head.num_neighbors, head.num_obstacles, head.model in TURNED_MODELS)
-
-    @property
-    def control_size(self) -> int:
-        """Components of a control ``m``."""
-        return len(self.arrays[f"bias_{self.header.layers - 1}"])
 
     def __call__(self, features: FloatArray) -> FloatArray:
         """``(N, m)`` most likely actions in ``[-1, 1]`` for ``(N, F)`` features."""
@@ -131,7 +127,8 @@ def load_network(path: str | Path) -> Network:
         raise ValueError(f"policy file {path} is no safetensors file ({error}); write one with 'd4orm train'") from None
     if text is None:
         raise ValueError(f"policy file {path} holds no policy of this program; write one with 'd4orm train'")
-    return Network(_header(path, text), _checked(path, _header(path, text), arrays))
+    header = _header(path, text)
+    return Network(header, _checked(path, header, arrays))
 
 
 def _header(path: Path, text: str) -> Header:
@@ -147,6 +144,10 @@ def _header(path: Path, text: str) -> Header:
         raise ValueError(
             f"policy file {path}: activation {header.activation!r} is unknown; known are {', '.join(_ACTIVATIONS)}"
         )
+    try:
+        get_model(header.model)
+    except ValueError as error:
+        raise ValueError(f"policy file {path}: {error}") from None
     return header
 
 
@@ -163,6 +164,9 @@ def _checked(path: Path, header: Header, arrays: dict[str, Any]) -> dict[str, Fl
         weight = arrays.get(f"weight_{layer}")
         shapes[f"weight_{layer}"] = (None, width)
         width = len(weight) if weight is not None and weight.ndim == 2 else None
+        if layer == header.layers - 1:
+            width = get_model(header.model).control_size
+            shapes[f"weight_{layer}"] = (width, *shapes[f"weight_{layer}"][1:])
         shapes[f"bias_{layer}"] = (width,)
     if set(arrays) != set(shapes):
         raise ValueError(f"policy file {path} holds {', '.join(sorted(arrays))}; expected {', '.join(sorted(shapes))}")
@@ -173,6 +177,8 @@ def _checked(path: Path, header: Header, arrays: dict[str, Any]) -> dict[str, Fl
             raise ValueError(
                 f"policy file {path}: {name} is {array.dtype} {array.shape}; expected finite float32 of shape {shape}"
             )
+    if (arrays["observation_variance"] < 0).any():
+        raise ValueError(f"policy file {path}: observation_variance is negative in places; it must not be")
     return arrays
 
 
