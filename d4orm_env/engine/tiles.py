@@ -32,9 +32,10 @@ STRIDE = ROWS * TILE
 ROBOT, OBSTACLE = 0, 1
 NOWHERE = np.uint64(0)
 
-OPTIONS: dict[str, Any] = {"fastmath": {"contract", "nsz", "reassoc"}, "error_model": "numpy"}
-"""Multiply-adds may fuse and sums be regrouped, which removes half the work of a Runge-Kutta step; nothing that changes
-the meaning of NaN or infinity is allowed."""
+OPTIONS: dict[str, Any] = {"fastmath": {"contract", "nsz", "reassoc", "arcp", "afn"}, "error_model": "numpy"}
+"""Multiply-adds may fuse and sums be regrouped, which removes half the work of a Runge-Kutta step, and one over a root
+may be an estimate with a Newton step behind it, good to the last bit or two; nothing that changes the meaning of NaN or
+infinity is allowed."""
 
 UNCOUNTED: dict[str, Any] = OPTIONS | {"_nrt": False}
 """For everything that kernels call: without numba's reference counts, which would cost more than the sums they
