@@ -55,7 +55,7 @@ def _squared_gap(builder: Any, pairs: list[tuple[Any, Any]]) -> Any:
 
 
 def _within(dimension: int) -> Any:
-    """``(w, a, b, squared_reach) -> mask``: where two places, whose rows begin at ``w[a]`` and ``w[b]``, are that near."""
+    """``(w, a, b, squared_reach) -> mask``: where the places in the rows from ``w[a]`` and ``w[b]`` are near."""
 
     @intrinsic
     def within(typing_context: Any, w: Any, a: Any, b: Any, squared_reach: Any) -> Any:

@@ -183,7 +183,9 @@ def _make_list(first: Any, last: Any, reach: Any, k: Any, radius: Any, s: Any, l
 
 
 @inlined
-def _list_near(radius: Any, margin: Any, moving: Any, moving_radius: Any, t: Any, num_steps: Any, w: Any, s: Any) -> None:
+def _list_near(
+    radius: Any, margin: Any, moving: Any, moving_radius: Any, t: Any, num_steps: Any, w: Any, s: Any
+) -> None:
     """Make the lists for time ``t`` and the steps until the next ones."""
     num_robots, num_bodies = radius.shape[0], moving.shape[0]
     for body in range(num_bodies):

@@ -16,8 +16,8 @@ from d4orm_env.core import collision, dynamics, reward, transition
 from d4orm_env.core.dynamics import MODELS, Model
 from d4orm_env.engine import lanes, noise, proximity, tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.noise import DRAWS
 from d4orm_env.engine.lanes import TILE, subtract_where, use_wide_registers
+from d4orm_env.engine.noise import DRAWS
 from d4orm_env.engine.proximity import STATIC, make_scratch, mark_robots, measure_strides, near_static
 from d4orm_env.engine.tiles import (
     DOCKED,

@@ -15,7 +15,7 @@ from numba.extending import register_jitable
 from d4orm_env.core import collision, dynamics, observation, reward, transition
 from d4orm_env.engine import lanes, tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.lanes import TILE
+from d4orm_env.engine.lanes import TILE, use_wide_registers
 from d4orm_env.engine.tiles import (
     CONTROL,
     DISTANCE2,
@@ -92,7 +92,9 @@ def _bit(mask: Any, s: Any) -> Any:
 
 
 @compiled
-def _judge(arrays: Any, inverse: Any, first: Any, w: Any, near: Any, collided: Any, violated: Any, rewards: Any) -> None:
+def _judge(
+    arrays: Any, inverse: Any, first: Any, w: Any, near: Any, collided: Any, violated: Any, rewards: Any
+) -> None:
     """Flag contacts and margin violations and compute rewards; all outputs ``(B, K)``."""
     num_robots = arrays.radius.shape[0]
     for k in range(num_robots):
@@ -145,6 +147,7 @@ def step_worlds(
         rewards: ``(B, K)``, output.
         tile_range: First tile of worlds and the one after the last.
     """
+    use_wide_registers()
     num_robots, dimension = arrays.goal.shape
     w = tiles.aligned_zeros(num_robots * STRIDE)
     near = np.empty((num_robots, 2), np.uint64)
@@ -168,6 +171,7 @@ def roll_out(
     Every output has ``H+1`` rows too, the first for the start. The motion comes first; then 64 moments at a time are
     judged, as if they were worlds.
     """
+    use_wide_registers()
     num_robots = arrays.radius.shape[0]
     w = tiles.aligned_zeros(num_robots * STRIDE)
     near = np.empty((num_robots, 2), np.uint64)
@@ -186,6 +190,7 @@ def judge_worlds(
     arrays: Any, goal: Any, inverse: Any, state: Any, control: Any, docked: Any, collided: Any, violated: Any
 ) -> None:
     """Contacts and margin violations of ``B`` worlds as they stand; arguments as in :func:`step_worlds`."""
+    use_wide_registers()
     w = tiles.aligned_zeros(arrays.radius.shape[0] * STRIDE)
     near = np.empty((arrays.radius.shape[0], 2), np.uint64)
     rewards = np.empty(collided.shape, np.float32)
@@ -395,6 +400,7 @@ def advance_worlds(
         tile_range: First tile of worlds and the one after the last.
         out: ``(B, K, D)`` observations; those of skipped worlds are not written.
     """
+    use_wide_registers()
     num_robots, dimension = arrays.goal.shape
     w = tiles.aligned_zeros(num_robots * STRIDE)
     near = np.empty((num_robots, 2), np.uint64)
