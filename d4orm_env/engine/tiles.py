@@ -34,8 +34,8 @@ NOWHERE = np.uint64(0)
 
 OPTIONS: dict[str, Any] = {"fastmath": {"contract", "nsz", "reassoc", "arcp", "afn"}, "error_model": "numpy"}
 """Multiply-adds may fuse and sums be regrouped, which removes half the work of a Runge-Kutta step, and one over a root
-may be an estimate with a Newton step behind it, good to the last bit or two; nothing that changes the meaning of NaN or
-infinity is allowed."""
+may be an estimate with a Newton step behind it, good to the last bit or two. Of infinity that is NaN, so that controls
+beyond 1e19, whose squares overflow, count as not finite; otherwise NaN and infinity mean what they always do."""
 
 UNCOUNTED: dict[str, Any] = OPTIONS | {"_nrt": False}
 """For everything that kernels call: without numba's reference counts, which would cost more than the sums they
