@@ -8,8 +8,11 @@ from __future__ import annotations
 from typing import Any
 
 from llvmlite import ir
+from numba import extending
 from numba.core import types
-from numba.extending import intrinsic
+
+intrinsic: Any = extending.intrinsic
+"""Its calls in compiled code lack the first argument, which type checkers cannot know."""
 
 TILE = 64
 """Worlds per tile, as many as a mask has bits."""

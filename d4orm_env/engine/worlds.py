@@ -176,8 +176,11 @@ def roll_out(
     w = tiles.aligned_zeros(num_robots * STRIDE)
     near = np.empty((num_robots, 2), np.uint64)
     for t in range(1, controls.shape[0]):
-        states[t] = states[t - 1]
-        docked[t] = docked[t - 1]
+        # Loops, because numba takes seconds to compile assignments of slices.
+        for k in range(num_robots):
+            for i in range(states.shape[2]):
+                states[t, k, i] = states[t - 1, k, i]
+            docked[t, k] = docked[t - 1, k]
         _load_world(goal, states, controls, docked, t, 0, w)
         for k in range(num_robots):
             tiles.move_robot(arrays, k, w)
@@ -332,7 +335,6 @@ class WorldBatch(NamedTuple):
 
 @compiled
 def _restart(batch: Any, b: Any) -> None:
-    # Loops, because numba takes seconds to compile assignments of slices.
     for k in range(batch.docked.shape[1]):
         for i in range(batch.state.shape[2]):
             batch.state[b, k, i] = batch.start[b, k, i]
