@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import ipaddress
 import json
 import logging
 import re
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from types import ModuleType
@@ -13,7 +16,7 @@ from typing import Any
 
 from d4orm_env.core.arrays import positive_number
 from d4orm_planners.distributed.messages import MAX_BYTES
-from d4orm_planners.distributed.transport import Mailbox
+from d4orm_planners.distributed.transport import WAITING, Mailbox
 
 logger = logging.getLogger(__name__)
 
@@ -107,7 +110,7 @@ class ZenohSettings:
 
 
 class ZenohTransport:
-    """One end of a network of zenoh peers.
+    """One end of a network of zenoh peers. The environment variable ``RUST_LOG`` makes zenoh tell what it does.
 
     Args:
         settings: Where the others are.
@@ -119,12 +122,15 @@ class ZenohTransport:
 
     def __init__(self, settings: ZenohSettings) -> None:
         zenoh = _import_zenoh()
+        zenoh.try_init_log_from_env()
         config = _config(zenoh, settings)
         key = f"{settings.namespace}/candidates"
         self._mailbox = Mailbox()
         self._error: type[Exception] = zenoh.ZError
         try:
             self._session = zenoh.open(config)
+            # One that is left open might keep the process from ending.
+            atexit.register(self._session.close)
             # Newer candidates replace older ones, so that it is better to lose one than to wait for a slow link.
             self._publisher = self._session.declare_publisher(
                 key,
@@ -132,14 +138,14 @@ class ZenohTransport:
                 express=True,
                 allowed_destination=zenoh.Locality.REMOTE,
             )
-            self._subscriber = self._session.declare_subscriber(
-                key, lambda sample: self._mailbox.put(sample.payload.to_bytes())
-            )
+            self._subscriber = self._session.declare_subscriber(key, zenoh.handlers.RingChannel(WAITING))
         except zenoh.ZError as error:
             raise ValueError(
                 f"zenoh cannot listen at {', '.join(settings.listen) or 'nothing'} or connect to "
                 f"{', '.join(settings.connect) or 'nothing'}: {_reason(error)}"
             ) from error
+        # Zenoh's own thread for a callback is none that the end of the process leaves alone.
+        threading.Thread(target=self._receive, daemon=True, name=f"zenoh-{key}").start()
 
     def publish(self, data: bytes) -> None:
         """See :meth:`~d4orm_planners.distributed.transport.Transport.publish`."""
@@ -159,6 +165,12 @@ class ZenohTransport:
         """See :meth:`~d4orm_planners.distributed.transport.Transport.close`."""
         self._mailbox.close()
         self._session.close()
+        atexit.unregister(self._session.close)
+
+    def _receive(self) -> None:
+        with contextlib.suppress(self._error):  # which says that the session is closed
+            while True:
+                self._mailbox.put(self._subscriber.recv().payload.to_bytes())
 
     @property
     def has_listeners(self) -> bool:
