@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from d4orm_planners.commands.evaluate import evaluate, leaderboard
-from d4orm_planners.commands.inputs import check_writable, make_folder, names, numbers, parse_settings
+from d4orm_planners.commands.inputs import check_target, make_folder, names, numbers, parse_settings
+from d4orm_planners.commands.node import node
 from d4orm_planners.commands.reproduce import reproduce
 from d4orm_planners.commands.robustness import robustness
 from d4orm_planners.commands.train import train
@@ -35,7 +36,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-for command in (evaluate, leaderboard, reproduce, robustness, train):
+for command in (evaluate, leaderboard, node, reproduce, robustness, train):
     app.command()(command)
 
 Scenario = Annotated[
@@ -101,7 +102,7 @@ def plan_command(
 ) -> None:
     """Plan for a team; write the plan, a picture or an animation."""
     for path, suffixes in ((out, (".npz",)), (picture, (".png", ".svg", ".pdf")), (animation, (".gif", ".mp4"))):
-        _check_target(path, suffixes)
+        check_target(path, suffixes)
     problem = _problem(scenario, robots, model, obstacles, seed)
     plan = _solve(problem, planner, preset, settings, engine, seed, time_limit, max_iterations, quiet)
     if not quiet:
@@ -137,7 +138,7 @@ def run(
     from d4orm_planners.registry import make_policy
 
     for path, suffixes in ((picture, (".png", ".svg", ".pdf")), (animation, (".gif", ".mp4"))):
-        _check_target(path, suffixes)
+        check_target(path, suffixes)
     if plan_file is not None:
         plan = Plan.load(plan_file)
         problem: Problem = plan.problem
@@ -331,19 +332,6 @@ def _require_solved(plan: Plan) -> None:
         for robot, reason in plan.failures.items():
             typer.echo(f"  {robot} {reason}", err=True)
         raise typer.Exit(1)
-
-
-def _check_target(path: Path | None, suffixes: tuple[str, ...]) -> None:
-    """Find out before planning whether a file can be written."""
-    if path is None:
-        return
-    if path.suffix not in suffixes:
-        raise ValueError(f"output file {str(path)!r} must end in {' or '.join(suffixes)}")
-    if not path.parent.is_dir():
-        raise ValueError(f"folder {str(path.parent)!r} does not exist; create it first")
-    if path.is_dir():
-        raise ValueError(f"output file {str(path)!r} is a folder")
-    check_writable(path.parent)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -14,9 +15,11 @@ from d4orm_planners.d4orm import D4orm
 from d4orm_planners.d4orm_d import D4ormD, D4ormDConfig
 from d4orm_planners.distributed.crew import MODES, AsyncCrew, Crew, SyncCrew
 from d4orm_planners.distributed.inbox import Inbox
+from d4orm_planners.distributed.network import NetworkCrew
 from d4orm_planners.distributed.node import Node, Selection
 from d4orm_planners.distributed.selection import SELECTIONS, shares
 from d4orm_planners.distributed.transport import TRANSPORTS, LocalNetwork
+from d4orm_planners.distributed.zenoh_transport import ZenohSettings, ZenohTransport
 
 INNER = MappingProxyType({kind.name: kind for kind in (D4orm, D4ormD)})
 """The planners that a node can run."""
@@ -37,7 +40,11 @@ class DD4ormConfig(D4ormDConfig):
             its own pace; plans then depend on who is sooner.
         patience: Seconds that are waited for stragglers: in asynchronous mode in every round, else beyond the time
             limit of the solve, after which a node is given up.
-        transport: How messages travel; ``"local"``, between threads of this process.
+        transport: How messages travel; ``"local"``, between threads of this process, or ``"zenoh"``, between this
+            process, as one node, and others on a network, each at its own pace (``mode="async"``).
+        node: Which of the nodes this process is, from 0; over a network only.
+        zenoh: Where the other nodes are: :class:`~d4orm_planners.distributed.zenoh_transport.ZenohSettings`, or a
+            mapping of them; over a network only.
     """
 
     planner: str = "d4orm"
@@ -47,6 +54,8 @@ class DD4ormConfig(D4ormDConfig):
     mode: str = "sync"
     patience: float = 1.0
     transport: str = "local"
+    node: int | None = None
+    zenoh: ZenohSettings | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -63,6 +72,27 @@ class DD4ormConfig(D4ormDConfig):
             self.node_settings(self.nodes)
         whole_number(self.k, "k", 1)
         positive_number(self.patience, "patience", zero_allowed=True)
+        if self.transport == "zenoh":
+            self._check_network()
+        else:
+            for name in ("node", "zenoh"):
+                if getattr(self, name) is not None:
+                    raise ValueError(f"{name} is {getattr(self, name)!r}; it is a setting of transport 'zenoh' only")
+
+    def _check_network(self) -> None:
+        object.__setattr__(self, "zenoh", ZenohSettings.of({} if self.zenoh is None else self.zenoh))
+        if self.mode != "async":
+            raise ValueError(f"mode is {self.mode!r}; over a network it must be 'async', as there are no common rounds")
+        if self.node is None:
+            raise ValueError("node is None; over a network it must say which of the nodes this process is, from 0")
+        whole_number(self.node, "node", 0)
+        if self.nodes is not None:
+            self.check_node(self.nodes)
+
+    def check_node(self, nodes: int) -> None:
+        """Raise ``ValueError`` if this process is none of so many nodes."""
+        if self.node is not None and self.node >= nodes:
+            raise ValueError(f"node is {self.node}; of {nodes} nodes the last one is {nodes - 1}")
 
     def node_settings(self, nodes: int) -> list[dict[str, Any]]:
         """The settings of each node's planner.
@@ -111,18 +141,30 @@ class DD4orm(Planner):
     def finish(self, search: Search) -> None:
         """See :meth:`Planner.finish`."""
         if "crew" in search.memory:
-            search.memory.pop("crew").close()
+            crew: Crew = search.memory.pop("crew")
+            crew.close()
+            # What was collected last is not lost, however the solve has ended.
+            search.best = max(search.best, crew.best, key=lambda candidate: candidate.rank)
 
     def _crew(self, search: Search) -> Crew:
         config, problem = self.config, search.problem
         number = config.nodes or problem.num_robots
         kind = INNER[config.planner]
         planners = [kind(kind.config_class(**settings)) for settings in config.node_settings(number)]
+        selection, base = Selection(config.selection, config.k), search.current.controls
+        if config.node is not None and config.zenoh is not None:
+            config.check_node(number)
+            transport = ZenohTransport(config.zenoh)
+            engine, planner = get_engine(config.engine), planners[config.node]
+            # Numbered by the clock, what a node tells that was started again is newer than what it told before.
+            node = Node(
+                config.node, number, planner, problem, search.seed, base, engine, transport, selection, time.time_ns()
+            )
+            return NetworkCrew(node, transport, config.patience, config.zenoh.linger)
         # Nodes of one machine share its cores.
         engine = get_engine(config.engine, max(available_cores() // number, 1))
-        network, selection = LocalNetwork(), Selection(config.selection, config.k)
+        network = LocalNetwork()
         ends = [network.join() for _ in planners]
-        base = search.current.controls
         nodes = [
             Node(i, number, planner, problem, search.seed, base, engine, end, selection)
             for i, (planner, end) in enumerate(zip(planners, ends, strict=True))

@@ -27,6 +27,7 @@ from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.base import Iteration, Search, evaluate_controls
 from d4orm_planners.d4orm import D4orm
+from d4orm_planners.distributed import inbox as inbox_module
 from d4orm_planners.distributed import messages, node
 from d4orm_planners.distributed.inbox import Inbox
 from d4orm_planners.distributed.messages import KINDS, MAGIC, Message, MessageError, decode, encode
@@ -278,6 +279,26 @@ def test_a_candidate_counts_for_what_it_is_not_for_what_is_claimed() -> None:
     assert box.false_claims == 1
 
 
+def test_what_is_told_again_is_not_judged_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    box, other = inbox()
+    judged = []
+
+    def judge(*arguments: Any) -> Any:
+        judged.append(arguments)
+        return evaluate_controls(*arguments)
+
+    monkeypatch.setattr(inbox_module, "evaluate_controls", judge)
+    other.publish(encode(message(), PROBLEM))
+    (first,) = box.receive()
+    executed = first.candidate.controls
+    for sender, sequence in ((1, 4), (1, 5), (2, 1)):
+        other.publish(encode(message(node=sender, sequence=sequence, controls=executed), PROBLEM))
+        (again,) = box.receive()
+        np.testing.assert_array_equal(again.candidate.controls, executed)
+        assert again.candidate.rank == first.candidate.rank
+    assert len(judged) == 1
+
+
 # The planner.
 
 
@@ -450,8 +471,14 @@ def test_an_asynchronous_node_waits_once_for_one_that_is_silent(monkeypatch: pyt
         ({"planner": "mppi"}, "planner 'mppi' is unknown; choose one of d4orm, d4orm-d"),
         ({"selection": "best"}, "selection 'best' is unknown; choose one of top-k, max, k-means"),
         ({"mode": "later"}, "mode 'later' is unknown; choose one of sync, async"),
-        ({"transport": "pigeon"}, "transport 'pigeon' is unknown; choose one of local"),
+        ({"transport": "pigeon"}, "transport 'pigeon' is unknown; choose one of local, zenoh"),
         ({"nodes": 0}, "nodes is 0; it must be at least 1"),
+        ({"node": 1}, "node is 1; it is a setting of transport 'zenoh' only"),
+        ({"zenoh": {}}, "zenoh is {}; it is a setting of transport 'zenoh' only"),
+        ({"transport": "zenoh", "node": 0}, "mode is 'sync'; over a network it must be 'async'"),
+        ({"transport": "zenoh", "mode": "async"}, "node is None; over a network it must say which"),
+        ({"transport": "zenoh", "mode": "async", "node": 2}, "node is 2; of 2 nodes the last one is 1"),
+        ({"transport": "zenoh", "mode": "async", "node": 0, "zenoh": {"port": 1}}, "'port' is no setting of zenoh"),
         ({"nodes": 2.0}, "nodes must be a whole number, not 2.0"),
         ({"k": 0}, "k is 0; it must be at least 1"),
         ({"patience": -1}, "patience is -1; it must be zero or more"),

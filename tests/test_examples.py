@@ -375,3 +375,16 @@ def test_count_of_seeds_below_one_is_refused(tmp_path: Path) -> None:
     result = run("one_dimension", tmp_path / "out", "--seeds", "0")
     assert result.returncode == 2
     assert "0 is too few; give at least 1" in result.stderr
+
+
+def test_the_cost_of_a_message_is_measured(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("message_overhead", out)
+    rows = table(out / "message_overhead.csv")
+    assert [row["transport"] for row in rows] == ["local", "zenoh"]
+    for row in rows:
+        # 100 steps of 4 robots with 2 controls, as float32, and header and checksum.
+        assert 3200 < float(row["bytes"]) < 3400
+        assert float(row["overhead"]) == pytest.approx(
+            sum(float(row[part]) for part in ("write", "send", "read")), rel=0.05
+        )

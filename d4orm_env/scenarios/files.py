@@ -42,9 +42,18 @@ def load_problem(path: str | os.PathLike[str]) -> Problem:
             names the file, the field, and what was expected.
     """
     try:
-        return parse(_read_yaml(_read_text(Path(path))))
+        return parse(read_yaml(path))
     except ValueError as error:
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
+
+
+def read_yaml(path: str | os.PathLike[str]) -> Any:
+    """The content of a YAML file: text, numbers, lists and mappings.
+
+    Raises:
+        ValueError: If it cannot be read, is larger than 10 MB, or is no such YAML.
+    """
+    return _read_yaml(_read_text(Path(path)))
 
 
 def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:
@@ -74,7 +83,7 @@ def _read_text(path: Path) -> str:
     except OSError as error:
         raise ValueError(f"cannot be read ({error.strerror})") from error
     if len(content) > MAX_BYTES:
-        raise ValueError(f"is larger than {MAX_BYTES // 1_000_000} MB; scenario files are smaller than that")
+        raise ValueError(f"is larger than {MAX_BYTES // 1_000_000} MB; files of this kind are smaller than that")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -99,7 +108,7 @@ def _node(events: Iterator[yaml.Event], event: Any, depth: int) -> Any:
     """The value that begins with ``event``; takes the rest of it from ``events``."""
     line = _line(event.start_mark)
     if depth > MAX_DEPTH:
-        raise ValueError(f"is nested more than {MAX_DEPTH} deep{line}; scenario files are not")
+        raise ValueError(f"is nested more than {MAX_DEPTH} deep{line}; files of this kind are not")
     if isinstance(event, yaml.AliasEvent):
         raise ValueError(f"uses the alias *{event.anchor}{line}; write the value out")
     if event.tag is not None:

@@ -83,3 +83,20 @@ def check_writable(folder: Path) -> None:
     except OSError as error:
         reason = error.strerror or "refused"
         raise ValueError(f"folder {str(folder)!r} cannot be written to ({reason}); choose another") from None
+
+
+def check_target(path: Path | None, suffixes: tuple[str, ...]) -> None:
+    """Find out before planning whether a file can be written.
+
+    Raises:
+        ValueError: If it ends otherwise or can not.
+    """
+    if path is None:
+        return
+    if path.suffix not in suffixes:
+        raise ValueError(f"output file {str(path)!r} must end in {' or '.join(suffixes)}")
+    if not path.parent.is_dir():
+        raise ValueError(f"folder {str(path.parent)!r} does not exist; create it first")
+    if path.is_dir():
+        raise ValueError(f"output file {str(path)!r} is a folder")
+    check_writable(path.parent)

@@ -30,14 +30,14 @@ LAST_WAIT = 30.0
 class _Job:
     """Work of a node in a thread of its own; an exception is kept instead of lost."""
 
-    def __init__(self, node: Node, work: Callable[[Node], None]) -> None:
+    def __init__(self, node: Node, work: Callable[[Node], object]) -> None:
         self.node = node
         self.error: Exception | None = None
         # A node that hangs must not keep the process from ending for ever.
         self.thread = threading.Thread(target=self._run, args=(work,), daemon=True, name=f"d-d4orm-{node.number}")
         self.thread.start()
 
-    def _run(self, work: Callable[[Node], None]) -> None:
+    def _run(self, work: Callable[[Node], object]) -> None:
         try:
             work(self.node)
         except Exception as error:  # whatever it is, it concerns this node only
@@ -94,6 +94,11 @@ class Crew(ABC):
             self._check_alive()
         best = max(candidates, key=lambda candidate: candidate.rank, default=search.current)
         return self._iteration(best)
+
+    @property
+    def best(self) -> Candidate:
+        """The best candidate that any node has made or received."""
+        return max((node.search.best for node in self._nodes), key=lambda candidate: candidate.rank)
 
     def close(self) -> None:
         """Part the nodes. A thread may end what it is at, but nobody waits longer for it than patience."""
@@ -158,7 +163,7 @@ class SyncCrew(Crew):
             self._all(Node.exchange, time_left)
         return candidates
 
-    def _all(self, work: Callable[[Node], None], time_left: Callable[[], float | None]) -> None:
+    def _all(self, work: Callable[[Node], object], time_left: Callable[[], float | None]) -> None:
         self._jobs = [_Job(node, work) for node in self.alive]
         for job in self._jobs:
             while job.thread.is_alive():

@@ -11,14 +11,17 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.base import Engine
-from d4orm_planners.base import Planner, Search
-from d4orm_planners.distributed.inbox import Inbox
+from d4orm_planners.base import Candidate, Planner, Search
+from d4orm_planners.distributed.inbox import TOLERANCE, Inbox
 from d4orm_planners.distributed.messages import Message, encode
 from d4orm_planners.distributed.selection import choose
 from d4orm_planners.distributed.transport import Transport
 
 CHOICE = 10**6
 """The stream of random numbers that a node chooses with; planners use lower ones."""
+
+RETELL = 0.2
+"""Seconds after which a candidate is told again, as messages may get lost."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,18 @@ def node_seed(seed: int, node: int) -> int:
 class Node:
     """A planner that exchanges candidates with others.
 
+    Args:
+        number: Its number, from 0.
+        num_nodes: How many there are.
+        planner: What it refines its candidate with.
+        problem: The problem.
+        seed: That of the whole solve.
+        controls: ``(H, K, m)`` to start from.
+        engine: What rolls out and samples.
+        transport: Its access to the others.
+        selection: How it chooses what to go on from.
+        told: What it begins to number its messages after; more than it had told before, if it did.
+
     Attributes:
         number: From 0.
         search: Its own search.
@@ -58,6 +73,7 @@ class Node:
         engine: Engine,
         transport: Transport,
         selection: Selection,
+        told: int = 0,
     ) -> None:
         self.number = number
         self.search = Search(planner, problem, node_seed(seed, number), controls, engine)
@@ -66,17 +82,15 @@ class Node:
         self.excluded = 0
         self._transport = transport
         self._selection = selection
-        self._awaited = set(range(num_nodes)) - {number}
+        self._told = told
+        self._others = set(range(num_nodes)) - {number}
+        self._awaited = self._others
 
     def refine(self) -> None:
         """One iteration of the planner; its candidate is broadcast."""
         self.excluded += self.search.advance().excluded
         self.candidate = self.search.current
-        reward = float(self.candidate.trajectory.rewards.mean())
-        message = Message(
-            self.number, self.search.iteration, self.candidate.controls, reward, bool(self.candidate.solved)
-        )
-        self._transport.publish(encode(message, self.search.problem))
+        self._tell(self.candidate)
 
     def exchange(self) -> None:
         """Take what has arrived and choose what to go on from."""
@@ -88,14 +102,53 @@ class Node:
 
         It waits for the others no longer than ``patience`` [s].
         """
-        while True:
-            self.refine()
-            if stop.is_set() or (self.search.best.solved and not improve):
+        while self.step(stop, patience, improve):
+            pass
+
+    def step(self, stop: threading.Event, patience: float, improve: bool) -> bool:
+        """One round of :meth:`run`; whether there is to be another one."""
+        self.refine()
+        if stop.is_set() or (self.search.best.solved and not improve):
+            return False
+        self._await_others(stop, patience)
+        if self.search.best.solved and not improve:
+            return False
+        self._choose()
+        return True
+
+    def settle(self, seconds: float) -> None:
+        """Tell the best candidate again and again, until all others have one as good or the seconds are over.
+
+        Without a solution it only takes what has arrived.
+        """
+        self._gather()
+        deadline = time.perf_counter() + seconds
+        told, again = None, 0.0
+        while self.search.best.solved:
+            now = time.perf_counter()
+            if told is not self.search.best or now >= again:
+                told, again = self.search.best, now + RETELL
+                self._tell(told)
+            if now >= deadline or self._all_have(told):
                 break
-            self._await_others(stop, patience)
-            if self.search.best.solved and not improve:
-                break
-            self._choose()
+            self._gather(min(again, deadline) - now)
+
+    def _tell(self, candidate: Candidate) -> None:
+        self._told += 1
+        reward = float(candidate.trajectory.rewards.mean())
+        message = Message(self.number, self._told, candidate.controls, reward, bool(candidate.solved))
+        self._transport.publish(encode(message, self.search.problem))
+
+    def _all_have(self, candidate: Candidate) -> bool:
+        """Whether each of the others has told a solution as good as this one."""
+        reward = candidate.trajectory.rewards.mean() - TOLERANCE
+        reports = self.inbox.newest
+        return all(
+            node in reports
+            and reports[node].candidate.solved
+            and reports[node].candidate.trajectory.rewards.mean() >= reward
+            for node in self._others
+        )
 
     def _await_others(self, stop: threading.Event, patience: float) -> None:
         """Gather until everybody heard from the last time is heard from again, or patience ends."""

@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from typing import Protocol
 
-TRANSPORTS = ("local",)
+TRANSPORTS = ("local", "zenoh")
 
 WAITING = 64
 """Messages that wait for a slow node at most; then the oldest are lost, which newer ones replace anyhow."""
@@ -31,39 +31,58 @@ class Transport(Protocol):
         ...
 
 
+class Mailbox:
+    """Where messages wait for one who collects them, whatever thread they come from.
+
+    Attributes:
+        closed: Whether there will be no more.
+    """
+
+    def __init__(self) -> None:
+        self._arrived: deque[bytes] = deque(maxlen=WAITING)
+        self._changed = threading.Condition()
+        self.closed = False
+
+    def put(self, data: bytes) -> None:
+        """Add a message."""
+        with self._changed:
+            self._arrived.append(data)
+            self._changed.notify_all()
+
+    def take(self, timeout: float = 0.0) -> list[bytes]:
+        """See :meth:`Transport.collect`."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.closed or self._arrived, timeout)
+            messages = [] if self.closed else list(self._arrived)
+            self._arrived.clear()
+        return messages
+
+    def close(self) -> None:
+        """Wake whoever waits; from now on there is nothing to take."""
+        with self._changed:
+            self.closed = True
+            self._changed.notify_all()
+
+
 class LocalTransport:
     """The ``"local"`` transport: one end of a :class:`LocalNetwork`."""
 
     def __init__(self, network: LocalNetwork) -> None:
         self._network = network
-        self._arrived: deque[bytes] = deque(maxlen=WAITING)
-        self._changed = threading.Condition()
-        self._closed = False
+        self.mailbox = Mailbox()
 
     def publish(self, data: bytes) -> None:
         """See :meth:`Transport.publish`."""
-        if not self._closed:
+        if not self.mailbox.closed:
             self._network.deliver(self, bytes(data))
 
     def collect(self, timeout: float = 0.0) -> list[bytes]:
         """See :meth:`Transport.collect`."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._closed or self._arrived, timeout)
-            messages = [] if self._closed else list(self._arrived)
-            self._arrived.clear()
-        return messages
+        return self.mailbox.take(timeout)
 
     def close(self) -> None:
         """See :meth:`Transport.close`."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-
-    def receive(self, data: bytes) -> None:
-        """Take what another end has sent."""
-        with self._changed:
-            self._arrived.append(data)
-            self._changed.notify_all()
+        self.mailbox.close()
 
 
 class LocalNetwork:
@@ -85,4 +104,4 @@ class LocalNetwork:
         with self._lock:
             ends = [end for end in self._ends if end is not sender]
         for end in ends:
-            end.receive(data)
+            end.mailbox.put(data)

@@ -1,0 +1,59 @@
+"""One node of this process among others on a network."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+
+from d4orm_planners.base import Candidate
+from d4orm_planners.distributed.crew import SyncCrew
+from d4orm_planners.distributed.node import Node
+from d4orm_planners.distributed.transport import Transport
+
+logger = logging.getLogger(__name__)
+
+
+class NetworkCrew(SyncCrew):
+    """A single node here; a round is over when the others were heard from, or patience has ended.
+
+    Args:
+        node: The node.
+        transport: Its access to the others.
+        patience: See :class:`~d4orm_planners.distributed.crew.Crew`.
+        linger: Seconds that a solution is told to the others in the end, see :meth:`Node.settle`.
+    """
+
+    def __init__(self, node: Node, transport: Transport, patience: float, linger: float) -> None:
+        super().__init__([node], [transport], patience)
+        self._node, self._linger = node, linger
+        self._stop = threading.Event()
+        self._met: set[int] = set()
+
+    def close(self) -> None:
+        """See :meth:`Crew.close`; before it, the others are told of a solution."""
+        self._stop.set()
+        try:
+            for job in self._jobs:
+                job.thread.join(self.patience)
+            self._node.settle(self._linger)
+            self._tell_whom_it_met()
+        except KeyboardInterrupt:
+            logger.info("interrupted while telling the others")
+        finally:
+            super().close()
+
+    def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
+        """See :meth:`Crew._round`."""
+        left = time_left()
+        patience = self.patience if left is None else min(self.patience, max(left, 0.0))
+        self._all(lambda node: node.step(self._stop, patience, improve), time_left)
+        if not self.alive:
+            return []
+        self._tell_whom_it_met()
+        return [self._node.candidate, *(report.candidate for report in self._node.inbox.newest.values())]
+
+    def _tell_whom_it_met(self) -> None:
+        for number in sorted(set(self._node.inbox.newest) - self._met):
+            logger.info("heard from node %d", number)
+            self._met.add(number)
