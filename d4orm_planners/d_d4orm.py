@@ -111,7 +111,9 @@ class DD4orm(Planner):
     def finish(self, search: Search) -> None:
         """See :meth:`Planner.finish`."""
         if "crew" in search.memory:
-            search.memory.pop("crew").close()
+            crew: Crew = search.memory.pop("crew")
+            crew.close()
+            search.metrics |= crew.metrics()
 
     def _crew(self, search: Search) -> Crew:
         config, problem = self.config, search.problem

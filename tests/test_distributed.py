@@ -421,6 +421,27 @@ def test_a_node_that_hangs_does_not_hang_the_solve(mode: str, monkeypatch: pytes
         assert plan.history[-1].note == "node 1 did not finish in time"
 
 
+@MODE
+def test_a_plan_tells_what_its_nodes_sent(mode: str) -> None:
+    problem = walled_in_problem()
+    plan = cheap_planner("d-d4orm", nodes=3, mode=mode, patience=10).solve(problem, max_iterations=2)
+    length = len(encode(Message(0, 1, plan.controls, 0.0, False), problem))
+    if mode == "sync":
+        assert plan.metrics["messages"] == 6
+    assert plan.metrics["messages"] >= 6
+    assert plan.metrics["message_bytes"] == length * plan.metrics["messages"]
+    assert 0 <= plan.metrics["waiting_share"] < 1
+    assert "messages" not in cheap_planner("d4orm").solve(problem, max_iterations=1).metrics
+
+
+@MODE
+def test_who_is_quick_waits_for_who_is_slow(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    planner = cheap_planner("d-d4orm", mode=mode, patience=60)
+    even = planner.solve(walled_in_problem(), seed=6).metrics["waiting_share"]
+    spoil(monkeypatch, 6, lambda search: time.sleep(0.3))
+    assert planner.solve(walled_in_problem(), seed=6).metrics["waiting_share"] > even
+
+
 def test_no_thread_outlives_a_solve() -> None:
     for mode in ("sync", "async"):
         distributed(mode=mode, patience=10).solve(walled_in_problem(), max_iterations=2)

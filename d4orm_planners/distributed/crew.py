@@ -33,6 +33,8 @@ class _Job:
     def __init__(self, node: Node, work: Callable[[Node], None]) -> None:
         self.node = node
         self.error: Exception | None = None
+        self._begin = time.perf_counter()
+        self._end: float | None = None
         # A node that hangs must not keep the process from ending for ever.
         self.thread = threading.Thread(target=self._run, args=(work,), daemon=True, name=f"d-d4orm-{node.number}")
         self.thread.start()
@@ -42,6 +44,13 @@ class _Job:
             work(self.node)
         except Exception as error:  # whatever it is, it concerns this node only
             self.error = error
+        finally:
+            self._end = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """How long it has taken."""
+        return (self._end or time.perf_counter()) - self._begin
 
     def leave(self) -> None:
         """Wait for it no longer."""
@@ -69,6 +78,7 @@ class Crew(ABC):
         self._error: Exception | None = None
         self._told: Counter[str] = Counter()
         self._spent = self._excluded = 0
+        self._seconds = self._waited = 0.0
 
     def iterate(self, search: Search) -> Iteration:
         """The best new candidate, after a round of all nodes that live.
@@ -104,6 +114,18 @@ class Crew(ABC):
             if job.node in self.alive:
                 job.thread.join(max(deadline - time.perf_counter(), 0))
             job.leave()
+
+    def metrics(self) -> dict[str, float]:
+        """What all nodes together sent, and the share of their time that they waited for each other.
+
+        To be asked for once closed.
+        """
+        meters = [node.transport for node in self._nodes]
+        return {
+            "messages": sum(meter.messages for meter in meters),
+            "message_bytes": sum(meter.message_bytes for meter in meters),
+            "waiting_share": self._waited / self._seconds if self._seconds else 0.0,
+        }
 
     @abstractmethod
     def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
@@ -159,6 +181,7 @@ class SyncCrew(Crew):
         return candidates
 
     def _all(self, work: Callable[[Node], None], time_left: Callable[[], float | None]) -> None:
+        begin = time.perf_counter()
         self._jobs = [_Job(node, work) for node in self.alive]
         for job in self._jobs:
             while job.thread.is_alive():
@@ -171,6 +194,9 @@ class SyncCrew(Crew):
                 self._lose(job, "did not finish in time")
             elif job.error is not None:
                 self._lose_failed(job)
+        seconds = time.perf_counter() - begin
+        self._seconds += seconds * len(self._jobs)
+        self._waited += sum(seconds - job.seconds for job in self._jobs)
 
 
 class AsyncCrew(Crew):
@@ -194,6 +220,8 @@ class AsyncCrew(Crew):
         """See :meth:`Crew.close`."""
         self._stop.set()
         super().close()
+        self._seconds += sum(job.seconds for job in self._jobs)
+        self._waited = sum(node.transport.waited for node in self._nodes)
 
     def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
         """See :meth:`Crew._round`."""
@@ -217,6 +245,7 @@ class AsyncCrew(Crew):
         """Start whoever does not run: at first all, later those who stopped at what proved to be no solution here."""
         running = [job for job in self._jobs if job.thread.is_alive()]
         failed = [job for job in self._jobs if job.error is not None]
+        self._seconds += sum(job.seconds for job in self._jobs if job not in running + failed)
         idle = [node for node in self.alive if node not in {job.node for job in running + failed}]
         self._jobs = [
             *running, *failed, *(_Job(node, lambda node: node.run(self._stop, self.patience, improve)) for node in idle)

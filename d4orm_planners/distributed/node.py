@@ -14,6 +14,7 @@ from d4orm_env.engine.base import Engine
 from d4orm_planners.base import Planner, Search
 from d4orm_planners.distributed.inbox import Inbox
 from d4orm_planners.distributed.messages import Message, encode
+from d4orm_planners.distributed.meter import Meter
 from d4orm_planners.distributed.selection import choose
 from d4orm_planners.distributed.transport import Transport
 
@@ -43,6 +44,7 @@ class Node:
         number: From 0.
         search: Its own search.
         candidate: The candidate that it made last.
+        transport: What it sends and receives by, with a count.
         inbox: What the others sent.
         excluded: Samples left out so far because their reward was not finite.
     """
@@ -62,9 +64,9 @@ class Node:
         self.number = number
         self.search = Search(planner, problem, node_seed(seed, number), controls, engine)
         self.candidate = self.search.current
-        self.inbox = Inbox(problem, engine, transport, num_nodes, number)
+        self.transport = Meter(transport)
+        self.inbox = Inbox(problem, engine, self.transport, num_nodes, number)
         self.excluded = 0
-        self._transport = transport
         self._selection = selection
         self._awaited = set(range(num_nodes)) - {number}
 
@@ -76,7 +78,7 @@ class Node:
         message = Message(
             self.number, self.search.iteration, self.candidate.controls, reward, bool(self.candidate.solved)
         )
-        self._transport.publish(encode(message, self.search.problem))
+        self.transport.publish(encode(message, self.search.problem))
 
     def exchange(self) -> None:
         """Take what has arrived and choose what to go on from."""
