@@ -14,7 +14,9 @@ from d4orm_planners.d4orm import D4orm
 from d4orm_planners.d4orm_d import D4ormD, D4ormDConfig
 from d4orm_planners.distributed.crew import MODES, AsyncCrew, Crew, SyncCrew
 from d4orm_planners.distributed.inbox import Inbox
-from d4orm_planners.distributed.node import Node, Selection
+from d4orm_planners.distributed.node import Node, Selection, node_seed
+from d4orm_planners.distributed.ray_connection import RayConnection, host_and_port, import_ray
+from d4orm_planners.distributed.ray_planner import ray_planners
 from d4orm_planners.distributed.selection import SELECTIONS, shares
 from d4orm_planners.distributed.transport import TRANSPORTS, LocalNetwork
 
@@ -37,7 +39,9 @@ class DD4ormConfig(D4ormDConfig):
             its own pace; plans then depend on who is sooner.
         patience: Seconds that are waited for stragglers: in asynchronous mode in every round, else beyond the time
             limit of the solve, after which a node is given up.
-        transport: How messages travel; ``"local"``, between threads of this process.
+        transport: ``"local"``: nodes are threads of this process. ``"ray"``: their iterations run in actors of Ray.
+        address: Of the Ray cluster, ``"host:port"``, or ``"auto"`` for the one that this machine belongs to; ``None``
+            for an instance on this machine that ends with the solve.
     """
 
     planner: str = "d4orm"
@@ -47,6 +51,7 @@ class DD4ormConfig(D4ormDConfig):
     mode: str = "sync"
     patience: float = 1.0
     transport: str = "local"
+    address: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -63,6 +68,10 @@ class DD4ormConfig(D4ormDConfig):
             self.node_settings(self.nodes)
         whole_number(self.k, "k", 1)
         positive_number(self.patience, "patience", zero_allowed=True)
+        if self.address is not None:
+            if self.transport != "ray":
+                raise ValueError(f"address {self.address!r} goes with transport 'ray', not {self.transport!r}")
+            host_and_port(self.address)
 
     def node_settings(self, nodes: int) -> list[dict[str, Any]]:
         """The settings of each node's planner.
@@ -101,6 +110,11 @@ class DD4orm(Planner):
     }
     config: DD4ormConfig
 
+    def __init__(self, config: DD4ormConfig) -> None:
+        super().__init__(config)
+        if config.transport == "ray":
+            import_ray("transport 'ray' of d-d4orm")
+
     def iterate(self, search: Search) -> Iteration:
         """See :meth:`Planner.iterate`: one round of all nodes, and the best candidate that they made in it."""
         if "crew" not in search.memory:
@@ -114,12 +128,19 @@ class DD4orm(Planner):
             crew: Crew = search.memory.pop("crew")
             crew.close()
             search.metrics |= crew.metrics()
+        if "ray" in search.memory:
+            search.memory.pop("ray").close()
 
     def _crew(self, search: Search) -> Crew:
         config, problem = self.config, search.problem
         number = config.nodes or problem.num_robots
         kind = INNER[config.planner]
-        planners = [kind(kind.config_class(**settings)) for settings in config.node_settings(number)]
+        planners: list[Planner] = [kind(kind.config_class(**settings)) for settings in config.node_settings(number)]
+        if config.transport == "ray":
+            with search.watch.paused():
+                connection = search.memory["ray"] = RayConnection(config.address or "local", "transport 'ray'")
+                seeds = [node_seed(search.seed, i) for i in range(number)]
+                planners = list(ray_planners(connection, planners, problem, seeds))
         # Nodes of one machine share its cores.
         engine = get_engine(config.engine, max(available_cores() // number, 1))
         network, selection = LocalNetwork(), Selection(config.selection, config.k)

@@ -78,6 +78,7 @@ class Crew(ABC):
         self._error: Exception | None = None
         self._told: Counter[str] = Counter()
         self._spent = self._excluded = 0
+        self._read: Counter[Node] = Counter()
         self._seconds = self._waited = 0.0
 
     def iterate(self, search: Search) -> Iteration:
@@ -107,6 +108,8 @@ class Crew(ABC):
 
     def close(self) -> None:
         """Part the nodes. A thread may end what it is at, but nobody waits longer for it than patience."""
+        for node in self._nodes:
+            node.close()
         for transport in self._transports:
             transport.close()
         deadline = time.perf_counter() + self.patience
@@ -162,10 +165,19 @@ class Crew(ABC):
             faults += node.inbox.dropped
             faults["false claim"] += node.inbox.false_claims
         new = faults - self._told
-        notes = self._notes + [f"received {count} x {kind}" for kind, count in sorted(new.items())]
+        notes = self._notes + self._node_notes() + [f"received {count} x {kind}" for kind, count in sorted(new.items())]
         iteration = Iteration(best.controls, steps - self._spent, excluded - self._excluded, "; ".join(notes), best)
         self._spent, self._excluded, self._told, self._notes = steps, excluded, faults, []
         return iteration
+
+    def _node_notes(self) -> list[str]:
+        """What the nodes' planners noted since the last time."""
+        notes = []
+        for node in self._nodes:
+            records = node.search.history[self._read[node] :]
+            self._read[node] += len(records)
+            notes += [record.note for record in records if record.note]
+        return notes
 
 
 class SyncCrew(Crew):

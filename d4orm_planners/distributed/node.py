@@ -99,6 +99,10 @@ class Node:
                 break
             self._choose()
 
+    def close(self) -> None:
+        """Let go of what the planner left open."""
+        self.search.planner.finish(self.search)
+
     def _await_others(self, stop: threading.Event, patience: float) -> None:
         """Gather until everybody heard from the last time is heard from again, or patience ends."""
         deadline = time.perf_counter() + patience

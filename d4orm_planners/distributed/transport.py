@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from typing import Protocol
 
-TRANSPORTS = ("local",)
+TRANSPORTS = ("local", "ray")
 
 WAITING = 64
 """Messages that wait for a slow node at most; then the oldest are lost, which newer ones replace anyhow."""
