@@ -471,7 +471,7 @@ def test_an_asynchronous_node_waits_once_for_one_that_is_silent(monkeypatch: pyt
         ({"planner": "mppi"}, "planner 'mppi' is unknown; choose one of d4orm, d4orm-d"),
         ({"selection": "best"}, "selection 'best' is unknown; choose one of top-k, max, k-means"),
         ({"mode": "later"}, "mode 'later' is unknown; choose one of sync, async"),
-        ({"transport": "pigeon"}, "transport 'pigeon' is unknown; choose one of local"),
+        ({"transport": "pigeon"}, "transport 'pigeon' is unknown; choose one of local, ray"),
         ({"nodes": 0}, "nodes is 0; it must be at least 1"),
         ({"nodes": 2.0}, "nodes must be a whole number, not 2.0"),
         ({"k": 0}, "k is 0; it must be at least 1"),

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from planner_support import program
 from scipy import stats
 
 from d4orm_env import make_problem, save_problem
@@ -51,15 +52,6 @@ def d4orm(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytes
         return int(exit_.value.code or 0), captured.out, captured.err
 
     return call
-
-
-def program(tmp_path: Path, body: str) -> subprocess.CompletedProcess[str]:
-    """Run a program that evaluates with worker processes, as a user would write it."""
-    (tmp_path / "program.py").write_text(body)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)])}
-    return subprocess.run(
-        [sys.executable, "program.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-    )
 
 
 # Rows.
