@@ -63,6 +63,17 @@ if __name__ == "__main__":
     print(json.dumps([before, after, [note for note in notes if note], plan.solved]))
 """
 
+OVERDUE = """
+import json
+from d4orm_env import make_problem
+from d4orm_planners import make_planner
+
+if __name__ == "__main__":
+    planner = make_planner("d-d4orm", engine="cpu", transport="ray", improve=True, patience=0.1, num_steps=20000)
+    plan = planner.solve(make_problem("circle", num_robots=8), time_limit=0.5)
+    print(json.dumps([plan.status, plan.history[-1].note]))
+"""
+
 SOCKETS = """
 import json, os
 from pathlib import Path
@@ -142,6 +153,14 @@ def test_an_actor_that_is_killed_too_often_is_done_without(tmp_path: Path, mode:
     assert before[:1] == after
     assert note.startswith("node 1 failed (ChildProcessError: its actor was lost for good (")
     assert solved
+
+
+@pytest.mark.slow
+def test_actors_that_do_not_finish_in_time_are_given_up(tmp_path: Path) -> None:
+    assert result_of(tmp_path, OVERDUE) == [
+        "time_limit",
+        "node 0 did not finish in time; node 1 did not finish in time",
+    ]
 
 
 @pytest.mark.slow

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import threading
+from dataclasses import replace
 from math import ceil
 from typing import Any, NamedTuple
 
@@ -18,6 +20,10 @@ RESTARTS = 3
 
 START = 120.0
 """Seconds that actors may take to start and to compile."""
+
+
+GLANCE = 0.1
+"""Seconds between looks at whether an iteration under way is still wanted."""
 
 
 class Outcome(NamedTuple):
@@ -56,8 +62,10 @@ class Worker:
         self._search = Search(planner, problem, seed, None, self._engine)
 
     def ready(self) -> int:
-        """Compile what an iteration needs, by one for nothing; the number of this process."""
-        Search(self._search.planner, self._search.problem, self._search.seed, None, self._engine).advance()
+        """Compile what an iteration needs, by one of a single step; the number of this process."""
+        planner, config = self._search.planner, self._search.planner.config
+        short: dict[str, Any] = {name: 1 for name in ("num_steps", "repair_steps") if name in config.setting_names()}
+        Search(type(planner)(replace(config, **short)), self._search.problem, 0, None, self._engine).advance()
         return os.getpid()
 
     def advance(self, iteration: int, data: bytes) -> Outcome:
@@ -95,6 +103,7 @@ class RayPlanner(Planner):
         self.process = 0
         self._node, self._num_nodes = node, num_nodes
         self._ray, self._actor = ray, actor
+        self._calling, self._closed = threading.Lock(), threading.Event()
 
     def start(self) -> None:
         """Wait until the actor is there.
@@ -114,13 +123,8 @@ class RayPlanner(Planner):
 
     def iterate(self, search: Search) -> Iteration:
         """See :meth:`Planner.iterate`."""
-        call = self._actor.advance.remote(search.iteration, _message(self._node, search))
-        try:
-            outcome: Outcome = self._ray.get(call)
-        except self._ray.exceptions.RayTaskError as error:
-            raise error.cause from error
-        except self._ray.exceptions.RayError as error:
-            raise ChildProcessError(f"its actor was lost for good ({_first_line(error)})") from error
+        with self._calling:
+            outcome = self._outcome(search.iteration, _message(self._node, search))
         search.watch.leave_out(outcome.compiling)
         note = "" if outcome.process == self.process else f"the actor of node {self._node} was lost and restarted"
         self.process = outcome.process
@@ -130,7 +134,27 @@ class RayPlanner(Planner):
     def finish(self, search: Search) -> None:
         """See :meth:`Planner.finish`: end the actor, whatever it is at."""
         del search
+        self._closed.set()
         self._ray.kill(self._actor)
+        # Ray ends the process of whoever calls it once it is shut down.
+        with self._calling:
+            pass
+
+    def _outcome(self, iteration: int, data: bytes) -> Outcome:
+        if self._closed.is_set():
+            raise ChildProcessError("its actor has been ended")
+        try:
+            call = self._actor.advance.remote(iteration, data)
+            # An actor whose machine cannot be reached may not be seen to end for long.
+            while not self._ray.wait([call], timeout=GLANCE)[0]:
+                if self._closed.is_set():
+                    raise ChildProcessError("its actor has been ended")
+            outcome: Outcome = self._ray.get(call)
+        except self._ray.exceptions.RayTaskError as error:
+            raise error.cause from error
+        except self._ray.exceptions.RayError as error:
+            raise ChildProcessError(f"its actor was lost for good ({_first_line(error)})") from error
+        return outcome
 
 
 def ray_planners(
