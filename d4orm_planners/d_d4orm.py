@@ -14,6 +14,7 @@ from d4orm_planners.d4orm import D4orm
 from d4orm_planners.d4orm_d import D4ormD, D4ormDConfig
 from d4orm_planners.distributed.crew import MODES, AsyncCrew, Crew, SyncCrew
 from d4orm_planners.distributed.inbox import Inbox
+from d4orm_planners.distributed.judge import Judge
 from d4orm_planners.distributed.node import Node, Selection, node_seed
 from d4orm_planners.distributed.ray_connection import RayConnection, host_and_port, import_ray
 from d4orm_planners.distributed.ray_planner import ray_planners
@@ -126,7 +127,9 @@ class DD4orm(Planner):
         """See :meth:`Planner.finish`."""
         if "crew" in search.memory:
             crew: Crew = search.memory.pop("crew")
-            crew.close()
+            best = crew.close()
+            if best.rank > search.best.rank:
+                search.best = best
             search.metrics |= crew.metrics()
         if "ray" in search.memory:
             search.memory.pop("ray").close()
@@ -144,13 +147,15 @@ class DD4orm(Planner):
         # Nodes of one machine share its cores.
         engine = get_engine(config.engine, max(available_cores() // number, 1))
         network, selection = LocalNetwork(), Selection(config.selection, config.k)
+        judge = Judge(engine, problem, 2 * number)
         ends = [network.join() for _ in planners]
         base = search.current.controls
         nodes = [
-            Node(i, number, planner, problem, search.seed, base, engine, end, selection)
+            Node(i, number, planner, problem, search.seed, base, engine, end, selection, judge)
             for i, (planner, end) in enumerate(zip(planners, ends, strict=True))
         ]
         if config.mode == "sync":
-            return SyncCrew(nodes, ends, config.patience)
+            return SyncCrew(nodes, ends, config.patience, judge)
         observer = network.join()
-        return AsyncCrew(nodes, [*ends, observer], config.patience, Inbox(problem, engine, observer, number))
+        inbox = Inbox(problem, engine, observer, number, judge=judge)
+        return AsyncCrew(nodes, [*ends, observer], config.patience, judge, inbox)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import signal
 import struct
 import threading
 import time
@@ -436,10 +437,49 @@ def test_a_plan_tells_what_its_nodes_sent(mode: str) -> None:
 
 @MODE
 def test_who_is_quick_waits_for_who_is_slow(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    planner = cheap_planner("d-d4orm", mode=mode, patience=60)
-    even = planner.solve(walled_in_problem(), seed=6).metrics["waiting_share"]
-    spoil(monkeypatch, 6, lambda search: time.sleep(0.3))
-    assert planner.solve(walled_in_problem(), seed=6).metrics["waiting_share"] > even
+    spoil(monkeypatch, 6, lambda search: time.sleep(0.5))
+    plan = cheap_planner("d-d4orm", mode=mode, patience=60).solve(walled_in_problem(), seed=6)
+    assert plan.metrics["waiting_share"] > 0.3
+
+
+def press_ctrl_c() -> None:
+    signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+
+
+POSIX = pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs signals to threads")
+
+
+@POSIX
+@MODE
+def test_ctrl_c_ends_an_iteration_under_way(mode: str) -> None:
+    # Which would take minutes, and patience as long.
+    planner = distributed(mode=mode, num_steps=10**6, patience=600)
+    threading.Timer(1, press_ctrl_c).start()
+    plan = planner.solve(walled_in_problem())
+    assert plan.status == "interrupted"
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("d-d4orm-")]
+
+
+@POSIX
+@MODE
+def test_ctrl_c_loses_nothing_that_a_node_has_found(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    sent, release = threading.Event(), threading.Event()
+
+    def send(sent_message: Message, problem: Problem) -> bytes:
+        sent.set()
+        return encode(sent_message, problem)
+
+    def interrupt() -> None:
+        sent.wait(60)
+        press_ctrl_c()
+        release.set()
+
+    monkeypatch.setattr(node, "encode", send)
+    spoil(monkeypatch, 5, lambda search: release.wait(60))
+    threading.Thread(target=interrupt).start()
+    plan = distributed(mode=mode, patience=60).solve(walled_in_problem(), seed=5)
+    assert plan.status == "interrupted"
+    assert plan.controls.any()
 
 
 def test_no_thread_outlives_a_solve() -> None:

@@ -49,14 +49,14 @@ if __name__ == "__main__":
     try:
         notes.append(search.advance().note)
         crew = search.memory["crew"]
-        before = [node.search.planner.process for node in crew.alive]
+        before = [node.search.planner.inner.process for node in crew.alive]
         # Into an iteration, or nearly.
         timer = threading.Timer(0.1, os.kill, (before[1], signal.SIGKILL))
         timer.start()
         while len(notes) < 8 and not any(notes):
             notes.append(search.advance().note)
         timer.join()
-        after = [node.search.planner.process for node in crew.alive]
+        after = [node.search.planner.inner.process for node in crew.alive]
     finally:
         planner.finish(search)
     plan = search.plan("stopped")

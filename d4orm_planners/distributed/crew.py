@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 
 from d4orm_planners.base import Candidate, Iteration, Search
 from d4orm_planners.distributed.inbox import Inbox
+from d4orm_planners.distributed.judge import Judge, Stopped
 from d4orm_planners.distributed.node import Node
 from d4orm_planners.distributed.transport import Transport
 
@@ -42,6 +43,8 @@ class _Job:
     def _run(self, work: Callable[[Node], None]) -> None:
         try:
             work(self.node)
+        except Stopped:
+            pass
         except Exception as error:  # whatever it is, it concerns this node only
             self.error = error
         finally:
@@ -65,11 +68,13 @@ class Crew(ABC):
         nodes: The nodes.
         transports: All ends to close in the end.
         patience: Seconds that are waited for stragglers: beyond the time limit, and when asynchronous in every round.
+        judge: The nodes' common judge.
     """
 
-    def __init__(self, nodes: Sequence[Node], transports: Sequence[Transport], patience: float) -> None:
+    def __init__(self, nodes: Sequence[Node], transports: Sequence[Transport], patience: float, judge: Judge) -> None:
         self.alive = list(nodes)
         self.patience = patience
+        self._judge = judge
         self._nodes = tuple(nodes)
         self._transports = tuple(transports)
         self._jobs: list[_Job] = []
@@ -106,8 +111,12 @@ class Crew(ABC):
         best = max(candidates, key=lambda candidate: candidate.rank, default=search.current)
         return self._iteration(best)
 
-    def close(self) -> None:
-        """Part the nodes. A thread may end what it is at, but nobody waits longer for it than patience."""
+    def close(self) -> Candidate:
+        """Part the nodes, and give the best candidate that they have seen.
+
+        A thread leaves what it is at where it can, and nobody waits longer for it than patience.
+        """
+        self._judge.stop.set()
         for node in self._nodes:
             node.close()
         for transport in self._transports:
@@ -117,6 +126,7 @@ class Crew(ABC):
             if job.node in self.alive:
                 job.thread.join(max(deadline - time.perf_counter(), 0))
             job.leave()
+        return max((node.search.best for node in self._nodes), key=lambda candidate: candidate.rank)
 
     def metrics(self) -> dict[str, float]:
         """What all nodes together sent, and the share of their time that they waited for each other.
@@ -218,22 +228,22 @@ class AsyncCrew(Crew):
         nodes: The nodes.
         transports: All ends to close in the end.
         patience: See :class:`Crew`.
+        judge: See :class:`Crew`.
         observer: What the solve itself hears of the nodes.
     """
 
     def __init__(
-        self, nodes: Sequence[Node], transports: Sequence[Transport], patience: float, observer: Inbox
+        self, nodes: Sequence[Node], transports: Sequence[Transport], patience: float, judge: Judge, observer: Inbox
     ) -> None:
-        super().__init__(nodes, transports, patience)
+        super().__init__(nodes, transports, patience, judge)
         self._observer = observer
-        self._stop = threading.Event()
 
-    def close(self) -> None:
+    def close(self) -> Candidate:
         """See :meth:`Crew.close`."""
-        self._stop.set()
-        super().close()
+        best = super().close()
         self._seconds += sum(job.seconds for job in self._jobs)
         self._waited = sum(node.transport.waited for node in self._nodes)
+        return best
 
     def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
         """See :meth:`Crew._round`."""
@@ -241,27 +251,36 @@ class AsyncCrew(Crew):
         heard: set[int] = set()
         first = None
         while True:
+            ended = not any(job.thread.is_alive() for job in self._jobs)
             heard |= {report.node for report in self._observer.receive(GLANCE)}
             self._lose_dead()
             now = time.perf_counter()
             first = now if heard and first is None else first
             left = time_left()
+            candidates = [self._observer.newest[number].candidate for number in sorted(heard)]
             if (
                 heard >= {node.number for node in self.alive}
                 or (first is not None and now - first >= self.patience)
                 or (left is not None and left <= 0)
+                or ended
+                or (not improve and any(candidate.solved for candidate in candidates))
             ):
-                return [self._observer.newest[number].candidate for number in sorted(heard)]
+                return candidates
 
     def _run(self, improve: bool) -> None:
         """Start whoever does not run: at first all, later those who stopped at what proved to be no solution here."""
+        self._judge.solution_ends = not improve
         running = [job for job in self._jobs if job.thread.is_alive()]
         failed = [job for job in self._jobs if job.error is not None]
         self._seconds += sum(job.seconds for job in self._jobs if job not in running + failed)
         idle = [node for node in self.alive if node not in {job.node for job in running + failed}]
-        self._jobs = [
-            *running, *failed, *(_Job(node, lambda node: node.run(self._stop, self.patience, improve)) for node in idle)
-        ]  # fmt: skip
+        if not running:
+            self._judge.stop.clear()
+
+        def run(node: Node) -> None:
+            node.run(self._judge.stop, self.patience, improve)
+
+        self._jobs = [*running, *failed, *(_Job(node, run) for node in idle)]
 
     def _lose_dead(self) -> None:
         for job in self._jobs:

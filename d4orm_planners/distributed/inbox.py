@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.base import Engine
-from d4orm_planners.base import Candidate, evaluate_controls
+from d4orm_planners.base import Candidate
+from d4orm_planners.distributed.judge import Judge
 from d4orm_planners.distributed.messages import KINDS, Message, MessageError, decode
 from d4orm_planners.distributed.selection import merge
 from d4orm_planners.distributed.transport import Transport
@@ -44,9 +45,16 @@ class Inbox:
     """
 
     def __init__(
-        self, problem: Problem, engine: Engine, transport: Transport, num_nodes: int, own: int | None = None
+        self,
+        problem: Problem,
+        engine: Engine,
+        transport: Transport,
+        num_nodes: int,
+        own: int | None = None,
+        judge: Judge | None = None,
     ) -> None:
-        self._problem, self._engine, self._transport = problem, engine, transport
+        self._problem, self._transport = problem, transport
+        self._judge = judge or Judge(engine, problem)
         self._num_nodes, self._own = num_nodes, own
         self._owner = "the observer" if own is None else f"node {own}"
         self._logged: set[str] = set()
@@ -79,7 +87,7 @@ class Inbox:
         return message
 
     def _judged(self, message: Message) -> Report:
-        candidate = evaluate_controls(self._engine, self._problem, message.controls)
+        candidate = self._judge.received(message.controls)
         reward = float(candidate.trajectory.rewards.mean())
         if candidate.solved != message.feasible or abs(reward - message.reward) > TOLERANCE:
             self.false_claims += 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.engine.base import Engine
 from d4orm_planners.base import Planner, Search
 from d4orm_planners.distributed.inbox import Inbox
+from d4orm_planners.distributed.judge import Judge, JudgedPlanner, StoppableEngine
 from d4orm_planners.distributed.messages import Message, encode
 from d4orm_planners.distributed.meter import Meter
 from d4orm_planners.distributed.selection import choose
@@ -60,12 +62,15 @@ class Node:
         engine: Engine,
         transport: Transport,
         selection: Selection,
+        judge: Judge | None = None,
     ) -> None:
         self.number = number
-        self.search = Search(planner, problem, node_seed(seed, number), controls, engine)
+        judge = judge or Judge(engine, problem)
+        stoppable: Any = StoppableEngine(engine, judge.stop)
+        self.search = Search(JudgedPlanner(planner, judge), problem, node_seed(seed, number), controls, stoppable)
         self.candidate = self.search.current
         self.transport = Meter(transport)
-        self.inbox = Inbox(problem, engine, self.transport, num_nodes, number)
+        self.inbox = Inbox(problem, engine, self.transport, num_nodes, number, judge)
         self.excluded = 0
         self._selection = selection
         self._awaited = set(range(num_nodes)) - {number}
