@@ -30,6 +30,7 @@ from d4orm_planners.base import Iteration, Search, evaluate_controls
 from d4orm_planners.d4orm import D4orm
 from d4orm_planners.distributed import messages, node
 from d4orm_planners.distributed.inbox import Inbox
+from d4orm_planners.distributed.judge import Judge, StoppableEngine, Stopped
 from d4orm_planners.distributed.messages import KINDS, MAGIC, Message, MessageError, decode, encode
 from d4orm_planners.distributed.node import node_seed
 from d4orm_planners.distributed.selection import choose, diverse, k_means, merge, shares, top_k
@@ -279,6 +280,29 @@ def test_a_candidate_counts_for_what_it_is_not_for_what_is_claimed() -> None:
     assert box.false_claims == 1
 
 
+def test_what_a_process_has_made_is_judged_once() -> None:
+    judge = Judge(get_engine("cpu"), PROBLEM, remembered=2)
+    made = [judge.own(message().controls * scale) for scale in (0.25, 0.5, 1.0)]
+    assert judge.received(made[2].controls.copy()) is made[2]
+    assert judge.received(made[1].controls) is made[1]
+    forgotten = judge.received(made[0].controls)
+    assert forgotten is not made[0]
+    assert forgotten.rank == made[0].rank
+    changed = made[2].controls.copy()
+    changed[0, 0, 0] += 0.125
+    assert judge.received(changed).rank != made[2].rank
+
+
+def test_the_word_to_stop_ends_judging_and_denoising() -> None:
+    judge = Judge(get_engine("cpu"), PROBLEM, remembered=1)
+    judge.stop.set()
+    with pytest.raises(Stopped):
+        judge.own(message().controls)
+    planner = cheap_planner("d4orm")
+    with pytest.raises(Stopped):
+        Search(planner, PROBLEM, 0, None, StoppableEngine(get_engine("cpu"), judge.stop)).advance()
+
+
 # The planner.
 
 
@@ -457,7 +481,8 @@ def test_ctrl_c_ends_an_iteration_under_way(mode: str) -> None:
     threading.Timer(1, press_ctrl_c).start()
     plan = planner.solve(walled_in_problem())
     assert plan.status == "interrupted"
-    assert not [thread for thread in threading.enumerate() if thread.name.startswith("d-d4orm-")]
+    # Python may still list a thread whose end was being waited for.
+    assert not [one for one in threading.enumerate() if one.name.startswith("d-d4orm-") and one.is_alive()]
 
 
 @POSIX
