@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,9 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.engine.base import Engine
 from d4orm_planners.base import Candidate, Planner, Search
 from d4orm_planners.distributed.inbox import TOLERANCE, Inbox
+from d4orm_planners.distributed.judge import Judge, JudgedPlanner, StoppableEngine
 from d4orm_planners.distributed.messages import Message, encode
+from d4orm_planners.distributed.meter import Meter
 from d4orm_planners.distributed.selection import choose
 from d4orm_planners.distributed.transport import Transport
 
@@ -58,6 +61,7 @@ class Node:
         number: From 0.
         search: Its own search.
         candidate: The candidate that it made last.
+        transport: What it sends and receives by, with a count.
         inbox: What the others sent.
         excluded: Samples left out so far because their reward was not finite.
     """
@@ -73,14 +77,17 @@ class Node:
         engine: Engine,
         transport: Transport,
         selection: Selection,
+        judge: Judge | None = None,
         told: int = 0,
     ) -> None:
         self.number = number
-        self.search = Search(planner, problem, node_seed(seed, number), controls, engine)
+        judge = judge or Judge(engine, problem)
+        stoppable: Any = StoppableEngine(engine, judge.stop)
+        self.search = Search(JudgedPlanner(planner, judge), problem, node_seed(seed, number), controls, stoppable)
         self.candidate = self.search.current
-        self.inbox = Inbox(problem, engine, transport, num_nodes, number)
+        self.transport = Meter(transport)
+        self.inbox = Inbox(problem, engine, self.transport, num_nodes, number, judge)
         self.excluded = 0
-        self._transport = transport
         self._selection = selection
         self._told = told
         self._others = set(range(num_nodes)) - {number}
@@ -137,7 +144,7 @@ class Node:
         self._told += 1
         reward = float(candidate.trajectory.rewards.mean())
         message = Message(self.number, self._told, candidate.controls, reward, bool(candidate.solved))
-        self._transport.publish(encode(message, self.search.problem))
+        self.transport.publish(encode(message, self.search.problem))
 
     def _all_have(self, candidate: Candidate) -> bool:
         """Whether each of the others has told a solution as good as this one."""
@@ -149,6 +156,10 @@ class Node:
             and reports[node].candidate.trajectory.rewards.mean() >= reward
             for node in self._others
         )
+
+    def close(self) -> None:
+        """Let go of what the planner left open."""
+        self.search.planner.finish(self.search)
 
     def _await_others(self, stop: threading.Event, patience: float) -> None:
         """Gather until everybody heard from the last time is heard from again, or patience ends."""
