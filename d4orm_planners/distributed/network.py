@@ -53,6 +53,7 @@ class NetworkCrew(SyncCrew):
         self._all(lambda node: node.step(self._judge.stop, patience, improve), time_left)
         if not self.alive:
             # What others have sent is not lost with the planner here.
+            self._node.settle(0.0)
             best = self._node.search.best
             return [best] if best.solved and not improve else []
         self._tell_whom_it_met()
