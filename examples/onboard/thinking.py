@@ -1,0 +1,105 @@
+"""A round of planning: a node of D-D4orm in a thread of its own, while the robot drives on."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+from onboard.course import Course
+from onboard.mission import Mission
+
+from d4orm_env import Problem
+from d4orm_env.engine.base import Engine
+from d4orm_planners.d4orm import D4orm, D4ormConfig
+from d4orm_planners.distributed.events import Observer
+from d4orm_planners.distributed.node import Node, Selection
+from d4orm_planners.distributed.transport import Transport
+
+PATIENCE = 0.25
+"""Seconds that a node waits for the others after each of its iterations."""
+
+RETELL = 0.1
+"""Seconds between two looks at whether everybody has the best candidate."""
+
+TOLD = 10_000
+"""More messages than a node sends in a round; a later round's are numbered on from there."""
+
+
+class Round:
+    """Planning from where the team will be when the plan takes over.
+
+    Args:
+        mission: The settings.
+        robot: Whose node it is.
+        takeover: Tick at which the plan begins.
+        number: Of the round; later ones have larger numbers.
+        problem: The problem that begins then.
+        guess: ``(H, K, m)`` controls to start from.
+        engine: What rolls out and samples.
+        team: Where candidates are exchanged.
+        observer: Is told what the node does.
+    """
+
+    def __init__(
+        self,
+        mission: Mission,
+        robot: int,
+        takeover: int,
+        number: int,
+        problem: Problem,
+        guess: Any,
+        engine: Engine,
+        team: Transport,
+        observer: Observer,
+    ) -> None:
+        self.takeover, self.number, self.problem = takeover, number, problem
+        self._enough, self._over = threading.Event(), threading.Event()
+        self._node: Node | None = None
+        self._error: Exception | None = None
+        planning = mission.planning()
+        planner = D4orm(D4ormConfig(**planning.node_settings(mission.robots)[robot]))
+        choice = Selection(planning.selection, planning.k)
+
+        def work() -> None:
+            try:
+                self._node = Node(
+                    robot, mission.robots, planner, problem, mission.seed + takeover, guess, engine, team, choice,
+                    told=TOLD * number, observer=observer,
+                )  # fmt: skip
+                self._think(self._node)
+            except Exception as error:
+                self._error = error
+
+        # A node that is at its last iteration must not keep the robot from ending.
+        self._thread = threading.Thread(target=work, daemon=True, name=f"round-{number}")
+        self._thread.start()
+
+    def _think(self, node: Node) -> None:
+        while not self._enough.is_set() and node.step(self._enough, PATIENCE, improve=True):
+            pass
+        while not self._over.is_set():
+            node.settle(RETELL)
+            self._over.wait(RETELL)
+
+    def enough(self) -> None:
+        """Begin no further iteration: tell the best candidate until everybody has it."""
+        self._enough.set()
+
+    def best(self) -> Course | None:
+        """The best solution that this robot has by now, its own or another's, if there is any.
+
+        Raises:
+            RuntimeError: If the node has failed.
+        """
+        if self._error is not None:
+            raise RuntimeError(f"round {self.number} has failed: {self._error}") from self._error
+        best = None if self._node is None else self._node.search.best
+        return Course.of(self.takeover, self.problem, best) if best is not None and best.solved else None
+
+    def end(self, timeout: float) -> None:
+        """Let go of it; an iteration under way is waited for, so that no two rounds take turns on a core."""
+        self._enough.set()
+        self._over.set()
+        self._thread.join(timeout)
+
+
