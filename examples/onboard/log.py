@@ -5,12 +5,12 @@ from __future__ import annotations
 import csv
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from onboard.course import digest
-
 from d4orm_planners.distributed.events import Event
+from onboard.course import digest
 
 COLUMNS = (
     "time", "until", "tick", "round", "robot", "event", "of", "message", "bytes", "plan", "reward", "solved"
@@ -27,6 +27,7 @@ class Log:
     Attributes:
         tick: The present tick.
         round: The present round.
+        members: Robots that take part in it, by the numbers of their nodes.
     """
 
     def __init__(self, path: Path, robot: int) -> None:
@@ -36,6 +37,7 @@ class Log:
         self._robot = robot
         self._lock = threading.Lock()
         self.tick = self.round = 0
+        self.members: Sequence[int] = ()
 
     def __enter__(self) -> Self:
         return self
@@ -59,7 +61,7 @@ class Log:
             event.kind,
             time=event.begin,
             until=event.end,
-            of=event.of,
+            of=self.members[event.of],
             message=event.sequence,
             bytes=event.size,
             plan=digest(event.candidate),

@@ -12,6 +12,9 @@ from d4orm_env.scenarios import make_problem
 from d4orm_planners.d_d4orm import DD4ormConfig
 from d4orm_planners.distributed.zenoh_transport import ZenohSettings, ZenohTransport
 
+TICK = 0.1
+"""Time step of the world and of plans [s]."""
+
 ROOM = 0.05
 """Gap that is left when a robot stops while the one behind it drives on for a tick [m]."""
 
@@ -27,8 +30,9 @@ class Mission:
         horizon: Steps of a plan.
         samples: Of all robots together in an iteration; each draws its share.
         denoising_steps: ``N`` of an iteration.
+        iterations: Of a round, at least; where they take longer than real time allows, the clock waits for them.
         think: Ticks that a round of planning is given.
-        agree: Ticks from then on in which the robots agree on the best plan and take it over.
+        agree: Ticks from then on until the best plan, which the robots agree on meanwhile, takes over.
         patience: Seconds that the world waits for a robot's command before it is given up.
         silence: Seconds without a word from the world after which a robot ends.
         namespace: Of the run on the network.
@@ -42,6 +46,7 @@ class Mission:
     horizon: int
     samples: int
     denoising_steps: int
+    iterations: int
     think: int
     agree: int
     patience: float
@@ -72,13 +77,13 @@ class Mission:
         """The team of ground robots in the square, with its first goals."""
         team = Team(("velocity2d",) * self.robots)
         # Who follows another one does not touch it when that one stops at once.
-        margin = float(np.max(np.asarray(team.max_speed))) * 0.1 + ROOM
+        margin = float(np.max(np.asarray(team.max_speed))) * TICK + ROOM
         size = self.side - 2 * (float(np.max(np.asarray(team.radius))) + margin)
         problem = make_problem(
             "random", num_robots=self.robots, model="velocity2d", seed=self.seed, margin=margin, size=size
         )
         half = np.full(2, self.side / 2)
-        return problem.replace(world=World(lower=-half, upper=half), horizon=self.horizon, dt=0.1, name="onboard")
+        return problem.replace(world=World(lower=-half, upper=half), horizon=self.horizon, dt=TICK, name="onboard")
 
     def planning(self) -> DD4ormConfig:
         """The settings of D-D4orm."""

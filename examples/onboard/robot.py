@@ -15,16 +15,16 @@ import time
 from pathlib import Path
 
 import numpy as np
-from onboard import wire
-from onboard.course import Course, first_guess, goals_to_plan_for, present_problem
-from onboard.log import Log
-from onboard.mission import Mission
-from onboard.thinking import Round
 
 from d4orm_env.engine.base import get_engine
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_planners.d4orm import D4orm, D4ormConfig
 from d4orm_planners.distributed.transport import Transport
+from onboard import wire
+from onboard.course import Course, first_guess, goals_to_plan_for, present_problem
+from onboard.log import Log
+from onboard.mission import Mission
+from onboard.thinking import Round
 
 LOOK = 0.5
 """Longest time between two looks at the clock [s]."""
@@ -97,7 +97,7 @@ class Robot:
 
     def _drop_round(self) -> None:
         if self._round is not None:
-            self._round.end(self._mission.patience / 2)
+            self._round.end(self._mission.patience / 3)
         self._round = self._ballot = None
 
     def _begin_round(self, joint: JointState) -> None:
@@ -114,8 +114,10 @@ class Robot:
         self._log.note("begins")
         problem = present_problem(self._problem, then, goals)
         guess = first_guess(self._course, problem, takeover)
+        members = [robot for robot in range(self._mission.robots) if robot not in self._lost]
+        self._log.members = members
         self._round = Round(
-            self._mission, self._number, takeover, self._rounds, problem, guess, self._engine, self._team,
+            self._mission, members, self._number, takeover, self._rounds, problem, guess, self._engine, self._team,
             self._log.observe,
         )  # fmt: skip
 
@@ -123,11 +125,15 @@ class Robot:
         """Announce the best plan known, once thinking is over."""
         if self._round is None:
             return
-        left = self._round.takeover - tick
-        if left <= self._mission.agree:
-            self._round.enough()
-            self._ballot = self._round.best()
-            self._log.note("announces", plan="" if self._ballot is None else self._ballot.digest)
+        left, wait = self._round.takeover - tick, self._mission.patience / 3
+        if left > self._mission.agree:
+            return
+        self._round.enough(wait)
+        if left == 1:
+            # The last word: this is what the others will go by.
+            self._round.settle(wait)
+        self._ballot = self._round.best()
+        self._log.note("announces", plan="" if self._ballot is None else self._ballot.digest)
 
 
 def drive(mission: Mission, number: int, robot: Robot, world: Transport) -> None:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from typing import Any
-
-from onboard.course import Course
-from onboard.mission import Mission
 
 from d4orm_env import Problem
 from d4orm_env.engine.base import Engine
@@ -14,12 +12,14 @@ from d4orm_planners.d4orm import D4orm, D4ormConfig
 from d4orm_planners.distributed.events import Observer
 from d4orm_planners.distributed.node import Node, Selection
 from d4orm_planners.distributed.transport import Transport
+from onboard.course import Course
+from onboard.mission import Mission
 
 PATIENCE = 0.25
 """Seconds that a node waits for the others after each of its iterations."""
 
-RETELL = 0.1
-"""Seconds between two looks at whether everybody has the best candidate."""
+RETELL = 0.2
+"""Seconds between two looks at whether everybody has the best candidate, once all had it."""
 
 TOLD = 10_000
 """More messages than a node sends in a round; a later round's are numbered on from there."""
@@ -30,6 +30,7 @@ class Round:
 
     Args:
         mission: The settings.
+        members: The robots that are alive, whose nodes are numbered in this order.
         robot: Whose node it is.
         takeover: Tick at which the plan begins.
         number: Of the round; later ones have larger numbers.
@@ -43,6 +44,7 @@ class Round:
     def __init__(
         self,
         mission: Mission,
+        members: Sequence[int],
         robot: int,
         takeover: int,
         number: int,
@@ -52,38 +54,54 @@ class Round:
         team: Transport,
         observer: Observer,
     ) -> None:
-        self.takeover, self.number, self.problem = takeover, number, problem
-        self._enough, self._over = threading.Event(), threading.Event()
+        self.members, self.takeover, self.number, self.problem = tuple(members), takeover, number, problem
+        self._mission = mission
+        self._iterated, self._enough, self._settled, self._over = (threading.Event() for _ in range(4))
         self._node: Node | None = None
         self._error: Exception | None = None
+        nodes, own = len(members), self.members.index(robot)
         planning = mission.planning()
-        planner = D4orm(D4ormConfig(**planning.node_settings(mission.robots)[robot]))
+        planner = D4orm(D4ormConfig(**planning.node_settings(nodes)[own]))
         choice = Selection(planning.selection, planning.k)
 
         def work() -> None:
             try:
                 self._node = Node(
-                    robot, mission.robots, planner, problem, mission.seed + takeover, guess, engine, team, choice,
+                    own, nodes, planner, problem, mission.seed + takeover, guess, engine, team, choice,
                     told=TOLD * number, observer=observer,
                 )  # fmt: skip
                 self._think(self._node)
             except Exception as error:
                 self._error = error
+            finally:
+                self._iterated.set()
+                self._settled.set()
 
         # A node that is at its last iteration must not keep the robot from ending.
         self._thread = threading.Thread(target=work, daemon=True, name=f"round-{number}")
         self._thread.start()
 
     def _think(self, node: Node) -> None:
-        while not self._enough.is_set() and node.step(self._enough, PATIENCE, improve=True):
-            pass
+        iterations = 0
+        while not self._enough.is_set():
+            node.step(self._enough, PATIENCE, improve=True)
+            iterations += 1
+            if iterations == self._mission.iterations:
+                self._iterated.set()
+        node.settle(self._mission.patience)
+        self._settled.set()
         while not self._over.is_set():
             node.settle(RETELL)
             self._over.wait(RETELL)
 
-    def enough(self) -> None:
-        """Begin no further iteration: tell the best candidate until everybody has it."""
+    def enough(self, timeout: float) -> None:
+        """Begin no further iteration, if the least number is done or the seconds are over: tell the best candidate."""
+        self._iterated.wait(timeout)
         self._enough.set()
+
+    def settle(self, timeout: float) -> None:
+        """Wait until every robot has told that it has the best candidate, or the seconds are over."""
+        self._settled.wait(timeout)
 
     def best(self) -> Course | None:
         """The best solution that this robot has by now, its own or another's, if there is any.
@@ -101,5 +119,3 @@ class Round:
         self._enough.set()
         self._over.set()
         self._thread.join(timeout)
-
-

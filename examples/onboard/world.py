@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from onboard import wire
-from onboard.mission import Mission
 
 from d4orm_env import navigation_v0
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_planners.distributed.transport import Transport
+from onboard import wire
+from onboard.mission import Mission
 
 AGAIN = 0.25
 """Seconds after which robots that have not answered are told again, as messages may get lost."""
@@ -49,6 +49,16 @@ class Record:
         """Ticks that were simulated."""
         return len(self.reached)
 
+    @property
+    def goals_reached(self) -> int:
+        """By all robots."""
+        return int(np.sum(self.reached))
+
+    @property
+    def wall(self) -> float:
+        """Seconds that it took."""
+        return self.began[-1] + self.answered[-1] - self.began[0] if self.answered else 0.0
+
 
 class World:
     """The environment, in lifelong mode, at the other end of the robots' network.
@@ -68,6 +78,9 @@ class World:
         self.record = Record()
         self._mission, self._robots, self._speed = mission, robots, speed
         self._env = navigation_v0.parallel_env(problem=self.problem, lifelong=True, max_cycles=ticks)
+        self._env.reset()
+        # A step may compile, which must not happen while robots wait.
+        self._env.step(dict.fromkeys(self.agents, np.zeros(self.problem.control_size, np.float32)))
         self._env.reset(seed=mission.seed)
         self._lost: set[int] = set()
         self._commands: dict[int, wire.Command] = {}
