@@ -35,6 +35,7 @@ class Course:
         states: ``(T+1, K, n)``.
         goals: ``(K, d)`` that it was made for.
         digest: What names it.
+        reward: What the planner makes of it.
     """
 
     begin: int
@@ -42,6 +43,7 @@ class Course:
     states: Any
     goals: Any
     digest: str
+    reward: float = 0.0
 
     @classmethod
     def standing(cls, problem: Problem, tick: int, states: Any) -> Course:
@@ -54,7 +56,7 @@ class Course:
     def of(cls, begin: int, problem: Problem, candidate: Candidate) -> Course:
         """A candidate that solves the problem which begins at a tick."""
         trajectory = candidate.trajectory
-        return cls(begin, candidate.controls, trajectory.states, problem.goal, digest(candidate))
+        return cls(begin, candidate.controls, trajectory.states, problem.goal, digest(candidate), reward(candidate))
 
     def controls_at(self, tick: int) -> Any:
         """``(K, m)``."""
@@ -98,6 +100,11 @@ class Course:
 def digest(candidate: Candidate) -> str:
     """A short name of a candidate, by its controls."""
     return hashlib.sha256(np.ascontiguousarray(candidate.controls, "<f4").tobytes()).hexdigest()[:12]
+
+
+def reward(candidate: Candidate) -> float:
+    """Mean reward of a candidate."""
+    return float(candidate.trajectory.rewards.mean())
 
 
 def goals_to_plan_for(problem: Problem, joint: JointState, lost: Collection[int]) -> Any:

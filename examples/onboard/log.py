@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from d4orm_planners.distributed.events import Event
-from onboard.course import digest
+from onboard.course import digest, reward
 
 COLUMNS = (
     "time", "until", "tick", "round", "robot", "event", "of", "message", "bytes", "plan", "reward", "solved"
@@ -65,6 +65,6 @@ class Log:
             message=event.sequence,
             bytes=event.size,
             plan=digest(event.candidate),
-            reward=f"{float(event.candidate.trajectory.rewards.mean()):.6f}",
+            reward=f"{reward(event.candidate):.6f}",
             solved=int(event.candidate.solved),
         )

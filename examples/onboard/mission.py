@@ -56,8 +56,8 @@ class Mission:
     team: str
 
     def __post_init__(self) -> None:
-        if self.agree < 2:
-            raise ValueError(f"agree is {self.agree}; to announce a choice and to hear the others' takes 2 ticks")
+        if self.agree < 3:
+            raise ValueError(f"agree is {self.agree}; to end, to announce the best and to settle on one takes 3 ticks")
 
     @classmethod
     def read(cls, text: str) -> Mission:

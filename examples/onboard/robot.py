@@ -64,10 +64,10 @@ class Robot:
             self._take_over(tick)
         if self._round is None:
             self._begin_round(joint)
-        self._choose(tick.number)
+        self._choose(tick)
         control = self._course.controls_at(tick.number)[self._number]
-        ballot = "" if self._ballot is None else self._ballot.digest
-        return wire.Command(tick.number, self._number, [float(u) for u in control], ballot, self._course.digest)
+        ballot, reward = ("", 0.0) if self._ballot is None else (self._ballot.digest, self._ballot.reward)
+        return wire.Command(tick.number, self._number, [float(u) for u in control], ballot, reward, self._course.digest)
 
     def end(self) -> None:
         """Stop planning."""
@@ -121,19 +121,25 @@ class Robot:
             self._log.observe,
         )  # fmt: skip
 
-    def _choose(self, tick: int) -> None:
-        """Announce the best plan known, once thinking is over."""
+    def _choose(self, tick: wire.Tick) -> None:
+        """When thinking is over announce the best plan known, and then the best of those that all have announced."""
         if self._round is None:
             return
-        left, wait = self._round.takeover - tick, self._mission.patience / 3
-        if left > self._mission.agree:
-            return
-        self._round.enough(wait)
-        if left == 1:
-            # The last word: this is what the others will go by.
+        left, wait = self._round.takeover - tick.number, self._mission.patience / 3
+        if left == self._mission.agree:
+            self._round.enough(wait)
+        elif left == 2:
             self._round.settle(wait)
-        self._ballot = self._round.best()
-        self._log.note("announces", plan="" if self._ballot is None else self._ballot.digest)
+            self._announce(self._round.best())
+        elif left == 1:
+            announced = [(tick.rewards[robot], -robot) for robot in self._round.members if tick.ballots[robot]]
+            if announced:
+                _, robot = max(announced)
+                self._announce(self._round.named(tick.ballots[-robot]))
+
+    def _announce(self, course: Course | None) -> None:
+        self._ballot = course
+        self._log.note("announces", plan="" if course is None else course.digest)
 
 
 def drive(mission: Mission, number: int, robot: Robot, world: Transport) -> None:

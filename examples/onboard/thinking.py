@@ -8,11 +8,12 @@ from typing import Any
 
 from d4orm_env import Problem
 from d4orm_env.engine.base import Engine
+from d4orm_planners.base import Candidate
 from d4orm_planners.d4orm import D4orm, D4ormConfig
-from d4orm_planners.distributed.events import Observer
+from d4orm_planners.distributed.events import Event, Observer
 from d4orm_planners.distributed.node import Node, Selection
 from d4orm_planners.distributed.transport import Transport
-from onboard.course import Course
+from onboard.course import Course, digest
 from onboard.mission import Mission
 
 PATIENCE = 0.25
@@ -60,15 +61,21 @@ class Round:
         self._node: Node | None = None
         self._error: Exception | None = None
         nodes, own = len(members), self.members.index(robot)
+        self._known: dict[str, Candidate] = {}
         planning = mission.planning()
         planner = D4orm(D4ormConfig(**planning.node_settings(nodes)[own]))
         choice = Selection(planning.selection, planning.k)
+
+        def observe(event: Event) -> None:
+            if event.candidate.solved:
+                self._known[digest(event.candidate)] = event.candidate
+            observer(event)
 
         def work() -> None:
             try:
                 self._node = Node(
                     own, nodes, planner, problem, mission.seed + takeover, guess, engine, team, choice,
-                    told=TOLD * number, observer=observer,
+                    told=TOLD * number, observer=observe,
                 )  # fmt: skip
                 self._think(self._node)
             except Exception as error:
@@ -100,7 +107,7 @@ class Round:
         self._enough.set()
 
     def settle(self, timeout: float) -> None:
-        """Wait until every robot has told that it has the best candidate, or the seconds are over."""
+        """Wait until every robot has told a candidate as good as the best one here, or the seconds are over."""
         self._settled.wait(timeout)
 
     def best(self) -> Course | None:
@@ -113,6 +120,11 @@ class Round:
             raise RuntimeError(f"round {self.number} has failed: {self._error}") from self._error
         best = None if self._node is None else self._node.search.best
         return Course.of(self.takeover, self.problem, best) if best is not None and best.solved else None
+
+    def named(self, plan: str) -> Course | None:
+        """The solution of that digest, if this robot has it."""
+        candidate = self._known.get(plan)
+        return None if candidate is None else Course.of(self.takeover, self.problem, candidate)
 
     def end(self, timeout: float) -> None:
         """Let go of it; an iteration under way is waited for, so that no two rounds take turns on a core."""

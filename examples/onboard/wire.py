@@ -19,12 +19,14 @@ class Tick:
         state: The joint state, see :mod:`d4orm_env.joint_state`.
         lost: Robots that have been given up; they stand where they stopped.
         ballots: What each robot announced last as the plan of its choice, ``""`` for none.
+        rewards: What each of those is worth.
     """
 
     number: int
     state: list[float]
     lost: list[int]
     ballots: list[str]
+    rewards: list[float]
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,7 @@ class Command:
         robot: Who.
         control: ``(m,)``.
         ballot: Digest of the plan that it would take over next, ``""`` for none.
+        reward: What that is worth.
         executing: Digest of the plan that it executes.
     """
 
@@ -43,10 +46,11 @@ class Command:
     robot: int
     control: list[float]
     ballot: str
+    reward: float
     executing: str
 
 
-END = Tick(-1, [], [], [])
+END = Tick(-1, [], [], [], [])
 
 Word = TypeVar("Word", Tick, Command)
 
@@ -72,10 +76,11 @@ def decode(data: bytes, kind: type[Word]) -> Word | None:
 
 def _is_sound(word: Tick | Command) -> bool:
     if isinstance(word, Tick):
-        lists = [(word.state, float), (word.lost, int), (word.ballots, str)]
+        lists = [(word.state, float), (word.lost, int), (word.ballots, str), (word.rewards, float)]
         return type(word.number) is int and all(_all_of(values, kind) for values, kind in lists)
     texts = isinstance(word.ballot, str) and isinstance(word.executing, str)
-    return type(word.number) is int and type(word.robot) is int and texts and _all_of(word.control, float)
+    numbers = type(word.number) is int and type(word.robot) is int and isinstance(word.control, list)
+    return texts and numbers and _all_of([*word.control, word.reward], float)
 
 
 def _all_of(values: Any, kind: type) -> bool:

@@ -127,8 +127,10 @@ class World:
     def _ask(self, tick: int, seconds: float) -> set[int]:
         """Tell where everybody is and collect the commands; who has not answered in time."""
         state = [float(value) for value in self._env.state()]
-        ballots = [self._commands[robot].ballot if robot in self._commands else "" for robot in range(len(self.agents))]
-        question = wire.encode(wire.Tick(tick, state, sorted(self._lost), ballots))
+        former = [self._commands.get(robot) for robot in range(len(self.agents))]
+        ballots = ["" if command is None else command.ballot for command in former]
+        rewards = [0.0 if command is None else command.reward for command in former]
+        question = wire.encode(wire.Tick(tick, state, sorted(self._lost), ballots, rewards))
         deadline, again = time.perf_counter() + seconds, 0.0
         while missing := {robot for robot in range(len(self.agents)) if self._is_awaited(robot, tick)}:
             now = time.perf_counter()
