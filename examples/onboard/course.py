@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env import Problem
+from d4orm_env import Problem, Team
 from d4orm_env.engine.base import Engine
 from d4orm_env.joint_state import JointState
-from d4orm_planners.base import Candidate
+from d4orm_planners.base import Candidate, evaluate_controls
 from d4orm_planners.steering import straight_drives
 
 LEAST_MARGIN = 0.01
@@ -20,6 +20,12 @@ LEAST_MARGIN = 0.01
 
 ROUNDING = 1e-3
 """Slack between the margin that bodies keep now and the one that is asked of a plan [m]."""
+
+STANDSTILL = 1e-6
+"""Speed limit of robots that are lost, which must be above zero [m/s]."""
+
+SETTLING = 8
+"""Times that controls are executed at most until they stay the same; two do."""
 
 DRIFT = 0.01
 """How far a robot may be from where the course has it [m]."""
@@ -53,10 +59,11 @@ class Course:
         return cls(tick, controls, np.stack([states, states]), goals, f"standing-{tick}")
 
     @classmethod
-    def of(cls, begin: int, problem: Problem, candidate: Candidate) -> Course:
-        """A candidate that solves the problem which begins at a tick."""
-        trajectory = candidate.trajectory
-        return cls(begin, candidate.controls, trajectory.states, problem.goal, digest(candidate), reward(candidate))
+    def of(cls, begin: int, problem: Problem, engine: Engine, candidate: Candidate) -> Course | None:
+        """The plan that a candidate is, for the problem that begins at a tick; ``None`` if it is no solution."""
+        same = evaluate_controls(engine, problem, settled_controls(engine, problem, candidate.controls))
+        name, worth = digest(engine, problem, candidate), reward(candidate)
+        return cls(begin, same.controls, same.trajectory.states, problem.goal, name, worth) if same.solved else None
 
     def controls_at(self, tick: int) -> Any:
         """``(K, m)``."""
@@ -84,7 +91,7 @@ class Course:
         In the last resort everybody stands, which is safe for robots that can stop at once.
         """
         controls = self.rest(joint.steps, problem.horizon)
-        here = present_problem(problem, joint.states, joint.goals)
+        here = present_problem(problem, joint.states, joint.goals, lost)
         standing = np.isin(np.arange(problem.num_robots), list(lost))
         while True:
             controls[:, standing] = 0
@@ -97,9 +104,23 @@ class Course:
         return Course(joint.steps, trajectory.controls, trajectory.states, self.goals, name)
 
 
-def digest(candidate: Candidate) -> str:
-    """A short name of a candidate, by its controls."""
-    return hashlib.sha256(np.ascontiguousarray(candidate.controls, "<f4").tobytes()).hexdigest()[:12]
+def settled_controls(engine: Engine, problem: Problem, controls: Any) -> Any:
+    """Controls that stay as they are, to the bit, when they are executed, told and executed again.
+
+    Limiting them to the robots' speed may change the last bit, and again wherever a candidate is passed on.
+    """
+    for _ in range(SETTLING):
+        executed = engine.rollout(problem, controls).controls
+        if np.array_equal(executed, controls):
+            break
+        controls = executed
+    return controls
+
+
+def digest(engine: Engine, problem: Problem, candidate: Candidate) -> str:
+    """A short name of a candidate by its controls, the same wherever it has been passed on."""
+    controls = settled_controls(engine, problem, candidate.controls)
+    return hashlib.sha256(np.ascontiguousarray(controls, "<f4").tobytes()).hexdigest()[:12]
 
 
 def reward(candidate: Candidate) -> float:
@@ -122,15 +143,21 @@ def goals_to_plan_for(problem: Problem, joint: JointState, lost: Collection[int]
         stays |= taken
 
 
-def present_problem(problem: Problem, states: Any, goals: Any) -> Problem:
-    """The problem that begins here. Robots that are nearer than the margin, after one stopped, may stay as near."""
+def present_problem(problem: Problem, states: Any, goals: Any, lost: Collection[int]) -> Problem:
+    """The problem that begins here, in which robots that are lost cannot move.
+
+    Robots that are nearer to each other than the margin, after one of them stopped, may stay as near.
+    """
     positions, radius = states[:, : problem.dimension], np.asarray(problem.team.radius)
     gaps = np.linalg.norm(positions[:, None] - positions[None], axis=2) - radius[:, None] - radius
     np.fill_diagonal(gaps, np.inf)
     walls = problem.world.clearance(positions) - radius
     least = min(gaps.min(), walls.min()) - ROUNDING
     margin = problem.margin if least >= problem.margin - 2 * ROUNDING else max(float(least), LEAST_MARGIN)
-    return problem.moment(states, goals, margin=margin)
+    speed = np.array(problem.team.max_speed)
+    speed[list(lost)] = STANDSTILL
+    team = Team(problem.team.models, problem.team.radius, speed)
+    return problem.moment(states, goals, margin=margin, team=team)
 
 
 def first_guess(course: Course, problem: Problem, tick: int) -> Any:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from d4orm_planners.distributed.events import Event
-from onboard.course import digest, reward
+from onboard.course import reward
 
 COLUMNS = (
     "time", "until", "tick", "round", "robot", "event", "of", "message", "bytes", "plan", "reward", "solved"
@@ -55,8 +55,8 @@ class Log:
                 self._writer.writerow(row | fields)
                 self._file.flush()
 
-    def observe(self, event: Event) -> None:
-        """Write what the robot's node did."""
+    def observe(self, event: Event, plan: str) -> None:
+        """Write what the robot's node did, and with which plan."""
         self.note(
             event.kind,
             time=event.begin,
@@ -64,7 +64,7 @@ class Log:
             of=self.members[event.of],
             message=event.sequence,
             bytes=event.size,
-            plan=digest(event.candidate),
+            plan=plan,
             reward=f"{reward(event.candidate):.6f}",
             solved=int(event.candidate.solved),
         )

@@ -112,7 +112,7 @@ class Robot:
         self._rounds += 1
         self._log.round = self._rounds
         self._log.note("begins")
-        problem = present_problem(self._problem, then, goals)
+        problem = present_problem(self._problem, then, goals, self._lost)
         guess = first_guess(self._course, problem, takeover)
         members = [robot for robot in range(self._mission.robots) if robot not in self._lost]
         self._log.members = members
@@ -135,7 +135,7 @@ class Robot:
             announced = [(tick.rewards[robot], -robot) for robot in self._round.members if tick.ballots[robot]]
             if announced:
                 _, robot = max(announced)
-                self._announce(self._round.named(tick.ballots[-robot]))
+                self._announce(self._round.named(tick.ballots[-robot], wait))
 
     def _announce(self, course: Course | None) -> None:
         self._ballot = course

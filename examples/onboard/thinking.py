@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from d4orm_env import Problem
 from d4orm_env.engine.base import Engine
 from d4orm_planners.base import Candidate
 from d4orm_planners.d4orm import D4orm, D4ormConfig
-from d4orm_planners.distributed.events import Event, Observer
+from d4orm_planners.distributed.events import Event
 from d4orm_planners.distributed.node import Node, Selection
 from d4orm_planners.distributed.transport import Transport
 from onboard.course import Course, digest
@@ -39,7 +39,7 @@ class Round:
         guess: ``(H, K, m)`` controls to start from.
         engine: What rolls out and samples.
         team: Where candidates are exchanged.
-        observer: Is told what the node does.
+        observer: Is told what the node does, and the digest of the plan that it is about.
     """
 
     def __init__(
@@ -53,23 +53,26 @@ class Round:
         guess: Any,
         engine: Engine,
         team: Transport,
-        observer: Observer,
+        observer: Callable[[Event, str], None],
     ) -> None:
         self.members, self.takeover, self.number, self.problem = tuple(members), takeover, number, problem
-        self._mission = mission
+        self._mission, self._engine = mission, engine
         self._iterated, self._enough, self._settled, self._over = (threading.Event() for _ in range(4))
         self._node: Node | None = None
         self._error: Exception | None = None
         nodes, own = len(members), self.members.index(robot)
         self._known: dict[str, Candidate] = {}
+        self._learned = threading.Condition()
         planning = mission.planning()
         planner = D4orm(D4ormConfig(**planning.node_settings(nodes)[own]))
         choice = Selection(planning.selection, planning.k)
 
         def observe(event: Event) -> None:
-            if event.candidate.solved:
-                self._known[digest(event.candidate)] = event.candidate
-            observer(event)
+            plan = digest(engine, problem, event.candidate)
+            with self._learned:
+                self._known[plan] = event.candidate
+                self._learned.notify_all()
+            observer(event, plan)
 
         def work() -> None:
             try:
@@ -118,16 +121,20 @@ class Round:
         """
         if self._error is not None:
             raise RuntimeError(f"round {self.number} has failed: {self._error}") from self._error
-        best = None if self._node is None else self._node.search.best
-        return Course.of(self.takeover, self.problem, best) if best is not None and best.solved else None
+        return None if self._node is None else self._course(self._node.search.best)
 
-    def named(self, plan: str) -> Course | None:
-        """The solution of that digest, if this robot has it."""
-        candidate = self._known.get(plan)
-        return None if candidate is None else Course.of(self.takeover, self.problem, candidate)
+    def named(self, plan: str, timeout: float) -> Course | None:
+        """The solution of that digest, if this robot has it or gets it within the seconds, and it is one."""
+        with self._learned:
+            self._learned.wait_for(lambda: plan in self._known, timeout)
+            candidate = self._known.get(plan)
+        return None if candidate is None else self._course(candidate)
 
     def end(self, timeout: float) -> None:
         """Let go of it; an iteration under way is waited for, so that no two rounds take turns on a core."""
         self._enough.set()
         self._over.set()
         self._thread.join(timeout)
+
+    def _course(self, candidate: Candidate) -> Course | None:
+        return Course.of(self.takeover, self.problem, self._engine, candidate)
