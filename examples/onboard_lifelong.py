@@ -17,6 +17,7 @@ import argparse
 import contextlib
 import csv
 import secrets
+import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -35,6 +36,9 @@ from d4orm_planners.distributed.transport import LocalNetwork
 
 REPORT = 10.0
 """Simulated seconds between lines on how it goes."""
+
+SHOWN = 15.0
+"""Simulated seconds that the lower half of the picture shows."""
 
 
 def kill_order(text: str) -> tuple[int, float]:
@@ -79,13 +83,18 @@ def main() -> int:
         think=7,
         agree=3,
         patience=arguments.patience,
-        silence=60.0,
+        silence=30.0,
         namespace=f"onboard-{secrets.token_hex(4)}",
         world=world_endpoint,
         team=team_endpoint,
     )
-    with tempfile.TemporaryDirectory() as folder:
-        return run(mission, arguments, minutes, Path(folder))
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            return run(mission, arguments, minutes, Path(folder))
+    except KeyboardInterrupt:
+        print("interrupted before there was anything to write", file=sys.stderr)
+        return 130
 
 
 def run(mission: Mission, arguments: argparse.Namespace, minutes: float, folder: Path) -> int:
@@ -108,9 +117,10 @@ def run(mission: Mission, arguments: argparse.Namespace, minutes: float, folder:
 
             try:
                 world.await_robots(processes.check)
+                print(f"{mission.robots} robots are ready", flush=True)
                 world.run(each_tick)
             except KeyboardInterrupt:
-                print("interrupted", file=sys.stderr)
+                print("interrupted; the robots are told to end", file=sys.stderr)
                 status = 130
             finally:
                 world.end()
@@ -134,7 +144,8 @@ def write(world: World, rows: list[Row], out: Path, seconds: float) -> None:
         writer.writeheader()
         writer.writerows(row | {name: f"{row[name]:.4f}" for name in ("time", "until")} for row in rows)
     print(f"wrote {path}")
-    save_figure(draw(rows, world.problem.num_robots, min(20.0, record.wall)), out / "onboard_lifelong_timeline.png")
+    until = record.began[min(round(SHOWN / TICK), record.steps - 1)] - record.began[0]
+    save_figure(draw(rows, world.problem.num_robots, until), out / "onboard_lifelong_timeline.png")
     save_gif(film(world.problem, record, seconds), out / "onboard_lifelong.gif", TICK)
 
 

@@ -103,12 +103,13 @@ def draw_round(axes: Any, rows: Sequence[Row], number: int, num_robots: int) -> 
     axes.legend(
         handles=[
             Patch(facecolor="#6B7280", label="computing"),
+            Patch(facecolor="#6B7280", edgecolor="white", hatch="////", label="no solution yet"),
             Line2D([], [], color=FAINT, label="candidate sent"),
             Line2D([], [], color=INK, marker="o", ms=3.5, label="gone on from"),
             Line2D([], [], color="white", marker="D", mec=INK, ms=5, label="announces"),
             Line2D([], [], color="none", marker=">", mfc=INK, mec=INK, ms=7, label="takes over"),
         ],
-        ncols=5, loc="upper center", bbox_to_anchor=(0.5, -0.16), fontsize=8,
+        ncols=6, loc="upper center", bbox_to_anchor=(0.5, -0.16), fontsize=8,
     )  # fmt: skip
 
 

@@ -18,6 +18,9 @@ from onboard.mission import Mission
 AGAIN = 0.25
 """Seconds after which robots that have not answered are told again, as messages may get lost."""
 
+FAREWELLS, FAREWELL = 3, 0.1
+"""How often the robots are told that it is over, and the seconds between."""
+
 START = 300.0
 """Seconds within which every robot must have answered for the first time."""
 
@@ -46,8 +49,8 @@ class Record:
 
     @property
     def steps(self) -> int:
-        """Ticks that were simulated."""
-        return len(self.reached)
+        """Ticks that were simulated, to the end of each."""
+        return max(len(self.joints) - 1, 0)
 
     @property
     def goals_reached(self) -> int:
@@ -121,7 +124,9 @@ class World:
 
     def end(self) -> None:
         """Tell the robots that it is over."""
-        self._robots.publish(wire.encode(wire.END))
+        for _ in range(FAREWELLS):
+            self._robots.publish(wire.encode(wire.END))
+            time.sleep(FAREWELL)
         self._env.close()
 
     def _ask(self, tick: int, seconds: float) -> set[int]:
