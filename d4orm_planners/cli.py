@@ -248,10 +248,14 @@ def _solve(
     max_iterations: int | None,
     quiet: bool,
 ) -> Plan:
+    from d4orm_env.engine.base import get_engine
+    from d4orm_planners.evaluation.warmup import compile_for_planning
     from d4orm_planners.progress import SolveProgress
     from d4orm_planners.registry import make_planner
 
     chosen = make_planner(planner, preset=preset, **{"engine": engine, **parse_settings(settings)})
+    if get_engine(engine).name == "cpu":
+        compile_for_planning(lambda: typer.echo("compiling, once per installation ...", err=True))
     limit = max_iterations if max_iterations is not None else chosen.config.max_iterations
     with SolveProgress(planner, problem.num_robots, limit, enabled=not quiet) as progress:
         return chosen.solve(

@@ -27,6 +27,7 @@ from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.base import Iteration, Search, evaluate_controls
 from d4orm_planners.d4orm import D4orm
+from d4orm_planners.distributed import inbox as inbox_module
 from d4orm_planners.distributed import messages, node
 from d4orm_planners.distributed.inbox import Inbox
 from d4orm_planners.distributed.messages import KINDS, MAGIC, Message, MessageError, decode, encode
@@ -276,6 +277,26 @@ def test_a_candidate_counts_for_what_it_is_not_for_what_is_claimed() -> None:
     other.publish(encode(message(sequence=4, reward=reward), PROBLEM))
     assert len(box.receive()) == 1
     assert box.false_claims == 1
+
+
+def test_what_is_told_again_is_not_judged_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    box, other = inbox()
+    judged = []
+
+    def judge(*arguments: Any) -> Any:
+        judged.append(arguments)
+        return evaluate_controls(*arguments)
+
+    monkeypatch.setattr(inbox_module, "evaluate_controls", judge)
+    other.publish(encode(message(), PROBLEM))
+    (first,) = box.receive()
+    executed = first.candidate.controls
+    for sender, sequence in ((1, 4), (1, 5), (2, 1)):
+        other.publish(encode(message(node=sender, sequence=sequence, controls=executed), PROBLEM))
+        (again,) = box.receive()
+        np.testing.assert_array_equal(again.candidate.controls, executed)
+        assert again.candidate.rank == first.candidate.rank
+    assert len(judged) == 1
 
 
 # The planner.

@@ -28,7 +28,8 @@ from d4orm_env.verify import verify
 from d4orm_planners import Plan, d_d4orm, make_planner
 from d4orm_planners.base import Callback, Iteration, Search
 from d4orm_planners.d4orm import D4orm
-from d4orm_planners.distributed.messages import KINDS, MAX_BYTES, Message, encode
+from d4orm_planners.distributed import messages as message_module
+from d4orm_planners.distributed.messages import KINDS, Message, encode
 from d4orm_planners.distributed.node import node_seed
 from d4orm_planners.distributed.zenoh_transport import ZenohSettings, ZenohTransport
 
@@ -36,6 +37,9 @@ pytestmark = pytest.mark.slow
 
 CIRCLE = make_problem("circle", num_robots=4)
 SEED = 3
+LIMIT = 2**16
+"""A limit of messages [bytes] that a busy machine is quick to exceed."""
+
 STRONG = {"num_samples": 512, "num_steps": 50}
 WEAK = {"num_samples": 6, "num_steps": 2}
 
@@ -252,7 +256,7 @@ def nonsense(problem: Problem) -> dict[str, bytes]:
     return {
         "garbage": random.Random(0).randbytes(5000),
         "truncated": data[:-9],
-        "too_large": bytes(MAX_BYTES + 1),
+        "too_large": bytes(LIMIT + 1),
         "version": data[:4] + struct.pack("<H", 9) + data[6:],
         "checksum": data[:-1] + bytes([data[-1] ^ 1]),
         "problem": encode(good, hop_problem(1, horizon=problem.horizon)),
@@ -265,8 +269,9 @@ def nonsense(problem: Problem) -> dict[str, bytes]:
 
 
 def test_a_node_that_sends_garbage_is_counted_and_harmless(
-    attacker: Callable[[str], ZenohTransport], caplog: pytest.LogCaptureFixture
+    attacker: Callable[[str], ZenohTransport], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(message_module, "MAX_BYTES", LIMIT)
     problem, endpoint, notes = walled_in_problem(), free_endpoint(), []
     messages = nonsense(problem)
     assert set(messages) == set(KINDS)

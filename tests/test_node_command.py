@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 from network_support import PATIENCE, free_endpoint, wait_until
 from planner_support import hop_problem, walled_in_problem
 
@@ -32,9 +35,9 @@ GOOD: dict[str, Any] = {
 }
 
 
-def write(folder: Path, **changes: Any) -> Path:
+def write(folder: Path, name: str = "node.yaml", **changes: Any) -> Path:
     """A node's file; a change to ``None`` leaves the field out."""
-    path = folder / f"node{changes.get('node', 1)}.yaml"
+    path = folder / name
     content = {key: value for key, value in {**GOOD, **changes}.items() if value is not None}
     path.write_text(yaml.safe_dump(content))
     return path
@@ -74,7 +77,7 @@ def start(tmp_path: Path):
     started: list[Process] = []
 
     def begin(**changes: Any) -> Process:
-        started.append(Process(write(tmp_path, **changes)))
+        started.append(Process(write(tmp_path, f"node{changes['node']}.yaml", **changes)))
         return started[-1]
 
     yield begin
@@ -210,6 +213,25 @@ def test_a_bad_file_is_refused_by_field(changes: dict[str, Any], text: str, tmp_
     with pytest.raises(ValueError, match=f"{path.name}: .*{text}") as caught:
         load_node(path)
     assert "\n" not in str(caught.value)
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers(-3, 3) | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=2) | st.dictionaries(st.text(max_size=8), inner, max_size=2),
+    max_leaves=4,
+)
+
+
+@given(st.sampled_from([*GOOD, "seed", "zenoh", "colour"]), VALUES)
+def test_any_value_of_a_field_is_taken_or_refused(field: str, value: Any) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = write(Path(folder), **{field: value})
+        complaint = str(path)
+        try:
+            load_node(path)
+        except ValueError as error:
+            complaint = str(error)
+        assert complaint.startswith(str(path))
 
 
 def test_what_is_no_file_of_a_node_is_refused(tmp_path: Path) -> None:

@@ -423,46 +423,60 @@ class Burst:
         return xp.asarray(factor)
 
 
+def bursting_controls(task: SamplingTask, burst: Burst) -> Any:
+    """The controls of the second step, whose noise is the burst."""
+    rules, sigma = SamplingRules(RecordedWeights(SOFTMAX.weights)), np.ones(1, np.float32)
+    mean = CPU.denoise(task, rules, 0 * task.base, sigma, NUM_SAMPLES, seed=4).mean
+    return sampled_controls(task, mean, burst(0, np), 4, 1)
+
+
 @pytest.mark.parametrize("credit", CREDITS)
-def test_samples_that_blow_up_are_excluded_and_counted_and_change_no_other(credit: str) -> None:
-    """A quarter of the samples in each tile gets a control that is infinite, and with it a robot that is nowhere."""
+def test_jax_excludes_and_counts_samples_with_infinite_controls(credit: str) -> None:
     task = replace(TASKS["obstacles"](), credit=credit)
     burst = Burst(task.base.shape, (6, 0, 1), 3e38)
+    with np.errstate(over="ignore", invalid="ignore"):
+        rules = SamplingRules(SOFTMAX.weights, burst)
+        result = JAX.denoise(task, rules, 0 * task.base, np.ones(2, np.float32), NUM_SAMPLES, seed=4)
+        blown = ~np.isfinite(bursting_controls(task, burst)).all(axis=(1, 2, 3))
+    assert 20 < blown.sum() < 80
+    assert result.excluded == blown.sum()
+    assert np.isfinite(result.mean).all()
+
+
+@pytest.mark.parametrize("credit", CREDITS)
+def test_samples_that_blow_up_are_excluded_and_counted_and_change_no_other(credit: str) -> None:
+    """A quarter of the samples in each tile gets a control whose square is infinite: its robot is nowhere."""
+    task = replace(TASKS["obstacles"](), credit=credit)
+    burst = Burst(task.base.shape, (6, 0, 1), 1.6e19)
     recorded = RecordedWeights(SOFTMAX.weights)
     sigma = np.ones(2, np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
         result = CPU.denoise(task, SamplingRules(recorded, burst), 0 * task.base, sigma, NUM_SAMPLES, seed=4)
-        first = SamplingRules(RecordedWeights(SOFTMAX.weights))
-        mean = CPU.denoise(task, first, 0 * task.base, sigma[:1], NUM_SAMPLES, seed=4).mean
-        controls = sampled_controls(task, mean, burst(0, np), 4, 1)
-        other = JAX.denoise(task, SamplingRules(SOFTMAX.weights, burst), 0 * task.base, sigma, NUM_SAMPLES, seed=4)
-    blown = ~np.isfinite(controls).all(axis=(1, 2, 3))
+        controls = bursting_controls(task, burst)
+        blown = ~np.isfinite(np.square(controls, dtype=np.float32)).all(axis=(1, 2, 3))
     assert 20 < blown.sum() < 80
     rewards = recorded.rewards[1]
     if credit == "team":
         np.testing.assert_array_equal(np.isneginf(rewards[0]), blown)
     else:
         np.testing.assert_array_equal(np.isneginf(rewards), [blown, 0 * blown, 0 * blown])
-    assert result.excluded == other.excluded == blown.sum()
+    assert result.excluded == blown.sum()
     for sample in np.flatnonzero(~blown):
         expected = plain_rewards(task, controls[sample])
         found = rewards[0, sample] if credit == "team" else rewards[:, sample]
         np.testing.assert_allclose(found, expected.mean() if credit == "team" else expected, atol=1e-4)
     assert np.isfinite(result.mean).all()
-    assert np.isfinite(other.mean).all()
-    np.testing.assert_allclose(result.rewards, other.rewards, rtol=1e-4, atol=2e-5)
 
 
 def test_samples_that_blow_up_do_not_hide_where_the_others_are() -> None:
     """Half the samples of every tile overflow early on, and the rest spread out for long after that."""
     task = replace(TASKS["obstacles"](), credit="robot")
-    task.base[3, 0, 0] = 2.5e38
-    burst = Burst(task.base.shape, (3, 0, 0), 3e38)
+    burst = Burst(task.base.shape, (3, 0, 0), 2.7e19)
     recorded = RecordedWeights(lambda rewards, xp: xp.zeros_like(rewards))
     with np.errstate(over="ignore", invalid="ignore"):
         CPU.denoise(task, SamplingRules(recorded, burst), 0 * task.base, np.ones(2, np.float32), NUM_SAMPLES, seed=0)
         controls = sampled_controls(task, 0, burst(0, np), 0, 1)
-    usable = np.flatnonzero(np.isfinite(controls).all(axis=(1, 2, 3)))
+        usable = np.flatnonzero(np.isfinite(np.square(controls, dtype=np.float32)).all(axis=(1, 2, 3)))
     assert 80 < len(usable) < 120
     expected = np.transpose([plain_rewards(task, controls[sample]) for sample in usable])
     np.testing.assert_allclose(recorded.rewards[1][:, usable], expected, atol=1e-4)

@@ -2,32 +2,22 @@
 
 from __future__ import annotations
 
-import socket
+import subprocess
 import sys
 import threading
-import time
+import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from network_support import free_endpoint, wait_until
 
 from d4orm_planners.distributed.zenoh_transport import ZenohSettings, ZenohTransport
 
 Join = Callable[..., ZenohTransport]
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def wait_until(condition: Callable[[], Any], seconds: float = 60) -> None:
-    deadline = time.perf_counter() + seconds
-    while not condition():
-        assert time.perf_counter() < deadline, "it did not come about"
-        time.sleep(0.01)
 
 
 @pytest.fixture
@@ -47,14 +37,14 @@ def join() -> Iterator[Join]:
 @pytest.fixture
 def pair(join: Join) -> tuple[ZenohTransport, ZenohTransport]:
     """Two connected ends."""
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = free_endpoint()
     first, second = join(listen=[endpoint]), join(connect=[endpoint])
     wait_until(lambda: first.has_listeners and second.has_listeners)
     return first, second
 
 
 def test_messages_reach_everybody_else_and_not_the_sender(join: Join) -> None:
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = free_endpoint()
     first = join(listen=[endpoint])
     second, third = join(connect=[endpoint]), join(connect=[endpoint])
     got: dict[ZenohTransport, set[bytes]] = {end: set() for end in (first, second, third)}
@@ -80,7 +70,7 @@ def test_big_messages_come_whole(pair: tuple[ZenohTransport, ZenohTransport]) ->
 
 
 def test_who_is_away_is_tried_again(join: Join) -> None:
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = free_endpoint()
     early = join(connect=[endpoint])
     early.publish(b"to nobody")
     assert early.collect() == []
@@ -91,7 +81,7 @@ def test_who_is_away_is_tried_again(join: Join) -> None:
 
 
 def test_two_solves_on_one_network_do_not_hear_each_other(join: Join) -> None:
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = free_endpoint()
     first = join(listen=[endpoint], namespace="team/1")
     other, second = join(connect=[endpoint], namespace="team/2"), join(connect=[endpoint], namespace="team/1")
     wait_until(lambda: second.has_listeners)
@@ -131,7 +121,7 @@ def _own_sockets(protocol: str) -> list[str]:
 
 def test_multicast_finds_others_on_this_machine(join: Join) -> None:
     # A namespace of its own, because nodes of other tests may be found as well.
-    namespace = f"test/{free_port()}"
+    namespace = f"test/{uuid.uuid4()}"
     first, second = (join(multicast=True, namespace=namespace) for _ in range(2))
     wait_until(lambda: first.has_listeners and second.has_listeners)
     first.publish(b"found")
@@ -142,6 +132,25 @@ def test_without_zenoh_the_error_says_what_to_install(monkeypatch: pytest.Monkey
     monkeypatch.setitem(sys.modules, "zenoh", None)
     with pytest.raises(ImportError, match=r'needs zenoh; install it with pip install "d4orm-env\[zenoh\]"'):
         ZenohTransport(ZenohSettings())
+
+
+def test_an_end_that_nobody_closed_does_not_keep_the_process_from_ending() -> None:
+    code = (
+        "from d4orm_planners.distributed.zenoh_transport import ZenohSettings, ZenohTransport\n"
+        "end = ZenohTransport(ZenohSettings())\nprint('done')"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=300)
+    assert result.stdout == "done\n"
+
+
+@given(st.text(max_size=30))
+def test_any_text_is_an_endpoint_or_refused(text: str) -> None:
+    for endpoint in (text, f"tcp/{text}", f"tcp/{text}:1", f"tcp/h:{text}"):
+        try:
+            kept = ZenohSettings(connect=(endpoint,)).connect
+        except ValueError as error:
+            kept = (endpoint,) if repr(endpoint) in str(error) else ()
+        assert kept == (endpoint,)
 
 
 @pytest.mark.parametrize(
@@ -193,7 +202,7 @@ def test_a_bad_configuration_file_is_refused(content: str | None, text: str, tmp
 
 
 def test_a_port_that_is_taken_is_named(join: Join) -> None:
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = free_endpoint()
     join(listen=[endpoint])
     with pytest.raises(ValueError, match=f"zenoh cannot listen at {endpoint} .*Address already in use"):
         join(listen=[endpoint])

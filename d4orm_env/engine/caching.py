@@ -43,3 +43,11 @@ def cached_kernel(key: str, **options: Any) -> Callable[[Callable[..., Any]], An
         return dispatcher
 
     return decorate
+
+
+def has_to_be_compiled(kernel: Any) -> bool:
+    """Whether a kernel of :func:`cached_kernel` could be kept on disk and has not been yet, as its sources are now."""
+    cache = kernel._cache
+    if not isinstance(cache, _SourceKeyedCache):
+        return False
+    return not any(key[-1] == cache._source_key for key in cache._cache_file._load_index())

@@ -12,9 +12,9 @@ from d4orm_env.core.problem import Problem, ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine import noise, sampling
 from d4orm_env.engine.base import SamplingResult, SamplingRules, SamplingTask, StepResult, checked_controls
+from d4orm_env.engine.lanes import TILE
 from d4orm_env.engine.noise import DRAWS, TURNS
 from d4orm_env.engine.threads import Threads, available_cores
-from d4orm_env.engine.tiles import TILE
 from d4orm_env.engine.worlds import WorldBatch, advance_worlds, judge_worlds, observe_world, roll_out, step_worlds
 
 

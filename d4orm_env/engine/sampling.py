@@ -14,24 +14,25 @@ from numba.extending import register_jitable
 
 from d4orm_env.core import collision, dynamics, reward, transition
 from d4orm_env.core.dynamics import MODELS, Model
-from d4orm_env.engine import noise, proximity, tiles
+from d4orm_env.engine import lanes, noise, proximity, tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.lanes import TILE, subtract_where, use_wide_registers
 from d4orm_env.engine.noise import DRAWS
-from d4orm_env.engine.proximity import FIRST, STATIC, TOUCHED, mark_robots, measure_strides, near_static
+from d4orm_env.engine.proximity import STATIC, make_scratch, mark_robots, measure_strides, near_static
 from d4orm_env.engine.tiles import (
     DOCKED,
     HOLONOMIC2D,
     HOLONOMIC3D,
     INLINED,
-    NEAR_OBSTACLE,
-    NEAR_ROBOT,
+    NOWHERE,
+    OBSTACLE,
     ONE,
     OPS,
     OPTIONS,
     READ,
+    ROBOT,
     STATE,
     STRIDE,
-    TILE,
     TOTAL,
     VELOCITY2D,
     WRITE,
@@ -41,7 +42,7 @@ from d4orm_env.engine.tiles import (
     make_stepper,
 )
 
-SOURCES = fingerprint((dynamics, transition, collision, reward, noise, tiles, proximity))
+SOURCES = fingerprint((dynamics, transition, collision, reward, noise, lanes, tiles, proximity))
 for _function in (
     noise.xor_shift,
     noise.hash32,
@@ -91,6 +92,7 @@ BIT_OPS = noise.BitOps(_uint32, _int32, _to_float, _float_bits, _bits_float, _sq
 @compiled
 def _perturb(key: Any, first: Any, offset: Any, scale: Any, rows: Any) -> None:
     """Fill two rows with ``offset + scale * noise``, turned as :func:`noise.turned` says; half a row with the noise."""
+    use_wide_registers()
     for s in range(DRAWS):
         x, y = noise.normal_pair(np.uint32(first + s), key, BIT_OPS)
         rows[2 * TILE + s] = x
@@ -143,6 +145,7 @@ def _runner(model: Model) -> Any:
 
     @compiled
     def run(limits: Any, h: Any, docking: Any, goal: Any, inverse: Any, controls: Any, w: Any) -> None:
+        use_wide_registers()
         goal = goal[:dimension]
         # Three loops for the same reason as in tiles.
         for s in range(TILE):
@@ -183,14 +186,6 @@ def _run_robot(
 
 
 @inlined
-def _subtract(row: Any, count: Any, k: Any, w: Any) -> None:
-    """Take ``count`` times a row of flags of robot ``k`` from its reward."""
-    robot = w[k * STRIDE : (k + 1) * STRIDE]
-    for s in range(TILE):
-        robot[TOTAL * TILE + s] -= count * robot[row * TILE + s]
-
-
-@inlined
 def _add_standing(goal: Any, inverse: Any, count: Any, k: Any, w: Any) -> None:
     """Add the reward, violations aside, of ``count`` steps in which robot ``k`` does not move."""
     robot = w[k * STRIDE : (k + 1) * STRIDE]
@@ -226,7 +221,7 @@ def _begin_tile(arrays: Any, docked: Any, w: Any) -> None:
 @compiled
 def _score_tile(
     arrays: Any, offset: Any, scale: Any, docked: Any, collisions: Any, penalty: Any, moving: Any, moving_radius: Any,
-    seed: Any, step: Any, first: Any, stride: Any, kept: Any, w: Any, controls: Any, standing: Any, due: Any, box: Any,
+    seed: Any, step: Any, first: Any, kept: Any, w: Any, controls: Any, standing: Any, scratch: Any,
 ) -> None:  # fmt: skip
     """Roll out a tile of samples, noise beginning with counter ``first``; leave summed rewards in rows TOTAL."""
     num_steps, num_robots, _ = offset.shape
@@ -237,6 +232,7 @@ def _score_tile(
     radius, margin = arrays.radius, arrays.margin
     standing[:] = False
     _begin_tile(arrays, docked, w)
+    due, near = scratch.due, scratch.near
     proximity.begin(due)
     for t in range(num_steps):
         for k in range(num_robots):
@@ -254,15 +250,15 @@ def _score_tile(
                 standing[k] = True
                 count = np.float32(num_steps - t)
                 _add_standing(goals, inverse, count - ONE, k, w)
-            if due[k, STATIC] <= t and near_static(arrays, k, t, num_steps, stride, w, due, box):
-                tiles.clear_row(NEAR_OBSTACLE, k, w)
-                tiles.mark_obstacles(arrays, k, margin, w)
-                _subtract(NEAR_OBSTACLE, count * penalty, k, w)
+            if due[k, STATIC] <= t and near_static(arrays, k, t, num_steps, w, scratch):
+                near[k, OBSTACLE] = NOWHERE
+                tiles.mark_obstacles(arrays, k, margin, w, near)
+                subtract_where(w, k * STRIDE + TOTAL * TILE, near[k, OBSTACLE], count * penalty)
         if collisions:
-            mark_robots(radius, margin, moving[t], moving_radius, t, num_steps, stride, w, due, box)
+            mark_robots(radius, margin, moving[t], moving_radius, t, num_steps, w, scratch)
             for k in range(num_robots):
-                if due[k, TOUCHED] != 0:
-                    _subtract(NEAR_ROBOT, penalty, k, w)
+                if near[k, ROBOT] != NOWHERE:
+                    subtract_where(w, k * STRIDE + TOTAL * TILE, near[k, ROBOT], penalty)
 
 
 @cached_kernel(SOURCES, **OPTIONS)
@@ -287,19 +283,18 @@ def score_tiles(
         kept: ``(K, H, P, 2, M / 4)`` the noise, in ``P`` pairs of components, output; ``M`` rounded up to whole tiles.
         rewards: Output.
     """
+    use_wide_registers()
     num_robots, num_samples = rewards.shape
-    w = np.zeros(num_robots * STRIDE, np.float32)
-    controls = np.zeros(5 * TILE, np.float32)
-    stride = np.empty(num_robots + moving.shape[1], np.float32)
-    measure_strides(arrays.limits, arrays.time_step[0], moving, stride)
+    w = tiles.aligned_zeros(num_robots * STRIDE)
+    controls = tiles.aligned_zeros(5 * TILE)
     standing = np.empty(num_robots, np.bool_)
-    due = np.empty((num_robots, FIRST + num_robots + moving.shape[1]), np.int32)
-    box = np.empty((num_robots, 2, arrays.goal.shape[1]), np.float32)
+    scratch = make_scratch(num_robots, moving.shape[1], arrays.goal.shape[1])
+    measure_strides(arrays.limits, arrays.time_step[0], moving, scratch.stride)
     for index in range(tile_range[0], tile_range[1]):
         first = index * TILE
         _score_tile(
             arrays, offset, scale, docked, collisions, penalty, moving, moving_radius, seed, step, index * DRAWS,
-            stride, kept, w, controls, standing, due, box,
+            kept, w, controls, standing, scratch,
         )  # fmt: skip
         for k in range(num_robots):
             # The last tile may reach beyond the last sample.
@@ -336,6 +331,7 @@ def average_noise(kept: Any, odd: Any, even: Any, time_range: Any, first_moment:
 
 @compiled
 def _dot(weight: Any, x: Any) -> Any:
+    use_wide_registers()
     total = ZERO
     for i in range(weight.shape[0]):
         total += weight[i] * x[i]
@@ -344,6 +340,7 @@ def _dot(weight: Any, x: Any) -> Any:
 
 @compiled
 def _dot_squares(weight: Any, x: Any) -> Any:
+    use_wide_registers()
     total = ZERO
     for i in range(weight.shape[0]):
         total += weight[i] * x[i] * x[i]

@@ -4,7 +4,7 @@ A tile is a block of :data:`TILE` worlds (samples of a plan, or environments) th
 tile needs lies in one flat float32 array, the workspace: for every robot :data:`ROWS` rows, every row one number per
 world. So every inner loop runs over worlds with distances between its operands that the compiler knows, which is what
 lets it vectorise without checking for overlap, and the tile stays in cache while all robots and pairs are visited.
-Flags are zeros and ones, because mixing widths would stop the vectoriser.
+Who is near what is kept apart, in ``near`` ``(K, 2)``: a bit for every world.
 """
 
 from __future__ import annotations
@@ -18,22 +18,24 @@ from numba.extending import register_jitable
 
 from d4orm_env.core import collision, dynamics, reward, transition
 from d4orm_env.core.dynamics import MODEL_CODES, MODELS, Model, ModelFunctions, Ops
+from d4orm_env.engine.lanes import TILE, at_most, use_wide_registers, within_2, within_3
 
 ZERO = np.float32(0)
 ONE = np.float32(1)
 
-TILE = 64
-"""Worlds per tile."""
-
 # First rows of a robot in the workspace. Normals come in pairs, so the three control rows are followed by a spare one;
 # a power of two in all would map the same row of every robot to the same cache set.
-STATE, CONTROL, GOAL, DOCKED, DISTANCE2, NEAR_ROBOT, NEAR_OBSTACLE, TOTAL = 0, 6, 10, 13, 14, 15, 16, 17
-SCRATCH, ROWS = 18, 19
+STATE, CONTROL, GOAL, DOCKED, DISTANCE2, TOTAL, SCRATCH, ROWS = 0, 6, 10, 13, 14, 15, 16, 17
 STRIDE = ROWS * TILE
 
-OPTIONS: dict[str, Any] = {"fastmath": {"contract", "nsz", "reassoc"}, "error_model": "numpy"}
-"""Multiply-adds may fuse and sums be regrouped, which removes half the work of a Runge-Kutta step; nothing that changes
-the meaning of NaN or infinity is allowed."""
+# Columns of ``near``.
+ROBOT, OBSTACLE = 0, 1
+NOWHERE = np.uint64(0)
+
+OPTIONS: dict[str, Any] = {"fastmath": {"contract", "nsz", "reassoc", "arcp", "afn"}, "error_model": "numpy"}
+"""Multiply-adds may fuse and sums be regrouped, which removes half the work of a Runge-Kutta step, and one over a root
+may be an estimate with a Newton step behind it, good to the last bit or two. Of infinity that is NaN, so that controls
+beyond 1e19, whose squares overflow, count as not finite; otherwise NaN and infinity mean what they always do."""
 
 UNCOUNTED: dict[str, Any] = OPTIONS | {"_nrt": False}
 """For everything that kernels call: without numba's reference counts, which would cost more than the sums they
@@ -60,6 +62,14 @@ for _function in (
 ):
     # Lets compiled code call the core's plain Python functions, which stay as they are for everyone else.
     register_jitable(**INLINED)(_function)
+
+
+@numba.njit(nogil=True, **OPTIONS)
+def aligned_zeros(size: Any) -> Any:
+    """A flat float32 array that begins with a cache line, so that no vector load touches two."""
+    space = np.zeros(size + 16, np.float32)
+    first = np.int64(-(space.ctypes.data // 4) % 16)
+    return space[first : first + size]
 
 
 @compiled
@@ -248,6 +258,7 @@ def _mover(model: Model) -> Any:
 
     @compiled
     def run(limits: Any, h: Any, docking: Any, w: Any) -> None:
+        use_wide_registers()
         for s in range(TILE):
             standing = w[DOCKED * TILE + s] > ZERO
             u = limit_control(read_u(w, CONTROL * TILE, s), limits, OPS)
@@ -293,14 +304,6 @@ def move_robot(arrays: Any, k: Any, w: Any) -> None:
 
 
 @inlined
-def clear_row(row: Any, k: Any, w: Any) -> None:
-    """Set a row of robot ``k`` to zero."""
-    robot = w[k * STRIDE : (k + 1) * STRIDE]
-    for s in range(TILE):
-        robot[row * TILE + s] = ZERO
-
-
-@inlined
 def measure_goal_distance(num_robots: Any, dimension: Any, w: Any) -> None:
     """Fill the squared distance to the goal from places."""
     for k in range(num_robots):
@@ -314,82 +317,70 @@ def measure_goal_distance(num_robots: Any, dimension: Any, w: Any) -> None:
 
 
 @inlined
-def mark_pair(reach: Any, k: Any, other: Any, dimension: Any, w: Any) -> None:
+def mark_pair(reach: Any, k: Any, other: Any, dimension: Any, w: Any, near: Any) -> None:
     """Flag two robots in every world where their centres are within ``reach``."""
-    reach2 = reach * reach
-    # Offsets into one array instead of two views, which would be checked for overlap at every call. Through uint32 they
-    # are plainly not negative.
-    a, b = np.int64(np.uint32(k * STRIDE)), np.int64(np.uint32(other * STRIDE))
-    near_a, near_b = a + NEAR_ROBOT * TILE, b + NEAR_ROBOT * TILE
     if dimension == 2:
-        for s in range(TILE):
-            touches = ONE if _squared_gap2(_read2(w, a, s), _read2(w, b, s)) <= reach2 else ZERO
-            w[near_a + s] = _maximum(w[near_a + s], touches)
-            w[near_b + s] = _maximum(w[near_b + s], touches)
+        touch = within_2(w, k * STRIDE, other * STRIDE, reach * reach)
     else:
-        for s in range(TILE):
-            touches = ONE if _squared_gap3(_read3(w, a, s), _read3(w, b, s)) <= reach2 else ZERO
-            w[near_a + s] = _maximum(w[near_a + s], touches)
-            w[near_b + s] = _maximum(w[near_b + s], touches)
+        touch = within_3(w, k * STRIDE, other * STRIDE, reach * reach)
+    near[k, ROBOT] |= touch
+    near[other, ROBOT] |= touch
 
 
 @inlined
-def mark_pairs(arrays: Any, extra: Any, w: Any) -> None:
+def mark_pairs(arrays: Any, extra: Any, w: Any, near: Any) -> None:
     """Flag every two robots closer than their radii plus ``extra``."""
     for k in range(1, arrays.radius.shape[0]):
         for other in range(k):
-            mark_pair(arrays.radius[k] + arrays.radius[other] + extra, k, other, arrays.goal.shape[1], w)
+            mark_pair(arrays.radius[k] + arrays.radius[other] + extra, k, other, arrays.goal.shape[1], w, near)
 
 
 @inlined
-def mark_round(reach: Any, k: Any, centre: Any, axes: Any, row: Any, w: Any) -> None:
+def mark_round(reach: Any, k: Any, centre: Any, axes: Any, column: Any, w: Any, near: Any) -> None:
     """Flag robot ``k`` where it is within ``reach`` of a centre, over the first two or three axes."""
-    reach2 = reach * reach
     robot = w[k * STRIDE : (k + 1) * STRIDE]
-    flag = row * TILE
     if axes == 2:
         point = (centre[0], centre[1])
         for s in range(TILE):
-            touches = ONE if _squared_gap2(_read2(robot, 0, s), point) <= reach2 else ZERO
-            robot[flag + s] = _maximum(robot[flag + s], touches)
+            robot[SCRATCH * TILE + s] = _squared_gap2(_read2(robot, 0, s), point)
     else:
         place = (centre[0], centre[1], centre[2])
         for s in range(TILE):
-            touches = ONE if _squared_gap3(_read3(robot, 0, s), place) <= reach2 else ZERO
-            robot[flag + s] = _maximum(robot[flag + s], touches)
+            robot[SCRATCH * TILE + s] = _squared_gap3(_read3(robot, 0, s), place)
+    near[k, column] |= at_most(robot, SCRATCH * TILE, reach * reach)
 
 
 @inlined
-def _mark_box(reach: Any, k: Any, box: Any, dimension: Any, w: Any) -> None:
-    reach2 = reach * reach
+def _mark_box(reach: Any, k: Any, box: Any, dimension: Any, w: Any, near: Any) -> None:
     robot = w[k * STRIDE : (k + 1) * STRIDE]
     for s in range(TILE):
         gap2 = ZERO
         for axis in range(dimension):
             gap = collision.axis_gap(robot[axis * TILE + s], box[axis], box[dimension + axis], ZERO, OPS)
             gap2 += gap * gap
-        touches = ONE if gap2 <= reach2 else ZERO
-        robot[NEAR_OBSTACLE * TILE + s] = _maximum(robot[NEAR_OBSTACLE * TILE + s], touches)
+        robot[SCRATCH * TILE + s] = gap2
+    near[k, OBSTACLE] |= at_most(robot, SCRATCH * TILE, reach * reach)
 
 
 @inlined
-def mark_obstacles(arrays: Any, k: Any, extra: Any, w: Any) -> None:
+def mark_obstacles(arrays: Any, k: Any, extra: Any, w: Any, near: Any) -> None:
     """Flag robot ``k`` where it is within its radius plus ``extra`` of an obstacle or the bounds."""
     dimension = arrays.goal.shape[1]
     reach = arrays.radius[k] + extra
     for i in range(arrays.balls.shape[0]):
-        mark_round(reach + arrays.balls[i, dimension], k, arrays.balls[i], dimension, NEAR_OBSTACLE, w)
+        mark_round(reach + arrays.balls[i, dimension], k, arrays.balls[i], dimension, OBSTACLE, w, near)
     for i in range(arrays.cylinders.shape[0]):
-        mark_round(reach + arrays.cylinders[i, 2], k, arrays.cylinders[i], 2, NEAR_OBSTACLE, w)
+        mark_round(reach + arrays.cylinders[i, 2], k, arrays.cylinders[i], 2, OBSTACLE, w, near)
     for i in range(arrays.boxes.shape[0]):
-        _mark_box(reach, k, arrays.boxes[i], dimension, w)
+        _mark_box(reach, k, arrays.boxes[i], dimension, w, near)
     for axis in range(dimension):
         lower, upper = arrays.bounds[0, axis], arrays.bounds[1, axis]
         if lower > -np.inf or upper < np.inf:
             robot = w[k * STRIDE : (k + 1) * STRIDE]
             for s in range(TILE):
-                outside = ONE if collision.leaves(robot[axis * TILE + s], reach, lower, upper) else ZERO
-                robot[NEAR_OBSTACLE * TILE + s] = _maximum(robot[NEAR_OBSTACLE * TILE + s], outside)
+                outside = collision.leaves(robot[axis * TILE + s], reach, lower, upper)
+                robot[SCRATCH * TILE + s] = ZERO if outside else ONE
+            near[k, OBSTACLE] |= at_most(robot, SCRATCH * TILE, ZERO)
 
 
 def _motion_reader(model: Model) -> Any:

@@ -13,27 +13,28 @@ import numpy as np
 from numba.extending import register_jitable
 
 from d4orm_env.core import collision, dynamics, observation, reward, transition
-from d4orm_env.engine import tiles
+from d4orm_env.engine import lanes, tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.lanes import TILE, use_wide_registers
 from d4orm_env.engine.tiles import (
     CONTROL,
     DISTANCE2,
     DOCKED,
     GOAL,
     INLINED,
-    NEAR_OBSTACLE,
-    NEAR_ROBOT,
+    NOWHERE,
+    OBSTACLE,
     ONE,
     OPTIONS,
+    ROBOT,
     STATE,
     STRIDE,
-    TILE,
     ZERO,
     compiled,
     inlined,
 )
 
-SOURCES = fingerprint((dynamics, transition, collision, reward, observation, tiles))
+SOURCES = fingerprint((dynamics, transition, collision, reward, observation, lanes, tiles))
 
 for _function in (
     observation.observe_robot,
@@ -85,43 +86,46 @@ def _store(state: Any, control: Any, docked: Any, first: Any, w: Any) -> None:
         _store_world(state, control, docked, first + s, s, w)
 
 
+@inlined
+def _bit(mask: Any, s: Any) -> Any:
+    return (mask >> np.uint64(s)) & np.uint64(1)
+
+
 @compiled
-def _judge(arrays: Any, inverse: Any, first: Any, w: Any, collided: Any, violated: Any, rewards: Any) -> None:
+def _judge(
+    arrays: Any, inverse: Any, first: Any, w: Any, near: Any, collided: Any, violated: Any, rewards: Any
+) -> None:
     """Flag contacts and margin violations and compute rewards; all outputs ``(B, K)``."""
     num_robots = arrays.radius.shape[0]
     for k in range(num_robots):
-        tiles.clear_row(NEAR_ROBOT, k, w)
-        tiles.clear_row(NEAR_OBSTACLE, k, w)
+        near[k, ROBOT] = near[k, OBSTACLE] = NOWHERE
     # Whatever is in contact is within the margin too, so the second level adds to the flags of the first.
     for level in range(2):
         extra = ZERO if level == 0 else arrays.margin
         flags = collided if level == 0 else violated
-        tiles.mark_pairs(arrays, extra, w)
+        tiles.mark_pairs(arrays, extra, w, near)
         for k in range(num_robots):
-            tiles.mark_obstacles(arrays, k, extra, w)
+            tiles.mark_obstacles(arrays, k, extra, w, near)
         for s in range(min(TILE, collided.shape[0] - first)):
             for k in range(num_robots):
-                o = k * STRIDE + s
-                flags[first + s, k] = w[o + NEAR_ROBOT * TILE] + w[o + NEAR_OBSTACLE * TILE] > ZERO
+                flags[first + s, k] = _bit(near[k, ROBOT] | near[k, OBSTACLE], s) != NOWHERE
     for s in range(min(TILE, collided.shape[0] - first)):
         for k in range(num_robots):
-            o = k * STRIDE + s
-            distance, near_robot = np.sqrt(w[o + DISTANCE2 * TILE]), w[o + NEAR_ROBOT * TILE]
-            near_obstacle = w[o + NEAR_OBSTACLE * TILE]
             rewards[first + s, k] = reward.step_reward(
-                distance, inverse[first + s, k], near_robot, near_obstacle, ONE
+                np.sqrt(w[k * STRIDE + DISTANCE2 * TILE + s]), inverse[first + s, k],
+                np.float32(_bit(near[k, ROBOT], s)), np.float32(_bit(near[k, OBSTACLE], s)), ONE,
             )  # fmt: skip
 
 
 @compiled
 def _judge_all(
     arrays: Any, goal: Any, inverse: Any, state: Any, control: Any, docked: Any, collided: Any, violated: Any,
-    rewards: Any, w: Any,
+    rewards: Any, w: Any, near: Any,
 ) -> None:  # fmt: skip
     for first in range(0, state.shape[0], TILE):
         _load(goal, state, control, docked, first, w)
         tiles.measure_goal_distance(arrays.goal.shape[0], arrays.goal.shape[1], w)
-        _judge(arrays, inverse, first, w, collided, violated, rewards)
+        _judge(arrays, inverse, first, w, near, collided, violated, rewards)
 
 
 @cached_kernel(SOURCES, **OPTIONS)
@@ -143,15 +147,17 @@ def step_worlds(
         rewards: ``(B, K)``, output.
         tile_range: First tile of worlds and the one after the last.
     """
+    use_wide_registers()
     num_robots, dimension = arrays.goal.shape
-    w = np.zeros(num_robots * STRIDE, np.float32)
+    w = tiles.aligned_zeros(num_robots * STRIDE)
+    near = np.empty((num_robots, 2), np.uint64)
     for index in range(tile_range[0], tile_range[1]):
         first = index * TILE
         _load(goal, state, control, docked, first, w)
         tiles.measure_goal_distance(num_robots, dimension, w)
         for k in range(num_robots):
             tiles.move_robot(arrays, k, w)
-        _judge(arrays, inverse, first, w, collided, violated, rewards)
+        _judge(arrays, inverse, first, w, near, collided, violated, rewards)
         _store(state, control, docked, first, w)
 
 
@@ -165,16 +171,21 @@ def roll_out(
     Every output has ``H+1`` rows too, the first for the start. The motion comes first; then 64 moments at a time are
     judged, as if they were worlds.
     """
+    use_wide_registers()
     num_robots = arrays.radius.shape[0]
-    w = np.zeros(num_robots * STRIDE, np.float32)
+    w = tiles.aligned_zeros(num_robots * STRIDE)
+    near = np.empty((num_robots, 2), np.uint64)
     for t in range(1, controls.shape[0]):
-        states[t] = states[t - 1]
-        docked[t] = docked[t - 1]
+        # Loops, because numba takes seconds to compile assignments of slices.
+        for k in range(num_robots):
+            for i in range(states.shape[2]):
+                states[t, k, i] = states[t - 1, k, i]
+            docked[t, k] = docked[t - 1, k]
         _load_world(goal, states, controls, docked, t, 0, w)
         for k in range(num_robots):
             tiles.move_robot(arrays, k, w)
         _store_world(states, controls, docked, t, 0, w)
-    _judge_all(arrays, goal, inverse, states, controls, docked, collided, violated, rewards, w)
+    _judge_all(arrays, goal, inverse, states, controls, docked, collided, violated, rewards, w, near)
 
 
 @cached_kernel(SOURCES, **OPTIONS)
@@ -182,9 +193,11 @@ def judge_worlds(
     arrays: Any, goal: Any, inverse: Any, state: Any, control: Any, docked: Any, collided: Any, violated: Any
 ) -> None:
     """Contacts and margin violations of ``B`` worlds as they stand; arguments as in :func:`step_worlds`."""
-    w = np.zeros(arrays.radius.shape[0] * STRIDE, np.float32)
+    use_wide_registers()
+    w = tiles.aligned_zeros(arrays.radius.shape[0] * STRIDE)
+    near = np.empty((arrays.radius.shape[0], 2), np.uint64)
     rewards = np.empty(collided.shape, np.float32)
-    _judge_all(arrays, goal, inverse, state, control, docked, collided, violated, rewards, w)
+    _judge_all(arrays, goal, inverse, state, control, docked, collided, violated, rewards, w, near)
 
 
 class Eyes(NamedTuple):
@@ -240,7 +253,7 @@ def observe_world(
 ) -> None:  # fmt: skip
     """Fill ``out`` ``(1, K, D)`` with what every robot of a single world sees."""
     num_robots, dimension = arrays.goal.shape
-    w = np.empty(num_robots * STRIDE, np.float32)
+    w = tiles.aligned_zeros(num_robots * STRIDE)
     _load_world(goal, state, control, docked, 0, 0, w)
     eyes = _open_eyes(num_robots, dimension, num_neighbors, num_obstacles)
     _observe(arrays, goal[0], docked[0], np.float32(time_left), 0, w, bounds, eyes, out[0])
@@ -322,7 +335,6 @@ class WorldBatch(NamedTuple):
 
 @compiled
 def _restart(batch: Any, b: Any) -> None:
-    # Loops, because numba takes seconds to compile assignments of slices.
     for k in range(batch.docked.shape[1]):
         for i in range(batch.state.shape[2]):
             batch.state[b, k, i] = batch.start[b, k, i]
@@ -390,8 +402,10 @@ def advance_worlds(
         tile_range: First tile of worlds and the one after the last.
         out: ``(B, K, D)`` observations; those of skipped worlds are not written.
     """
+    use_wide_registers()
     num_robots, dimension = arrays.goal.shape
-    w = np.zeros(num_robots * STRIDE, np.float32)
+    w = tiles.aligned_zeros(num_robots * STRIDE)
+    near = np.empty((num_robots, 2), np.uint64)
     eyes = _open_eyes(num_robots, dimension, num_neighbors, num_obstacles)
     for index in range(tile_range[0], tile_range[1]):
         first = index * TILE
@@ -409,7 +423,7 @@ def advance_worlds(
         tiles.measure_goal_distance(num_robots, dimension, w)
         if moving:
             _move_tile(arrays, batch, orders, first, count, w)
-        _judge(arrays, batch.inverse, first, w, batch.collided, batch.violated, batch.rewards)
+        _judge(arrays, batch.inverse, first, w, near, batch.collided, batch.violated, batch.rewards)
         for s in range(count):
             b = first + s
             if orders[b] == STEP:

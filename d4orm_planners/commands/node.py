@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,9 +28,10 @@ def node(
     check_target(task.out, (".npz",))
     number = task.planner.config.node
     typer.echo(f"node {number} of {task.planner.config.nodes}, problem {task.problem.digest[:8]}")
-    with _events_as_lines(), _ended_by_signals():
+    with _events_as_lines(), _ended_by_signals() as over:
         plan = task.planner.solve(task.problem, task.seed, task.time_limit, callback=_tell)
-    plan.save(task.out)
+        over.set()
+        plan.save(task.out)
     typer.echo(
         f"node {number} ends ({plan.status.replace('_', ' ')}): best candidate "
         f"{'solves the problem' if plan.solved else 'does not solve the problem'}, reward {plan.metrics['reward']:.6f}"
@@ -65,19 +67,21 @@ def _events_as_lines() -> Iterator[None]:
 
 
 @contextmanager
-def _ended_by_signals() -> Iterator[None]:
-    """The first SIGINT or SIGTERM interrupts the solve, which then ends with the best so far; later ones do nothing."""
-    interrupted = False
+def _ended_by_signals() -> Iterator[threading.Event]:
+    """The first SIGINT or SIGTERM interrupts the solve, which then ends with the best so far; later ones do nothing.
+
+    Nor does the first, once the event that is handed out is set.
+    """
+    over = threading.Event()
 
     def interrupt(number: int, frame: Any) -> None:
-        nonlocal interrupted
-        if not interrupted:
-            interrupted = True
+        if not over.is_set():
+            over.set()
             raise KeyboardInterrupt
 
     former = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield
+        yield over
     finally:
         for number, handler in former.items():
             signal.signal(number, handler)

@@ -17,7 +17,9 @@ import json, sys, time
 begin = time.perf_counter()
 from d4orm_env import make_problem
 from d4orm_planners import make_planner
+from d4orm_planners.evaluation.warmup import compile_for_planning
 imported = time.perf_counter()
+compile_for_planning()  # as the command line does
 plan = make_planner("d4orm", engine="cpu").solve(make_problem("circle", num_robots=int(sys.argv[1])), seed=0)
 done = time.perf_counter()
 print(json.dumps({"import": imported - begin, "solve": done - imported, "planning": plan.wall_time,
@@ -67,8 +69,8 @@ def measure_startup(num_robots: int, repetitions: int) -> dict[str, Any]:
     """First plan of a process: once with an empty kernel cache, then with a full one.
 
     Returns:
-        ``cold`` seconds from start to exit of the first process and ``compiling``, the part of its solve that was not
-        planning; ``warm`` the :class:`Spread` of the processes after it, start to exit.
+        ``cold`` seconds from start to exit of the first process and ``compiling``, the part that was neither importing
+        nor planning; ``warm`` the :class:`Spread` of the processes after it, start to exit.
     """
     with tempfile.TemporaryDirectory() as cache:
         cold, first = _run(_FIRST_PLAN, num_robots, cache=cache)

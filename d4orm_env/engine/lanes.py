@@ -1,0 +1,135 @@
+"""All worlds of a tile at once, where loops over them would not do: as vector instructions written out.
+
+What holds in some worlds only is a mask, one bit per world, lowest bit first.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba import extending
+from numba.core import types
+
+intrinsic: Any = extending.intrinsic
+"""Its calls in compiled code lack the first argument, which type checkers cannot know."""
+
+TILE = 64
+"""Worlds per tile, as many as a mask has bits."""
+
+CHUNK = 16
+"""Worlds per instruction; where registers hold fewer, the compiler splits it."""
+
+_FLOATS = ir.VectorType(ir.FloatType(), CHUNK)
+_BITS = ir.IntType(CHUNK)
+_MASK = ir.IntType(TILE)
+
+
+def _splat(builder: Any, value: Any) -> Any:
+    lane = builder.insert_element(ir.Constant(_FLOATS, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
+    order = ir.Constant(ir.VectorType(ir.IntType(32), CHUNK), [0] * CHUNK)
+    return builder.shuffle_vector(lane, ir.Constant(_FLOATS, ir.Undefined), order)
+
+
+def _place(context: Any, builder: Any, array_type: Any, array: Any, offset: Any, first: int) -> Any:
+    """The address of ``array[offset + first]`` as that of a vector."""
+    data = context.make_array(array_type)(context, builder, array).data
+    index = builder.add(offset, ir.Constant(offset.type, first))
+    return builder.bitcast(builder.gep(data, [index], inbounds=True), _FLOATS.as_pointer())
+
+
+def _load(context: Any, builder: Any, array_type: Any, array: Any, offset: Any, first: int) -> Any:
+    return builder.load(_place(context, builder, array_type, array, offset, first), align=4)
+
+
+def _at_most(builder: Any, first: int, values: Any, bound: Any) -> Any:
+    """The part of a mask that begins with world ``first``; not a number is not at most anything."""
+    bits = builder.bitcast(builder.fcmp_ordered("<=", values, bound), _BITS)
+    return builder.shl(builder.zext(bits, _MASK), ir.Constant(_MASK, first))
+
+
+def _squared_gap(builder: Any, pairs: list[tuple[Any, Any]]) -> Any:
+    total = None
+    for a, b in pairs:
+        gap = builder.fsub(a, b)
+        square = builder.fmul(gap, gap, flags=("contract",))
+        total = square if total is None else builder.fadd(total, square, flags=("contract",))
+    return total
+
+
+def _within(dimension: int) -> Any:
+    """``(w, a, b, squared_reach) -> mask``: where the places in the rows from ``w[a]`` and ``w[b]`` are near."""
+
+    @intrinsic
+    def within(typing_context: Any, w: Any, a: Any, b: Any, squared_reach: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            array, offset_a, offset_b, reach = arguments
+            bound = _splat(builder, reach)
+            mask = ir.Constant(_MASK, 0)
+            for first in range(0, TILE, CHUNK):
+                pairs = [
+                    tuple(
+                        _load(context, builder, signature.args[0], array, offset, axis * TILE + first)
+                        for offset in (offset_a, offset_b)
+                    )
+                    for axis in range(dimension)
+                ]
+                mask = builder.or_(mask, _at_most(builder, first, _squared_gap(builder, pairs), bound))
+            return mask
+
+        return types.uint64(w, types.int64, types.int64, types.float32), generate
+
+    return within
+
+
+within_2, within_3 = _within(2), _within(3)
+
+
+@intrinsic
+def at_most(typing_context: Any, w: Any, offset: Any, bound: Any) -> Any:
+    """Where ``w[offset:offset + TILE] <= bound``, as a mask."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array, start, limit = arguments
+        limit = _splat(builder, limit)
+        mask = ir.Constant(_MASK, 0)
+        for first in range(0, TILE, CHUNK):
+            values = _load(context, builder, signature.args[0], array, start, first)
+            mask = builder.or_(mask, _at_most(builder, first, values, limit))
+        return mask
+
+    return types.uint64(w, types.int64, types.float32), generate
+
+
+@intrinsic
+def subtract_where(typing_context: Any, w: Any, offset: Any, mask: Any, amount: Any) -> Any:
+    """Take ``amount`` from ``w[offset:offset + TILE]`` where the mask is set."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array, start, bits, value = arguments
+        value, nothing = _splat(builder, value), ir.Constant(_FLOATS, [0.0] * CHUNK)
+        for first in range(0, TILE, CHUNK):
+            place = _place(context, builder, signature.args[0], array, start, first)
+            part = builder.trunc(builder.lshr(bits, ir.Constant(_MASK, first)), _BITS)
+            part = builder.bitcast(part, ir.VectorType(ir.IntType(1), CHUNK))
+            old = builder.load(place, align=4)
+            builder.store(builder.fsub(old, builder.select(part, value, nothing)), place, align=4)
+        return context.get_dummy_value()
+
+    return types.void(w, types.int64, types.uint64, types.float32), generate
+
+
+@intrinsic
+def use_wide_registers(typing_context: Any) -> Any:
+    """Let the compiler use all of the registers' width in the function that calls this.
+
+    LLVM keeps to half of AVX-512's by default, because using all of it may slow the clock of some processors a little.
+    The kernels gain more than that. Without AVX-512 this does nothing.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        # llvmlite knows no attributes with values, but writes down whatever is in the set.
+        set.add(builder.function.attributes, '"prefer-vector-width"="512"')
+        return context.get_dummy_value()
+
+    return types.void(), generate
