@@ -122,10 +122,13 @@ class Node:
         self._choose()
         return True
 
-    def settle(self, seconds: float) -> None:
+    def settle(self, seconds: float) -> bool:
         """Tell the best candidate again and again, until all others have one as good or the seconds are over.
 
         Without a solution it only takes what has arrived.
+
+        Returns:
+            Whether all others have told a solution as good as the best one here.
         """
         self._gather()
         deadline = time.perf_counter() + seconds
@@ -135,9 +138,12 @@ class Node:
             if told is not self.search.best or now >= again:
                 told, again = self.search.best, now + RETELL
                 self._tell(told)
-            if now >= deadline or self._all_have(told):
+            if self._all_have(told):
+                return True
+            if now >= deadline:
                 break
             self._gather(min(again, deadline) - now)
+        return False
 
     def _tell(self, candidate: Candidate) -> None:
         self._told += 1

@@ -61,7 +61,10 @@ class Course:
     @classmethod
     def of(cls, begin: int, problem: Problem, engine: Engine, candidate: Candidate) -> Course | None:
         """The plan that a candidate is, for the problem that begins at a tick; ``None`` if it is no solution."""
-        same = evaluate_controls(engine, problem, settled_controls(engine, problem, candidate.controls))
+        controls = settled_controls(engine, problem, candidate.controls)
+        # To judge it again takes its time.
+        is_settled = np.array_equal(controls, candidate.controls)
+        same = candidate if is_settled else evaluate_controls(engine, problem, controls)
         name, worth = digest(engine, problem, candidate), reward(candidate)
         return cls(begin, same.controls, same.trajectory.states, problem.goal, name, worth) if same.solved else None
 

@@ -22,6 +22,9 @@ PATIENCE = 0.25
 RETELL = 0.2
 """Seconds between two looks at whether everybody has the best candidate, once all had it."""
 
+LOOK = 0.02
+"""Seconds between two looks at what has arrived, before that."""
+
 TOLD = 10_000
 """More messages than a node sends in a round; a later round's are numbered on from there."""
 
@@ -98,11 +101,10 @@ class Round:
             iterations += 1
             if iterations == self._mission.iterations:
                 self._iterated.set()
-        node.settle(self._mission.patience)
-        self._settled.set()
         while not self._over.is_set():
-            node.settle(RETELL)
-            self._over.wait(RETELL)
+            if all_have := node.settle(RETELL):
+                self._settled.set()
+            self._over.wait(RETELL if all_have else LOOK)
 
     def enough(self, timeout: float) -> None:
         """Begin no further iteration, if the least number is done or the seconds are over: tell the best candidate."""
