@@ -112,8 +112,10 @@ def test_plans_begin_with_less_margin_only_where_robots_are_nearer(onboard: Any)
     assert np.asarray(lost.max_speed) == pytest.approx([1, 1e-6, 1])
 
 
-def test_a_plan_has_the_same_name_after_it_was_passed_on(onboard: Any) -> None:
-    problem, engine = corridor(), get_engine("cpu", 1)
+@pytest.mark.parametrize("lost", [[], [1]])
+def test_a_plan_has_the_same_name_after_it_was_passed_on(onboard: Any, lost: list[int]) -> None:
+    engine, whole = get_engine("cpu", 1), corridor()
+    problem = onboard.course.present_problem(whole, whole.start, whole.goal, lost)
     random = np.random.default_rng(0)
     candidate = evaluate_controls(engine, problem, random.normal(0, 2, (40, 3, 2)).astype(np.float32))
     again = evaluate_controls(engine, problem, candidate.controls)

@@ -21,7 +21,7 @@ LEAST_MARGIN = 0.01
 ROUNDING = 1e-3
 """Slack between the margin that bodies keep now and the one that is asked of a plan [m]."""
 
-STANDSTILL = 1e-6
+STANDSTILL = float(np.float32(1e-6))
 """Speed limit of robots that are lost, which must be above zero [m/s]."""
 
 SETTLING = 8
@@ -108,10 +108,11 @@ class Course:
 
 
 def settled_controls(engine: Engine, problem: Problem, controls: Any) -> Any:
-    """Controls that stay as they are, to the bit, when they are executed, told and executed again.
+    """Controls that stay as they are, to the bit, when they are executed, told and executed again; zero for the lost.
 
     Limiting them to the robots' speed may change the last bit, and again wherever a candidate is passed on.
     """
+    controls = np.where(np.asarray(problem.team.max_speed)[:, None] > STANDSTILL, controls, 0).astype(np.float32)
     for _ in range(SETTLING):
         executed = engine.rollout(problem, controls).controls
         if np.array_equal(executed, controls):

@@ -46,6 +46,7 @@ class Robot:
         self._engine = get_engine("cpu", 1)
         self._course = Course.standing(self._problem, 0, self._problem.start)
         self._round: Round | None = None
+        self._former: Round | None = None
         self._rounds = 0
         self._lost: list[int] = []
         self._ballot: Course | None = None
@@ -98,7 +99,7 @@ class Robot:
     def _drop_round(self) -> None:
         if self._round is not None:
             self._round.end(self._mission.patience / 3)
-        self._round = self._ballot = None
+        self._former, self._round, self._ballot = self._round, None, None
 
     def _begin_round(self, joint: JointState) -> None:
         """Plan if the plan under way is not for the present goals."""
@@ -113,7 +114,10 @@ class Robot:
         self._log.round = self._rounds
         self._log.note("begins")
         problem = present_problem(self._problem, then, goals, self._lost)
-        guess = first_guess(self._course, problem, takeover)
+        # Where nothing has changed since a round in vain, its work is gone on with.
+        guess = None if self._former is None else self._former.progress_on(problem)
+        if guess is None:
+            guess = first_guess(self._course, problem, takeover)
         members = [robot for robot in range(self._mission.robots) if robot not in self._lost]
         self._log.members = members
         self._round = Round(

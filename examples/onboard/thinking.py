@@ -125,6 +125,10 @@ class Round:
             raise RuntimeError(f"round {self.number} has failed: {self._error}") from self._error
         return None if self._node is None else self._course(self._node.search.best)
 
+    def progress_on(self, problem: Problem) -> Any:
+        """``(H, K, m)`` controls that this round ended with, if it was about the same problem; else ``None``."""
+        return self._node.search.best.controls if self._node is not None and problem == self.problem else None
+
     def named(self, plan: str, timeout: float) -> Course | None:
         """The solution of that digest, if this robot has it or gets it within the seconds, and it is one."""
         with self._learned:
