@@ -27,13 +27,15 @@ from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.base import Iteration, Search, evaluate_controls
-from d4orm_planners.d4orm import D4orm
+from d4orm_planners.d4orm import D4orm, D4ormConfig
 from d4orm_planners.distributed import judge as judge_module
 from d4orm_planners.distributed import messages, node
+from d4orm_planners.distributed.events import KINDS as KINDS_OF_EVENTS
+from d4orm_planners.distributed.events import Event
 from d4orm_planners.distributed.inbox import Inbox
 from d4orm_planners.distributed.judge import Judge, StoppableEngine, Stopped
 from d4orm_planners.distributed.messages import KINDS, MAGIC, Message, MessageError, decode, encode
-from d4orm_planners.distributed.node import node_seed
+from d4orm_planners.distributed.node import Node, Selection, node_seed
 from d4orm_planners.distributed.selection import choose, diverse, k_means, merge, shares, top_k
 from d4orm_planners.distributed.transport import WAITING, LocalNetwork
 
@@ -532,6 +534,43 @@ def test_no_thread_outlives_a_solve() -> None:
     for mode in ("sync", "async"):
         distributed(mode=mode, patience=10).solve(walled_in_problem(), max_iterations=2)
         assert not [thread for thread in threading.enumerate() if thread.name.startswith("d-d4orm-")]
+
+
+def test_an_observer_is_told_what_a_node_does() -> None:
+    problem, engine, network = hop_problem(2), get_engine("cpu"), LocalNetwork()
+    planner = D4orm(D4ormConfig(engine="cpu", num_samples=64, num_steps=5))
+    events: list[Event] = []
+    controls = np.zeros((problem.horizon, 2, 2), np.float32)
+    selection = Selection("max", 1)
+    nodes = [
+        Node(i, 2, planner, problem, 0, controls, engine, network.join(), selection, observer=observer)
+        for i, observer in enumerate((events.append, None))
+    ]
+    for one in nodes:
+        one.refine()
+    nodes[0].exchange()
+    computed, sent, received, selected = events
+    assert [event.kind for event in events] == list(KINDS_OF_EVENTS)
+    assert [(event.node, event.of, event.sequence) for event in events[:3]] == [(0, 0, 0), (0, 0, 1), (0, 1, 1)]
+    assert computed.begin < computed.end <= sent.begin == sent.end <= received.begin
+    assert sent.candidate is computed.candidate is nodes[0].candidate
+    assert received.candidate is nodes[0].inbox.newest[1].candidate
+    header_and_checksum = 76
+    assert sent.size == controls.nbytes + header_and_checksum
+    best = max((sent, received), key=lambda event: event.candidate.trajectory.rewards.mean())
+    assert (selected.of, selected.sequence, selected.candidate) == (best.of, 1, best.candidate)
+
+
+def test_settling_says_whether_all_others_have_a_solution_as_good() -> None:
+    problem, engine, network = hop_problem(2), get_engine("cpu"), LocalNetwork()
+    solution = distributed().solve(problem).controls
+    first, second = (
+        Node(i, 2, cheap_planner("d4orm"), problem, 0, solution, engine, network.join(), Selection("max", 1))
+        for i in range(2)
+    )
+    assert not first.settle(0), "nobody has told it anything"
+    assert second.settle(0)
+    assert first.settle(0)
 
 
 def test_an_asynchronous_node_waits_once_for_one_that_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:

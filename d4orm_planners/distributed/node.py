@@ -13,6 +13,7 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.base import Engine
 from d4orm_planners.base import Candidate, Planner, Search
+from d4orm_planners.distributed.events import Event, Observer
 from d4orm_planners.distributed.inbox import TOLERANCE, Inbox
 from d4orm_planners.distributed.judge import Judge, JudgedPlanner, StoppableEngine
 from d4orm_planners.distributed.messages import Message, encode
@@ -56,6 +57,7 @@ class Node:
         transport: Its access to the others.
         selection: How it chooses what to go on from.
         told: What it begins to number its messages after; more than it had told before, if it did.
+        observer: Called with every :class:`~d4orm_planners.distributed.events.Event`, in the node's own thread.
 
     Attributes:
         number: From 0.
@@ -79,6 +81,7 @@ class Node:
         selection: Selection,
         judge: Judge | None = None,
         told: int = 0,
+        observer: Observer | None = None,
     ) -> None:
         self.number = number
         judge = judge or Judge(engine, problem)
@@ -90,13 +93,16 @@ class Node:
         self.excluded = 0
         self._selection = selection
         self._told = told
+        self._observer = observer
         self._others = set(range(num_nodes)) - {number}
         self._awaited = self._others
 
     def refine(self) -> None:
         """One iteration of the planner; its candidate is broadcast."""
+        begin = time.perf_counter()
         self.excluded += self.search.advance().excluded
         self.candidate = self.search.current
+        self._note("computed", self.number, 0, self.candidate, begin)
         self._tell(self.candidate)
 
     def exchange(self) -> None:
@@ -123,10 +129,13 @@ class Node:
         self._choose()
         return True
 
-    def settle(self, seconds: float) -> None:
+    def settle(self, seconds: float) -> bool:
         """Tell the best candidate again and again, until all others have one as good or the seconds are over.
 
         Without a solution it only takes what has arrived.
+
+        Returns:
+            Whether all others have told a solution as good as the best one here.
         """
         self._gather()
         deadline = time.perf_counter() + seconds
@@ -136,15 +145,20 @@ class Node:
             if told is not self.search.best or now >= again:
                 told, again = self.search.best, now + RETELL
                 self._tell(told)
-            if now >= deadline or self._all_have(told):
+            if self._all_have(told):
+                return True
+            if now >= deadline:
                 break
             self._gather(min(again, deadline) - now)
+        return False
 
     def _tell(self, candidate: Candidate) -> None:
         self._told += 1
         reward = float(candidate.trajectory.rewards.mean())
         message = Message(self.number, self._told, candidate.controls, reward, bool(candidate.solved))
-        self.transport.publish(encode(message, self.search.problem))
+        data = encode(message, self.search.problem)
+        self.transport.publish(data)
+        self._note("sent", self.number, self._told, candidate, size=len(data))
 
     def _all_have(self, candidate: Candidate) -> bool:
         """Whether each of the others has told a solution as good as this one."""
@@ -177,21 +191,31 @@ class Node:
         """Who sent something new."""
         reports = self.inbox.receive(timeout)
         for report in reports:
+            self._note("received", report.node, report.sequence, report.candidate)
             if report.candidate.rank > self.search.best.rank:
                 self.search.best = report.candidate
         return {report.node for report in reports}
 
     def _choose(self) -> None:
-        received = {node: report.candidate for node, report in self.inbox.newest.items()} | {
-            self.number: self.candidate
-        }
-        candidates = [received[node] for node in sorted(received)]
-        self.search.current = candidates[
-            choose(
-                self._selection.rule,
-                [candidate.trajectory.rewards.mean() for candidate in candidates],
-                np.stack([candidate.controls for candidate in candidates]),
-                self._selection.k,
-                np.random.default_rng(self.search.iteration_seed(CHOICE)),
-            )
-        ]
+        reports = self.inbox.newest
+        received = {node: (report.sequence, report.candidate) for node, report in reports.items()}
+        received[self.number] = (self._told, self.candidate)
+        nodes = sorted(received)
+        candidates = [received[node][1] for node in nodes]
+        chosen = choose(
+            self._selection.rule,
+            [candidate.trajectory.rewards.mean() for candidate in candidates],
+            np.stack([candidate.controls for candidate in candidates]),
+            self._selection.k,
+            np.random.default_rng(self.search.iteration_seed(CHOICE)),
+        )
+        self.search.current = candidates[chosen]
+        self._note("selected", nodes[chosen], *received[nodes[chosen]])
+
+    def _note(
+        self, kind: str, of: int, sequence: int, candidate: Candidate, begin: float | None = None, size: int = 0
+    ) -> None:
+        if self._observer is not None:
+            now = time.perf_counter()
+            start = now if begin is None else begin
+            self._observer(Event(self.number, kind, start, now, of, sequence, candidate, size))
