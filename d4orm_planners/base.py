@@ -225,6 +225,7 @@ class Search:
         best: The best candidate so far.
         iteration: Iterations done.
         memory: What a planner keeps between its own iterations.
+        metrics: Numbers of the method's own that the plan's metrics will have.
         time_limit: Seconds that the solve may take, or ``None``.
     """
 
@@ -252,6 +253,7 @@ class Search:
         self.denoising_steps = 0
         self.history: list[IterationRecord] = []
         self.memory: dict[str, Any] = {}
+        self.metrics: dict[str, float] = {}
         self.time_limit: float | None = None
 
     @property
@@ -304,5 +306,5 @@ class Search:
             wall_time=self.watch.elapsed,
             history=tuple(self.history),
             trajectory=self.best.trajectory,
-            metrics=trajectory_metrics(self.problem, self.best.trajectory),
+            metrics=trajectory_metrics(self.problem, self.best.trajectory) | self.metrics,
         )

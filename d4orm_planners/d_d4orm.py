@@ -15,8 +15,11 @@ from d4orm_planners.d4orm import D4orm
 from d4orm_planners.d4orm_d import D4ormD, D4ormDConfig
 from d4orm_planners.distributed.crew import MODES, AsyncCrew, Crew, SyncCrew
 from d4orm_planners.distributed.inbox import Inbox
+from d4orm_planners.distributed.judge import Judge
 from d4orm_planners.distributed.network import NetworkCrew
-from d4orm_planners.distributed.node import Node, Selection
+from d4orm_planners.distributed.node import Node, Selection, node_seed
+from d4orm_planners.distributed.ray_connection import RayConnection, host_and_port, import_ray
+from d4orm_planners.distributed.ray_planner import ray_planners
 from d4orm_planners.distributed.selection import SELECTIONS, shares
 from d4orm_planners.distributed.transport import TRANSPORTS, LocalNetwork
 from d4orm_planners.distributed.zenoh_transport import ZenohSettings, ZenohTransport
@@ -40,8 +43,10 @@ class DD4ormConfig(D4ormDConfig):
             its own pace; plans then depend on who is sooner.
         patience: Seconds that are waited for stragglers: in asynchronous mode in every round, else beyond the time
             limit of the solve, after which a node is given up.
-        transport: How messages travel; ``"local"``, between threads of this process, or ``"zenoh"``, between this
-            process, as one node, and others on a network, each at its own pace (``mode="async"``).
+        transport: ``"local"``: nodes are threads of this process. ``"ray"``: their iterations run in actors of Ray.
+            ``"zenoh"``: this process is one node among others on a network, each at its own pace (``mode="async"``).
+        address: Of the Ray cluster, ``"host:port"``, or ``"auto"`` for the one that this machine belongs to; ``None``
+            for an instance on this machine that ends with the solve.
         node: Which of the nodes this process is, from 0; over a network only.
         zenoh: Where the other nodes are: :class:`~d4orm_planners.distributed.zenoh_transport.ZenohSettings`, or a
             mapping of them; over a network only.
@@ -56,6 +61,7 @@ class DD4ormConfig(D4ormDConfig):
     transport: str = "local"
     node: int | None = None
     zenoh: ZenohSettings | None = None
+    address: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -93,6 +99,10 @@ class DD4ormConfig(D4ormDConfig):
         """Raise ``ValueError`` if this process is none of so many nodes."""
         if self.node is not None and self.node >= nodes:
             raise ValueError(f"node is {self.node}; of {nodes} nodes the last one is {nodes - 1}")
+        if self.address is not None:
+            if self.transport != "ray":
+                raise ValueError(f"address {self.address!r} goes with transport 'ray', not {self.transport!r}")
+            host_and_port(self.address)
 
     def node_settings(self, nodes: int) -> list[dict[str, Any]]:
         """The settings of each node's planner.
@@ -131,6 +141,11 @@ class DD4orm(Planner):
     }
     config: DD4ormConfig
 
+    def __init__(self, config: DD4ormConfig) -> None:
+        super().__init__(config)
+        if config.transport == "ray":
+            import_ray("transport 'ray' of d-d4orm")
+
     def iterate(self, search: Search) -> Iteration:
         """See :meth:`Planner.iterate`: one round of all nodes, and the best candidate that they made in it."""
         if "crew" not in search.memory:
@@ -142,34 +157,45 @@ class DD4orm(Planner):
         """See :meth:`Planner.finish`."""
         if "crew" in search.memory:
             crew: Crew = search.memory.pop("crew")
-            crew.close()
-            # What was collected last is not lost, however the solve has ended.
-            search.best = max(search.best, crew.best, key=lambda candidate: candidate.rank)
+            best = crew.close()
+            if best.rank > search.best.rank:
+                search.best = best
+            search.metrics |= crew.metrics()
+        if "ray" in search.memory:
+            search.memory.pop("ray").close()
 
     def _crew(self, search: Search) -> Crew:
         config, problem = self.config, search.problem
         number = config.nodes or problem.num_robots
         kind = INNER[config.planner]
-        planners = [kind(kind.config_class(**settings)) for settings in config.node_settings(number)]
+        planners: list[Planner] = [kind(kind.config_class(**settings)) for settings in config.node_settings(number)]
         selection, base = Selection(config.selection, config.k), search.current.controls
         if config.node is not None and config.zenoh is not None:
             config.check_node(number)
             transport = ZenohTransport(config.zenoh)
             engine, planner = get_engine(config.engine), planners[config.node]
+            judge = Judge(engine, problem)
             # Numbered by the clock, what a node tells that was started again is newer than what it told before.
             node = Node(
-                config.node, number, planner, problem, search.seed, base, engine, transport, selection, time.time_ns()
-            )
-            return NetworkCrew(node, transport, config.patience, config.zenoh.linger)
+                config.node, number, planner, problem, search.seed, base, engine, transport, selection, judge,
+                time.time_ns(),
+            )  # fmt: skip
+            return NetworkCrew(node, transport, config.patience, judge, config.zenoh.linger)
+        if config.transport == "ray":
+            with search.watch.paused():
+                connection = search.memory["ray"] = RayConnection(config.address or "local", "transport 'ray'")
+                seeds = [node_seed(search.seed, i) for i in range(number)]
+                planners = list(ray_planners(connection, planners, problem, seeds))
         # Nodes of one machine share its cores.
         engine = get_engine(config.engine, max(available_cores() // number, 1))
-        network = LocalNetwork()
+        network, judge = LocalNetwork(), Judge(engine, problem, 2 * number)
         ends = [network.join() for _ in planners]
         nodes = [
-            Node(i, number, planner, problem, search.seed, base, engine, end, selection)
+            Node(i, number, planner, problem, search.seed, base, engine, end, selection, judge)
             for i, (planner, end) in enumerate(zip(planners, ends, strict=True))
         ]
         if config.mode == "sync":
-            return SyncCrew(nodes, ends, config.patience)
+            return SyncCrew(nodes, ends, config.patience, judge)
         observer = network.join()
-        return AsyncCrew(nodes, [*ends, observer], config.patience, Inbox(problem, engine, observer, number))
+        inbox = Inbox(problem, engine, observer, number, judge=judge)
+        return AsyncCrew(nodes, [*ends, observer], config.patience, judge, inbox)

@@ -71,7 +71,9 @@ class Plan:
         wall_time: Seconds, first-call compilation excluded.
         history: One record per iteration.
         trajectory: Rollout of the controls.
-        metrics: See :func:`d4orm_env.core.metrics.trajectory_metrics`.
+        metrics: See :func:`d4orm_env.core.metrics.trajectory_metrics`. ``d-d4orm`` adds ``"messages"`` and
+            ``"message_bytes"`` that its nodes sent, each to all others, and ``"waiting_share"``, the share of their
+            time that they waited for each other.
     """
 
     planner: str

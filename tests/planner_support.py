@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -104,3 +108,12 @@ def algorithm_1(
         score = -controls / (1 - abar) + np.sqrt(abar) / (1 - abar) * mean  # line 6
         controls = (controls + (1 - abar) * score) / np.sqrt(alpha)  # line 7
     return controls
+
+
+def program(tmp_path: Path, body: str) -> subprocess.CompletedProcess[str]:
+    """Run a program that starts processes of its own, as a user would write it."""
+    (tmp_path / "program.py").write_text(body)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)])}
+    return subprocess.run(
+        [sys.executable, "program.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )

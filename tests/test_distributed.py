@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import signal
 import struct
 import threading
 import time
@@ -27,11 +28,12 @@ from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.base import Iteration, Search, evaluate_controls
 from d4orm_planners.d4orm import D4orm, D4ormConfig
-from d4orm_planners.distributed import inbox as inbox_module
+from d4orm_planners.distributed import judge as judge_module
 from d4orm_planners.distributed import messages, node
 from d4orm_planners.distributed.events import KINDS as KINDS_OF_EVENTS
 from d4orm_planners.distributed.events import Event
 from d4orm_planners.distributed.inbox import Inbox
+from d4orm_planners.distributed.judge import Judge, StoppableEngine, Stopped
 from d4orm_planners.distributed.messages import KINDS, MAGIC, Message, MessageError, decode, encode
 from d4orm_planners.distributed.node import Node, Selection, node_seed
 from d4orm_planners.distributed.selection import choose, diverse, k_means, merge, shares, top_k
@@ -289,7 +291,7 @@ def test_what_is_told_again_is_not_judged_again(monkeypatch: pytest.MonkeyPatch)
         judged.append(arguments)
         return evaluate_controls(*arguments)
 
-    monkeypatch.setattr(inbox_module, "evaluate_controls", judge)
+    monkeypatch.setattr(judge_module, "evaluate_controls", judge)
     other.publish(encode(message(), PROBLEM))
     (first,) = box.receive()
     executed = first.candidate.controls
@@ -299,6 +301,29 @@ def test_what_is_told_again_is_not_judged_again(monkeypatch: pytest.MonkeyPatch)
         np.testing.assert_array_equal(again.candidate.controls, executed)
         assert again.candidate.rank == first.candidate.rank
     assert len(judged) == 1
+
+
+def test_what_a_process_has_made_is_judged_once() -> None:
+    judge = Judge(get_engine("cpu"), PROBLEM, remembered=2)
+    made = [judge.own(message().controls * scale) for scale in (0.25, 0.5, 1.0)]
+    assert judge.received(made[2].controls.copy()) is made[2]
+    assert judge.received(made[1].controls) is made[1]
+    forgotten = judge.received(made[0].controls)
+    assert forgotten is not made[0]
+    assert forgotten.rank == made[0].rank
+    changed = made[2].controls.copy()
+    changed[0, 0, 0] += 0.125
+    assert judge.received(changed).rank != made[2].rank
+
+
+def test_the_word_to_stop_ends_judging_and_denoising() -> None:
+    judge = Judge(get_engine("cpu"), PROBLEM, remembered=1)
+    judge.stop.set()
+    with pytest.raises(Stopped):
+        judge.own(message().controls)
+    planner = cheap_planner("d4orm")
+    with pytest.raises(Stopped):
+        Search(planner, PROBLEM, 0, None, StoppableEngine(get_engine("cpu"), judge.stop)).advance()
 
 
 # The planner.
@@ -444,6 +469,67 @@ def test_a_node_that_hangs_does_not_hang_the_solve(mode: str, monkeypatch: pytes
         assert plan.history[-1].note == "node 1 did not finish in time"
 
 
+@MODE
+def test_a_plan_tells_what_its_nodes_sent(mode: str) -> None:
+    problem = walled_in_problem()
+    plan = cheap_planner("d-d4orm", nodes=3, mode=mode, patience=10).solve(problem, max_iterations=2)
+    length = len(encode(Message(0, 1, plan.controls, 0.0, False), problem))
+    if mode == "sync":
+        assert plan.metrics["messages"] == 6
+    assert plan.metrics["messages"] >= 6
+    assert plan.metrics["message_bytes"] == length * plan.metrics["messages"]
+    assert 0 <= plan.metrics["waiting_share"] < 1
+    assert "messages" not in cheap_planner("d4orm").solve(problem, max_iterations=1).metrics
+
+
+@MODE
+def test_who_is_quick_waits_for_who_is_slow(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    spoil(monkeypatch, 6, lambda search: time.sleep(0.5))
+    plan = cheap_planner("d-d4orm", mode=mode, patience=60).solve(walled_in_problem(), seed=6)
+    assert plan.metrics["waiting_share"] > 0.3
+
+
+def press_ctrl_c() -> None:
+    signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+
+
+POSIX = pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs signals to threads")
+
+
+@POSIX
+@MODE
+def test_ctrl_c_ends_an_iteration_under_way(mode: str) -> None:
+    # Which would take minutes, and patience as long.
+    planner = distributed(mode=mode, num_steps=10**6, patience=600)
+    threading.Timer(1, press_ctrl_c).start()
+    plan = planner.solve(walled_in_problem())
+    assert plan.status == "interrupted"
+    # Python may still list a thread whose end was being waited for.
+    assert not [one for one in threading.enumerate() if one.name.startswith("d-d4orm-") and one.is_alive()]
+
+
+@POSIX
+@MODE
+def test_ctrl_c_loses_nothing_that_a_node_has_found(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    sent, release = threading.Event(), threading.Event()
+
+    def send(sent_message: Message, problem: Problem) -> bytes:
+        sent.set()
+        return encode(sent_message, problem)
+
+    def interrupt() -> None:
+        sent.wait(60)
+        press_ctrl_c()
+        release.set()
+
+    monkeypatch.setattr(node, "encode", send)
+    spoil(monkeypatch, 5, lambda search: release.wait(60))
+    threading.Thread(target=interrupt).start()
+    plan = distributed(mode=mode, patience=60).solve(walled_in_problem(), seed=5)
+    assert plan.status == "interrupted"
+    assert plan.controls.any()
+
+
 def test_no_thread_outlives_a_solve() -> None:
     for mode in ("sync", "async"):
         distributed(mode=mode, patience=10).solve(walled_in_problem(), max_iterations=2)
@@ -510,7 +596,7 @@ def test_an_asynchronous_node_waits_once_for_one_that_is_silent(monkeypatch: pyt
         ({"planner": "mppi"}, "planner 'mppi' is unknown; choose one of d4orm, d4orm-d"),
         ({"selection": "best"}, "selection 'best' is unknown; choose one of top-k, max, k-means"),
         ({"mode": "later"}, "mode 'later' is unknown; choose one of sync, async"),
-        ({"transport": "pigeon"}, "transport 'pigeon' is unknown; choose one of local, zenoh"),
+        ({"transport": "pigeon"}, "transport 'pigeon' is unknown; choose one of local, ray, zenoh"),
         ({"nodes": 0}, "nodes is 0; it must be at least 1"),
         ({"node": 1}, "node is 1; it is a setting of transport 'zenoh' only"),
         ({"zenoh": {}}, "zenoh is {}; it is a setting of transport 'zenoh' only"),

@@ -236,12 +236,37 @@ def test_what_arrives_while_a_node_hangs_is_not_lost(monkeypatch: pytest.MonkeyP
         hanging = Solve(CIRCLE, node=1, nodes=2, time_limit=3, zenoh={"listen": [endpoint]}, **STRONG)
         other = Solve(CIRCLE, node=0, nodes=2, zenoh={"connect": [endpoint]}, **STRONG)
         assert_verified(other.plan)
-        assert hanging.plan.status == "time_limit"
-        assert hanging.plan.solved
-        assert verify(CIRCLE, hanging.plan.controls).ok
+        assert_verified(hanging.plan)
         assert hanging.plan.history[-1].note == "node 1 did not finish in time"
     finally:
         go.set()
+
+
+@pytest.mark.parametrize("heard", [True, False])
+def test_what_has_arrived_is_not_lost_with_the_planner_here(heard: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    iterate, go = D4orm.iterate, threading.Event()
+
+    def broken(self: D4orm, search: Search) -> Iteration:
+        if search.seed != node_seed(SEED, 1):
+            return iterate(self, search)
+        go.wait()
+        raise ArithmeticError("out of order")
+
+    monkeypatch.setattr(D4orm, "iterate", broken)
+    endpoint = free_endpoint()
+    try:
+        failing = Solve(CIRCLE, node=1, nodes=2, zenoh={"listen": [endpoint]}, **STRONG)
+        if heard:
+            other = Solve(CIRCLE, node=0, nodes=2, zenoh={"connect": [endpoint], "linger": 2.0}, **STRONG)
+            assert_verified(other.plan)
+    finally:
+        go.set()
+    if heard:
+        assert_verified(failing.plan)
+        assert failing.plan.history[-1].note == "node 1 failed (ArithmeticError: out of order)"
+    else:
+        with pytest.raises(RuntimeError, match="out of order"):
+            _ = failing.plan
 
 
 def nonsense(problem: Problem) -> dict[str, bytes]:

@@ -37,8 +37,10 @@ def assert_same_plan(a: Plan, b: Plan) -> None:
     np.testing.assert_array_equal(a.controls, b.controls)
     for field in fields(a.trajectory):
         np.testing.assert_array_equal(getattr(a.trajectory, field.name), getattr(b.trajectory, field.name))
-    for name in ("status", "solved", "iterations", "denoising_steps", "metrics"):
+    for name in ("status", "solved", "iterations", "denoising_steps"):
         assert getattr(a, name) == getattr(b, name)
+    # Who waits how long for whom is a matter of time, not of the seed.
+    assert {**a.metrics, "waiting_share": 0} == {**b.metrics, "waiting_share": 0}
     assert [record.reward for record in a.history] == [record.reward for record in b.history]
 
 
@@ -66,7 +68,7 @@ def test_solve_returns_a_plan(name: str) -> None:
     assert 1 <= plan.iterations == len(plan.history) <= 2
     assert (plan.denoising_steps > 0) == (name != "ipopt")
     assert plan.wall_time > 0
-    assert plan.metrics == trajectory_metrics(problem, plan.trajectory)
+    assert trajectory_metrics(problem, plan.trajectory).items() <= plan.metrics.items()
 
 
 @ALL

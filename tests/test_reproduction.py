@@ -77,6 +77,7 @@ def test_the_quick_version_writes_its_tables_and_picture_and_is_not_run_twice(d4
     assert [(row["section"], row["scenario"], row["label"], float(row["noise"])) for row in rows] == [
         (section.title, scenario, label, noise)
         for section in chosen.sections
+        for _ in section.nodes or (None,)
         for scenario in section.scenarios
         for _ in section.robots
         for label in section.policies
@@ -181,6 +182,31 @@ def test_the_reward_is_that_of_the_last_best_plan_of_every_trial() -> None:
 def test_the_best_reward_is_a_staircase() -> None:
     rewards = best_reward(trial(), np.array([0.1, 0.5, 1.0, 1.5, 9.0]))
     assert rewards == pytest.approx([np.nan, 0.6, 0.6, 0.5, 0.7], nan_ok=True)
+
+
+def test_every_policy_is_run_with_every_number_of_nodes(tmp_path: Path) -> None:
+    few = {"policy": "d-d4orm", "engine": "cpu", "num_samples": 64, "num_steps": 5, "max_iterations": 1}
+    policies = {"top-k": few, "max": {**few, "selection": "max"}}
+    section = Section(title="Circle", policies=policies, scenarios=("circle",), robots=(2,), nodes=(1, 3))
+    chosen = figure(sections=(section,), across="nodes", metrics=("success", "messages"))
+    rows = [measured(group) for group in reproduce(chosen, tmp_path, seeds=2)]
+    assert [(row.label, row.nodes) for row in rows] == [("top-k", 1), ("max", 1), ("top-k", 3), ("max", 3)]
+
+
+def test_what_nodes_sent_is_over_the_successes() -> None:
+    config = '{"nodes": null}'
+    trials = [trial(seed, config=config, messages=2 + seed, message_bytes=500, waiting_share=0.25) for seed in range(2)]
+    row = measured(Group("Circle", "d-d4orm", [*trials, trial(2, history="[]", messages=99)]))
+    assert (row.nodes, row.messages, row.message_bytes, row.waiting_share) == (8, 2.5, 500, 0.25)
+    page = markdown(
+        figure(across="nodes", metrics=("messages", "message_bytes", "waiting_share")),
+        [Group("Circle", "d-d4orm", trials)],
+    )
+    assert "|  | nodes | 8 |" in page
+    assert "| messages, kB | d-d4orm | 0.5 |" in page
+    assert "| waiting, % | d-d4orm | 25 |" in page
+    alone = measured(Group("Circle", "d4orm", [trial()]))
+    assert (alone.nodes, alone.messages) == (1, None)
 
 
 # Tables.

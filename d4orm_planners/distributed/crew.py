@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 
 from d4orm_planners.base import Candidate, Iteration, Search
 from d4orm_planners.distributed.inbox import Inbox
+from d4orm_planners.distributed.judge import Judge, Stopped
 from d4orm_planners.distributed.node import Node
 from d4orm_planners.distributed.transport import Transport
 
@@ -33,6 +34,8 @@ class _Job:
     def __init__(self, node: Node, work: Callable[[Node], object]) -> None:
         self.node = node
         self.error: Exception | None = None
+        self._begin = time.perf_counter()
+        self._end: float | None = None
         # A node that hangs must not keep the process from ending for ever.
         self.thread = threading.Thread(target=self._run, args=(work,), daemon=True, name=f"d-d4orm-{node.number}")
         self.thread.start()
@@ -40,8 +43,17 @@ class _Job:
     def _run(self, work: Callable[[Node], object]) -> None:
         try:
             work(self.node)
+        except Stopped:
+            pass
         except Exception as error:  # whatever it is, it concerns this node only
             self.error = error
+        finally:
+            self._end = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """How long it has taken."""
+        return (self._end or time.perf_counter()) - self._begin
 
     def leave(self) -> None:
         """Wait for it no longer."""
@@ -56,11 +68,13 @@ class Crew(ABC):
         nodes: The nodes.
         transports: All ends to close in the end.
         patience: Seconds that are waited for stragglers: beyond the time limit, and when asynchronous in every round.
+        judge: The nodes' common judge.
     """
 
-    def __init__(self, nodes: Sequence[Node], transports: Sequence[Transport], patience: float) -> None:
+    def __init__(self, nodes: Sequence[Node], transports: Sequence[Transport], patience: float, judge: Judge) -> None:
         self.alive = list(nodes)
         self.patience = patience
+        self._judge = judge
         self._nodes = tuple(nodes)
         self._transports = tuple(transports)
         self._jobs: list[_Job] = []
@@ -69,6 +83,8 @@ class Crew(ABC):
         self._error: Exception | None = None
         self._told: Counter[str] = Counter()
         self._spent = self._excluded = 0
+        self._read: Counter[Node] = Counter()
+        self._seconds = self._waited = 0.0
 
     def iterate(self, search: Search) -> Iteration:
         """The best new candidate, after a round of all nodes that live.
@@ -95,13 +111,14 @@ class Crew(ABC):
         best = max(candidates, key=lambda candidate: candidate.rank, default=search.current)
         return self._iteration(best)
 
-    @property
-    def best(self) -> Candidate:
-        """The best candidate that any node has made or received."""
-        return max((node.search.best for node in self._nodes), key=lambda candidate: candidate.rank)
+    def close(self) -> Candidate:
+        """Part the nodes, and give the best candidate that they have seen.
 
-    def close(self) -> None:
-        """Part the nodes. A thread may end what it is at, but nobody waits longer for it than patience."""
+        A thread leaves what it is at where it can, and nobody waits longer for it than patience.
+        """
+        self._judge.stop.set()
+        for node in self._nodes:
+            node.close()
         for transport in self._transports:
             transport.close()
         deadline = time.perf_counter() + self.patience
@@ -109,6 +126,19 @@ class Crew(ABC):
             if job.node in self.alive:
                 job.thread.join(max(deadline - time.perf_counter(), 0))
             job.leave()
+        return max((node.search.best for node in self._nodes), key=lambda candidate: candidate.rank)
+
+    def metrics(self) -> dict[str, float]:
+        """What all nodes together sent, and the share of their time that they waited for each other.
+
+        To be asked for once closed.
+        """
+        meters = [node.transport for node in self._nodes]
+        return {
+            "messages": sum(meter.messages for meter in meters),
+            "message_bytes": sum(meter.message_bytes for meter in meters),
+            "waiting_share": self._waited / self._seconds if self._seconds else 0.0,
+        }
 
     @abstractmethod
     def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
@@ -145,10 +175,19 @@ class Crew(ABC):
             faults += node.inbox.dropped
             faults["false claim"] += node.inbox.false_claims
         new = faults - self._told
-        notes = self._notes + [f"received {count} x {kind}" for kind, count in sorted(new.items())]
+        notes = self._notes + self._node_notes() + [f"received {count} x {kind}" for kind, count in sorted(new.items())]
         iteration = Iteration(best.controls, steps - self._spent, excluded - self._excluded, "; ".join(notes), best)
         self._spent, self._excluded, self._told, self._notes = steps, excluded, faults, []
         return iteration
+
+    def _node_notes(self) -> list[str]:
+        """What the nodes' planners noted since the last time."""
+        notes = []
+        for node in self._nodes:
+            records = node.search.history[self._read[node] :]
+            self._read[node] += len(records)
+            notes += [record.note for record in records if record.note]
+        return notes
 
 
 class SyncCrew(Crew):
@@ -164,6 +203,7 @@ class SyncCrew(Crew):
         return candidates
 
     def _all(self, work: Callable[[Node], object], time_left: Callable[[], float | None]) -> None:
+        begin = time.perf_counter()
         self._jobs = [_Job(node, work) for node in self.alive]
         for job in self._jobs:
             while job.thread.is_alive():
@@ -176,6 +216,9 @@ class SyncCrew(Crew):
                 self._lose(job, "did not finish in time")
             elif job.error is not None:
                 self._lose_failed(job)
+        seconds = time.perf_counter() - begin
+        self._seconds += seconds * len(self._jobs)
+        self._waited += sum(seconds - job.seconds for job in self._jobs)
 
 
 class AsyncCrew(Crew):
@@ -185,20 +228,22 @@ class AsyncCrew(Crew):
         nodes: The nodes.
         transports: All ends to close in the end.
         patience: See :class:`Crew`.
+        judge: See :class:`Crew`.
         observer: What the solve itself hears of the nodes.
     """
 
     def __init__(
-        self, nodes: Sequence[Node], transports: Sequence[Transport], patience: float, observer: Inbox
+        self, nodes: Sequence[Node], transports: Sequence[Transport], patience: float, judge: Judge, observer: Inbox
     ) -> None:
-        super().__init__(nodes, transports, patience)
+        super().__init__(nodes, transports, patience, judge)
         self._observer = observer
-        self._stop = threading.Event()
 
-    def close(self) -> None:
+    def close(self) -> Candidate:
         """See :meth:`Crew.close`."""
-        self._stop.set()
-        super().close()
+        best = super().close()
+        self._seconds += sum(job.seconds for job in self._jobs)
+        self._waited = sum(node.transport.waited for node in self._nodes)
+        return best
 
     def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
         """See :meth:`Crew._round`."""
@@ -206,26 +251,36 @@ class AsyncCrew(Crew):
         heard: set[int] = set()
         first = None
         while True:
+            ended = not any(job.thread.is_alive() for job in self._jobs)
             heard |= {report.node for report in self._observer.receive(GLANCE)}
             self._lose_dead()
             now = time.perf_counter()
             first = now if heard and first is None else first
             left = time_left()
+            candidates = [self._observer.newest[number].candidate for number in sorted(heard)]
             if (
                 heard >= {node.number for node in self.alive}
                 or (first is not None and now - first >= self.patience)
                 or (left is not None and left <= 0)
+                or ended
+                or (not improve and any(candidate.solved for candidate in candidates))
             ):
-                return [self._observer.newest[number].candidate for number in sorted(heard)]
+                return candidates
 
     def _run(self, improve: bool) -> None:
         """Start whoever does not run: at first all, later those who stopped at what proved to be no solution here."""
+        self._judge.solution_ends = not improve
         running = [job for job in self._jobs if job.thread.is_alive()]
         failed = [job for job in self._jobs if job.error is not None]
+        self._seconds += sum(job.seconds for job in self._jobs if job not in running + failed)
         idle = [node for node in self.alive if node not in {job.node for job in running + failed}]
-        self._jobs = [
-            *running, *failed, *(_Job(node, lambda node: node.run(self._stop, self.patience, improve)) for node in idle)
-        ]  # fmt: skip
+        if not running:
+            self._judge.stop.clear()
+
+        def run(node: Node) -> None:
+            node.run(self._judge.stop, self.patience, improve)
+
+        self._jobs = [*running, *failed, *(_Job(node, run) for node in idle)]
 
     def _lose_dead(self) -> None:
         for job in self._jobs:

@@ -10,7 +10,8 @@ import numpy as np
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.base import Engine
-from d4orm_planners.base import Candidate, evaluate_controls
+from d4orm_planners.base import Candidate
+from d4orm_planners.distributed.judge import Judge
 from d4orm_planners.distributed.messages import KINDS, Message, MessageError, decode
 from d4orm_planners.distributed.selection import merge
 from d4orm_planners.distributed.transport import Transport
@@ -46,9 +47,16 @@ class Inbox:
     """
 
     def __init__(
-        self, problem: Problem, engine: Engine, transport: Transport, num_nodes: int, own: int | None = None
+        self,
+        problem: Problem,
+        engine: Engine,
+        transport: Transport,
+        num_nodes: int,
+        own: int | None = None,
+        judge: Judge | None = None,
     ) -> None:
-        self._problem, self._engine, self._transport = problem, engine, transport
+        self._problem, self._transport = problem, transport
+        self._judge = judge or Judge(engine, problem)
         self._num_nodes, self._own = num_nodes, own
         self._owner = "the observer" if own is None else f"node {own}"
         self._logged: set[str] = set()
@@ -84,7 +92,7 @@ class Inbox:
         # What is told again, by the same node or another, need not be verified again, which takes its time.
         known = (report.candidate for report in self.newest.values())
         same = (candidate for candidate in known if np.array_equal(candidate.controls, message.controls))
-        candidate = next(same, None) or evaluate_controls(self._engine, self._problem, message.controls)
+        candidate = next(same, None) or self._judge.received(message.controls)
         reward = float(candidate.trajectory.rewards.mean())
         if candidate.solved != message.feasible or abs(reward - message.reward) > TOLERANCE:
             self.false_claims += 1

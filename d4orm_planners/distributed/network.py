@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Callable
 
 from d4orm_planners.base import Candidate
 from d4orm_planners.distributed.crew import SyncCrew
+from d4orm_planners.distributed.judge import Judge
 from d4orm_planners.distributed.node import Node
 from d4orm_planners.distributed.transport import Transport
 
@@ -21,18 +21,18 @@ class NetworkCrew(SyncCrew):
         node: The node.
         transport: Its access to the others.
         patience: See :class:`~d4orm_planners.distributed.crew.Crew`.
+        judge: See :class:`~d4orm_planners.distributed.crew.Crew`.
         linger: Seconds that a solution is told to the others in the end, see :meth:`Node.settle`.
     """
 
-    def __init__(self, node: Node, transport: Transport, patience: float, linger: float) -> None:
-        super().__init__([node], [transport], patience)
+    def __init__(self, node: Node, transport: Transport, patience: float, judge: Judge, linger: float) -> None:
+        super().__init__([node], [transport], patience, judge)
         self._node, self._linger = node, linger
-        self._stop = threading.Event()
         self._met: set[int] = set()
 
-    def close(self) -> None:
+    def close(self) -> Candidate:
         """See :meth:`Crew.close`; before it, the others are told of a solution."""
-        self._stop.set()
+        self._judge.stop.set()
         try:
             for job in self._jobs:
                 job.thread.join(self.patience)
@@ -41,15 +41,21 @@ class NetworkCrew(SyncCrew):
         except KeyboardInterrupt:
             logger.info("interrupted while telling the others")
         finally:
-            super().close()
+            best = super().close()
+        # Waiting is part of a node's own round here.
+        self._waited = self._node.transport.waited
+        return best
 
     def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
         """See :meth:`Crew._round`."""
         left = time_left()
         patience = self.patience if left is None else min(self.patience, max(left, 0.0))
-        self._all(lambda node: node.step(self._stop, patience, improve), time_left)
+        self._all(lambda node: node.step(self._judge.stop, patience, improve), time_left)
         if not self.alive:
-            return []
+            # What others have sent is not lost with the planner here.
+            self._node.settle(0.0)
+            best = self._node.search.best
+            return [best] if best.solved and not improve else []
         self._tell_whom_it_met()
         return [self._node.candidate, *(report.candidate for report in self._node.inbox.newest.values())]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,9 @@ from d4orm_env.engine.base import Engine
 from d4orm_planners.base import Candidate, Planner, Search
 from d4orm_planners.distributed.events import Event, Observer
 from d4orm_planners.distributed.inbox import TOLERANCE, Inbox
+from d4orm_planners.distributed.judge import Judge, JudgedPlanner, StoppableEngine
 from d4orm_planners.distributed.messages import Message, encode
+from d4orm_planners.distributed.meter import Meter
 from d4orm_planners.distributed.selection import choose
 from d4orm_planners.distributed.transport import Transport
 
@@ -60,6 +63,7 @@ class Node:
         number: From 0.
         search: Its own search.
         candidate: The candidate that it made last.
+        transport: What it sends and receives by, with a count.
         inbox: What the others sent.
         excluded: Samples left out so far because their reward was not finite.
     """
@@ -75,15 +79,18 @@ class Node:
         engine: Engine,
         transport: Transport,
         selection: Selection,
+        judge: Judge | None = None,
         told: int = 0,
         observer: Observer | None = None,
     ) -> None:
         self.number = number
-        self.search = Search(planner, problem, node_seed(seed, number), controls, engine)
+        judge = judge or Judge(engine, problem)
+        stoppable: Any = StoppableEngine(engine, judge.stop)
+        self.search = Search(JudgedPlanner(planner, judge), problem, node_seed(seed, number), controls, stoppable)
         self.candidate = self.search.current
-        self.inbox = Inbox(problem, engine, transport, num_nodes, number)
+        self.transport = Meter(transport)
+        self.inbox = Inbox(problem, engine, self.transport, num_nodes, number, judge)
         self.excluded = 0
-        self._transport = transport
         self._selection = selection
         self._told = told
         self._observer = observer
@@ -150,7 +157,7 @@ class Node:
         reward = float(candidate.trajectory.rewards.mean())
         message = Message(self.number, self._told, candidate.controls, reward, bool(candidate.solved))
         data = encode(message, self.search.problem)
-        self._transport.publish(data)
+        self.transport.publish(data)
         self._note("sent", self.number, self._told, candidate, size=len(data))
 
     def _all_have(self, candidate: Candidate) -> bool:
@@ -163,6 +170,10 @@ class Node:
             and reports[node].candidate.trajectory.rewards.mean() >= reward
             for node in self._others
         )
+
+    def close(self) -> None:
+        """Let go of what the planner left open."""
+        self.search.planner.finish(self.search)
 
     def _await_others(self, stop: threading.Event, patience: float) -> None:
         """Gather until everybody heard from the last time is heard from again, or patience ends."""

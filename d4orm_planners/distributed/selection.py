@@ -111,7 +111,7 @@ def choose(selection: str, rewards: Any, points: Any, k: int, generator: np.rand
 
     Args:
         selection: ``"top-k"`` draws one of the ``k`` best (Algorithm 5); ``"max"`` takes the best; ``"k-means"`` draws
-            one of the best of ``k`` clusters (section VIII-C).
+            one of the best of ``k`` clusters (section VIII-D).
         rewards: ``(n,)``.
         points: ``(n, ...)`` the candidates' controls.
         k: How many to draw from.

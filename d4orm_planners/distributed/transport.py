@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from typing import Protocol
 
-TRANSPORTS = ("local", "zenoh")
+TRANSPORTS = ("local", "ray", "zenoh")
 
 WAITING = 64
 """Messages that wait for a slow node at most; then the oldest are lost, which newer ones replace anyhow."""

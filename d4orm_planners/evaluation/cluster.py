@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import os
-import socket
 from collections.abc import Iterator
 from itertools import count
 from typing import Any
 
+from d4orm_planners.distributed.ray_connection import RayConnection
 from d4orm_planners.evaluation.schedule import Lost, Message, Sign
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.trials import Job, describe_error, run_job
 
 QUEUED = 2
 """Jobs under way per core of the cluster: one that runs, and one that need not be waited for."""
-
-PATIENCE = 10.0
-"""Seconds to wait for the head of a cluster to answer."""
 
 
 class RayCrew:
@@ -34,21 +31,9 @@ class RayCrew:
     """
 
     def __init__(self, address: str, size: int | None = None) -> None:
-        self._ray: Any = _import_ray()
-        self._owner = not self._ray.is_initialized()
-        host, port = _host_and_port(address)
-        try:
-            if host:
-                # Ray itself tries for minutes.
-                socket.create_connection((host, port), PATIENCE).close()
-            if self._owner:
-                self._ray.init(address=address, log_to_driver=False, include_dashboard=False)
-            cores = int(self._ray.cluster_resources().get("CPU", 1))
-        except Exception as error:  # Ray raises errors of many kinds
-            raise ConnectionError(
-                f"Ray cluster {address!r} cannot be reached ({describe_error(error)}); "
-                "start one with `ray start --head`, or leave the address out to run on this machine"
-            ) from error
+        self._connection = RayConnection(address, "running on a cluster")
+        self._ray = self._connection.ray
+        cores = int(self._ray.cluster_resources().get("CPU", 1))
         self._size = size or QUEUED * max(cores, 1)
         # A generator's results come back one by one, so that what is done is not lost with the process.
         self._task = self._ray.remote(num_cpus=1, max_retries=0)(_work)
@@ -76,8 +61,7 @@ class RayCrew:
     def close(self) -> None:
         for task in self._jobs:
             self._ray.cancel(task, force=True)
-        if self._owner:
-            self._ray.shutdown()
+        self._connection.close()
 
     def _next(self, task: Any) -> Trial | Sign | Lost:
         try:
@@ -96,23 +80,3 @@ def _work(job: Job) -> Iterator[Trial | Sign]:
     yield Sign.BEGUN
     yield from run_job(job)
     yield Sign.ENDED
-
-
-def _host_and_port(address: str) -> tuple[str, int]:
-    """What an address names; nothing for one that is no ``host:port``, with ``ray://`` before it or without."""
-    if address in ("auto", "local"):
-        return "", 0
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    if not host or not port.isdigit():
-        raise ValueError(f"Ray address {address!r} is neither auto, nor local, nor of the form host:port")
-    return host.strip("[]"), int(port)
-
-
-def _import_ray() -> Any:
-    try:
-        import ray
-    except ImportError as error:
-        raise ImportError(
-            'running on a cluster needs ray; install it with pip install "d4orm-env[distributed]"'
-        ) from error
-    return ray

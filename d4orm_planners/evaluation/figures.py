@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
+from d4orm_planners.evaluation import figures_distributed
 from d4orm_planners.evaluation.reproduction import Figure, Section
 
 PAPER: dict[str, Any] = {"preset": "paper"}
@@ -253,7 +254,10 @@ def _amswarm() -> Figure:
 
 FIGURES: Mapping[str, Figure] = MappingProxyType({
     figure.name: figure
-    for figure in (_team_size(), _ipopt(), _big_teams(), _robustness(), _coarseness(), _noise_schedule(), _amswarm())
+    for figure in (
+        _team_size(), _ipopt(), _big_teams(), _robustness(), _coarseness(), _noise_schedule(), _amswarm(),
+        figures_distributed.selections(), figures_distributed.nodes(),
+    )
 })  # fmt: skip
 """Every figure by its name."""
 

@@ -16,7 +16,7 @@ from d4orm_planners.evaluation.store import Trial
 
 PaperNumbers = Mapping[tuple[str, str, str], Mapping[str, str]]
 """By section, label and metric: what the paper says, by column."""
-Across = Literal["robots", "scenario", "noise", "policy"]
+Across = Literal["robots", "nodes", "scenario", "noise", "policy"]
 
 _FEW: dict[str, Any] = {"num_samples": 64, "num_steps": 10, "max_iterations": 3}
 QUICK_SETTINGS: Mapping[str, Mapping[str, Any]] = MappingProxyType({
@@ -26,6 +26,7 @@ QUICK_SETTINGS: Mapping[str, Mapping[str, Any]] = MappingProxyType({
                   "num_samples": 32, "num_steps": 5},
     "mppi": _FEW,
     "cem": _FEW,
+    "d-d4orm": _FEW,
     "i-mbd": _FEW,
     "mbd": {"num_samples": 64, "num_steps": 30},
 })  # fmt: skip
@@ -44,6 +45,7 @@ class Section:
         robots: Team sizes; ``None`` is the scenario's own.
         quick_robots: Those of the quick version.
         model: Robot model; ``None`` is the scenario's own.
+        nodes: Numbers of nodes that every policy is run with; none leaves it to their other settings.
         noise: Standard deviations of the execution noise, in the controls' units.
         time_limit: Seconds after which planners begin no further iteration; ``None`` leaves it to their other settings.
     """
@@ -54,11 +56,20 @@ class Section:
     robots: tuple[int | None, ...] = (None,)
     quick_robots: tuple[int | None, ...] = (2,)
     model: str | None = None
+    nodes: tuple[int, ...] = ()
     noise: tuple[float, ...] = (0.0,)
     time_limit: float | None = None
 
+    def variants(self) -> list[Mapping[str, Mapping[str, Any]]]:
+        """The policies, with every number of nodes."""
+        if not self.nodes:
+            return [self.policies]
+        return [
+            {label: {**settings, "nodes": nodes} for label, settings in self.policies.items()} for nodes in self.nodes
+        ]
+
     def quick(self) -> Section:
-        """The same in a few seconds: tiny teams, few samples, two scenarios and two levels of noise at most."""
+        """The same in a few seconds: tiny teams, few samples; of scenarios, nodes and levels of noise two at most."""
         policies = {
             label: {**settings, **QUICK_SETTINGS.get(settings.get("policy", label), {})}
             for label, settings in self.policies.items()
@@ -68,6 +79,7 @@ class Section:
             policies=policies,
             scenarios=self.scenarios[:2],
             robots=self.quick_robots,
+            nodes=self.nodes[:2],
             noise=tuple(dict.fromkeys((self.noise[0], self.noise[-1]))),
             time_limit=None if self.time_limit is None else min(self.time_limit, QUICK_TIME_LIMIT),
         )
@@ -175,20 +187,22 @@ def reproduce(
     """
     count = whole_number(figure.seeds if seeds is None else seeds, "seeds", 1)
     for section in figure.sections:  # before the first of them runs for hours
-        configurations(section.policies, section.time_limit)
+        for policies in section.variants():
+            configurations(policies, section.time_limit)
     groups = []
     for section in figure.sections:
-        for label, trials in gather(
-            section.policies,
-            section.scenarios,
-            out=Path(out),
-            seeds=range(count),
-            control_noise_std=section.noise,
-            num_robots=section.robots,
-            model=section.model,
-            time_limit=section.time_limit,
-            workers=workers,
-            progress=progress,
-        ):
-            groups.append(Group(section.title, label, trials))
+        for policies in section.variants():
+            for label, trials in gather(
+                policies,
+                section.scenarios,
+                out=Path(out),
+                seeds=range(count),
+                control_noise_std=section.noise,
+                num_robots=section.robots,
+                model=section.model,
+                time_limit=section.time_limit,
+                workers=workers,
+                progress=progress,
+            ):
+                groups.append(Group(section.title, label, trials))
     return groups

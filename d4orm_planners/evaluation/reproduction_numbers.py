@@ -42,6 +42,10 @@ class Measured:
         travel_time: Mean arrival time [s].
         makespan: Mean of the latest arrival time [s].
         jerk: Mean squared jerk [m^2/s^6].
+        nodes: Nodes that plan; 1 unless the planner is a distributed one.
+        messages: Mean number of candidates that nodes sent, each to all others; ``None`` for other planners, as below.
+        message_bytes: Mean of their length together.
+        waiting_share: Mean share of the nodes' time that they waited for each other.
         step_time: Mean seconds of a control loop; ``None`` for policies that execute a plan.
         error: The first error.
     """
@@ -68,6 +72,10 @@ class Measured:
     travel_time: float | None
     makespan: float | None
     jerk: float | None
+    nodes: int
+    messages: float | None
+    message_bytes: float | None
+    waiting_share: float | None
     step_time: float | None
     error: str
 
@@ -128,6 +136,10 @@ def measured(group: Group) -> Measured:
         travel_time=mean("travel_time"),
         makespan=mean("makespan"),
         jerk=mean("mean_squared_jerk"),
+        nodes=_nodes(first),
+        messages=mean("messages"),
+        message_bytes=mean("message_bytes"),
+        waiting_share=mean("waiting_share"),
         step_time=_step_time([trial for trial, _ in solved]),
         error=errors[0] if errors else "",
     )
@@ -140,6 +152,11 @@ def _step_time(trials: Sequence[Trial]) -> float | None:
         if not trial.status and trial.wall_time is not None and trial.preparation is not None and trial.steps
     ]
     return float(np.mean(values)) if values else None
+
+
+def _nodes(trial: Trial) -> int:
+    nodes = json.loads(trial.config).get("nodes", 1)
+    return trial.robots if nodes is None else int(nodes)
 
 
 @dataclass(frozen=True)
@@ -184,6 +201,9 @@ METRICS: Mapping[str, Metric] = MappingProxyType({
     "travel_time": Metric("travel time, s", _number("travel_time", 2)),
     "makespan": Metric("makespan, s", _number("makespan", 2)),
     "jerk": Metric("mean squared jerk", _number("jerk", 1)),
+    "messages": Metric("messages", _number("messages", 0)),
+    "message_bytes": Metric("messages, kB", _number("message_bytes", 1, 1e-3)),
+    "waiting_share": Metric("waiting, %", _number("waiting_share", 0, 100)),
     "step_time": Metric("control loop, ms", _number("step_time", 0, 1000)),
 })  # fmt: skip
 """What can be tabulated."""

@@ -15,6 +15,10 @@ from d4orm_planners.evaluation.reproduction import Figure, Group
 from d4orm_planners.evaluation.reproduction_numbers import Measured, column
 from d4orm_planners.evaluation.store import Trial
 
+NUMERIC: Mapping[str, str] = MappingProxyType(
+    {"robots": "robots", "nodes": "nodes", "noise": "standard deviation of the noise"}
+)
+"""What may vary from left to right as a number, and what to write below."""
 INSTANTS = 200
 """Points of an anytime curve."""
 
@@ -71,7 +75,7 @@ def _metric(ax: Any, figure: Figure, shown: Shown, *, value: str, ends: tuple[st
             log: bool = False) -> None:  # fmt: skip
     """A number against what the figure varies, with a band; markers are crosses where trials failed."""
     columns = list(dict.fromkeys(column(figure, row) for _, row in shown))
-    numeric = figure.across in ("robots", "noise")
+    numeric = figure.across in NUMERIC
     for i, (name, rows) in enumerate(_lines(figure, shown).items()):
         known = [row for row in rows if getattr(row, value) is not None]
         places = [float(column(figure, row)) if numeric else columns.index(column(figure, row)) for row in known]
@@ -88,9 +92,9 @@ def _metric(ax: Any, figure: Figure, shown: Shown, *, value: str, ends: tuple[st
                 ax.vlines(places, low, high, color=f"C{i}", alpha=0.5)
     if not numeric:
         ax.set_xticks(range(len(columns)), columns, rotation=60 if figure.across == "policy" else 20, ha="right")
-    elif figure.across == "robots":
+    elif figure.across != "noise":
         ax.set_xticks([int(name) for name in columns])
-    ax.set_xlabel({"robots": "robots", "noise": "standard deviation of the noise"}.get(figure.across, ""))
+    ax.set_xlabel(NUMERIC.get(figure.across, ""))
     ax.set_ylabel(label)
     if log:
         ax.set_yscale("log")
@@ -146,6 +150,8 @@ PLOTS: Mapping[str, Callable[[Any, Figure, Shown], None]] = MappingProxyType({
     "success": _success,
     "travel_time": partial(_metric, value="travel_time", ends=None, label="travel time, s"),
     "makespan": partial(_metric, value="makespan", ends=None, label="makespan, s"),
+    "iterations": partial(_metric, value="iterations", ends=None, label="iterations", log=True),
+    "waiting_share": partial(_metric, value="waiting_share", ends=None, label="share of time spent waiting"),
     "jerk": partial(_metric, value="jerk", ends=None, label="mean squared jerk"),
     "anytime": _anytime,
 })  # fmt: skip

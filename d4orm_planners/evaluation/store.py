@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 APPLICATION_ID = 0x64346F72
 """Marks the file as one of ours, in its header ("d4or")."""
-VERSION = 3
+VERSION = 4
 STORE = "trials.sqlite"
 """Name of the file in a folder of results."""
 PATIENCE = 60.0
@@ -74,6 +74,9 @@ class Trial:
         elapsed: Seconds that the trial took, with the environment and the judge.
         history: Moments of the solve at which the best plan so far changed, as JSON: a list of
             ``[seconds, solved (0 or 1), mean reward]``; empty for a policy that executes no plan.
+        messages: Candidates that the nodes of a distributed planner sent, each to all others; ``None`` for others.
+        message_bytes: Their length together.
+        waiting_share: Share of the nodes' time that they waited for each other.
         error: Why there is no outcome; empty for a trial that ran to its end.
     """
 
@@ -106,6 +109,9 @@ class Trial:
     preparation: float | None = None
     elapsed: float | None = None
     history: str = "[]"
+    messages: int | None = None
+    message_bytes: int | None = None
+    waiting_share: float | None = None
     error: str = ""
 
     @property
@@ -125,7 +131,8 @@ CREATE TABLE trials (
     collided INTEGER NOT NULL, arrived INTEGER NOT NULL,
     travel_time REAL, makespan REAL, reward REAL, mean_squared_jerk REAL,
     steps INTEGER NOT NULL, iterations INTEGER, status TEXT NOT NULL,
-    wall_time REAL, preparation REAL, elapsed REAL, history TEXT NOT NULL, error TEXT NOT NULL,
+    wall_time REAL, preparation REAL, elapsed REAL, history TEXT NOT NULL,
+    messages INTEGER, message_bytes INTEGER, waiting_share REAL, error TEXT NOT NULL,
     PRIMARY KEY ({_KEY})
 ) WITHOUT ROWID
 """

@@ -122,6 +122,7 @@ def _outcome(policy: _TimedPolicy, job: Job, noise: float) -> dict[str, Any]:
     rest = np.zeros((problem.horizon - len(executed), *executed.shape[1:]), executed.dtype)
     report = verify(problem, np.concatenate([executed, rest]))
     metrics, plan = episode.metrics, policy.plan
+    sent = {} if plan is None else plan.metrics
     return {
         "success": bool(metrics["success"]),
         "verified": report.ok,
@@ -131,6 +132,7 @@ def _outcome(policy: _TimedPolicy, job: Job, noise: float) -> dict[str, Any]:
         "iterations": None if plan is None else plan.iterations,
         "status": "" if plan is None else plan.status,
         "history": "[]" if plan is None else compact_history(plan.history),
+        **{name: sent.get(name) for name in ("messages", "message_bytes", "waiting_share")},
         "wall_time": policy.wall_time,
         "preparation": policy.preparation,
     }

@@ -1,0 +1,109 @@
+"""What the nodes of one process share: their candidates, each judged once, and the word to stop."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from typing import Any
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.engine.base import Engine, SamplingResult, SamplingRules, SamplingTask
+from d4orm_planners.base import Candidate, Iteration, Planner, Search, evaluate_controls
+
+
+class Stopped(Exception):
+    """An iteration was left because its result is no longer wanted."""
+
+
+class Judge:
+    """Judges candidates, and remembers some.
+
+    Args:
+        engine: What rolls out.
+        problem: The problem.
+        remembered: Candidates of this process's own nodes that are remembered.
+
+    Attributes:
+        stop: Once set, nodes leave their iterations between denoising steps.
+        solution_ends: Whether to set it at the first solution.
+    """
+
+    def __init__(self, engine: Engine, problem: Problem, remembered: int = 0) -> None:
+        self.stop = threading.Event()
+        self.solution_ends = False
+        self._engine, self._problem, self._remembered = engine, problem, remembered
+        self._known: dict[bytes, Candidate] = {}
+        self._lock = threading.Lock()
+
+    def own(self, controls: FloatArray) -> Candidate:
+        """Judge what a node of this process has made.
+
+        Raises:
+            Stopped: If it is no longer wanted.
+        """
+        # The judge holds the interpreter's lock: two at once would both be half as fast.
+        with self._lock:
+            if self.stop.is_set():
+                raise Stopped
+            candidate = evaluate_controls(self._engine, self._problem, controls)
+            self._known[candidate.controls.tobytes()] = candidate
+            while len(self._known) > self._remembered:
+                del self._known[next(iter(self._known))]
+            if candidate.solved and self.solution_ends:
+                self.stop.set()
+        return candidate
+
+    def received(self, controls: FloatArray) -> Candidate:
+        """Judge what has arrived; the very controls that a node of this process has made are known already."""
+        return self._known.get(controls.tobytes()) or evaluate_controls(self._engine, self._problem, controls)
+
+
+class StoppableEngine:
+    """An engine that leaves a denoising run when told to; one that compiles the whole run does so after it."""
+
+    def __init__(self, engine: Engine, stop: threading.Event) -> None:
+        self._engine, self._stop = engine, stop
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._engine, name)
+
+    def denoise(self, task: SamplingTask, rules: SamplingRules, *rest: Any) -> SamplingResult:
+        """See :meth:`d4orm_env.engine.base.Engine.denoise`.
+
+        Raises:
+            Stopped: If told to stop.
+        """
+        if self._engine.name == "cpu":
+            rules = rules._replace(weights=self._checked(rules.weights))
+        return self._engine.denoise(task, rules, *rest)
+
+    def _checked(self, weights: Any) -> Any:
+        def checked(*arguments: Any) -> Any:
+            if self._stop.is_set():
+                raise Stopped
+            return weights(*arguments)
+
+        return checked
+
+
+class JudgedPlanner(Planner):
+    """A planner whose candidates a common judge looks at.
+
+    Attributes:
+        inner: The planner.
+    """
+
+    def __init__(self, inner: Planner, judge: Judge) -> None:
+        super().__init__(inner.config)
+        self.inner = inner
+        self._judge = judge
+
+    def iterate(self, search: Search) -> Iteration:
+        """See :meth:`Planner.iterate`."""
+        iteration = self.inner.iterate(search)
+        return replace(iteration, judged=self._judge.own(iteration.controls))
+
+    def finish(self, search: Search) -> None:
+        """See :meth:`Planner.finish`."""
+        self.inner.finish(search)
