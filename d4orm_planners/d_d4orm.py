@@ -78,6 +78,10 @@ class DD4ormConfig(D4ormDConfig):
             self.node_settings(self.nodes)
         whole_number(self.k, "k", 1)
         positive_number(self.patience, "patience", zero_allowed=True)
+        if self.address is not None:
+            if self.transport != "ray":
+                raise ValueError(f"address {self.address!r} goes with transport 'ray', not {self.transport!r}")
+            host_and_port(self.address)
         if self.transport == "zenoh":
             self._check_network()
         else:
@@ -99,10 +103,6 @@ class DD4ormConfig(D4ormDConfig):
         """Raise ``ValueError`` if this process is none of so many nodes."""
         if self.node is not None and self.node >= nodes:
             raise ValueError(f"node is {self.node}; of {nodes} nodes the last one is {nodes - 1}")
-        if self.address is not None:
-            if self.transport != "ray":
-                raise ValueError(f"address {self.address!r} goes with transport 'ray', not {self.transport!r}")
-            host_and_port(self.address)
 
     def node_settings(self, nodes: int) -> list[dict[str, Any]]:
         """The settings of each node's planner.

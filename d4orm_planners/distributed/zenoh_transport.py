@@ -25,6 +25,9 @@ LOOPBACK = ("tcp/127.0.0.1:0",)
 
 PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws")
 
+LAST_WAIT = 5.0
+"""Seconds to wait for the thread that receives, once there is nothing more to come."""
+
 RESERVED = {
     "listen/endpoints": "listen",
     "connect/endpoints": "connect",
@@ -129,8 +132,6 @@ class ZenohTransport:
         self._error: type[Exception] = zenoh.ZError
         try:
             self._session = zenoh.open(config)
-            # One that is left open might keep the process from ending.
-            atexit.register(self._session.close)
             # Newer candidates replace older ones, so that it is better to lose one than to wait for a slow link.
             self._publisher = self._session.declare_publisher(
                 key,
@@ -145,7 +146,10 @@ class ZenohTransport:
                 f"{', '.join(settings.connect) or 'nothing'}: {_reason(error)}"
             ) from error
         # Zenoh's own thread for a callback is none that the end of the process leaves alone.
-        threading.Thread(target=self._receive, daemon=True, name=f"zenoh-{key}").start()
+        self._receiver = threading.Thread(target=self._receive, daemon=True, name=f"zenoh-{key}")
+        self._receiver.start()
+        # A session that is left open might keep the process from ending, and a thread inside it would abort it.
+        atexit.register(self._leave)
 
     def publish(self, data: bytes) -> None:
         """See :meth:`~d4orm_planners.distributed.transport.Transport.publish`."""
@@ -164,8 +168,12 @@ class ZenohTransport:
     def close(self) -> None:
         """See :meth:`~d4orm_planners.distributed.transport.Transport.close`."""
         self._mailbox.close()
+        atexit.unregister(self._leave)
+        self._leave()
+
+    def _leave(self) -> None:
         self._session.close()
-        atexit.unregister(self._session.close)
+        self._receiver.join(LAST_WAIT)
 
     def _receive(self) -> None:
         with contextlib.suppress(self._error):  # which says that the session is closed
