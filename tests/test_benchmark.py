@@ -184,7 +184,8 @@ def test_after_a_warm_up_nothing_is_left_to_compile(tmp_path: Path) -> None:
 
     first = run("-m", "d4orm_planners.cli", "warmup")
     assert str(tmp_path / "cache") in first
-    assert not first.startswith("0 kernels compiled")
+    # Those that another process has compiled meanwhile count as compiled too.
+    assert " 0 found in the cache" in first
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.nb*")}
     assert before
     run("-m", "d4orm_planners.cli", "plan", "--robots", "3", "--out", "plan.npz", "--quiet")
