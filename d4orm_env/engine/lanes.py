@@ -5,6 +5,7 @@ What holds in some worlds only is a mask, one bit per world, lowest bit first.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from llvmlite import ir
@@ -19,6 +20,12 @@ TILE = 64
 
 CHUNK = 16
 """Worlds per instruction; where registers hold fewer, the compiler splits it."""
+
+BLOCK = 4
+"""Rows that :func:`enclose` takes at once."""
+
+BOX = 2 * (TILE + CHUNK)
+"""Numbers it makes of them."""
 
 _FLOATS = ir.VectorType(ir.FloatType(), CHUNK)
 _BITS = ir.IntType(CHUNK)
@@ -57,8 +64,10 @@ def _squared_gap(builder: Any, pairs: list[tuple[Any, Any]]) -> Any:
     return total
 
 
-def _within(dimension: int) -> Any:
-    """``(w, a, b, squared_reach) -> mask``: where the places in the rows from ``w[a]`` and ``w[b]`` are near."""
+def _within(dimension: int, count: int) -> Any:
+    """``(w, a, b, squared_reach) -> mask``: where the places in the rows from ``w[a]`` and ``w[b]`` on are near, in the
+    first ``count`` worlds.
+    """
 
     @intrinsic
     def within(typing_context: Any, w: Any, a: Any, b: Any, squared_reach: Any) -> Any:
@@ -66,7 +75,7 @@ def _within(dimension: int) -> Any:
             array, offset_a, offset_b, reach = arguments
             bound = _splat(builder, reach)
             mask = ir.Constant(_MASK, 0)
-            for first in range(0, TILE, CHUNK):
+            for first in range(0, count, CHUNK):
                 pairs = [
                     tuple(
                         _load(context, builder, signature.args[0], array, offset, axis * TILE + first)
@@ -82,7 +91,86 @@ def _within(dimension: int) -> Any:
     return within
 
 
-within_2, within_3 = _within(2), _within(3)
+within_2, within_3 = _within(2, TILE), _within(3, TILE)
+chunk_within_2, chunk_within_3 = _within(2, CHUNK), _within(3, CHUNK)
+
+
+@intrinsic
+def enclose(typing_context: Any, w: Any, first: Any, step: Any, widening: Any, boxes: Any, begin: Any) -> Any:
+    """Enclose the numbers of ``BLOCK`` rows, the first at ``w[first]`` and the others ``step`` numbers apart.
+
+    From ``boxes[begin]`` on this fills a row of ``TILE`` lower ends, world by world, and one of upper ends,
+    ``widening`` beyond the numbers; then rows of ``CHUNK`` ends, lane by lane: a lane encloses four worlds. What
+    is not a number is left out.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array, offset, distance, extra, target, start = arguments
+        offsets = [offset]
+        for _ in range(1, BLOCK):
+            offsets.append(builder.add(offsets[-1], distance))
+        extra = _splat(builder, extra)
+        for end, (comparison, sign) in enumerate((("<", 1), (">", -1))):
+            beyond, ends = builder.fsub if end == 0 else builder.fadd, []
+            for chunk in range(0, TILE, CHUNK):
+                most = ir.Constant(_FLOATS, [sign * math.inf] * CHUNK)
+                for row in offsets:
+                    values = _load(context, builder, signature.args[0], array, row, chunk)
+                    most = builder.select(builder.fcmp_ordered(comparison, values, most), values, most)
+                ends.append(beyond(most, extra))
+                place = _place(context, builder, signature.args[4], target, start, end * TILE + chunk)
+                builder.store(ends[-1], place, align=4)
+            most = ends[0]
+            for other in ends[1:]:
+                most = builder.select(builder.fcmp_ordered(comparison, other, most), other, most)
+            place = _place(context, builder, signature.args[4], target, start, 2 * TILE + end * CHUNK)
+            builder.store(most, place, align=4)
+        return context.get_dummy_value()
+
+    return types.void(w, types.int64, types.int64, types.float32, boxes, types.int64), generate
+
+
+def _overlap(dimension: int, width: int, begin: int) -> Any:
+    """``(boxes, a, b) -> mask``: where the boxes from ``boxes[a]`` and ``boxes[b]`` on touch, of the worlds or of the
+    lanes of :func:`enclose`.
+    """
+
+    @intrinsic
+    def overlap(typing_context: Any, boxes: Any, a: Any, b: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            array, offset_a, offset_b = arguments
+            mask = ir.Constant(_MASK, 0)
+            for first in range(0, width, CHUNK):
+                touch = ir.Constant(ir.VectorType(ir.IntType(1), CHUNK), [1] * CHUNK)
+                for axis in range(dimension):
+                    for low, high in ((offset_a, offset_b), (offset_b, offset_a)):
+                        row = axis * BOX + begin + first
+                        lower = _load(context, builder, signature.args[0], array, low, row)
+                        upper = _load(context, builder, signature.args[0], array, high, row + width)
+                        touch = builder.and_(touch, builder.fcmp_ordered("<=", lower, upper))
+                bits = builder.zext(builder.bitcast(touch, _BITS), _MASK)
+                mask = builder.or_(mask, builder.shl(bits, ir.Constant(_MASK, first)))
+            return mask
+
+        return types.uint64(boxes, types.int64, types.int64), generate
+
+    return overlap
+
+
+worlds_overlap_2, worlds_overlap_3 = _overlap(2, TILE, 0), _overlap(3, TILE, 0)
+lanes_overlap_2, lanes_overlap_3 = _overlap(2, CHUNK, 2 * TILE), _overlap(3, CHUNK, 2 * TILE)
+
+
+@intrinsic
+def copy_chunk(typing_context: Any, source: Any, a: Any, target: Any, b: Any) -> Any:
+    """Copy ``CHUNK`` numbers from ``source[a]`` on to ``target[b]`` on."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        values = _load(context, builder, signature.args[0], arguments[0], arguments[1], 0)
+        builder.store(values, _place(context, builder, signature.args[2], arguments[2], arguments[3], 0), align=4)
+        return context.get_dummy_value()
+
+    return types.void(source, types.int64, target, types.int64), generate
 
 
 @intrinsic

@@ -1,9 +1,9 @@
-"""Which contacts a tile has to check at a step, so that the checks do not stay quadratic where nothing is near.
+"""Which contacts a tile has to check, so that the checks do not stay quadratic where nothing is near.
 
-A robot's places in all samples of a tile fit a box. Two boxes with a gap between them cannot touch before the robots
-have had time to cross it. So every few steps each robot gets a list of those, robots before it and moving bodies, that
-it may touch until the next time, and only they are checked; the same holds for obstacles and the bounds. Boxes are made
-only where the gaps measured earlier do not rule everything out.
+A tile moves its robots a block of steps at a time and checks the block's places afterwards. Sixteen boxes hold a
+robot's places in the block, each those of four of the tile's samples, one box a lane of a vector: four comparisons tell
+that two robots keep apart in all of them. Every robot gets a list of those before it for which they do not tell. Then
+64 boxes, one a sample, tell which samples to look at. Moving bodies, obstacles and the bounds have boxes too.
 """
 
 from __future__ import annotations
@@ -13,273 +13,254 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from d4orm_env.core.dynamics import ACCELERATION, SPEED
-from d4orm_env.engine import tiles
-from d4orm_env.engine.lanes import TILE, use_wide_registers
-from d4orm_env.engine.tiles import NOWHERE, OPTIONS, ROBOT, ROWS, ZERO, compiled, inlined
+from d4orm_env.engine import lanes, tiles
+from d4orm_env.engine.lanes import (
+    BLOCK,
+    BOX,
+    CHUNK,
+    TILE,
+    chunk_within_2,
+    chunk_within_3,
+    lanes_overlap_2,
+    lanes_overlap_3,
+    use_wide_registers,
+    worlds_overlap_2,
+    worlds_overlap_3,
+)
+from d4orm_env.engine.tiles import NOWHERE, OPTIONS, compiled, inlined
 
 SLACK = np.float32(1e-4)
 """Allowance for rounding [m]."""
 
-_SIGN = np.int32(31)
-_MAGNITUDE = np.int32(0x7FFFFFFF)
-_LOWEST = np.int32(-0x80000000)
 _INFINITY = np.float32(np.inf)
-
-INTERVAL = np.int32(4)
-"""Steps from one list to the next: making one costs as much as checking some pairs."""
-
-# Columns of ``due`` ``(K, 3)`` int32, in time steps: when the robot's box was made, when it may touch a robot before it
-# or a body at the earliest, and when to look at obstacles and bounds again.
-SEEN, EARLIEST, STATIC = range(3)
+_CHUNK_BITS = np.uint64((1 << CHUNK) - 1)
+_HALF = np.float32(0.5)
 
 
 class Scratch(NamedTuple):
-    """What a tile remembers of ``K`` robots and ``O`` moving bodies, numbered after the robots.
+    """What a tile notes of ``K`` robots, ``O`` moving bodies and ``S`` static things, numbered in this order.
 
     Attributes:
-        stride: ``(K + O,)`` how far each gets in one step at most [m].
-        due: ``(K, 3)`` see above.
-        low: ``(d, K + O)`` boxes, the lower corners.
-        high: ``(d, K + O)`` the upper corners.
-        wait: ``(K + O,)`` steps until one robot may touch another thing.
+        boxes: Where everything is within a block, widened so that what is within the margin of each other touches: rows
+            of ``CHUNK`` numbers, two an axis and ``2 d`` a thing.
+        static: ``(S,)`` numbers of the static things.
         num_robots: ``(K,)`` how many robots before it each may touch,
         robots: ``(K, K)`` and which.
-        num_bodies: ``(K,)`` how many bodies each may touch,
-        bodies: ``(K, O)`` and which.
-        near: ``(K, 2)`` who is near something in which samples, see :mod:`~d4orm_env.engine.tiles`.
+        near: ``(K, BLOCK)`` who is near a robot or a body at which step of the block, a bit for every sample.
     """
 
-    stride: Any
-    due: Any
-    low: Any
-    high: Any
-    wait: Any
+    boxes: Any
+    static: Any
     num_robots: Any
     robots: Any
-    num_bodies: Any
-    bodies: Any
     near: Any
 
 
+@inlined
+def _is_open(arrays: Any, axis: Any, side: Any) -> Any:
+    bound = arrays.bounds[side, axis]
+    return bound == -_INFINITY or bound == _INFINITY
+
+
+@compiled
+def _num_static(arrays: Any) -> Any:
+    count = arrays.balls.shape[0] + arrays.cylinders.shape[0] + arrays.boxes.shape[0]
+    for axis in range(arrays.bounds.shape[1]):
+        for side in range(2):
+            count += 0 if _is_open(arrays, axis, side) else 1
+    return count
+
+
 @numba.njit(nogil=True, **OPTIONS)
-def make_scratch(num_robots: Any, num_bodies: Any, dimension: Any) -> Any:
-    """Unfilled scratch."""
-    things = num_robots + num_bodies
-    return Scratch(
-        np.empty(things, np.float32), np.empty((num_robots, 3), np.int32), np.empty((dimension, things), np.float32),
-        np.empty((dimension, things), np.float32), np.empty(things, np.float32), np.empty(num_robots, np.int32),
-        np.empty((num_robots, num_robots), np.int32), np.empty(num_robots, np.int32),
-        np.empty((num_robots, num_bodies), np.int32), np.empty((num_robots, 2), np.uint64),
+def make_scratch(arrays: Any, num_bodies: Any) -> Any:
+    """Scratch in which the boxes of static things are filled."""
+    num_robots, dimension = arrays.goal.shape
+    num_static = _num_static(arrays)
+    scratch = Scratch(
+        tiles.aligned_zeros(box_of(num_robots + num_bodies + num_static, dimension)),
+        np.arange(num_robots + num_bodies, num_robots + num_bodies + num_static), np.empty(num_robots, np.int32),
+        np.empty((num_robots, num_robots), np.int32), np.empty((num_robots, BLOCK), np.uint64),
     )  # fmt: skip
+    _fill_static(arrays, num_robots + num_bodies, scratch.boxes)
+    return scratch
 
 
 @inlined
-def measure_strides(limits: Any, dt: Any, moving: Any, stride: Any) -> None:
-    """Fill ``stride`` ``(K + O,)`` with how far a robot and a body get in one step at most [m].
-
-    Args:
-        limits: ``(K, 3)``.
-        dt: Time step [s].
-        moving: ``(H, O, d)`` places of the bodies.
-        stride: Output.
-    """
-    num_robots = limits.shape[0]
-    stride[num_robots:] = ZERO
-    for k in range(num_robots):
-        stride[k] = (limits[k, SPEED] + limits[k, ACCELERATION] * dt) * dt + SLACK
-    for body in range(moving.shape[1]):
-        for t in range(1, moving.shape[0]):
-            gap2 = ZERO
-            for axis in range(moving.shape[2]):
-                gap = moving[t, body, axis] - moving[t - 1, body, axis]
-                gap2 += gap * gap
-            stride[num_robots + body] = max(stride[num_robots + body], np.sqrt(gap2) + SLACK)
+def place_of(k: Any, step: Any, dimension: Any) -> Any:
+    """Where the rows of robot ``k``'s places after a step of the block begin: a row an axis."""
+    return (k * BLOCK + step) * dimension * TILE
 
 
 @inlined
-def begin(due: Any) -> None:
-    """Everything is due at the first step."""
-    due[:] = np.int32(0)
-    due[:, SEEN] = np.int32(-1)
+def box_of(thing: Any, dimension: Any) -> Any:
+    """Where the rows of a thing's boxes begin."""
+    return thing * dimension * BOX
 
 
 @inlined
-def _ordered(bits: Any) -> Any:
-    """Numbers' bits in an order that integers compare in, and back; a number that is none comes before or after all
-    others, so that it cannot hide them.
-    """
-    return np.int32(bits ^ np.int32(np.int32(bits >> _SIGN) & _MAGNITUDE))
+def _fill(low: Any, high: Any, thing: Any, axis: Any, dimension: Any, boxes: Any) -> None:
+    """Make a thing's boxes in all lanes reach from ``low`` to ``high`` along an axis; it has none world by world."""
+    begin = box_of(thing, dimension) + axis * BOX + 2 * TILE
+    boxes[begin : begin + CHUNK] = low
+    boxes[begin + CHUNK : begin + 2 * CHUNK] = high
 
 
 @compiled
-def _extent(row: Any, w: Any) -> Any:
-    """Smallest and largest number of a row of the workspace."""
-    use_wide_registers()
-    # Through uint32 the index is plainly not negative, which the vectoriser needs to know.
-    first = np.int64(np.uint32(row * TILE))
-    lower, upper = _MAGNITUDE, _LOWEST
-    for s in range(TILE):
-        value = _ordered(np.float32(w[first + s]).view(np.int32))
-        lower = min(lower, value)
-        upper = max(upper, value)
-    low, high = np.int32(_ordered(lower)).view(np.float32), np.int32(_ordered(upper)).view(np.float32)
-    # A sample that blew up may be anywhere.
-    return low if low == low else -_INFINITY, high if high == high else _INFINITY
-
-
-@inlined
-def _look(t: Any, k: Any, w: Any, due: Any, low: Any, high: Any) -> None:
-    """Make the box of robot ``k`` at time ``t`` if that has not been done."""
-    if due[k, SEEN] != t:
-        due[k, SEEN] = t
-        for axis in range(low.shape[0]):
-            low[axis, k], high[axis, k] = _extent(k * ROWS + axis, w)
-
-
-@compiled
-def _add_gaps(low_k: Any, high_k: Any, low: Any, high: Any, gap2: Any) -> None:
-    """Add the squared gaps along one axis from one box to others."""
-    use_wide_registers()
-    for i in range(gap2.shape[0]):
-        above, below = low_k - high[i], low[i] - high_k
-        gap = above if above > below else below
-        gap = gap if gap > ZERO else ZERO
-        gap2[i] += gap * gap
-
-
-@compiled
-def _gaps_to_waits(reach: Any, radius: Any, stride_k: Any, stride: Any, wait: Any) -> None:
-    """Replace squared gaps by the steps it takes to cross them."""
-    use_wide_registers()
-    for i in range(wait.shape[0]):
-        wait[i] = (np.sqrt(wait[i]) - (reach + radius[i])) / (stride_k + stride[i])
-
-
-@compiled
-def _list_due(wait: Any, listed: Any) -> Any:
-    """List those that may be touched before the next list is made.
-
-    Returns:
-        The length of the list, and the least number of steps until any thing may be touched.
-    """
-    count, least = np.int32(0), _INFINITY
-    for i in range(wait.shape[0]):
-        listed[count] = i
-        count += np.int32(1) if wait[i] <= np.float32(INTERVAL - 1) else np.int32(0)
-        least = wait[i] if wait[i] < least else least
-    return count, least
-
-
-@inlined
-def _make_list(first: Any, last: Any, reach: Any, k: Any, radius: Any, s: Any, listed: Any) -> Any:
-    """Measure the gaps from robot ``k`` to things from number ``first`` to ``last``; see :func:`_list_due`."""
-    waits = s.wait[first:last]
-    waits[:] = ZERO
-    for axis in range(s.low.shape[0]):
-        _add_gaps(s.low[axis, k], s.high[axis, k], s.low[axis, first:last], s.high[axis, first:last], waits)
-    _gaps_to_waits(reach + SLACK, radius, s.stride[k], s.stride[first:last], waits)
-    return _list_due(waits, listed)
-
-
-@inlined
-def _list_near(
-    radius: Any, margin: Any, moving: Any, moving_radius: Any, t: Any, num_steps: Any, w: Any, s: Any
-) -> None:
-    """Make the lists for time ``t`` and the steps until the next ones."""
-    num_robots, num_bodies = radius.shape[0], moving.shape[0]
-    for body in range(num_bodies):
-        for axis in range(s.low.shape[0]):
-            s.low[axis, num_robots + body] = s.high[axis, num_robots + body] = moving[body, axis]
-    for k in range(num_robots):
-        s.num_robots[k] = s.num_bodies[k] = np.int32(0)
-        if s.due[k, EARLIEST] < t + INTERVAL:
-            for other in range(k + 1):
-                _look(t, other, w, s.due, s.low, s.high)
-            reach = radius[k] + margin
-            s.num_robots[k], soon = _make_list(0, k, reach, k, radius, s, s.robots[k])
-            if num_bodies > 0:
-                s.num_bodies[k], sooner = _make_list(
-                    num_robots, num_robots + num_bodies, reach, k, moving_radius, s, s.bodies[k]
-                )  # fmt: skip
-                soon = min(soon, sooner)
-            s.due[k, EARLIEST] = t + np.int32(min(max(soon, ZERO), np.float32(num_steps)))
-
-
-@inlined
-def _gap(low_a: Any, high_a: Any, low_b: Any, high_b: Any) -> Any:
-    return max(max(low_a - high_b, low_b - high_a), ZERO)
-
-
-@inlined
-def _point_gap(low: Any, high: Any, k: Any, point: Any, axes: Any) -> Any:
-    gap2 = ZERO
-    for axis in range(axes):
-        gap = _gap(low[axis, k], high[axis, k], point[axis], point[axis])
-        gap2 += gap * gap
-    return np.sqrt(gap2)
-
-
-@inlined
-def _box_gap(low: Any, high: Any, k: Any, obstacle: Any) -> Any:
-    gap2 = ZERO
-    dimension = low.shape[0]
-    for axis in range(dimension):
-        gap = _gap(low[axis, k], high[axis, k], obstacle[axis], obstacle[dimension + axis])
-        gap2 += gap * gap
-    return np.sqrt(gap2)
-
-
-@inlined
-def _static_gap(arrays: Any, k: Any, low: Any, high: Any) -> Any:
-    """Smallest distance from the box of robot ``k`` to any obstacle or out of the bounds."""
-    dimension = low.shape[0]
-    nearest = _INFINITY
-    for axis in range(dimension):
-        nearest = min(nearest, low[axis, k] - arrays.bounds[0, axis])
-        nearest = min(nearest, arrays.bounds[1, axis] - high[axis, k])
+def _fill_static(arrays: Any, thing: Any, boxes: Any) -> None:
+    """Fill the boxes of obstacles, and of what lies beyond each of the bounds, from number ``thing`` on."""
+    dimension = arrays.goal.shape[1]
+    widening = _HALF * arrays.margin + SLACK
     for i in range(arrays.balls.shape[0]):
-        nearest = min(nearest, _point_gap(low, high, k, arrays.balls[i], dimension) - arrays.balls[i, dimension])
+        reach = arrays.balls[i, dimension] + widening
+        for axis in range(dimension):
+            _fill(arrays.balls[i, axis] - reach, arrays.balls[i, axis] + reach, thing, axis, dimension, boxes)
+        thing += 1
     for i in range(arrays.cylinders.shape[0]):
-        nearest = min(nearest, _point_gap(low, high, k, arrays.cylinders[i], 2) - arrays.cylinders[i, 2])
+        reach = arrays.cylinders[i, 2] + widening
+        for axis in range(2):
+            centre = arrays.cylinders[i, axis]
+            _fill(centre - reach, centre + reach, thing, axis, dimension, boxes)
+        for axis in range(2, dimension):
+            _fill(-_INFINITY, _INFINITY, thing, axis, dimension, boxes)
+        thing += 1
     for i in range(arrays.boxes.shape[0]):
-        nearest = min(nearest, _box_gap(low, high, k, arrays.boxes[i]))
-    return nearest
+        for axis in range(dimension):
+            low, high = arrays.boxes[i, axis] - widening, arrays.boxes[i, dimension + axis] + widening
+            _fill(low, high, thing, axis, dimension, boxes)
+        thing += 1
+    for beyond in range(dimension):
+        for side in range(2):
+            if not _is_open(arrays, beyond, side):
+                for axis in range(dimension):
+                    _fill(-_INFINITY, _INFINITY, thing, axis, dimension, boxes)
+                bound = arrays.bounds[side, beyond]
+                low = -_INFINITY if side == 0 else bound - widening
+                high = bound + widening if side == 0 else _INFINITY
+                _fill(low, high, thing, beyond, dimension, boxes)
+                thing += 1
+
+
+@inlined
+def enclose(k: Any, reach: Any, dimension: Any, places: Any, boxes: Any) -> None:
+    """Make the boxes of robot ``k`` in this block, for its radius and half of the margin as reach."""
+    for axis in range(dimension):
+        first, begin = place_of(k, 0, dimension) + axis * TILE, box_of(k, dimension) + axis * BOX
+        lanes.enclose(places, first, dimension * TILE, reach + SLACK, boxes, begin)
+
+
+@inlined
+def _overlap(a: Any, b: Any, dimension: Any, boxes: Any) -> Any:
+    """Whether two things may touch in any lane."""
+    if dimension == 2:
+        return lanes_overlap_2(boxes, box_of(a, dimension), box_of(b, dimension)) != NOWHERE
+    return lanes_overlap_3(boxes, box_of(a, dimension), box_of(b, dimension)) != NOWHERE
+
+
+@inlined
+def _samples_overlap(a: Any, b: Any, dimension: Any, boxes: Any) -> Any:
+    """The samples in which two robots may touch."""
+    if dimension == 2:
+        return worlds_overlap_2(boxes, box_of(a, dimension), box_of(b, dimension))
+    return worlds_overlap_3(boxes, box_of(a, dimension), box_of(b, dimension))
+
+
+@inlined
+def _near_pair(reach: Any, a: Any, b: Any, dimension: Any, places: Any) -> Any:
+    """Where two centres are within reach, of the first ``CHUNK`` samples in the rows from ``a`` and from ``b`` on."""
+    if dimension == 2:
+        return chunk_within_2(places, a, b, reach * reach)
+    return chunk_within_3(places, a, b, reach * reach)
+
+
+@inlined
+def _enclose_bodies(moving: Any, radius: Any, margin: Any, first: Any, count: Any, thing: Any, boxes: Any) -> None:
+    """Fill the boxes of moving bodies in this block, from number ``thing`` on."""
+    for body in range(moving.shape[1]):
+        widening = radius[body] + _HALF * margin + SLACK
+        for axis in range(moving.shape[2]):
+            low = high = moving[first, body, axis]
+            for t in range(first + 1, first + count):
+                low, high = min(low, moving[t, body, axis]), max(high, moving[t, body, axis])
+            _fill(low - widening, high + widening, thing + body, axis, moving.shape[2], boxes)
 
 
 @compiled
-def _mark_listed(radius: Any, margin: Any, count: Any, listed: Any, dimension: Any, w: Any, near: Any) -> None:
+def _list_near(dimension: Any, s: Any) -> None:
+    """List for every robot those before it that it may touch in this block."""
+    use_wide_registers()
+    for k in range(s.num_robots.shape[0]):
+        listed, count = s.robots[k], np.int32(0)
+        for other in range(k):
+            listed[count] = other
+            count += np.int32(_overlap(k, other, dimension, s.boxes))
+        s.num_robots[k] = count
+
+
+@compiled
+def _mark_listed(radius: Any, margin: Any, dimension: Any, places: Any, s: Any) -> None:
     """Flag robots within the margin of those on their lists."""
     use_wide_registers()
-    num_robots = radius.shape[0]
+    for k in range(radius.shape[0]):
+        for i in range(s.num_robots[k]):
+            other = np.int64(np.uint32(s.robots[k, i]))
+            reach = radius[k] + radius[other] + margin
+            samples = _samples_overlap(k, other, dimension, s.boxes)
+            for chunk in range(0, TILE, CHUNK):
+                if (samples >> np.uint64(chunk)) & _CHUNK_BITS == NOWHERE:
+                    continue
+                for step in range(BLOCK):
+                    a, b = place_of(k, step, dimension) + chunk, place_of(other, step, dimension) + chunk
+                    touch = _near_pair(reach, a, b, dimension, places) << np.uint64(chunk)
+                    s.near[k, step] |= touch
+                    s.near[other, step] |= touch
+
+
+@compiled
+def _mark_bodies(
+    radius: Any, margin: Any, moving: Any, moving_radius: Any, first: Any, count: Any, places: Any, s: Any
+) -> None:
+    """Flag robots within the margin of moving bodies."""
+    num_robots, dimension = radius.shape[0], moving.shape[2]
+    _enclose_bodies(moving, moving_radius, margin, first, count, num_robots, s.boxes)
     for k in range(num_robots):
-        for i in range(count[k]):
-            other = np.int64(np.uint32(listed[k, i]))
-            tiles.mark_pair(radius[k] + radius[other] + margin, k, other, dimension, w, near)
+        for body in range(moving.shape[1]):
+            if _overlap(k, num_robots + body, dimension, s.boxes):
+                reach = radius[k] + moving_radius[body] + margin
+                for step in range(count):
+                    s.near[k, step] |= tiles.near_round(
+                        reach, moving[first + step, body], dimension, place_of(k, step, dimension),
+                        place_of(num_robots, 0, dimension), places,
+                    )  # fmt: skip
 
 
 @inlined
 def mark_robots(
-    radius: Any, margin: Any, moving: Any, moving_radius: Any, t: Any, num_steps: Any, w: Any, s: Any
+    radius: Any, margin: Any, moving: Any, moving_radius: Any, first: Any, count: Any, places: Any, s: Any
 ) -> None:
-    """Flag robots within the margin of each other or of a body at time ``t``; ``moving`` ``(O, d)`` are the bodies."""
-    num_robots, dimension = radius.shape[0], s.low.shape[0]
-    s.near[:, ROBOT] = NOWHERE
-    if t % INTERVAL == 0:
-        _list_near(radius, margin, moving, moving_radius, t, num_steps, w, s)
-    _mark_listed(radius, margin, s.num_robots, s.robots, dimension, w, s.near)
-    for k in range(num_robots):
-        for i in range(s.num_bodies[k]):
-            body = s.bodies[k, i]
-            tiles.mark_round(radius[k] + moving_radius[body] + margin, k, moving[body], dimension, ROBOT, w, s.near)
+    """Flag in ``s.near`` robots within the margin of each other or of a body in a block.
+
+    Args:
+        radius: ``(K,)``.
+        margin: The margin.
+        moving: ``(H, O, d)`` places of the bodies.
+        moving_radius: ``(O,)``.
+        first: Time of the block's first step.
+        count: Steps in the block; of later ones the flags mean nothing.
+        places: Rows of places, see :func:`place_of`, and a spare one.
+        s: Scratch with the boxes of the robots in this block.
+    """
+    s.near[:] = NOWHERE
+    dimension = moving.shape[2]
+    _list_near(dimension, s)
+    _mark_listed(radius, margin, dimension, places, s)
+    if moving.shape[1] > 0:
+        _mark_bodies(radius, margin, moving, moving_radius, first, count, places, s)
 
 
 @inlined
-def near_static(arrays: Any, k: Any, t: Any, num_steps: Any, w: Any, s: Any) -> Any:
-    """Whether any sample of robot ``k`` may be within the margin of an obstacle or the bounds at time ``t``."""
-    _look(t, k, w, s.due, s.low, s.high)
-    gap = _static_gap(arrays, k, s.low, s.high) - arrays.radius[k] - arrays.margin - SLACK
-    if not gap > ZERO:
-        return True
-    s.due[k, STATIC] = np.int32(t + 1) + np.int32(min(gap / s.stride[k], np.float32(num_steps)))
-    return False
+def near_static(k: Any, dimension: Any, s: Any) -> Any:
+    """Whether any sample of robot ``k`` may be within the margin of an obstacle or the bounds in this block."""
+    touch = False
+    for thing in s.static:
+        touch |= _overlap(k, thing, dimension, s.boxes)
+    return touch

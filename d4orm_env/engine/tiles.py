@@ -23,9 +23,9 @@ from d4orm_env.engine.lanes import TILE, at_most, use_wide_registers, within_2, 
 ZERO = np.float32(0)
 ONE = np.float32(1)
 
-# First rows of a robot in the workspace. Normals come in pairs, so the three control rows are followed by a spare one;
-# a power of two in all would map the same row of every robot to the same cache set.
-STATE, CONTROL, GOAL, DOCKED, DISTANCE2, TOTAL, SCRATCH, ROWS = 0, 6, 10, 13, 14, 15, 16, 17
+# First rows of a robot in the workspace. A power of two in all would map the same row of every robot to the same cache
+# set, so that one is left unused.
+STATE, CONTROL, GOAL, DOCKED, DISTANCE2, SPARE, ROWS = 0, 6, 10, 13, 14, 15, 17
 STRIDE = ROWS * TILE
 
 # Columns of ``near``.
@@ -317,14 +317,11 @@ def measure_goal_distance(num_robots: Any, dimension: Any, w: Any) -> None:
 
 
 @inlined
-def mark_pair(reach: Any, k: Any, other: Any, dimension: Any, w: Any, near: Any) -> None:
-    """Flag two robots in every world where their centres are within ``reach``."""
+def near_pair(reach: Any, a: Any, b: Any, dimension: Any, w: Any) -> Any:
+    """Where two centres, in the rows of ``w`` from ``a`` and from ``b`` on, are within ``reach`` of each other."""
     if dimension == 2:
-        touch = within_2(w, k * STRIDE, other * STRIDE, reach * reach)
-    else:
-        touch = within_3(w, k * STRIDE, other * STRIDE, reach * reach)
-    near[k, ROBOT] |= touch
-    near[other, ROBOT] |= touch
+        return within_2(w, a, b, reach * reach)
+    return within_3(w, a, b, reach * reach)
 
 
 @inlined
@@ -332,55 +329,60 @@ def mark_pairs(arrays: Any, extra: Any, w: Any, near: Any) -> None:
     """Flag every two robots closer than their radii plus ``extra``."""
     for k in range(1, arrays.radius.shape[0]):
         for other in range(k):
-            mark_pair(arrays.radius[k] + arrays.radius[other] + extra, k, other, arrays.goal.shape[1], w, near)
+            reach = arrays.radius[k] + arrays.radius[other] + extra
+            touch = near_pair(reach, k * STRIDE, other * STRIDE, arrays.goal.shape[1], w)
+            near[k, ROBOT] |= touch
+            near[other, ROBOT] |= touch
 
 
 @inlined
-def mark_round(reach: Any, k: Any, centre: Any, axes: Any, column: Any, w: Any, near: Any) -> None:
-    """Flag robot ``k`` where it is within ``reach`` of a centre, over the first two or three axes."""
-    robot = w[k * STRIDE : (k + 1) * STRIDE]
+def near_round(reach: Any, centre: Any, axes: Any, place: Any, spare: Any, w: Any) -> Any:
+    """Where the rows from ``place`` on are within ``reach`` of a centre, over the first two or three axes; the row at
+    ``spare`` is overwritten.
+    """
     if axes == 2:
         point = (centre[0], centre[1])
         for s in range(TILE):
-            robot[SCRATCH * TILE + s] = _squared_gap2(_read2(robot, 0, s), point)
+            w[spare + s] = _squared_gap2(_read2(w, place, s), point)
     else:
-        place = (centre[0], centre[1], centre[2])
+        spot = (centre[0], centre[1], centre[2])
         for s in range(TILE):
-            robot[SCRATCH * TILE + s] = _squared_gap3(_read3(robot, 0, s), place)
-    near[k, column] |= at_most(robot, SCRATCH * TILE, reach * reach)
+            w[spare + s] = _squared_gap3(_read3(w, place, s), spot)
+    return at_most(w, spare, reach * reach)
 
 
 @inlined
-def _mark_box(reach: Any, k: Any, box: Any, dimension: Any, w: Any, near: Any) -> None:
-    robot = w[k * STRIDE : (k + 1) * STRIDE]
+def _near_box(reach: Any, box: Any, dimension: Any, place: Any, spare: Any, w: Any) -> Any:
     for s in range(TILE):
         gap2 = ZERO
         for axis in range(dimension):
-            gap = collision.axis_gap(robot[axis * TILE + s], box[axis], box[dimension + axis], ZERO, OPS)
+            gap = collision.axis_gap(w[place + axis * TILE + s], box[axis], box[dimension + axis], ZERO, OPS)
             gap2 += gap * gap
-        robot[SCRATCH * TILE + s] = gap2
-    near[k, OBSTACLE] |= at_most(robot, SCRATCH * TILE, reach * reach)
+        w[spare + s] = gap2
+    return at_most(w, spare, reach * reach)
 
 
 @inlined
-def mark_obstacles(arrays: Any, k: Any, extra: Any, w: Any, near: Any) -> None:
-    """Flag robot ``k`` where it is within its radius plus ``extra`` of an obstacle or the bounds."""
+def near_obstacles(arrays: Any, reach: Any, place: Any, spare: Any, w: Any) -> Any:
+    """Where a body of this reach, its centre in the rows from ``place`` on, touches an obstacle or the bounds.
+
+    The row at ``spare`` is overwritten.
+    """
     dimension = arrays.goal.shape[1]
-    reach = arrays.radius[k] + extra
+    mask = NOWHERE
     for i in range(arrays.balls.shape[0]):
-        mark_round(reach + arrays.balls[i, dimension], k, arrays.balls[i], dimension, OBSTACLE, w, near)
+        mask |= near_round(reach + arrays.balls[i, dimension], arrays.balls[i], dimension, place, spare, w)
     for i in range(arrays.cylinders.shape[0]):
-        mark_round(reach + arrays.cylinders[i, 2], k, arrays.cylinders[i], 2, OBSTACLE, w, near)
+        mask |= near_round(reach + arrays.cylinders[i, 2], arrays.cylinders[i], 2, place, spare, w)
     for i in range(arrays.boxes.shape[0]):
-        _mark_box(reach, k, arrays.boxes[i], dimension, w, near)
+        mask |= _near_box(reach, arrays.boxes[i], dimension, place, spare, w)
     for axis in range(dimension):
         lower, upper = arrays.bounds[0, axis], arrays.bounds[1, axis]
         if lower > -np.inf or upper < np.inf:
-            robot = w[k * STRIDE : (k + 1) * STRIDE]
             for s in range(TILE):
-                outside = collision.leaves(robot[axis * TILE + s], reach, lower, upper)
-                robot[SCRATCH * TILE + s] = ZERO if outside else ONE
-            near[k, OBSTACLE] |= at_most(robot, SCRATCH * TILE, ZERO)
+                w[spare + s] = ZERO if collision.leaves(w[place + axis * TILE + s], reach, lower, upper) else ONE
+            mask |= at_most(w, spare, ZERO)
+    return mask
 
 
 def _motion_reader(model: Model) -> Any:

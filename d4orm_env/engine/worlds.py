@@ -27,6 +27,7 @@ from d4orm_env.engine.tiles import (
     ONE,
     OPTIONS,
     ROBOT,
+    SPARE,
     STATE,
     STRIDE,
     ZERO,
@@ -105,7 +106,8 @@ def _judge(
         flags = collided if level == 0 else violated
         tiles.mark_pairs(arrays, extra, w, near)
         for k in range(num_robots):
-            tiles.mark_obstacles(arrays, k, extra, w, near)
+            place, spare = k * STRIDE + STATE * TILE, k * STRIDE + SPARE * TILE
+            near[k, OBSTACLE] |= tiles.near_obstacles(arrays, arrays.radius[k] + extra, place, spare, w)
         for s in range(min(TILE, collided.shape[0] - first)):
             for k in range(num_robots):
                 flags[first + s, k] = _bit(near[k, ROBOT] | near[k, OBSTACLE], s) != NOWHERE
