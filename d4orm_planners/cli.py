@@ -255,7 +255,7 @@ def _solve(
 
     chosen = make_planner(planner, preset=preset, **{"engine": engine, **parse_settings(settings)})
     if get_engine(chosen.config.engine).name == "cpu":
-        compile_for_planning(lambda: typer.echo("compiling, once per installation ...", err=True))
+        compile_for_planning(problem.team.models, lambda: typer.echo("compiling, once per installation ...", err=True))
     limit = max_iterations if max_iterations is not None else chosen.config.max_iterations
     with SolveProgress(planner, problem.num_robots, limit, enabled=not quiet) as progress:
         return chosen.solve(

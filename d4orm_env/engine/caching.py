@@ -19,14 +19,16 @@ def fingerprint(modules: tuple[ModuleType, ...]) -> str:
 
 
 class _SourceKeyedCache(FunctionCache):
-    """numba notices an edit of the file a kernel is in, but not of the files it calls into: this adds those."""
+    """Kernels by a key of our own: numba notices an edit of the file a kernel is in, but neither of those it calls into
+    nor what functions one kernel of a factory has that another has not.
+    """
 
     def __init__(self, function: Callable[..., Any], key: str) -> None:
         super().__init__(function)
         self._source_key = key
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
-        return (*super()._index_key(sig, codegen), self._source_key)
+        return sig, codegen.magic_tuple(), self._source_key
 
 
 def cached_kernel(key: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:

@@ -14,6 +14,7 @@ from d4orm_env.engine import noise, sampling
 from d4orm_env.engine.base import SamplingResult, SamplingRules, SamplingTask, StepResult, checked_controls
 from d4orm_env.engine.lanes import TILE
 from d4orm_env.engine.noise import DRAWS, TURNS
+from d4orm_env.engine.proximity import make_scratch
 from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_env.engine.worlds import WorldBatch, advance_worlds, judge_worlds, observe_world, roll_out, step_worlds
 
@@ -142,9 +143,9 @@ class CpuEngine:
         )
 
     def prepare(self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int) -> None:
-        """See :meth:`d4orm_env.engine.base.Engine.prepare`; one compilation serves every problem."""
+        """See :meth:`d4orm_env.engine.base.Engine.prepare`; one compilation serves all teams of the same models."""
         del noise_scale, num_samples
-        if not sampling.average_noise.signatures:
+        if not (sampling.score_kernel(task.problem.team.models).signatures and sampling.average_noise.signatures):
             self.denoise(task, rules, task.base, np.zeros(1, np.float32), TILE, 0)
 
     def denoise(
@@ -187,6 +188,8 @@ class _Sampling:
         problem = task.problem
         self.task, self.threads = task, threads
         self.arrays = _typed(task.arrays)
+        self.kernel = sampling.score_kernel(problem.team.models)
+        self.spaces: dict[int, tuple[Any, Any]] = {}
         self.base = np.ascontiguousarray(task.base, np.float32)
         docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
         self.docked = np.ascontiguousarray(docked, bool)
@@ -198,8 +201,16 @@ class _Sampling:
             self.moving_radius = np.ascontiguousarray(task.moving.radius, np.float32)
         self.seed = np.array(noise.seed_words(seed), np.uint32)
         self.rewards = np.empty((problem.num_robots, num_samples), np.float32)
-        pairs, counters = (problem.control_size + 1) // 2, -(-num_samples // TILE) * DRAWS
-        self.kept = np.empty((problem.num_robots, len(self.base), pairs, 2, counters), np.float32)
+        num_tiles, pairs = -(-num_samples // TILE), (problem.control_size + 1) // 2
+        self.kept = np.empty((num_tiles, problem.num_robots, len(self.base), pairs, 2, DRAWS), np.float32)
+
+    def space(self, first: int) -> tuple[Any, Any]:
+        """Workspace and scratch of the thread whose tiles begin with this number."""
+        if first not in self.spaces:
+            num_steps, num_robots, num_controls = self.base.shape
+            workspace = sampling.make_workspace(num_steps, num_robots, num_controls, self.arrays.goal.shape[1])
+            self.spaces[first] = workspace, make_scratch(self.arrays, self.moving.shape[1])
+        return self.spaces[first]
 
     def score(self, step: int, mean: FloatArray, scale: FloatArray) -> FloatArray:
         """Rewards of this step's samples, ``(M,)`` for team credit and ``(K, M)`` for robot credit."""
@@ -207,29 +218,29 @@ class _Sampling:
         offset, scale = self.base + mean, np.ascontiguousarray(scale, np.float32)
         self.threads.over(
             num_tiles,
-            lambda part: sampling.score_tiles(
+            lambda part: self.kernel(
                 self.arrays, offset, scale, self.docked, self.task.collisions, np.float32(self.task.penalty),
-                self.moving, self.moving_radius, self.seed, step, part, self.kept, self.rewards,
+                self.moving, self.moving_radius, self.seed, step, part, *self.space(part[0]), self.kept, self.rewards,
             ),
         )  # fmt: skip
         return self.rewards.mean(axis=0, keepdims=True) if self.task.credit == "team" else self.rewards
 
     def log_ratio(self, mean: FloatArray, scale: FloatArray) -> FloatArray:
         """The last samples' :attr:`SamplingRules.importance` terms, ``(1, M)`` or ``(K, M)`` like their rewards."""
-        num_steps, num_robots, pairs = (*self.base.shape[:2], self.kept.shape[2])
+        num_steps, num_robots, pairs = (*self.base.shape[:2], self.kept.shape[3])
         centre: FloatArray = np.zeros((num_steps, num_robots, 2 * pairs), np.float32)
         centre[:, :, : mean.shape[2]] = (self.base + mean) / scale
         centre = centre.reshape(num_steps, num_robots, pairs, 2)
-        along = np.einsum("tkpi,ktpim->km", centre, self.kept)
-        across = np.einsum("tkpi,ktpim->km", np.stack([centre[..., 1], -centre[..., 0]], axis=-1), self.kept)
-        turns = np.stack([along, -along, across, -across], axis=1).reshape(num_robots, TURNS, -1, DRAWS)
-        samples = turns.transpose(0, 2, 1, 3).reshape(num_robots, -1)[:, : self.rewards.shape[1]]
+        along = np.einsum("tkpi,nktpim->knm", centre, self.kept)
+        across = np.einsum("tkpi,nktpim->knm", np.stack([centre[..., 1], -centre[..., 0]], axis=-1), self.kept)
+        turns = np.stack([along, -along, across, -across], axis=2)
+        samples = turns.reshape(num_robots, -1)[:, : self.rewards.shape[1]]
         return -(samples.sum(axis=0, keepdims=True) if self.task.credit == "team" else samples)
 
     def moments(self, step: int, weights: Any, with_second: bool) -> tuple[FloatArray, FloatArray]:
         """``(H, K, m)`` weighted mean of the noise and, if asked for, of its square."""
-        num_steps, num_robots, _ = self.base.shape
-        odd, even = _by_counter(np.broadcast_to(np.asarray(weights, np.float32), (num_robots, self.rewards.shape[1])))
+        num_steps = len(self.base)
+        odd, even = _by_counter(np.asarray(weights, np.float32))
         first = np.empty_like(self.base)
         second = np.empty_like(self.base) if with_second else np.empty((0, 0, 0), np.float32)
         self.threads.over(num_steps, lambda part: sampling.average_noise(self.kept, odd, even, part, first, second))
@@ -237,7 +248,7 @@ class _Sampling:
 
 
 def _by_counter(weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Weights ``(K, M)`` of samples gathered by the counter of their noise (see :func:`noise.turned`).
+    """Weights ``(K, M)`` or ``(1, M)`` of samples gathered by the counter of their noise (see :func:`noise.turned`).
 
     Returns:
         ``(2, K, .)`` weights in an odd moment, summed over the samples of a counter with the cosine and the sine of

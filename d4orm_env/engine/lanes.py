@@ -173,6 +173,48 @@ def copy_chunk(typing_context: Any, source: Any, a: Any, target: Any, b: Any) ->
     return types.void(source, types.int64, target, types.int64), generate
 
 
+def _add_turned(power: int) -> Any:
+    """``(sums, a, draws, b, cosine, c, sine, d)``: add ``CHUNK`` weighted draws to as many sums, lane by lane.
+
+    With power 1 the rows ``(x, y)`` from ``draws[b]`` on add ``cosine x - sine y`` and ``cosine y + sine x`` to the two
+    rows from ``sums[a]`` on; with power 2 ``cosine x^2 + sine y^2`` and ``cosine y^2 + sine x^2``.
+    """
+
+    @intrinsic
+    def add_turned(
+        typing_context: Any, sums: Any, a: Any, draws: Any, b: Any, cosine: Any, c: Any, sine: Any, d: Any
+    ) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            def load(array: int, row: int) -> Any:
+                return _load(context, builder, signature.args[array], arguments[array], arguments[array + 1], row)
+
+            def multiply(x: Any, y: Any) -> Any:
+                return builder.fmul(x, y, flags=("contract",))
+
+            x, y = load(2, 0), load(2, CHUNK)
+            if power == 2:
+                x, y = multiply(x, x), multiply(y, y)
+            along, across = load(4, 0), load(6, 0)
+            first, second = load(0, 0), load(0, CHUNK)
+            first = builder.fadd(first, multiply(along, x), flags=("contract",))
+            second = builder.fadd(second, multiply(along, y), flags=("contract",))
+            fold = builder.fsub if power == 1 else builder.fadd
+            first = fold(first, multiply(across, y), flags=("contract",))
+            second = builder.fadd(second, multiply(across, x), flags=("contract",))
+            for row, value in enumerate((first, second)):
+                place = _place(context, builder, signature.args[0], arguments[0], arguments[1], row * CHUNK)
+                builder.store(value, place, align=4)
+            return context.get_dummy_value()
+
+        offset = types.int64
+        return types.void(sums, offset, draws, offset, cosine, offset, sine, offset), generate
+
+    return add_turned
+
+
+add_turned, add_turned_squares = _add_turned(1), _add_turned(2)
+
+
 @intrinsic
 def at_most(typing_context: Any, w: Any, offset: Any, bound: Any) -> Any:
     """Where ``w[offset:offset + TILE] <= bound``, as a mask."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
 from d4orm_env.engine import lanes, tiles
@@ -27,7 +26,7 @@ from d4orm_env.engine.lanes import (
     worlds_overlap_2,
     worlds_overlap_3,
 )
-from d4orm_env.engine.tiles import NOWHERE, OPTIONS, compiled, inlined
+from d4orm_env.engine.tiles import NOWHERE, compiled, inlined
 
 SLACK = np.float32(1e-4)
 """Allowance for rounding [m]."""
@@ -41,8 +40,8 @@ class Scratch(NamedTuple):
     """What a tile notes of ``K`` robots, ``O`` moving bodies and ``S`` static things, numbered in this order.
 
     Attributes:
-        boxes: Where everything is within a block, widened so that what is within the margin of each other touches: rows
-            of ``CHUNK`` numbers, two an axis and ``2 d`` a thing.
+        boxes: ``((K + O + S) d BOX,)`` where everything is within a block, see :func:`~d4orm_env.engine.lanes.enclose`,
+            widened so that what is within the margin of each other touches. Only robots have boxes world by world.
         static: ``(S,)`` numbers of the static things.
         num_robots: ``(K,)`` how many robots before it each may touch,
         robots: ``(K, K)`` and which.
@@ -56,33 +55,41 @@ class Scratch(NamedTuple):
     near: Any
 
 
-@inlined
-def _is_open(arrays: Any, axis: Any, side: Any) -> Any:
-    bound = arrays.bounds[side, axis]
-    return bound == -_INFINITY or bound == _INFINITY
-
-
-@compiled
-def _num_static(arrays: Any) -> Any:
-    count = arrays.balls.shape[0] + arrays.cylinders.shape[0] + arrays.boxes.shape[0]
-    for axis in range(arrays.bounds.shape[1]):
-        for side in range(2):
-            count += 0 if _is_open(arrays, axis, side) else 1
-    return count
-
-
-@numba.njit(nogil=True, **OPTIONS)
-def make_scratch(arrays: Any, num_bodies: Any) -> Any:
-    """Scratch in which the boxes of static things are filled."""
+def make_scratch(arrays: Any, num_bodies: int) -> Scratch:
+    """Scratch for one thread, in which the boxes of static things are filled."""
     num_robots, dimension = arrays.goal.shape
-    num_static = _num_static(arrays)
-    scratch = Scratch(
-        tiles.aligned_zeros(box_of(num_robots + num_bodies + num_static, dimension)),
-        np.arange(num_robots + num_bodies, num_robots + num_bodies + num_static), np.empty(num_robots, np.int32),
-        np.empty((num_robots, num_robots), np.int32), np.empty((num_robots, BLOCK), np.uint64),
+    static = _static_boxes(arrays)
+    first, last = num_robots + num_bodies, num_robots + num_bodies + static.shape[1]
+    boxes = tiles.aligned_zeros(last * dimension * BOX)
+    widening = _HALF * arrays.margin + SLACK
+    lanes_of = boxes.reshape(last, dimension, BOX)[first:, :, 2 * TILE :]
+    lanes_of[..., :CHUNK] = static[0][..., None] - widening
+    lanes_of[..., CHUNK:] = static[1][..., None] + widening
+    return Scratch(
+        boxes, np.arange(first, last), np.empty(num_robots, np.int32), np.empty((num_robots, num_robots), np.int32),
+        np.empty((num_robots, BLOCK), np.uint64),
     )  # fmt: skip
-    _fill_static(arrays, num_robots + num_bodies, scratch.boxes)
-    return scratch
+
+
+def _static_boxes(arrays: Any) -> Any:
+    """``(2, S, d)`` lower and upper ends of the boxes round obstacles and of what lies beyond each of the bounds."""
+    dimension = arrays.goal.shape[1]
+    balls, radius = arrays.balls[:, :dimension], arrays.balls[:, dimension:]
+    upright = np.full((len(arrays.cylinders), dimension), _INFINITY)
+    upright[:, :2] = arrays.cylinders[:, 2:]
+    centre = np.zeros_like(upright)
+    centre[:, :2] = arrays.cylinders[:, :2]
+    low = [balls - radius, centre - upright, arrays.boxes[:, :dimension]]
+    high = [balls + radius, centre + upright, arrays.boxes[:, dimension:]]
+    for axis in range(dimension):
+        for side, bound in enumerate(arrays.bounds[:, axis]):
+            if np.isfinite(bound):
+                beyond = np.full((2, 1, dimension), _INFINITY)
+                beyond[0] = -_INFINITY
+                beyond[1 - side, 0, axis] = bound
+                low.append(beyond[0])
+                high.append(beyond[1])
+    return np.array([np.concatenate(low), np.concatenate(high)], np.float32)
 
 
 @inlined
@@ -103,41 +110,6 @@ def _fill(low: Any, high: Any, thing: Any, axis: Any, dimension: Any, boxes: Any
     begin = box_of(thing, dimension) + axis * BOX + 2 * TILE
     boxes[begin : begin + CHUNK] = low
     boxes[begin + CHUNK : begin + 2 * CHUNK] = high
-
-
-@compiled
-def _fill_static(arrays: Any, thing: Any, boxes: Any) -> None:
-    """Fill the boxes of obstacles, and of what lies beyond each of the bounds, from number ``thing`` on."""
-    dimension = arrays.goal.shape[1]
-    widening = _HALF * arrays.margin + SLACK
-    for i in range(arrays.balls.shape[0]):
-        reach = arrays.balls[i, dimension] + widening
-        for axis in range(dimension):
-            _fill(arrays.balls[i, axis] - reach, arrays.balls[i, axis] + reach, thing, axis, dimension, boxes)
-        thing += 1
-    for i in range(arrays.cylinders.shape[0]):
-        reach = arrays.cylinders[i, 2] + widening
-        for axis in range(2):
-            centre = arrays.cylinders[i, axis]
-            _fill(centre - reach, centre + reach, thing, axis, dimension, boxes)
-        for axis in range(2, dimension):
-            _fill(-_INFINITY, _INFINITY, thing, axis, dimension, boxes)
-        thing += 1
-    for i in range(arrays.boxes.shape[0]):
-        for axis in range(dimension):
-            low, high = arrays.boxes[i, axis] - widening, arrays.boxes[i, dimension + axis] + widening
-            _fill(low, high, thing, axis, dimension, boxes)
-        thing += 1
-    for beyond in range(dimension):
-        for side in range(2):
-            if not _is_open(arrays, beyond, side):
-                for axis in range(dimension):
-                    _fill(-_INFINITY, _INFINITY, thing, axis, dimension, boxes)
-                bound = arrays.bounds[side, beyond]
-                low = -_INFINITY if side == 0 else bound - widening
-                high = bound + widening if side == 0 else _INFINITY
-                _fill(low, high, thing, beyond, dimension, boxes)
-                thing += 1
 
 
 @inlined

@@ -8,28 +8,34 @@ quarter of a number per sample and control, because samples share it, which is a
 
 from __future__ import annotations
 
-from typing import Any
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba.extending import register_jitable
 
 from d4orm_env.core import collision, dynamics, reward, transition
-from d4orm_env.core.dynamics import MODELS, Model
+from d4orm_env.core.dynamics import MODEL_CODES, MODELS, Model
 from d4orm_env.engine import lanes, noise, proximity, tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.lanes import TILE, copy_chunk, subtract_where, use_wide_registers
+from d4orm_env.engine.lanes import (
+    BLOCK,
+    TILE,
+    add_turned,
+    add_turned_squares,
+    copy_chunk,
+    subtract_where,
+    use_wide_registers,
+)
 from d4orm_env.engine.noise import DRAWS
-from d4orm_env.engine.proximity import BLOCK, enclose, make_scratch, mark_robots, near_static, place_of
+from d4orm_env.engine.proximity import enclose, mark_robots, near_static, place_of
 from d4orm_env.engine.tiles import (
-    HOLONOMIC2D,
-    HOLONOMIC3D,
     INLINED,
     NOWHERE,
     ONE,
     OPS,
     OPTIONS,
     READ,
-    VELOCITY2D,
     WRITE,
     ZERO,
     compiled,
@@ -42,6 +48,36 @@ STATE, DOCKED, TOTAL, ROWS = 0, 6, 7, 9
 STRIDE = ROWS * TILE
 
 HALF = np.float32(0.5)
+
+
+class Workspace(NamedTuple):
+    """What one thread needs to score tiles of ``K`` robots over ``H`` steps.
+
+    Attributes:
+        w: ``(K STRIDE,)`` the robots.
+        places: Their places in a block, see :func:`~d4orm_env.engine.proximity.place_of`, and a spare row.
+        draws: ``(BLOCK 4 DRAWS,)`` one robot's noise in a block.
+        controls: ``(BLOCK CONTROL_ROWS TILE,)`` one robot's controls in a block.
+        keys: ``(2, K H P)`` keys of the noise streams, ``P`` pairs of components each.
+        standing: ``(K,)`` whether a robot has docked in all samples.
+    """
+
+    w: Any
+    places: Any
+    draws: Any
+    controls: Any
+    keys: Any
+    standing: Any
+
+
+def make_workspace(num_steps: int, num_robots: int, num_controls: int, dimension: int) -> Workspace:
+    """A workspace."""
+    return Workspace(
+        tiles.aligned_zeros(num_robots * STRIDE), tiles.aligned_zeros((num_robots * BLOCK * dimension + 1) * TILE),
+        tiles.aligned_zeros(BLOCK * 4 * DRAWS), tiles.aligned_zeros(BLOCK * CONTROL_ROWS * TILE),
+        np.empty((2, num_robots * num_steps * ((num_controls + 1) // 2)), np.uint32), np.empty(num_robots, np.bool_),
+    )  # fmt: skip
+
 
 CONTROL_ROWS = 3
 """Rows of one step's controls."""
@@ -115,20 +151,21 @@ def _draw_block(keys: Any, first: Any, begin: Any, count: Any, num_pairs: Any, k
 
     Args:
         keys: ``(2, K H P)`` see :func:`_fill_keys`.
-        first: The first counter number.
+        first: The tile's first counter number.
         begin: Number of the robot's stream at the first step.
         count: Steps in the block.
         num_pairs: ``P``, pairs of components.
-        kept: ``(K H P 2 M / 4,)`` where the noise is kept, output.
+        kept: ``(T K H P 2 DRAWS,)`` where the noise is kept, output.
         draws: ``(BLOCK 4 DRAWS,)`` the same noise, two rows for each of up to two pairs of components, output.
     """
-    counters = kept.shape[0] // (2 * keys.shape[1])
+    # Of all tiles before this one.
+    before = first // DRAWS * keys.shape[1]
     for i in range(count):
         for pair in range(num_pairs):
             stream, row = begin + i * num_pairs + pair, (2 * i + pair) * 2 * DRAWS
             _draw((keys[0, stream], keys[1, stream]), first, draws[row : row + 2 * DRAWS])
-            copy_chunk(draws, row, kept, 2 * stream * counters + first)
-            copy_chunk(draws, row + DRAWS, kept, (2 * stream + 1) * counters + first)
+            for half in range(2):
+                copy_chunk(draws, row + half * DRAWS, kept, (2 * (before + stream) + half) * DRAWS)
 
 
 # The four samples that share their draws, see :func:`noise.turned`, of which ``o`` is the mean and ``c`` the scale.
@@ -208,26 +245,32 @@ def _runner(model: Model) -> Any:
     return run
 
 
-_run_holonomic2d = _runner(MODELS["holonomic2d"])
-_run_holonomic3d = _runner(MODELS["holonomic3d"])
-_run_velocity2d = _runner(MODELS["velocity2d"])
-_run_differential_drive = _runner(MODELS["differential_drive"])
+_RUN = {name: _runner(model) for name, model in MODELS.items()}
 
 
-@inlined
-def _run_robot(
-    code: Any, limits: Any, h: Any, docking: Any, goal: Any, inverse: Any, offset: Any, scale: Any, draws: Any,
-    controls: Any, places: Any, w: Any,
-) -> None:  # fmt: skip
-    """Move one robot a block of steps in every sample of the tile and add its reward, violations aside."""
-    if code == HOLONOMIC2D:
-        _run_holonomic2d(limits, h, docking, goal, inverse, offset, scale, draws, controls, places, w)
-    elif code == HOLONOMIC3D:
-        _run_holonomic3d(limits, h, docking, goal, inverse, offset, scale, draws, controls, places, w)
-    elif code == VELOCITY2D:
-        _run_velocity2d(limits, h, docking, goal, inverse, offset, scale, draws, controls, places, w)
-    else:
-        _run_differential_drive(limits, h, docking, goal, inverse, offset, scale, draws, controls, places, w)
+def _any_runner(models: tuple[str, ...]) -> Any:
+    """A function that moves a robot of any of these models, told by its code, with the arguments of :func:`_runner`."""
+    first, first_code = _RUN[models[0]], MODEL_CODES[models[0]]
+    others: Any = _any_runner(models[1:]) if len(models) > 1 else None
+
+    @inlined
+    def run_only(
+        code: Any, limits: Any, h: Any, docking: Any, goal: Any, inverse: Any, offset: Any, scale: Any, draws: Any,
+        controls: Any, places: Any, w: Any,
+    ) -> None:  # fmt: skip
+        first(limits, h, docking, goal, inverse, offset, scale, draws, controls, places, w)
+
+    @inlined
+    def run_any(
+        code: Any, limits: Any, h: Any, docking: Any, goal: Any, inverse: Any, offset: Any, scale: Any, draws: Any,
+        controls: Any, places: Any, w: Any,
+    ) -> None:  # fmt: skip
+        if code == first_code:
+            first(limits, h, docking, goal, inverse, offset, scale, draws, controls, places, w)
+        else:
+            others(code, limits, h, docking, goal, inverse, offset, scale, draws, controls, places, w)
+
+    return run_only if others is None else run_any
 
 
 @inlined
@@ -268,12 +311,13 @@ def _stay(dimension: Any, w: Any, places: Any) -> None:
         _copy(w[: dimension * TILE], places[step * dimension * TILE : (step + 1) * dimension * TILE])
 
 
-@compiled
+@inlined
 def _score_tile(
-    arrays: Any, offset: Any, scale: Any, docked: Any, collisions: Any, penalty: Any, moving: Any, moving_radius: Any,
-    keys: Any, counter: Any, kept: Any, w: Any, places: Any, draws: Any, controls: Any, standing: Any, scratch: Any,
+    run_robot: Any, arrays: Any, offset: Any, scale: Any, docked: Any, collisions: Any, penalty: Any, moving: Any,
+    moving_radius: Any, keys: Any, counter: Any, kept: Any, space: Any, scratch: Any,
 ) -> None:  # fmt: skip
     """Roll out a tile of samples, noise beginning with this counter; leave summed rewards in rows TOTAL."""
+    w, places, draws, controls, standing = space.w, space.places, space.draws, space.controls, space.standing
     num_steps, num_robots, num_controls = offset.shape
     num_pairs = (num_controls + 1) // 2
     # Taken out of the tuple once: every access counts a reference, which costs as much as several samples.
@@ -299,7 +343,7 @@ def _score_tile(
             limits = (all_limits[k, 0], all_limits[k, 1], all_limits[k, 2])
             goal = (goals[k, 0], goals[k, 1], goals[k, dimension - 1])
             last = first + count
-            _run_robot(
+            run_robot(
                 codes[k], limits, h, docking, goal, inverse[k], offset[first:last, k], scale[first:last, k], draws,
                 controls, own_places, robot,
             )  # fmt: skip
@@ -341,50 +385,85 @@ def _fill_keys(seed: Any, step: Any, num_robots: Any, num_steps: Any, num_pairs:
                 keys[1, stream] = key[1]
 
 
-@cached_kernel(SOURCES, **OPTIONS)
-def score_tiles(
-    arrays: Any, offset: Any, scale: Any, docked: Any, collisions: Any, penalty: Any, moving: Any, moving_radius: Any,
-    seed: Any, step: Any, tile_range: Any, kept: Any, rewards: Any,
+@inlined
+def _score_tiles(
+    run_robot: Any, arrays: Any, offset: Any, scale: Any, docked: Any, collisions: Any, penalty: Any, moving: Any,
+    moving_radius: Any, seed: Any, step: Any, tile_range: Any, space: Any, scratch: Any, kept: Any, rewards: Any,
 ) -> None:  # fmt: skip
-    """Fill the columns of ``rewards`` ``(K, M)`` that a range of tiles covers with mean rewards over time.
-
-    Args:
-        arrays: The problem.
-        offset: ``(H, K, m)`` base controls plus mean deformation.
-        scale: ``(H, K, m)`` standard deviation of the noise.
-        docked: ``(K,)`` bool, docked from the beginning.
-        collisions: Whether robots count when near each other or near a moving body.
-        penalty: What a violation costs per step.
-        moving: ``(H, O, d)`` places of moving bodies after every step.
-        moving_radius: ``(O,)``.
-        seed: Two uint32 words.
-        step: Number of the denoising step.
-        tile_range: First tile and the one after the last.
-        kept: ``(K, H, P, 2, M / 4)`` the noise, in ``P`` pairs of components, output; ``M`` rounded up to whole tiles.
-        rewards: Output.
-    """
-    use_wide_registers()
     num_robots, num_samples = rewards.shape
-    dimension = arrays.goal.shape[1]
-    w = tiles.aligned_zeros(num_robots * STRIDE)
-    places = tiles.aligned_zeros(place_of(num_robots, 0, dimension) + TILE)
-    draws = tiles.aligned_zeros(BLOCK * 4 * DRAWS)
-    controls = tiles.aligned_zeros(BLOCK * CONTROL_ROWS * TILE)
-    num_steps, num_pairs = kept.shape[1], kept.shape[2]
-    keys = np.empty((2, num_robots * num_steps * num_pairs), np.uint32)
-    _fill_keys(seed, step, num_robots, num_steps, num_pairs, keys)
-    standing = np.empty(num_robots, np.bool_)
-    scratch = make_scratch(arrays, moving.shape[1])
+    _fill_keys(seed, step, num_robots, kept.shape[2], kept.shape[3], space.keys)
     for index in range(tile_range[0], tile_range[1]):
         first = index * TILE
         _score_tile(
-            arrays, offset, scale, docked, collisions, penalty, moving, moving_radius, keys, index * DRAWS,
-            kept.reshape(-1), w, places, draws, controls, standing, scratch,
+            run_robot, arrays, offset, scale, docked, collisions, penalty, moving, moving_radius, space.keys,
+            index * DRAWS, kept.reshape(-1), space, scratch,
         )  # fmt: skip
         for k in range(num_robots):
             # The last tile may reach beyond the last sample.
             for s in range(min(TILE, num_samples - first)):
-                rewards[k, first + s] = w[k * STRIDE + TOTAL * TILE + s] / np.float32(offset.shape[0])
+                rewards[k, first + s] = space.w[k * STRIDE + TOTAL * TILE + s] / np.float32(offset.shape[0])
+
+
+def score_kernel(models: tuple[str, ...]) -> Any:
+    """The first pass for a team of these models.
+
+    Every model has a kernel of its own, because compiling takes seconds a model; mixed teams share one for all
+    models of their dimension.
+
+    The kernel fills the columns of ``rewards`` ``(K, M)`` that a range of tiles covers with mean rewards over time. Its
+    arguments:
+
+    - ``arrays``: The problem.
+    - ``offset``: ``(H, K, m)`` base controls plus mean deformation.
+    - ``scale``: ``(H, K, m)`` standard deviation of the noise.
+    - ``docked``: ``(K,)`` bool, docked from the beginning.
+    - ``collisions``: Whether robots count when near each other or near a moving body.
+    - ``penalty``: What a violation costs per step.
+    - ``moving``: ``(H, O, d)`` places of moving bodies after every step.
+    - ``moving_radius``: ``(O,)``.
+    - ``seed``: Two uint32 words.
+    - ``step``: Number of the denoising step.
+    - ``tile_range``: First tile and the one after the last.
+    - ``space``, ``scratch``: This thread's.
+    - ``kept``: ``(T, K, H, P, 2, DRAWS)`` the noise of ``T`` tiles, in ``P`` pairs of components, output.
+    - ``rewards``: Output.
+    """
+    different = set(models)
+    if len(different) > 1:
+        dimension = MODELS[models[0]].dimension
+        different = {name for name, model in MODELS.items() if model.dimension == dimension}
+    return _score_kernel(tuple(sorted(different)))
+
+
+@cache
+def _score_kernel(models: tuple[str, ...]) -> Any:
+    run_robot = _any_runner(models)
+
+    @cached_kernel(SOURCES + ",".join(models), **OPTIONS)
+    def score_tiles(
+        arrays: Any, offset: Any, scale: Any, docked: Any, collisions: Any, penalty: Any, moving: Any,
+        moving_radius: Any, seed: Any, step: Any, tile_range: Any, space: Any, scratch: Any, kept: Any, rewards: Any,
+    ) -> None:  # fmt: skip
+        use_wide_registers()
+        _score_tiles(
+            run_robot, arrays, offset, scale, docked, collisions, penalty, moving, moving_radius, seed, step,
+            tile_range, space, scratch, kept, rewards,
+        )  # fmt: skip
+
+    return score_tiles
+
+
+@compiled
+def _sum_lanes(sums: Any, time_range: Any, k: Any, moment: Any) -> None:
+    """Put the sums ``(T P 2 DRAWS,)`` of robot ``k`` over their lanes into ``moment`` ``(H, K, m)``."""
+    num_controls = moment.shape[2]
+    rows = num_controls + num_controls % 2
+    for t in range(time_range[0], time_range[1]):
+        for i in range(num_controls):
+            total, begin = ZERO, ((t - time_range[0]) * rows + i) * DRAWS
+            for lane in range(DRAWS):
+                total += sums[begin + lane]
+            moment[t, k, i] = total
 
 
 @cached_kernel(SOURCES, **OPTIONS)
@@ -394,39 +473,30 @@ def average_noise(kept: Any, odd: Any, even: Any, time_range: Any, first_moment:
     Args:
         kept: The noise that :func:`score_tiles` kept.
         odd: ``(2, K, M / 4)`` weights summed over the samples that share a counter, times the cosine of their turn and
-            times its sine.
-        even: ``(2, K, M / 4)`` the same with the squares of cosine and sine.
+            times its sine; ``(2, 1, M / 4)`` where all robots have the same weights.
+        even: As many with the squares of cosine and sine.
         time_range: First time step and the one after the last.
         first_moment: ``(H, K, m)``, output.
         second_moment: ``(H, K, m)``, output, or an empty array to do without.
     """
-    num_controls = first_moment.shape[2]
-    for t in range(time_range[0], time_range[1]):
-        for k in range(first_moment.shape[1]):
-            for pair in range(kept.shape[2]):
-                x, y, last = kept[k, t, pair, 0], kept[k, t, pair, 1], 2 * pair + 1
-                first_moment[t, k, last - 1] = _dot(odd[0, k], x) - _dot(odd[1, k], y)
-                if last < num_controls:
-                    first_moment[t, k, last] = _dot(odd[0, k], y) + _dot(odd[1, k], x)
-                if second_moment.size > 0:
-                    second_moment[t, k, last - 1] = _dot_squares(even[0, k], x) + _dot_squares(even[1, k], y)
-                    if last < num_controls:
-                        second_moment[t, k, last] = _dot_squares(even[0, k], y) + _dot_squares(even[1, k], x)
-
-
-@compiled
-def _dot(weight: Any, x: Any) -> Any:
     use_wide_registers()
-    total = ZERO
-    for i in range(weight.shape[0]):
-        total += weight[i] * x[i]
-    return total
-
-
-@compiled
-def _dot_squares(weight: Any, x: Any) -> Any:
-    use_wide_registers()
-    total = ZERO
-    for i in range(weight.shape[0]):
-        total += weight[i] * x[i] * x[i]
-    return total
+    num_tiles, num_robots, num_steps, num_pairs = kept.shape[0], kept.shape[1], kept.shape[2], kept.shape[3]
+    draws, count = kept.reshape(-1), (time_range[1] - time_range[0]) * num_pairs
+    sums = tiles.aligned_zeros(count * 2 * DRAWS)
+    squares = tiles.aligned_zeros(count * 2 * DRAWS if second_moment.size > 0 else 0)
+    for k in range(num_robots):
+        row = min(k, odd.shape[1] - 1)
+        sums[:] = ZERO
+        squares[:] = ZERO
+        for tile in range(num_tiles):
+            stream, lane = ((tile * num_robots + k) * num_steps + time_range[0]) * num_pairs, tile * DRAWS
+            for i in range(count):
+                begin = 2 * (stream + i) * DRAWS
+                add_turned(sums, 2 * i * DRAWS, draws, begin, odd[0, row], lane, odd[1, row], lane)
+            if second_moment.size > 0:
+                for i in range(count):
+                    begin = 2 * (stream + i) * DRAWS
+                    add_turned_squares(squares, 2 * i * DRAWS, draws, begin, even[0, row], lane, even[1, row], lane)
+        _sum_lanes(sums, time_range, k, first_moment)
+        if second_moment.size > 0:
+            _sum_lanes(squares, time_range, k, second_moment)

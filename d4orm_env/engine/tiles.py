@@ -37,9 +37,10 @@ OPTIONS: dict[str, Any] = {"fastmath": {"contract", "nsz", "reassoc", "arcp", "a
 may be an estimate with a Newton step behind it, good to the last bit or two. Of infinity that is NaN, so that controls
 beyond 1e19, whose squares overflow, count as not finite; otherwise NaN and infinity mean what they always do."""
 
-UNCOUNTED: dict[str, Any] = OPTIONS | {"_nrt": False}
+UNCOUNTED: dict[str, Any] = OPTIONS | {"_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 """For everything that kernels call: without numba's reference counts, which would cost more than the sums they
-surround. Such functions cannot make arrays."""
+surround, and without what Python would call them by, which takes a third of the time of compiling them. Such functions
+cannot make arrays, and a call from Python ends the process: tests call them from compiled functions of their own."""
 
 compiled = numba.njit(nogil=True, **UNCOUNTED)
 
@@ -64,7 +65,7 @@ for _function in (
     register_jitable(**INLINED)(_function)
 
 
-@numba.njit(nogil=True, **OPTIONS)
+@register_jitable(nogil=True, **OPTIONS)
 def aligned_zeros(size: Any) -> Any:
     """A flat float32 array that begins with a cache line, so that no vector load touches two."""
     space = np.zeros(size + 16, np.float32)

@@ -19,8 +19,9 @@ from d4orm_env import make_problem
 from d4orm_planners import make_planner
 from d4orm_planners.evaluation.warmup import compile_for_planning
 imported = time.perf_counter()
-compile_for_planning()  # as the command line does
-plan = make_planner("d4orm", engine="cpu").solve(make_problem("circle", num_robots=int(sys.argv[1])), seed=0)
+problem = make_problem("circle", num_robots=int(sys.argv[1]))
+compile_for_planning(problem.team.models)  # as the command line does
+plan = make_planner("d4orm", engine="cpu").solve(problem, seed=0)
 done = time.perf_counter()
 print(json.dumps({"import": imported - begin, "solve": done - imported, "planning": plan.wall_time,
                   "solved": plan.solved}))

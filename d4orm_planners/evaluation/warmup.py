@@ -1,7 +1,7 @@
 """Compile ahead whatever planning, rolling out and the environments need, into the cache on disk.
 
-The two largest kernels, that which samples and that which rolls out a plan, take equally long. numba compiles one at a
-time in a process, so that two processes do it in half the time.
+The two kernels that a plan needs, that which samples and that which rolls out, take equally long. numba compiles one
+at a time in a process, so that two processes do it in half the time.
 """
 
 from __future__ import annotations
@@ -18,10 +18,12 @@ from typing import Any
 
 import numpy as np
 
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
 from d4orm_env.engine.base import SamplingRules, SamplingTask, get_engine
 from d4orm_env.engine.caching import has_to_be_compiled
-from d4orm_env.scenarios import make_problem
 from d4orm_planners.sampling.weights import SoftmaxWeights
 
 
@@ -42,65 +44,88 @@ class WarmupReport:
     folders: tuple[Path, ...]
 
 
-def compile_for_planning(announce: Callable[[], None] = lambda: None) -> None:
+TEAMS = (*((model, model) for model in MODELS), ("holonomic2d", "differential_drive"))
+"""The smallest teams that have a sampling kernel of their own."""
+
+
+def compile_for_planning(models: tuple[str, ...], announce: Callable[[], None] = lambda: None) -> None:
     """Compile what planning on the CPU needs, in this process and another, unless it is on disk already.
 
     Args:
+        models: The team's.
         announce: Called before it begins, if there is anything to do.
     """
-    from d4orm_env.engine.sampling import score_tiles
+    from d4orm_env.engine.sampling import score_kernel
     from d4orm_env.engine.worlds import roll_out
 
-    if has_to_be_compiled(score_tiles) and has_to_be_compiled(roll_out):
+    if has_to_be_compiled(score_kernel(models)) and has_to_be_compiled(roll_out):
         announce()
         # Should it fail, the kernel is compiled when it is needed, like any other.
-        other = subprocess.Popen([sys.executable, "-c", f"from {__name__} import roll_out_once; roll_out_once()"])
-        _sample_once()
+        other = _in_another_process("roll_out_once()")
+        sample_once((models,))
         other.wait()
+
+
+def _in_another_process(call: str) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, "-c", f"from {__name__} import roll_out_once, sample_once; {call}"])
 
 
 def roll_out_once() -> None:
     """Roll out a plan of the smallest problem on the CPU."""
-    problem = _smallest_problem()
-    shape = (problem.horizon, problem.num_robots, problem.control_size)
-    get_engine("cpu").rollout(problem, np.zeros(shape, np.float32))
+    problem = _smallest_problem(TEAMS[0])
+    get_engine("cpu").rollout(problem, _no_controls(problem))
 
 
-def _sample_once() -> None:
-    problem = _smallest_problem()
-    shape = (problem.horizon, problem.num_robots, problem.control_size)
-    rules = SamplingRules(weights=SoftmaxWeights(1.0))
-    task = SamplingTask(problem, np.zeros(shape, np.float32))
-    get_engine("cpu").prepare(task, rules, np.ones(1, np.float32), 2)
+def sample_once(teams: tuple[tuple[str, ...], ...]) -> None:
+    """Sample once for teams of these models on the CPU."""
+    for models in teams:
+        problem = _smallest_problem(models)
+        task = SamplingTask(problem, _no_controls(problem))
+        rules = SamplingRules(weights=SoftmaxWeights(1.0))
+        get_engine("cpu").prepare(task, rules, np.ones(1, np.float32), 2)
 
 
 def warm_up() -> WarmupReport:
     """Run everything once on the smallest problems.
 
-    One compilation of a kernel serves every problem, so two robots stand for all teams.
+    One compilation of a kernel serves every problem with the same models, so two robots stand for all teams.
     """
     begin = time.perf_counter()
     # Before anything runs: what the other process compiles is in the cache when it is needed here.
-    missing = {kernel.__name__ for kernel in _kernels() if has_to_be_compiled(kernel)}
-    compile_for_planning()
+    missing = [kernel for kernel in _kernels() if has_to_be_compiled(kernel)]
+    # The last kernel, for three models, takes as long as two others.
+    other = _in_another_process(f"roll_out_once(); sample_once({TEAMS[1:-1]})")
+    sample_once((TEAMS[0], TEAMS[-1]))
+    other.wait()
+    sample_once(TEAMS)
     _plan()
     _step_environments()
     seconds = time.perf_counter() - begin
     kernels = [kernel for kernel in _kernels() if kernel.signatures]
-    compiled = tuple(kernel.__name__ for kernel in kernels if kernel.stats.cache_misses or kernel.__name__ in missing)
-    loaded = tuple(kernel.__name__ for kernel in kernels if kernel.__name__ not in compiled)
-    return WarmupReport(seconds, compiled, loaded, tuple(sorted({Path(kernel.stats.cache_path) for kernel in kernels})))
+    compiled = [kernel for kernel in kernels if kernel.stats.cache_misses or kernel in missing]
+    loaded = [kernel for kernel in kernels if kernel not in compiled]
+    return WarmupReport(
+        seconds, tuple(kernel.__name__ for kernel in compiled), tuple(kernel.__name__ for kernel in loaded),
+        tuple(sorted({Path(kernel.stats.cache_path) for kernel in kernels})),
+    )  # fmt: skip
 
 
-def _smallest_problem() -> Problem:
-    return make_problem("circle", num_robots=2, horizon=5)
+def _smallest_problem(models: tuple[str, ...]) -> Problem:
+    team = Team(models)
+    start = np.zeros((team.num_robots, team.state_size))
+    start[:, 0] = np.arange(team.num_robots)
+    return Problem(team, start=start, goal=start[:, : team.dimension] + 1, horizon=5)
+
+
+def _no_controls(problem: Problem) -> FloatArray:
+    return np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
 
 
 def _plan() -> None:
     from d4orm_planners.registry import PLANNERS, make_planner
     from d4orm_planners.sampling.optimizer import SamplingPlanner
 
-    problem = _smallest_problem()
+    problem = _smallest_problem(TEAMS[0])
     # A planner that does not sample has nothing to compile that the others have not.
     for name in (name for name, kind in PLANNERS.items() if issubclass(kind, SamplingPlanner)):
         make_planner(name, engine="cpu", num_samples=32, num_steps=1).solve(problem, max_iterations=1)
@@ -110,7 +135,7 @@ def _step_environments() -> None:
     from d4orm_env import navigation_v0
 
     for arguments in ({}, {"lifelong": True}, {"control_noise_std": 0.1}):
-        env = navigation_v0.parallel_env(problem=_smallest_problem(), **arguments)
+        env = navigation_v0.parallel_env(problem=_smallest_problem(TEAMS[0]), **arguments)
         env.reset(seed=0)
         zero = np.zeros(env.action_space(env.possible_agents[0]).shape, np.float32)
         env.step(dict.fromkeys(env.agents, zero))
@@ -129,8 +154,10 @@ def _kernels() -> list[Any]:
     from numba.core.dispatcher import Dispatcher
 
     from d4orm_env import engine
+    from d4orm_env.engine.sampling import score_kernel
 
     modules = [import_module(f"{engine.__name__}.{module.name}") for module in pkgutil.iter_modules(engine.__path__)
                if module.name != "jax"]  # fmt: skip
     found = {name: value for module in modules for name, value in vars(module).items() if isinstance(value, Dispatcher)}
-    return [kernel for kernel in found.values() if kernel.stats.cache_path is not None]
+    kernels = [*found.values(), *(score_kernel(models) for models in TEAMS)]
+    return [kernel for kernel in kernels if kernel.stats.cache_path is not None]
