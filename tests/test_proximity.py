@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from d4orm_env import World, make_problem
 from d4orm_env.engine import proximity
 from d4orm_env.engine.lanes import BLOCK, TILE
-from d4orm_env.engine.proximity import make_scratch
+from d4orm_env.engine.proximity import make_scratch, static_boxes
 from d4orm_env.engine.tiles import aligned_zeros
 
 
@@ -66,9 +66,7 @@ def test_whoever_is_within_the_margin_is_flagged_and_nobody_else(
     first = 2
     moving = random.uniform(-1.5, 1.5, (first + BLOCK, num_bodies, dimension)).astype(np.float32)
     moving_radius = random.uniform(0.05, 0.3, num_bodies).astype(np.float32)
-    model = "holonomic2d" if dimension == 2 else "holonomic3d"
-    arrays = make_problem("circle", num_robots=num_robots, model=model).arrays
-    scratch, places = make_scratch(arrays, num_bodies), places_of(positions)
+    scratch, places = make_scratch(num_robots, num_bodies, np.empty((2, 0, dimension))), places_of(positions)
     _enclose(radius, margin, dimension, places, scratch)
     _mark(radius, margin, moving, moving_radius, first, count, places, scratch)
 
@@ -102,7 +100,7 @@ def test_obstacles_and_bounds_are_looked_at_where_a_sample_is_near(dimension, se
         **{"circles" if dimension == 2 else "spheres": [[*far[0], 0.5]]},
     )  # fmt: skip
     problem = make_problem("circle", num_robots=2, model=model).replace(world=world)
-    scratch = make_scratch(problem.arrays, 0)
+    scratch = make_scratch(2, 0, static_boxes(problem.arrays))
     place = random.uniform(-8, 10, (2, 1, 1, dimension)) + 0.1 * random.normal(size=(2, BLOCK, TILE, dimension))
     _enclose(problem.arrays.radius, problem.arrays.margin, dimension, places_of(place.astype(np.float32)), scratch)
     for k in range(2):

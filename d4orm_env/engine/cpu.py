@@ -14,7 +14,7 @@ from d4orm_env.engine import noise, sampling
 from d4orm_env.engine.base import SamplingResult, SamplingRules, SamplingTask, StepResult, checked_controls
 from d4orm_env.engine.lanes import TILE
 from d4orm_env.engine.noise import DRAWS, TURNS
-from d4orm_env.engine.proximity import make_scratch
+from d4orm_env.engine.proximity import make_scratch, static_boxes
 from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_env.engine.worlds import WorldBatch, advance_worlds, judge_worlds, observe_world, roll_out, step_worlds
 
@@ -163,21 +163,21 @@ class CpuEngine:
         mean_rewards = np.empty(len(noise_scale), np.float32)
         excluded = 0
         for step, sigma in enumerate(noise_scale):
-            rewards = run.score(step, mean, factor * sigma)
+            scale = factor * sigma
+            rewards = run.score(step, mean, scale)
             mean_rewards[step] = rewards.mean()
             if not np.isfinite(mean_rewards[step]):
                 usable = np.isfinite(rewards)
                 excluded += int(usable.size - usable.sum())
                 mean_rewards[step] = np.where(usable, rewards, 0).sum() / max(usable.sum(), 1)
                 rewards = np.where(usable, rewards, np.float32(-np.inf))
-            extra = (rules.importance * run.log_ratio(mean, factor * sigma),) if rules.importance else ()
+            extra = (rules.importance * run.log_ratio(mean, scale),) if rules.importance else ()
             weights = rules.weights(rewards, np, *extra)
-            first, second = run.moments(step, weights, rules.adapt is not None)
-            new_mean = mean + factor * sigma * first
+            first, second = run.moments(weights, rules.adapt is not None)
+            mean = mean + scale * first
             if rules.adapt is not None:
                 # The square deviation of the samples from their new mean.
-                factor = rules.adapt((factor * sigma) ** 2 * (second - first**2), np).astype(np.float32)
-            mean = new_mean
+                factor = rules.adapt(scale**2 * (second - first**2), np).astype(np.float32)
         return SamplingResult(mean, mean_rewards, excluded)
 
 
@@ -189,6 +189,7 @@ class _Sampling:
         self.task, self.threads = task, threads
         self.arrays = _typed(task.arrays)
         self.kernel = sampling.score_kernel(problem.team.models)
+        self.static = static_boxes(self.arrays)
         self.spaces: dict[int, tuple[Any, Any]] = {}
         self.base = np.ascontiguousarray(task.base, np.float32)
         docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
@@ -209,7 +210,7 @@ class _Sampling:
         if first not in self.spaces:
             num_steps, num_robots, num_controls = self.base.shape
             workspace = sampling.make_workspace(num_steps, num_robots, num_controls, self.arrays.goal.shape[1])
-            self.spaces[first] = workspace, make_scratch(self.arrays, self.moving.shape[1])
+            self.spaces[first] = workspace, make_scratch(num_robots, self.moving.shape[1], self.static)
         return self.spaces[first]
 
     def score(self, step: int, mean: FloatArray, scale: FloatArray) -> FloatArray:
@@ -237,7 +238,7 @@ class _Sampling:
         samples = turns.reshape(num_robots, -1)[:, : self.rewards.shape[1]]
         return -(samples.sum(axis=0, keepdims=True) if self.task.credit == "team" else samples)
 
-    def moments(self, step: int, weights: Any, with_second: bool) -> tuple[FloatArray, FloatArray]:
+    def moments(self, weights: Any, with_second: bool) -> tuple[FloatArray, FloatArray]:
         """``(H, K, m)`` weighted mean of the noise and, if asked for, of its square."""
         num_steps = len(self.base)
         odd, even = _by_counter(np.asarray(weights, np.float32))

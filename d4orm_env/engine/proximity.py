@@ -55,41 +55,38 @@ class Scratch(NamedTuple):
     near: Any
 
 
-def make_scratch(arrays: Any, num_bodies: int) -> Scratch:
-    """Scratch for one thread, in which the boxes of static things are filled."""
-    num_robots, dimension = arrays.goal.shape
-    static = _static_boxes(arrays)
-    first, last = num_robots + num_bodies, num_robots + num_bodies + static.shape[1]
+def make_scratch(num_robots: int, num_bodies: int, static: Any) -> Scratch:
+    """Scratch for one thread, with the boxes of static things, see :func:`static_boxes`."""
+    _, num_static, dimension = static.shape
+    first, last = num_robots + num_bodies, num_robots + num_bodies + num_static
     boxes = tiles.aligned_zeros(last * dimension * BOX)
-    widening = _HALF * arrays.margin + SLACK
-    lanes_of = boxes.reshape(last, dimension, BOX)[first:, :, 2 * TILE :]
-    lanes_of[..., :CHUNK] = static[0][..., None] - widening
-    lanes_of[..., CHUNK:] = static[1][..., None] + widening
+    rows = boxes.reshape(last, dimension, BOX)[first:, :, 2 * TILE :]
+    rows[..., :CHUNK], rows[..., CHUNK:] = static[0][..., None], static[1][..., None]
     return Scratch(
         boxes, np.arange(first, last), np.empty(num_robots, np.int32), np.empty((num_robots, num_robots), np.int32),
         np.empty((num_robots, BLOCK), np.uint64),
     )  # fmt: skip
 
 
-def _static_boxes(arrays: Any) -> Any:
-    """``(2, S, d)`` lower and upper ends of the boxes round obstacles and of what lies beyond each of the bounds."""
+def static_boxes(arrays: Any) -> Any:
+    """``(2, S, d)`` lower and upper ends of the boxes round obstacles and round what lies beyond each of the bounds,
+    widened by half of the margin.
+    """
     dimension = arrays.goal.shape[1]
-    balls, radius = arrays.balls[:, :dimension], arrays.balls[:, dimension:]
-    upright = np.full((len(arrays.cylinders), dimension), _INFINITY)
-    upright[:, :2] = arrays.cylinders[:, 2:]
-    centre = np.zeros_like(upright)
-    centre[:, :2] = arrays.cylinders[:, :2]
-    low = [balls - radius, centre - upright, arrays.boxes[:, :dimension]]
-    high = [balls + radius, centre + upright, arrays.boxes[:, dimension:]]
-    for axis in range(dimension):
-        for side, bound in enumerate(arrays.bounds[:, axis]):
-            if np.isfinite(bound):
-                beyond = np.full((2, 1, dimension), _INFINITY)
-                beyond[0] = -_INFINITY
-                beyond[1 - side, 0, axis] = bound
-                low.append(beyond[0])
-                high.append(beyond[1])
-    return np.array([np.concatenate(low), np.concatenate(high)], np.float32)
+    centres, reaches = [arrays.balls[:, :dimension]], [arrays.balls[:, dimension:]]
+    for x, y, radius in arrays.cylinders:
+        centres.append([(x, y, 0)])
+        reaches.append([(radius, radius, _INFINITY)])
+    low = [*(np.subtract(*pair) for pair in zip(centres, reaches, strict=True)), arrays.boxes[:, :dimension]]
+    high = [*(np.add(*pair) for pair in zip(centres, reaches, strict=True)), arrays.boxes[:, dimension:]]
+    for side, axis in np.argwhere(np.isfinite(arrays.bounds)):
+        beyond = np.full((2, 1, dimension), _INFINITY)
+        beyond[0] = -_INFINITY
+        beyond[1 - side, 0, axis] = arrays.bounds[side, axis]
+        low.append(beyond[0])
+        high.append(beyond[1])
+    widening = _HALF * arrays.margin + SLACK
+    return np.array([np.concatenate(low) - widening, np.concatenate(high) + widening], np.float32)
 
 
 @inlined
