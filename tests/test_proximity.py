@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from d4orm_env import World, make_problem
 from d4orm_env.engine import proximity
 from d4orm_env.engine.lanes import BLOCK, TILE
-from d4orm_env.engine.proximity import make_scratch, static_boxes
+from d4orm_env.engine.proximity import body_boxes, make_scratch, static_boxes
 from d4orm_env.engine.tiles import aligned_zeros
 
 
@@ -20,20 +20,20 @@ def _enclose(radius, margin, dimension, places, scratch):
 
 
 @numba.njit
-def _mark(radius, margin, moving, moving_radius, first, count, places, scratch):
-    proximity.mark_robots(radius, margin, moving, moving_radius, first, count, places, scratch)
+def _mark(radius, margin, moving, moving_radius, boxes, first, count, places, scratch):
+    proximity.mark_robots(radius, margin, moving, moving_radius, boxes, first, count, places, scratch)
 
 
 @numba.njit
-def _near_static(k, dimension, scratch):
-    return proximity.near_static(k, dimension, scratch)
+def _near_static(k, dimension, static, scratch):
+    return proximity.near_static(k, dimension, static, scratch.boxes)
 
 
 def places_of(positions):
     """Positions ``(K, BLOCK, TILE, d)`` in the kernel's rows."""
     rows = positions.transpose(0, 1, 3, 2).ravel()
-    places = aligned_zeros(rows.size + TILE)
-    places[: rows.size] = rows
+    places = aligned_zeros(rows.size)
+    places[:] = rows
     return places
 
 
@@ -63,16 +63,17 @@ def test_whoever_is_within_the_margin_is_flagged_and_nobody_else(
     if broken:
         positions[0, :, random.integers(TILE)] = random.choice([np.nan, np.inf, -np.inf])
     radius, margin = random.uniform(0.05, 0.3, num_robots).astype(np.float32), np.float32(0.05)
-    first = 2
-    moving = random.uniform(-1.5, 1.5, (first + BLOCK, num_bodies, dimension)).astype(np.float32)
+    first = BLOCK
+    moving = random.uniform(-1.5, 1.5, (first + count, num_bodies, dimension)).astype(np.float32)
     moving_radius = random.uniform(0.05, 0.3, num_bodies).astype(np.float32)
-    scratch, places = make_scratch(num_robots, num_bodies, np.empty((2, 0, dimension))), places_of(positions)
+    scratch, places = make_scratch(num_robots, dimension), places_of(positions)
     _enclose(radius, margin, dimension, places, scratch)
-    _mark(radius, margin, moving, moving_radius, first, count, places, scratch)
+    boxes = body_boxes(moving, moving_radius, margin)
+    _mark(radius, margin, moving, moving_radius, boxes, first, count, places, scratch)
 
-    things = [*positions.astype(np.float64), *np.broadcast_to(
-        moving[first:].astype(np.float64).transpose(1, 0, 2)[:, :, None], (num_bodies, BLOCK, TILE, dimension)
-    )]  # fmt: skip
+    steps = np.minimum(first + np.arange(BLOCK), first + count - 1)
+    bodies = moving[steps].astype(np.float64).transpose(1, 0, 2)[:, :, None]
+    things = [*positions.astype(np.float64), *np.broadcast_to(bodies, (num_bodies, BLOCK, TILE, dimension))]
     reach = np.concatenate([radius, moving_radius]).astype(np.float64)
     flagged = bits(scratch.near)
     for k in range(num_robots):
@@ -100,7 +101,7 @@ def test_obstacles_and_bounds_are_looked_at_where_a_sample_is_near(dimension, se
         **{"circles" if dimension == 2 else "spheres": [[*far[0], 0.5]]},
     )  # fmt: skip
     problem = make_problem("circle", num_robots=2, model=model).replace(world=world)
-    scratch = make_scratch(2, 0, static_boxes(problem.arrays))
+    scratch, static = make_scratch(2, dimension), static_boxes(problem.arrays)
     place = random.uniform(-8, 10, (2, 1, 1, dimension)) + 0.1 * random.normal(size=(2, BLOCK, TILE, dimension))
     _enclose(problem.arrays.radius, problem.arrays.margin, dimension, places_of(place.astype(np.float32)), scratch)
     for k in range(2):
@@ -111,6 +112,6 @@ def test_obstacles_and_bounds_are_looked_at_where_a_sample_is_near(dimension, se
         if dimension == 3:
             gaps.append(np.linalg.norm(place[k][..., :2] - far[2, :2], axis=-1) - 0.4)
         if min(gap.min() for gap in gaps) < reach - 1e-5:
-            assert _near_static(k, dimension, scratch)
+            assert _near_static(k, dimension, static, scratch)
         if min(gap.min() for gap in gaps) > 1.5 + reach:
-            assert not _near_static(k, dimension, scratch)
+            assert not _near_static(k, dimension, static, scratch)

@@ -14,7 +14,7 @@ from d4orm_env.engine import noise, sampling
 from d4orm_env.engine.base import SamplingResult, SamplingRules, SamplingTask, StepResult, checked_controls
 from d4orm_env.engine.lanes import TILE
 from d4orm_env.engine.noise import DRAWS, TURNS
-from d4orm_env.engine.proximity import make_scratch, static_boxes
+from d4orm_env.engine.proximity import body_boxes, make_scratch, static_boxes
 from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_env.engine.worlds import WorldBatch, advance_worlds, judge_worlds, observe_world, roll_out, step_worlds
 
@@ -189,7 +189,6 @@ class _Sampling:
         self.task, self.threads = task, threads
         self.arrays = _typed(task.arrays)
         self.kernel = sampling.score_kernel(problem.team.models)
-        self.static = static_boxes(self.arrays)
         self.spaces: dict[int, tuple[Any, Any]] = {}
         self.base = np.ascontiguousarray(task.base, np.float32)
         docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
@@ -200,6 +199,8 @@ class _Sampling:
         else:
             self.moving = np.ascontiguousarray(task.moving.positions, np.float32)
             self.moving_radius = np.ascontiguousarray(task.moving.radius, np.float32)
+        self.static = static_boxes(self.arrays)
+        self.body_boxes = body_boxes(self.moving, self.moving_radius, self.arrays.margin)
         self.seed = np.array(noise.seed_words(seed), np.uint32)
         self.rewards = np.empty((problem.num_robots, num_samples), np.float32)
         num_tiles, pairs = -(-num_samples // TILE), (problem.control_size + 1) // 2
@@ -208,9 +209,9 @@ class _Sampling:
     def space(self, first: int) -> tuple[Any, Any]:
         """Workspace and scratch of the thread whose tiles begin with this number."""
         if first not in self.spaces:
-            num_steps, num_robots, num_controls = self.base.shape
-            workspace = sampling.make_workspace(num_steps, num_robots, num_controls, self.arrays.goal.shape[1])
-            self.spaces[first] = workspace, make_scratch(num_robots, self.moving.shape[1], self.static)
+            (num_steps, num_robots, num_controls), dimension = self.base.shape, self.arrays.goal.shape[1]
+            workspace = sampling.make_workspace(num_steps, num_robots, num_controls, dimension)
+            self.spaces[first] = workspace, make_scratch(num_robots, dimension)
         return self.spaces[first]
 
     def score(self, step: int, mean: FloatArray, scale: FloatArray) -> FloatArray:
@@ -221,7 +222,8 @@ class _Sampling:
             num_tiles,
             lambda part: self.kernel(
                 self.arrays, offset, scale, self.docked, self.task.collisions, np.float32(self.task.penalty),
-                self.moving, self.moving_radius, self.seed, step, part, *self.space(part[0]), self.kept, self.rewards,
+                self.moving, self.moving_radius, self.body_boxes, self.static, self.seed, step, part,
+                *self.space(part[0]), self.kept, self.rewards,
             ),
         )  # fmt: skip
         return self.rewards.mean(axis=0, keepdims=True) if self.task.credit == "team" else self.rewards

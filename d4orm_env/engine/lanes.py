@@ -157,8 +157,37 @@ def _overlap(dimension: int, width: int, begin: int) -> Any:
     return overlap
 
 
+def _meets(dimension: int) -> Any:
+    """``(boxes, a, limits, b) -> bool``: whether in any lane the boxes from ``boxes[a]`` on touch one more box, whose
+    lower and upper end along the first axis, and then along the others, are the numbers from ``limits[b]`` on.
+    """
+
+    @intrinsic
+    def meets(typing_context: Any, boxes: Any, a: Any, limits: Any, b: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            array, offset, others, first = arguments
+            data = context.make_array(signature.args[2])(context, builder, others).data
+            touch = ir.Constant(ir.VectorType(ir.IntType(1), CHUNK), [1] * CHUNK)
+            for axis in range(dimension):
+                low, high = (
+                    _splat(builder, builder.load(builder.gep(data, [builder.add(first, ir.Constant(first.type, i))])))
+                    for i in (2 * axis, 2 * axis + 1)
+                )
+                row = axis * BOX + 2 * TILE
+                lower = _load(context, builder, signature.args[0], array, offset, row)
+                upper = _load(context, builder, signature.args[0], array, offset, row + CHUNK)
+                touch = builder.and_(touch, builder.fcmp_ordered("<=", lower, high))
+                touch = builder.and_(touch, builder.fcmp_ordered("<=", low, upper))
+            return builder.icmp_unsigned("!=", builder.bitcast(touch, _BITS), ir.Constant(_BITS, 0))
+
+        return types.boolean(boxes, types.int64, limits, types.int64), generate
+
+    return meets
+
+
 worlds_overlap_2, worlds_overlap_3 = _overlap(2, TILE, 0), _overlap(3, TILE, 0)
 lanes_overlap_2, lanes_overlap_3 = _overlap(2, CHUNK, 2 * TILE), _overlap(3, CHUNK, 2 * TILE)
+lanes_meet_2, lanes_meet_3 = _meets(2), _meets(3)
 
 
 @intrinsic

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from d4orm_env.core.arrays import FloatArray
 from d4orm_env.engine import lanes, tiles
 from d4orm_env.engine.lanes import (
     BLOCK,
@@ -20,6 +21,8 @@ from d4orm_env.engine.lanes import (
     TILE,
     chunk_within_2,
     chunk_within_3,
+    lanes_meet_2,
+    lanes_meet_3,
     lanes_overlap_2,
     lanes_overlap_3,
     use_wide_registers,
@@ -37,40 +40,36 @@ _HALF = np.float32(0.5)
 
 
 class Scratch(NamedTuple):
-    """What a tile notes of ``K`` robots, ``O`` moving bodies and ``S`` static things, numbered in this order.
+    """What a tile notes of ``K`` robots.
 
     Attributes:
-        boxes: ``((K + O + S) d BOX,)`` where everything is within a block, see :func:`~d4orm_env.engine.lanes.enclose`,
-            widened so that what is within the margin of each other touches. Only robots have boxes world by world.
-        static: ``(S,)`` numbers of the static things.
+        boxes: ``(K d BOX,)`` where the robots are within a block, see :func:`~d4orm_env.engine.lanes.enclose`, widened
+            so that what is within the margin of each other touches.
         num_robots: ``(K,)`` how many robots before it each may touch,
         robots: ``(K, K)`` and which.
         near: ``(K, BLOCK)`` who is near a robot or a body at which step of the block, a bit for every sample.
+        spare: ``(TILE,)`` a row to overwrite.
     """
 
     boxes: Any
-    static: Any
     num_robots: Any
     robots: Any
     near: Any
+    spare: Any
 
 
-def make_scratch(num_robots: int, num_bodies: int, static: Any) -> Scratch:
-    """Scratch for one thread, with the boxes of static things, see :func:`static_boxes`."""
-    _, num_static, dimension = static.shape
-    first, last = num_robots + num_bodies, num_robots + num_bodies + num_static
-    boxes = tiles.aligned_zeros(last * dimension * BOX)
-    rows = boxes.reshape(last, dimension, BOX)[first:, :, 2 * TILE :]
-    rows[..., :CHUNK], rows[..., CHUNK:] = static[0][..., None], static[1][..., None]
+def make_scratch(num_robots: int, dimension: int) -> Scratch:
+    """Scratch for one thread."""
     return Scratch(
-        boxes, np.arange(first, last), np.empty(num_robots, np.int32), np.empty((num_robots, num_robots), np.int32),
-        np.empty((num_robots, BLOCK), np.uint64),
+        tiles.aligned_zeros(num_robots * dimension * BOX), np.empty(num_robots, np.int32),
+        np.empty((num_robots, num_robots), np.int32), np.empty((num_robots, BLOCK), np.uint64),
+        tiles.aligned_zeros(TILE),
     )  # fmt: skip
 
 
-def static_boxes(arrays: Any) -> Any:
-    """``(2, S, d)`` lower and upper ends of the boxes round obstacles and round what lies beyond each of the bounds,
-    widened by half of the margin.
+def static_boxes(arrays: Any) -> FloatArray:
+    """``(S, d, 2)`` ends of the boxes round obstacles and round what lies beyond each of the bounds, widened by half of
+    the margin.
     """
     dimension = arrays.goal.shape[1]
     centres, reaches = [arrays.balls[:, :dimension]], [arrays.balls[:, dimension:]]
@@ -85,8 +84,28 @@ def static_boxes(arrays: Any) -> Any:
         beyond[1 - side, 0, axis] = arrays.bounds[side, axis]
         low.append(beyond[0])
         high.append(beyond[1])
-    widening = _HALF * arrays.margin + SLACK
-    return np.array([np.concatenate(low) - widening, np.concatenate(high) + widening], np.float32)
+    return _widened(np.concatenate(low), np.concatenate(high), arrays.margin)
+
+
+def body_boxes(moving: FloatArray, radius: FloatArray, margin: Any) -> FloatArray:
+    """``(B, O, d, 2)`` ends of the boxes round moving bodies in each of the blocks of a horizon, widened by half of the
+    margin.
+
+    Args:
+        moving: ``(H, O, d)`` places of the bodies.
+        radius: ``(O,)``.
+        margin: The margin.
+    """
+    num_steps, num_blocks = len(moving), -(-len(moving) // BLOCK)
+    # A last block that is short goes on with its last place.
+    blocks = moving[np.minimum(np.arange(num_blocks * BLOCK), num_steps - 1)]
+    blocks = blocks.reshape(num_blocks, BLOCK, *moving.shape[1:])
+    return _widened(blocks.min(axis=1) - radius[:, None], blocks.max(axis=1) + radius[:, None], margin)
+
+
+def _widened(low: Any, high: Any, margin: Any) -> FloatArray:
+    widening = _HALF * margin + SLACK
+    return np.ascontiguousarray(np.stack([low - widening, high + widening], axis=-1), np.float32)
 
 
 @inlined
@@ -99,14 +118,6 @@ def place_of(k: Any, step: Any, dimension: Any) -> Any:
 def box_of(thing: Any, dimension: Any) -> Any:
     """Where the rows of a thing's boxes begin."""
     return thing * dimension * BOX
-
-
-@inlined
-def _fill(low: Any, high: Any, thing: Any, axis: Any, dimension: Any, boxes: Any) -> None:
-    """Make a thing's boxes in all lanes reach from ``low`` to ``high`` along an axis; it has none world by world."""
-    begin = box_of(thing, dimension) + axis * BOX + 2 * TILE
-    boxes[begin : begin + CHUNK] = low
-    boxes[begin + CHUNK : begin + 2 * CHUNK] = high
 
 
 @inlined
@@ -142,15 +153,11 @@ def _near_pair(reach: Any, a: Any, b: Any, dimension: Any, places: Any) -> Any:
 
 
 @inlined
-def _enclose_bodies(moving: Any, radius: Any, margin: Any, first: Any, count: Any, thing: Any, boxes: Any) -> None:
-    """Fill the boxes of moving bodies in this block, from number ``thing`` on."""
-    for body in range(moving.shape[1]):
-        widening = radius[body] + _HALF * margin + SLACK
-        for axis in range(moving.shape[2]):
-            low = high = moving[first, body, axis]
-            for t in range(first + 1, first + count):
-                low, high = min(low, moving[t, body, axis]), max(high, moving[t, body, axis])
-            _fill(low - widening, high + widening, thing + body, axis, moving.shape[2], boxes)
+def _meets(k: Any, thing: Any, dimension: Any, boxes: Any, limits: Any) -> Any:
+    """Whether robot ``k`` may touch, in any lane, the thing of this number in ``limits`` ``(. d 2,)``."""
+    if dimension == 2:
+        return lanes_meet_2(boxes, box_of(k, dimension), limits, thing * 4)
+    return lanes_meet_3(boxes, box_of(k, dimension), limits, thing * 6)
 
 
 @compiled
@@ -186,25 +193,23 @@ def _mark_listed(radius: Any, margin: Any, dimension: Any, places: Any, s: Any) 
 
 @compiled
 def _mark_bodies(
-    radius: Any, margin: Any, moving: Any, moving_radius: Any, first: Any, count: Any, places: Any, s: Any
+    radius: Any, margin: Any, moving: Any, moving_radius: Any, boxes: Any, first: Any, count: Any, places: Any, s: Any
 ) -> None:
     """Flag robots within the margin of moving bodies."""
-    num_robots, dimension = radius.shape[0], moving.shape[2]
-    _enclose_bodies(moving, moving_radius, margin, first, count, num_robots, s.boxes)
-    for k in range(num_robots):
-        for body in range(moving.shape[1]):
-            if _overlap(k, num_robots + body, dimension, s.boxes):
+    _, num_bodies, dimension = moving.shape
+    limits, before = boxes.reshape(-1), first // BLOCK * num_bodies
+    for k in range(radius.shape[0]):
+        for body in range(num_bodies):
+            if _meets(k, before + body, dimension, s.boxes, limits):
                 reach = radius[k] + moving_radius[body] + margin
                 for step in range(count):
-                    s.near[k, step] |= tiles.near_round(
-                        reach, moving[first + step, body], dimension, place_of(k, step, dimension),
-                        place_of(num_robots, 0, dimension), places,
-                    )  # fmt: skip
+                    rows = places[place_of(k, step, dimension) : place_of(k, step + 1, dimension)]
+                    s.near[k, step] |= tiles.near_round(reach, moving[first + step, body], dimension, rows, s.spare)
 
 
 @inlined
 def mark_robots(
-    radius: Any, margin: Any, moving: Any, moving_radius: Any, first: Any, count: Any, places: Any, s: Any
+    radius: Any, margin: Any, moving: Any, moving_radius: Any, boxes: Any, first: Any, count: Any, places: Any, s: Any
 ) -> None:
     """Flag in ``s.near`` robots within the margin of each other or of a body in a block.
 
@@ -213,9 +218,10 @@ def mark_robots(
         margin: The margin.
         moving: ``(H, O, d)`` places of the bodies.
         moving_radius: ``(O,)``.
+        boxes: ``(B, O, d, 2)`` see :func:`body_boxes`.
         first: Time of the block's first step.
         count: Steps in the block; of later ones the flags mean nothing.
-        places: Rows of places, see :func:`place_of`, and a spare one.
+        places: Rows of places, see :func:`place_of`.
         s: Scratch with the boxes of the robots in this block.
     """
     s.near[:] = NOWHERE
@@ -223,13 +229,13 @@ def mark_robots(
     _list_near(dimension, s)
     _mark_listed(radius, margin, dimension, places, s)
     if moving.shape[1] > 0:
-        _mark_bodies(radius, margin, moving, moving_radius, first, count, places, s)
+        _mark_bodies(radius, margin, moving, moving_radius, boxes, first, count, places, s)
 
 
 @inlined
-def near_static(k: Any, dimension: Any, s: Any) -> Any:
-    """Whether any sample of robot ``k`` may be within the margin of an obstacle or the bounds in this block."""
-    touch = False
-    for thing in s.static:
-        touch |= _overlap(k, thing, dimension, s.boxes)
+def near_static(k: Any, dimension: Any, static: Any, boxes: Any) -> Any:
+    """Whether any sample of robot ``k`` may be within the margin of a static thing, ``(S, d, 2)``, in this block."""
+    limits, touch = static.reshape(-1), False
+    for thing in range(static.shape[0]):
+        touch |= _meets(k, thing, dimension, boxes, limits)
     return touch

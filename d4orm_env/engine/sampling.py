@@ -55,7 +55,7 @@ class Workspace(NamedTuple):
 
     Attributes:
         w: ``(K STRIDE,)`` the robots.
-        places: Their places in a block, see :func:`~d4orm_env.engine.proximity.place_of`, and a spare row.
+        places: Their places in a block, see :func:`~d4orm_env.engine.proximity.place_of`.
         draws: ``(BLOCK 4 DRAWS,)`` one robot's noise in a block.
         controls: ``(BLOCK CONTROL_ROWS TILE,)`` one robot's controls in a block.
         keys: ``(2, K H P)`` keys of the noise streams, ``P`` pairs of components each.
@@ -73,7 +73,7 @@ class Workspace(NamedTuple):
 def make_workspace(num_steps: int, num_robots: int, num_controls: int, dimension: int) -> Workspace:
     """A workspace."""
     return Workspace(
-        tiles.aligned_zeros(num_robots * STRIDE), tiles.aligned_zeros((num_robots * BLOCK * dimension + 1) * TILE),
+        tiles.aligned_zeros(num_robots * STRIDE), tiles.aligned_zeros(num_robots * BLOCK * dimension * TILE),
         tiles.aligned_zeros(BLOCK * 4 * DRAWS), tiles.aligned_zeros(BLOCK * CONTROL_ROWS * TILE),
         np.empty((2, num_robots * num_steps * ((num_controls + 1) // 2)), np.uint32), np.empty(num_robots, np.bool_),
     )  # fmt: skip
@@ -314,10 +314,11 @@ def _stay(dimension: Any, w: Any, places: Any) -> None:
 @inlined
 def _score_tile(
     run_robot: Any, arrays: Any, offset: Any, scale: Any, docked: Any, collisions: Any, penalty: Any, moving: Any,
-    moving_radius: Any, keys: Any, counter: Any, kept: Any, space: Any, scratch: Any,
+    moving_radius: Any, body_boxes: Any, static: Any, counter: Any, kept: Any, space: Any, scratch: Any,
 ) -> None:  # fmt: skip
     """Roll out a tile of samples, noise beginning with this counter; leave summed rewards in rows TOTAL."""
     w, places, draws, controls, standing = space.w, space.places, space.draws, space.controls, space.standing
+    keys = space.keys
     num_steps, num_robots, num_controls = offset.shape
     num_pairs = (num_controls + 1) // 2
     # Taken out of the tuple once: every access counts a reference, which costs as much as several samples.
@@ -355,16 +356,14 @@ def _score_tile(
                 rest = num_steps - (first + count)
                 _add_standing(goals[k], inverse[k], np.float32(rest), robot)
             enclose(k, radius[k] + HALF * margin, dimension, places, boxes)
-            if near_static(k, dimension, scratch):
+            if near_static(k, dimension, static, boxes):
                 for step in range(count):
-                    touch = tiles.near_obstacles(
-                        arrays, radius[k] + margin, place_of(k, step, dimension), place_of(num_robots, 0, dimension),
-                        places,
-                    )  # fmt: skip
+                    rows = own_places[step * dimension * TILE : (step + 1) * dimension * TILE]
+                    touch = tiles.near_obstacles(arrays, radius[k] + margin, rows, scratch.spare)
                     steps = np.float32(1 + rest if step == count - 1 else 1)
                     subtract_where(robot, TOTAL * TILE, touch, steps * penalty)
         if collisions:
-            mark_robots(radius, margin, moving, moving_radius, first, count, places, scratch)
+            mark_robots(radius, margin, moving, moving_radius, body_boxes, first, count, places, scratch)
             for k in range(num_robots):
                 for step in range(count):
                     if near[k, step] != NOWHERE:
@@ -388,14 +387,15 @@ def _fill_keys(seed: Any, step: Any, num_robots: Any, num_steps: Any, num_pairs:
 @inlined
 def _score_tiles(
     run_robot: Any, arrays: Any, offset: Any, scale: Any, docked: Any, collisions: Any, penalty: Any, moving: Any,
-    moving_radius: Any, seed: Any, step: Any, tile_range: Any, space: Any, scratch: Any, kept: Any, rewards: Any,
+    moving_radius: Any, body_boxes: Any, static: Any, seed: Any, step: Any, tile_range: Any, space: Any, scratch: Any,
+    kept: Any, rewards: Any,
 ) -> None:  # fmt: skip
     num_robots, num_samples = rewards.shape
     _fill_keys(seed, step, num_robots, kept.shape[2], kept.shape[3], space.keys)
     for index in range(tile_range[0], tile_range[1]):
         first = index * TILE
         _score_tile(
-            run_robot, arrays, offset, scale, docked, collisions, penalty, moving, moving_radius, space.keys,
+            run_robot, arrays, offset, scale, docked, collisions, penalty, moving, moving_radius, body_boxes, static,
             index * DRAWS, kept.reshape(-1), space, scratch,
         )  # fmt: skip
         for k in range(num_robots):
@@ -421,6 +421,7 @@ def score_kernel(models: tuple[str, ...]) -> Any:
     - ``penalty``: What a violation costs per step.
     - ``moving``: ``(H, O, d)`` places of moving bodies after every step.
     - ``moving_radius``: ``(O,)``.
+    - ``body_boxes``, ``static``: Boxes of moving bodies and static things, see :mod:`~d4orm_env.engine.proximity`.
     - ``seed``: Two uint32 words.
     - ``step``: Number of the denoising step.
     - ``tile_range``: First tile and the one after the last.
@@ -442,12 +443,13 @@ def _score_kernel(models: tuple[str, ...]) -> Any:
     @cached_kernel(SOURCES + ",".join(models), **OPTIONS)
     def score_tiles(
         arrays: Any, offset: Any, scale: Any, docked: Any, collisions: Any, penalty: Any, moving: Any,
-        moving_radius: Any, seed: Any, step: Any, tile_range: Any, space: Any, scratch: Any, kept: Any, rewards: Any,
+        moving_radius: Any, body_boxes: Any, static: Any, seed: Any, step: Any, tile_range: Any, space: Any,
+        scratch: Any, kept: Any, rewards: Any,
     ) -> None:  # fmt: skip
         use_wide_registers()
         _score_tiles(
-            run_robot, arrays, offset, scale, docked, collisions, penalty, moving, moving_radius, seed, step,
-            tile_range, space, scratch, kept, rewards,
+            run_robot, arrays, offset, scale, docked, collisions, penalty, moving, moving_radius, body_boxes, static,
+            seed, step, tile_range, space, scratch, kept, rewards,
         )  # fmt: skip
 
     return score_tiles

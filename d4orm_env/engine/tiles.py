@@ -337,52 +337,54 @@ def mark_pairs(arrays: Any, extra: Any, w: Any, near: Any) -> None:
 
 
 @inlined
-def near_round(reach: Any, centre: Any, axes: Any, place: Any, spare: Any, w: Any) -> Any:
-    """Where the rows from ``place`` on are within ``reach`` of a centre, over the first two or three axes; the row at
-    ``spare`` is overwritten.
+def near_round(reach: Any, centre: Any, axes: Any, places: Any, spare: Any) -> Any:
+    """Where the first rows of ``places`` are within ``reach`` of a centre, over two or three axes.
+
+    ``spare`` is a row to overwrite.
     """
     if axes == 2:
         point = (centre[0], centre[1])
         for s in range(TILE):
-            w[spare + s] = _squared_gap2(_read2(w, place, s), point)
+            spare[s] = _squared_gap2(_read2(places, 0, s), point)
     else:
         spot = (centre[0], centre[1], centre[2])
         for s in range(TILE):
-            w[spare + s] = _squared_gap3(_read3(w, place, s), spot)
-    return at_most(w, spare, reach * reach)
+            spare[s] = _squared_gap3(_read3(places, 0, s), spot)
+    return at_most(spare, 0, reach * reach)
 
 
 @inlined
-def _near_box(reach: Any, box: Any, dimension: Any, place: Any, spare: Any, w: Any) -> Any:
+def _near_box(reach: Any, box: Any, dimension: Any, places: Any, spare: Any) -> Any:
     for s in range(TILE):
         gap2 = ZERO
         for axis in range(dimension):
-            gap = collision.axis_gap(w[place + axis * TILE + s], box[axis], box[dimension + axis], ZERO, OPS)
+            gap = collision.axis_gap(places[axis * TILE + s], box[axis], box[dimension + axis], ZERO, OPS)
             gap2 += gap * gap
-        w[spare + s] = gap2
-    return at_most(w, spare, reach * reach)
+        spare[s] = gap2
+    return at_most(spare, 0, reach * reach)
 
 
 @inlined
-def near_obstacles(arrays: Any, reach: Any, place: Any, spare: Any, w: Any) -> Any:
-    """Where a body of this reach, its centre in the rows from ``place`` on, touches an obstacle or the bounds.
+def near_obstacles(arrays: Any, reach: Any, places: Any, spare: Any) -> Any:
+    """Where a body of this reach, its centre in the first rows of ``places``, touches an obstacle or the bounds.
 
-    The row at ``spare`` is overwritten.
+    ``spare`` is a row to overwrite.
     """
     dimension = arrays.goal.shape[1]
     mask = NOWHERE
     for i in range(arrays.balls.shape[0]):
-        mask |= near_round(reach + arrays.balls[i, dimension], arrays.balls[i], dimension, place, spare, w)
+        mask |= near_round(reach + arrays.balls[i, dimension], arrays.balls[i], dimension, places, spare)
     for i in range(arrays.cylinders.shape[0]):
-        mask |= near_round(reach + arrays.cylinders[i, 2], arrays.cylinders[i], 2, place, spare, w)
+        mask |= near_round(reach + arrays.cylinders[i, 2], arrays.cylinders[i], 2, places, spare)
     for i in range(arrays.boxes.shape[0]):
-        mask |= _near_box(reach, arrays.boxes[i], dimension, place, spare, w)
+        mask |= _near_box(reach, arrays.boxes[i], dimension, places, spare)
     for axis in range(dimension):
         lower, upper = arrays.bounds[0, axis], arrays.bounds[1, axis]
         if lower > -np.inf or upper < np.inf:
+            row = places[axis * TILE : (axis + 1) * TILE]
             for s in range(TILE):
-                w[spare + s] = ZERO if collision.leaves(w[place + axis * TILE + s], reach, lower, upper) else ONE
-            mask |= at_most(w, spare, ZERO)
+                spare[s] = ZERO if collision.leaves(row[s], reach, lower, upper) else ONE
+            mask |= at_most(spare, 0, ZERO)
     return mask
 
 

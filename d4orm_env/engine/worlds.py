@@ -106,8 +106,9 @@ def _judge(
         flags = collided if level == 0 else violated
         tiles.mark_pairs(arrays, extra, w, near)
         for k in range(num_robots):
-            place, spare = k * STRIDE + STATE * TILE, k * STRIDE + SPARE * TILE
-            near[k, OBSTACLE] |= tiles.near_obstacles(arrays, arrays.radius[k] + extra, place, spare, w)
+            robot = w[k * STRIDE : (k + 1) * STRIDE]
+            places, spare = robot[STATE * TILE : CONTROL * TILE], robot[SPARE * TILE : (SPARE + 1) * TILE]
+            near[k, OBSTACLE] |= tiles.near_obstacles(arrays, arrays.radius[k] + extra, places, spare)
         for s in range(min(TILE, collided.shape[0] - first)):
             for k in range(num_robots):
                 flags[first + s, k] = _bit(near[k, ROBOT] | near[k, OBSTACLE], s) != NOWHERE

@@ -101,6 +101,9 @@ QUICK: dict[str, Any] = {
 }
 """What differs in a benchmark of about a minute, for a first look."""
 
+FIRST_STEPS = 5
+"""Steps at the largest noise that are run together to time one."""
+
 Part = tuple[str, str, Callable[[], Any]]
 
 
@@ -154,8 +157,10 @@ def _measure_denoising(
     planner: Any = make_planner("d4orm", num_steps=settings.num_steps)
     noise_scale = planner.noise_scale()
     timed = partial(measure, repetitions=settings.repetitions, time_limit=settings.time_limit)
-    step = timed(lambda: run(noise_scale[:1], True))
-    free = timed(lambda: run(noise_scale[:1], False))
+    # Steps in a row, because what a run begins with is no part of a step.
+    first = np.repeat(noise_scale[:1], FIRST_STEPS)
+    step = timed(lambda: run(first, True)).times(1 / FIRST_STEPS)
+    free = timed(lambda: run(first, False)).times(1 / FIRST_STEPS)
     expected = step.median * settings.num_steps
     iteration = timed(lambda: run(noise_scale, True)) if expected <= settings.iteration_limit else None
     robot_steps = settings.num_samples * settings.horizon * num_robots
