@@ -21,8 +21,8 @@ from d4orm_planners.plan import IterationRecord, Plan
 
 Callback = Callable[[IterationRecord], Any]
 
-PLAN_REACH = 1000.0
-"""Times its limit that a planned control may be. What went on from its last result for ever would overflow."""
+PLAN_REACH = 1e15
+"""Times its limit that a planned control may be, so that no square of it overflows: some methods scale theirs up."""
 
 
 class Stopwatch:
