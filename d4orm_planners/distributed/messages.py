@@ -89,8 +89,8 @@ def decode(data: bytes, problem: Problem, num_nodes: int) -> Message:
         num_nodes: Nodes are numbered below it.
 
     Raises:
-        MessageError: If it is anything but a message of this version with finite controls within reach of their limits
-            for this problem from one of the nodes.
+        MessageError: If it is anything but a message of this version with finite controls, none beyond
+            :data:`~d4orm_planners.base.PLAN_REACH`, for this problem from one of the nodes.
     """
     if len(data) > MAX_BYTES:
         raise MessageError("too_large", f"{len(data)} bytes; at most {MAX_BYTES} are read")
@@ -128,5 +128,5 @@ def _checked(controls: FloatArray, shape: tuple[int, ...], reward: float, proble
         raise MessageError("not_finite", "a control or the reward is not finite")
     controls = controls.reshape(shape)
     if (np.abs(controls) > PLAN_REACH * problem.team.control_limits).any():
-        raise MessageError("limits", f"a control exceeds its limit by more than {PLAN_REACH:g} times")
+        raise MessageError("limits", f"a control is more than {PLAN_REACH:g} times its limit")
     return controls

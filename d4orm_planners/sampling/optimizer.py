@@ -37,7 +37,7 @@ class SamplingConfig(PlannerConfig):
             part of a sample by the robot's own reward, which keeps the signal from diluting with the number of robots;
             ``"alternate"`` does the second in the first iteration, the first in the next, and so on.
         clip_between_iterations: Start the next iteration from the controls as executed, inside the limits, rather than
-            as the last one left them. They are zero once docked in both.
+            as the last one left them. Either way they are zero once docked.
     """
 
     num_samples: int = 1024
