@@ -22,8 +22,8 @@ class D4ormConfig(SamplingConfig):
         num_steps: ``N``.
         credit: ``"alternate"`` by default: per-robot weights find their way soonest. Where robots must yield to each
             other, which no robot's own reward asks of it, the next iteration's team weights do.
-        clip_between_iterations: True by default: with the default's credit it solves slightly sooner. The paper clips in
-            the rollout only.
+        clip_between_iterations: True by default: with the default's credit that solves slightly sooner. The paper clips
+            in the rollout only.
         random_start: Start every deformation from ``U_N ~ N(0, I)``, as Algorithm 1 is written, rather than from zero.
             The code that the paper's authors published starts from zero, and so does the preset: it solves more.
     """
