@@ -21,6 +21,9 @@ from d4orm_planners.plan import IterationRecord, Plan
 
 Callback = Callable[[IterationRecord], Any]
 
+PLAN_REACH = 1e15
+"""Times its limit that a planned control may be, so that no square of it overflows: some methods scale theirs up."""
+
 
 class Stopwatch:
     """Wall time of a solve, without the time spent compiling."""
@@ -88,12 +91,14 @@ class Candidate:
     """Controls and what they lead to.
 
     Attributes:
+        planned: ``(H, K, m)`` as the method left them, at most :data:`PLAN_REACH` times the limits; zero once docked.
         controls: ``(H, K, m)`` as executed: inside the limits, zero once docked.
         trajectory: Their rollout.
         solved: Whether everyone arrives, the margin is kept at every step, and :func:`d4orm_env.verify` agrees.
         failed: ``(K,)`` robots that do not arrive, or violate the margin at some step.
     """
 
+    planned: FloatArray
     controls: FloatArray
     trajectory: Trajectory
     solved: bool
@@ -108,11 +113,14 @@ class Candidate:
 
 def evaluate_controls(engine: Engine, problem: Problem, controls: FloatArray) -> Candidate:
     """Roll controls out and judge them."""
-    trajectory = engine.rollout(problem, controls)
+    reach = PLAN_REACH * problem.team.control_limits
+    bounded = np.clip(controls, -reach, reach)
+    trajectory = engine.rollout(problem, bounded)
+    planned = np.where(trajectory.arrived[:-1, :, None], np.float32(0), bounded)
     # The start itself cannot be planned away, so it does not count.
     failed = ~trajectory.arrived[-1] | trajectory.margin_violated[1:].any(axis=0)
     solved = not failed.any() and verify(problem, trajectory.controls).ok
-    return Candidate(trajectory.controls, trajectory, solved, failed)
+    return Candidate(planned, trajectory.controls, trajectory, solved, failed)
 
 
 @dataclass(frozen=True)

@@ -72,4 +72,5 @@ class CEM(SamplingPlanner):
 
     def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
         """See :meth:`SamplingPlanner.initial`."""
-        return search.current.controls, np.zeros_like(search.current.controls)
+        base = self.base(search)
+        return base, np.zeros_like(base)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from d4orm_env.core.arrays import positive_number, whole_number
+from d4orm_env.core.arrays import FloatArray, positive_number, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.base import MovingObstacles, SamplingTask
@@ -177,11 +177,11 @@ class _Repair:
 
     def denoise(
         self, robots: Sequence[int], horizon: int, num_samples: int, noise_scale: Any, **scoring: Any
-    ) -> tuple[Problem, Trajectory]:
+    ) -> tuple[Problem, FloatArray, Trajectory]:
         """Deform these robots' first ``horizon`` controls around all others.
 
         Returns:
-            The problem of these robots alone, and the rollout of their new controls in it.
+            The problem of these robots alone, their new controls as planned, and the rollout of those in it.
         """
         planner, search, problem = self.planner, self.search, self.problem
         part = problem.select(robots)
@@ -202,17 +202,20 @@ class _Repair:
         self.excluded += result.excluded
         controls = np.zeros((problem.horizon, len(robots), part.control_size), np.float32)
         controls[:horizon] = base + result.mean
-        return part, search.engine.rollout(part, controls)
+        return part, controls, search.engine.rollout(part, controls)
 
     def groups(self) -> None:
         """Algorithm 3: every group in turn, the robots outside it as moving obstacles."""
         memory = self.search.memory
+        self.controls = self.planner.base(self.search).copy()
         joined = reconnected(self.graph, memory.get("graph"))
         memory["graph"] = self.graph
         for group in failure_groups(self.failed, joined):
             robots, scale = list(group), self.planner.noise_scale()
-            part, trajectory = self.denoise(robots, self.problem.horizon, self.config.num_samples, scale, credit="team")
-            self.controls[:, robots, : part.control_size] = trajectory.controls
+            part, controls, trajectory = self.denoise(
+                robots, self.problem.horizon, self.config.num_samples, scale, credit="team"
+            )
+            self.controls[:, robots, : part.control_size] = controls
             self.positions[:, robots] = trajectory.positions
 
     def independent(self) -> None:
@@ -223,7 +226,7 @@ class _Repair:
         horizon = min(int(self.arrival[list(robots)].max()) + SLACK, problem.horizon)
         scale = annealed(config.repair_steps, config.beta_start, config.beta_end)
         distance = np.linalg.norm(problem.goal - problem.start[:, : problem.dimension], axis=1)
-        part, trajectory = self.denoise(
+        part, _, trajectory = self.denoise(
             robots,
             horizon,
             config.repair_samples,

@@ -169,7 +169,7 @@ class DD4orm(Planner):
         number = config.nodes or problem.num_robots
         kind = INNER[config.planner]
         planners: list[Planner] = [kind(kind.config_class(**settings)) for settings in config.node_settings(number)]
-        selection, base = Selection(config.selection, config.k), search.current.controls
+        selection, base = Selection(config.selection, config.k), search.current.planned
         if config.node is not None and config.zenoh is not None:
             config.check_node(number)
             transport = ZenohTransport(config.zenoh)

@@ -56,4 +56,4 @@ class IterativeMBD(_DirectDenoising):
 
     def noisy_controls(self, search: Search) -> FloatArray:
         """The last result, or noise in the first iteration."""
-        return search.current.controls if search.iteration else super().noisy_controls(search)
+        return self.base(search) if search.iteration else super().noisy_controls(search)

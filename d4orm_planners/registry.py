@@ -56,8 +56,7 @@ def make_planner(name: str, *, preset: str | None = None, **config: Any) -> Plan
 
     Args:
         name: One of :func:`list_planners`.
-        preset: ``"paper"`` for the paper's algorithm and parameters to the letter; ``None`` for this project's
-            defaults.
+        preset: ``"paper"`` for the paper's algorithm and parameters; ``None`` for this project's defaults.
         **config: Settings that differ from the preset; see the planner's configuration class.
 
     Raises:

@@ -33,10 +33,10 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
 COLOUR = {**COLOURS, "d4orm (default)": COLOURS["default"], "mbd": "#7F7F7F"}
 
 TEAMS: dict[str, tuple[dict[str, Any], int]] = {
-    "8 holonomic": ({"num_robots": 8}, 4),
-    "16 holonomic": ({"num_robots": 16}, 6),
-    "8 differential drive": ({"num_robots": 8, "model": "differential_drive"}, 4),
-    "8 in space": ({"num_robots": 8, "model": "holonomic3d"}, 4),
+    "8 holonomic": ({"num_robots": 8}, 6),
+    "16 holonomic": ({"num_robots": 16}, 10),
+    "8 differential drive": ({"num_robots": 8, "model": "differential_drive"}, 6),
+    "8 in space": ({"num_robots": 8, "model": "holonomic3d"}, 6),
 }
 """Label: circle scenario's arguments, and how many of the paper's iterations every method may spend."""
 

@@ -86,6 +86,11 @@ def test_the_papers_algorithm_solves_too() -> None:
     assert plan.denoising_steps == 100 * plan.iterations
 
 
+@pytest.mark.slow
+def test_the_papers_algorithm_solves_what_the_paper_does() -> None:
+    assert_solves({"scenario": "circle", "num_robots": 16}, 0, 10, preset="paper")
+
+
 def test_a_team_of_one() -> None:
     plan = assert_solves({"scenario": "circle", "num_robots": 1}, 0, 5)
     # Five metres, less the goal radius, from rest: 1 s to reach 1 m/s within half a metre, then full speed.

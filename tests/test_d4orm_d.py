@@ -84,6 +84,8 @@ def test_the_paper_preset_replans_exactly_the_groups_that_fail() -> None:
         search.advance()
         changed = {k for k in range(12) if (search.current.controls[:, k] != before.controls[:, k]).any()}
         assert changed == replanned
+        kept = [k for k in range(12) if k not in replanned]
+        np.testing.assert_array_equal(search.current.planned[:, kept], before.planned[:, kept])
         previous = graph
 
 

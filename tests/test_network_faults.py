@@ -288,7 +288,7 @@ def nonsense(problem: Problem) -> dict[str, bytes]:
         "node": encode(replace(good, node=7), problem),
         "shape": encode(replace(good, controls=np.zeros((1, 1, 2), np.float32)), problem),
         "not_finite": controls(np.nan),
-        "limits": controls(1e9),
+        "limits": controls(1e20),
         "stale": data,
     }
 

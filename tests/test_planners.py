@@ -403,6 +403,7 @@ def test_keeping_contact_free_but_not_the_margin_is_no_solution() -> None:
         ("elite_fraction", 1.5, "elite_fraction is 1.5.*at most 1"),
         ("adapt_variance", 1, "adapt_variance must be True or False"),
         ("random_start", "no", "random_start must be True or False"),
+        ("clip_between_iterations", 1, "clip_between_iterations must be True or False, not 1"),
         ("num_sample", 64, "'num_sample' is no setting of planner '.*num_samples"),
     ],
 )
@@ -456,10 +457,11 @@ def test_the_paper_preset_has_the_papers_parameters(name: str) -> None:
     assert (config.beta_start, config.beta_end) == (1e-4, 2e-2)
     assert config.credit == "team"
     assert config.weight_cutoff == 0
+    assert config.clip_between_iterations is False
 
 
 def test_the_paper_presets_of_the_methods_own_parameters() -> None:
-    assert make_planner("d4orm", preset="paper").config.random_start is True
+    assert make_planner("d4orm", preset="paper").config.random_start is False
     assert make_planner("mppi", preset="paper").config.sigma == 1
     cem = make_planner("cem", preset="paper").config
     assert (cem.elite_fraction, cem.sigma, cem.adapt_variance) == (0.05, 1, False)
@@ -557,13 +559,41 @@ def test_i_mbd_goes_on_from_its_last_result_as_if_it_were_noise() -> None:
     search = start_of("i-mbd", tiny_problem(1))
     search.advance()
     expected = algorithm_1(
-        search.current.controls,
+        search.current.planned,
         list(alpha_bar(STEPS, *BETAS)),
         draws_of(search),
         rewards_of(search, np.float32(0)),
         TEMPERATURE,
     )
     assert_controls(search, expected)
+
+
+@pytest.mark.parametrize("clip", [None, False, True])
+@pytest.mark.parametrize("name", ["d4orm", "mppi", "cem", "i-mbd"])
+def test_an_iteration_starts_from_the_controls_as_planned_or_as_executed(name: str, clip: bool | None) -> None:
+    limit, wanted, docks = 1, 5, 20
+    given = np.zeros((30, 2, 2))
+    given[:, :, 0] = [wanted, -wanted]  # One robot docks, the other drives away from its goal.
+    settings = {} if clip is None else {"clip_between_iterations": clip}
+    silent = {"beta_start": 1e-12, "beta_end": 1e-12} if name in ("d4orm", "i-mbd") else {"sigma": 1e-5}
+    planner = make_planner(name, engine="cpu", num_samples=2, num_steps=1, **silent, **settings)
+    search = Search(planner, hop_problem(2), 0, given)
+    search.iteration = 1
+    assert search.current.trajectory.arrived[docks, 0]
+    got = planner.iterate(search).controls[:, :, 0]
+    start = limit if clip or (clip is None and name == "d4orm") else wanted
+    np.testing.assert_allclose(got[:10, 0], start, atol=1e-3)
+    np.testing.assert_allclose(got[docks:, 0], 0, atol=1e-3)
+    np.testing.assert_allclose(got[:, 1], -start, atol=1e-3)
+
+
+def test_controls_that_are_scaled_up_for_ever_stay_finite() -> None:
+    # By 1.66 in every iteration: 200 of them would be more than a float32 holds.
+    plan = cheap_planner("i-mbd", num_samples=2, num_steps=1).solve(walled_in_problem(), max_iterations=200)
+    assert plan.iterations == 200
+    search = Search(cheap_planner("i-mbd"), hop_problem(1), 0, np.full((30, 1, 2), 1e37))
+    assert search.current.planned.max() == np.float32(1e15)
+    assert np.abs(search.current.controls).max() <= 1
 
 
 def test_mbd_goes_on_from_noise_again() -> None:

@@ -91,7 +91,7 @@ class Inbox:
     def _judged(self, message: Message) -> Report:
         # What is told again, by the same node or another, need not be verified again, which takes its time.
         known = (report.candidate for report in self.newest.values())
-        same = (candidate for candidate in known if np.array_equal(candidate.controls, message.controls))
+        same = (candidate for candidate in known if np.array_equal(candidate.planned, message.controls))
         candidate = next(same, None) or self._judge.received(message.controls)
         reward = float(candidate.trajectory.rewards.mean())
         if candidate.solved != message.feasible or abs(reward - message.reward) > TOLERANCE:

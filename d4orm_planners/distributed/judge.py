@@ -47,7 +47,7 @@ class Judge:
             if self.stop.is_set():
                 raise Stopped
             candidate = evaluate_controls(self._engine, self._problem, controls)
-            self._known[candidate.controls.tobytes()] = candidate
+            self._known[candidate.planned.tobytes()] = candidate
             while len(self._known) > self._remembered:
                 del self._known[next(iter(self._known))]
             if candidate.solved and self.solution_ends:

@@ -14,6 +14,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
+from d4orm_planners.base import PLAN_REACH
 
 MAGIC = b"D4DC"
 VERSION = 1
@@ -26,9 +27,6 @@ KINDS = (
 )  # fmt: skip
 """What is wrong with a message that is dropped. ``"stale"`` is not the codec's to see, but the inbox's."""
 
-SLACK = 1.001
-"""Rounding that a control may exceed its limit by."""
-
 _HEADER = struct.Struct("<4sHHIQIIId32s")
 _CHECKSUM = struct.Struct("<I")
 
@@ -40,7 +38,7 @@ class Message:
     Attributes:
         node: Who sends it, from 0.
         sequence: Which of its candidates it is, from 1.
-        controls: ``(H, K, m)``.
+        controls: ``(H, K, m)`` as planned, for the receiver to go on from as the sender would.
         reward: Mean reward.
         feasible: Whether it is a solution.
     """
@@ -91,8 +89,8 @@ def decode(data: bytes, problem: Problem, num_nodes: int) -> Message:
         num_nodes: Nodes are numbered below it.
 
     Raises:
-        MessageError: If it is anything but a message of this version with finite controls inside the limits for this
-            problem from one of the nodes.
+        MessageError: If it is anything but a message of this version with finite controls, none beyond
+            :data:`~d4orm_planners.base.PLAN_REACH`, for this problem from one of the nodes.
     """
     if len(data) > MAX_BYTES:
         raise MessageError("too_large", f"{len(data)} bytes; at most {MAX_BYTES} are read")
@@ -129,7 +127,6 @@ def _checked(controls: FloatArray, shape: tuple[int, ...], reward: float, proble
     if not (np.isfinite(controls).all() and np.isfinite(reward)):
         raise MessageError("not_finite", "a control or the reward is not finite")
     controls = controls.reshape(shape)
-    # What a node sends is what its rollout executed, and so inside the limits.
-    if (np.abs(controls) > SLACK * problem.team.control_limits).any():
-        raise MessageError("limits", "a control exceeds its limit")
+    if (np.abs(controls) > PLAN_REACH * problem.team.control_limits).any():
+        raise MessageError("limits", f"a control is more than {PLAN_REACH:g} times its limit")
     return controls

@@ -155,7 +155,7 @@ class Node:
     def _tell(self, candidate: Candidate) -> None:
         self._told += 1
         reward = float(candidate.trajectory.rewards.mean())
-        message = Message(self.number, self._told, candidate.controls, reward, bool(candidate.solved))
+        message = Message(self.number, self._told, candidate.planned, reward, bool(candidate.solved))
         data = encode(message, self.search.problem)
         self.transport.publish(data)
         self._note("sent", self.number, self._told, candidate, size=len(data))

@@ -191,7 +191,7 @@ def _message(node: int, search: Search) -> bytes:
     """The search's current candidate."""
     candidate = search.current
     reward = float(candidate.trajectory.rewards.mean())
-    message = Message(node, search.iteration, candidate.controls, reward, bool(candidate.solved))
+    message = Message(node, search.iteration, candidate.planned, reward, bool(candidate.solved))
     return encode(message, search.problem)
 
 

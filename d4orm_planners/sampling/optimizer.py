@@ -36,6 +36,8 @@ class SamplingConfig(PlannerConfig):
         credit: ``"team"`` weights samples by the team's mean reward, as in the paper; ``"robot"`` weights each robot's
             part of a sample by the robot's own reward, which keeps the signal from diluting with the number of robots;
             ``"alternate"`` does the second in the first iteration, the first in the next, and so on.
+        clip_between_iterations: Start the next iteration from the controls as executed, inside the limits, rather than
+            as the last one left them. Either way they are zero once docked.
     """
 
     num_samples: int = 1024
@@ -45,6 +47,7 @@ class SamplingConfig(PlannerConfig):
     beta_start: float = 1e-4
     beta_end: float = 2e-2
     credit: str = "team"
+    clip_between_iterations: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -61,9 +64,11 @@ class SamplingConfig(PlannerConfig):
             raise ValueError(f"beta_start {self.beta_start:g} is above beta_end {self.beta_end:g}; swap them")
         if self.credit not in CREDITS:
             raise ValueError(f"credit {self.credit!r} is unknown; choose one of {', '.join(CREDITS)}")
+        if not isinstance(self.clip_between_iterations, bool):
+            raise ValueError(f"clip_between_iterations must be True or False, not {self.clip_between_iterations!r}")
 
 
-PAPER = {"num_samples": 1024, "num_steps": 100, "weight_cutoff": 0.0}
+PAPER = {"num_samples": 1024, "num_steps": 100, "weight_cutoff": 0.0, "clip_between_iterations": False}
 """What the paper's experiments share (section IV-B)."""
 
 
@@ -83,6 +88,11 @@ class SamplingPlanner(Planner):
     @abstractmethod
     def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
         """``(base, mean)``, each ``(H, K, m)``: samples are drawn around ``mean`` on top of ``base``."""
+
+    def base(self, search: Search) -> FloatArray:
+        """``(H, K, m)`` controls of the last iteration for this one to start from."""
+        current = search.current
+        return current.controls if self.config.clip_between_iterations else current.planned
 
     def task(self, search: Search, base: FloatArray) -> SamplingTask:
         """What this iteration samples and scores."""
