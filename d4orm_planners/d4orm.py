@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, positive_number
 from d4orm_planners.base import Search
 from d4orm_planners.sampling.optimizer import PAPER, SamplingConfig, SamplingPlanner, standard_normal
 from d4orm_planners.sampling.schedule import alpha_bar, annealed
@@ -24,6 +24,8 @@ class D4ormConfig(SamplingConfig):
             other, which no robot's own reward asks of it, the next iteration's team weights do.
         clip_between_iterations: True by default: with the default's credit that solves slightly sooner. The paper clips
             in the rollout only.
+        late_steps: Share of the steps, the last ones, at which the noise is small enough for fewer samples.
+        late_samples: Share of the samples that these steps draw.
         random_start: Start every deformation from ``U_N ~ N(0, I)``, as Algorithm 1 is written, rather than from zero.
             The code that the paper's authors published starts from zero, and so does the preset: it solves more.
     """
@@ -32,10 +34,16 @@ class D4ormConfig(SamplingConfig):
     num_steps: int = 100
     credit: str = "alternate"
     clip_between_iterations: bool = True
+    late_steps: float = 0.7
+    late_samples: float = 0.5
     random_start: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for name in ("late_steps", "late_samples"):
+            share = positive_number(getattr(self, name), name, zero_allowed=name == "late_steps")
+            if share > 1:
+                raise ValueError(f"{name} is {share:g}; it is a share, and must not be above 1")
         if not isinstance(self.random_start, bool):
             raise ValueError(f"random_start must be True or False, not {self.random_start!r}")
 
@@ -45,11 +53,23 @@ class D4orm(SamplingPlanner):
 
     name: ClassVar[str] = "d4orm"
     config_class = D4ormConfig
-    presets: ClassVar[dict[str, dict[str, Any]]] = {"paper": {**PAPER, "credit": "team", "random_start": False}}
+    presets: ClassVar[dict[str, dict[str, Any]]] = {
+        "paper": {**PAPER, "credit": "team", "late_samples": 1.0, "random_start": False}
+    }
 
     def noise_scale(self) -> FloatArray:
         """See :meth:`SamplingPlanner.noise_scale`."""
         return annealed(self.config.num_steps, self.config.beta_start, self.config.beta_end)
+
+    def stages(self, search: Search) -> list[tuple[FloatArray, int]]:
+        """See :meth:`SamplingPlanner.stages`."""
+        noise_scale, num_samples = self.noise_scale(), self.num_samples(search)
+        early = len(noise_scale) - round(self.config.late_steps * len(noise_scale))
+        fewer = max(2, round(self.config.late_samples * num_samples))
+        if fewer == num_samples:
+            return [(noise_scale, num_samples)]
+        parts = [(noise_scale[:early], num_samples), (noise_scale[early:], fewer)]
+        return [(scale, samples) for scale, samples in parts if len(scale)]
 
     def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
         """See :meth:`SamplingPlanner.initial`."""

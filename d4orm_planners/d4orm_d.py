@@ -101,6 +101,8 @@ class D4ormD(D4orm):
     presets: ClassVar[dict[str, dict[str, Any]]] = {
         "paper": {
             **D4orm.presets["paper"],
+            # The authors' code clips the controls of robots that keep failing; the paper says nothing of it.
+            "clip_between_iterations": True,
             "decoupling": "groups",
             "start": "team",
             "first_collisions": False,

@@ -131,6 +131,7 @@ class DD4orm(Planner):
     presets: ClassVar[dict[str, dict[str, Any]]] = {
         "paper": {
             **D4ormD.presets["paper"],
+            "clip_between_iterations": False,
             "num_samples": 2048,
             "planner": "d4orm",
             "nodes": None,

@@ -63,7 +63,9 @@ def solve(method: str, problem: Problem, seed: int, iterations: int, engine: str
     else:
         planner = make_planner(name, **settings, improve=True, engine=engine)
     config: Any = planner.config
-    share = config.num_samples / PAPER_SAMPLES
+    # A step of half the samples is half a step.
+    saved = getattr(config, "late_steps", 0.0) * (1 - getattr(config, "late_samples", 1.0))
+    share = config.num_samples * (1 - saved) / PAPER_SAMPLES
     limit = max(1, round(iterations * PAPER_STEPS / (config.num_steps * share)))
     plan = planner.solve(problem, seed=seed, max_iterations=limit)
     if plan.solved and not verify(problem, plan.controls).ok:

@@ -192,3 +192,23 @@ def test_after_a_warm_up_nothing_is_left_to_compile(tmp_path: Path) -> None:
     run("-m", "d4orm_planners.cli", "run", "plan.npz", "--noise", "0.01", "--quiet")
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.nb*")} == before
     assert run("-m", "d4orm_planners.cli", "warmup").startswith("0 kernels compiled")
+
+
+@pytest.mark.slow
+def test_the_process_that_compiles_plans_what_later_ones_plan(tmp_path: Path) -> None:
+    code = (
+        "import hashlib\n"
+        "from d4orm_env import make_problem\n"
+        "from d4orm_planners import make_planner\n"
+        "for scenario in ('circle', 'heterogeneous'):\n"
+        "    problem = make_problem(scenario, num_robots=4, seed=0)\n"
+        "    plan = make_planner('d4orm', num_samples=96, num_steps=20).solve(problem, seed=0, max_iterations=2)\n"
+        "    print(hashlib.sha256(plan.controls.tobytes()).hexdigest())\n"
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    first, later = (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment).stdout
+        for _ in range(2)
+    )
+    assert len(first.split()) == 2
+    assert first == later

@@ -72,8 +72,9 @@ CROSSING = make_problem("circle", num_robots=12)
 FEW = {"num_samples": 64, "num_steps": 10, "repair_samples": 64, "repair_steps": 10}
 
 
-def test_the_paper_preset_replans_exactly_the_groups_that_fail() -> None:
-    search = search_of(CROSSING, iterations=1, preset="paper", **FEW)
+@pytest.mark.parametrize("clip", [True, False])
+def test_the_paper_preset_replans_exactly_the_groups_that_fail(clip: bool) -> None:
+    search = search_of(CROSSING, iterations=1, preset="paper", clip_between_iterations=clip, **FEW)
     assert search.current.failed.any()
     previous = None
     for _ in range(4):
@@ -82,10 +83,12 @@ def test_the_paper_preset_replans_exactly_the_groups_that_fail() -> None:
         groups = failure_groups(before.failed, reconnected(graph, previous))
         replanned = {robot for group in groups for robot in group}
         search.advance()
-        changed = {k for k in range(12) if (search.current.controls[:, k] != before.controls[:, k]).any()}
-        assert changed == replanned
+        # Clipping what is clipped already may change the last bit.
+        change = np.abs(search.current.controls - before.controls).max(axis=(0, 2))
+        assert set(np.flatnonzero(change > 1e-5)) == replanned
         kept = [k for k in range(12) if k not in replanned]
-        np.testing.assert_array_equal(search.current.planned[:, kept], before.planned[:, kept])
+        went_on_from = before.controls if clip else before.planned
+        np.testing.assert_allclose(search.current.planned[:, kept], went_on_from[:, kept], atol=1e-6)
         previous = graph
 
 

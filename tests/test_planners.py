@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import fields
 from typing import Any
 
@@ -283,7 +284,9 @@ def test_samples_that_were_left_out_are_in_the_history(name: str, monkeypatch: p
     denoise = CpuEngine.denoise
     monkeypatch.setattr(CpuEngine, "denoise", lambda *a, **k: denoise(*a, **k)._replace(excluded=3))
     plan = cheap_planner(name).solve(walled_in_problem(), max_iterations=2)
-    assert [record.excluded for record in plan.history] == [3, 3]
+    # D4orm has two stages, and what D4orm-D does second is a repair, which has one.
+    expected = {"d4orm": [6, 6], "d4orm-d": [6, 3]}.get(name, [3, 3])
+    assert [record.excluded for record in plan.history] == expected
 
 
 @pytest.mark.parametrize("name", ["d4orm", "mppi", "cem"])
@@ -457,11 +460,12 @@ def test_the_paper_preset_has_the_papers_parameters(name: str) -> None:
     assert (config.beta_start, config.beta_end) == (1e-4, 2e-2)
     assert config.credit == "team"
     assert config.weight_cutoff == 0
-    assert config.clip_between_iterations is False
+    assert config.clip_between_iterations is (name == "d4orm-d")
 
 
 def test_the_paper_presets_of_the_methods_own_parameters() -> None:
     assert make_planner("d4orm", preset="paper").config.random_start is False
+    assert make_planner("d4orm", preset="paper").config.late_samples == 1
     assert make_planner("mppi", preset="paper").config.sigma == 1
     cem = make_planner("cem", preset="paper").config
     assert (cem.elite_fraction, cem.sigma, cem.adapt_variance) == (0.05, 1, False)
@@ -525,7 +529,7 @@ CREDIT = pytest.mark.parametrize(("num_robots", "credit"), [(1, "team"), (2, "te
 
 @CREDIT
 def test_d4orm_is_algorithm_1_on_a_deformation(num_robots: int, credit: str) -> None:
-    search = start_of("d4orm", tiny_problem(num_robots), credit=credit, random_start=True)
+    search = start_of("d4orm", tiny_problem(num_robots), credit=credit, late_samples=1.0, random_start=True)
     base = search.current.controls
     noise = standard_normal(search, search.current.controls.shape, stream=1)
     assert noise.std() == pytest.approx(1, abs=0.7)
@@ -537,12 +541,57 @@ def test_d4orm_is_algorithm_1_on_a_deformation(num_robots: int, credit: str) -> 
 
 @CREDIT
 def test_d4orm_by_default_starts_its_deformation_at_zero(num_robots: int, credit: str) -> None:
-    search = start_of("d4orm", tiny_problem(num_robots), credit=credit)
+    search = start_of("d4orm", tiny_problem(num_robots), credit=credit, late_samples=1.0)
     base = search.current.controls
     deformation = algorithm_1(
         np.zeros_like(base), list(alpha_bar(STEPS, *BETAS)), draws_of(search), rewards_of(search, base), TEMPERATURE
     )
     assert_controls(search, base + deformation)
+
+
+@pytest.mark.parametrize(
+    ("late", "parts"),
+    [
+        ({}, [(3, 40), (7, 20)]),
+        ({"late_steps": 0.2, "late_samples": 0.25}, [(8, 40), (2, 10)]),
+        ({"late_steps": 1.0}, [(10, 20)]),
+        ({"late_steps": 0.0}, [(10, 40)]),
+        ({"late_samples": 1.0}, [(10, 40)]),
+        ({"late_samples": 0.001}, [(3, 40), (7, 2)]),
+    ],
+)
+def test_late_steps_go_on_with_fewer_samples(late: Any, parts: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    denoise, calls = CpuEngine.denoise, []
+
+    def recorded(engine: Any, task: Any, rules: Any, mean: Any, scale: Any, num_samples: int, seed: int) -> Any:
+        result = denoise(engine, task, rules, mean, scale, num_samples, seed)
+        calls.append((mean, scale, num_samples, seed, result))
+        return result
+
+    monkeypatch.setattr(CpuEngine, "denoise", recorded)
+    planner = make_planner("d4orm", num_samples=40, num_steps=10, **late)
+    search = Search(planner, walled_in_problem(), 0, None)
+    iteration = planner.iterate(search)
+    assert [(len(scale), num_samples) for _, scale, num_samples, _, _ in calls] == parts
+    np.testing.assert_array_equal(np.concatenate([call[1] for call in calls]), planner.noise_scale())
+    assert len({call[3] for call in calls}) == len(calls)
+    for before, after in itertools.pairwise(calls):
+        np.testing.assert_array_equal(after[0], before[4].mean)
+    assert iteration.denoising_steps == 10
+    np.testing.assert_array_equal(iteration.controls, calls[-1][4].mean)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "message"),
+    [
+        ("late_steps", 1.5, "late_steps is 1.5.*above 1"), ("late_steps", -0.1, "late_steps"),
+        ("late_samples", 0, "late_samples"), ("late_samples", 2, "late_samples is 2.*above 1"),
+        ("late_samples", "half", "late_samples"),
+    ],
+)  # fmt: skip
+def test_shares_of_late_steps_are_checked(setting: str, value: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_planner("d4orm", **{setting: value})
 
 
 @pytest.mark.parametrize("name", ["mbd", "i-mbd"])

@@ -124,7 +124,7 @@ def parts(settings: BenchmarkSettings) -> Iterator[Part]:
             for engine in settings.engines:
                 if engine != "cpu" and num_robots > settings.most_robots_slow:
                     continue
-                # The rules of the default planner skip samples of no weight, which only the CPU engine gains by.
+                # The default planner's weights, by robot and with a cut-off, on the engine that it is meant for.
                 for preset in PRESETS if engine == "cpu" else ("paper",):
                     label = f"{num_robots} {model} on {engine}"
                     yield "denoising", label, partial(_measure_denoising, settings, engine, preset, num_robots, model)

@@ -72,6 +72,10 @@ PAPER = {"num_samples": 1024, "num_steps": 100, "weight_cutoff": 0.0, "clip_betw
 """What the paper's experiments share (section IV-B)."""
 
 
+STAGE_STREAM = 1 << 16
+"""Stages of an iteration draw their noise from every so many-th stream, so that it differs from all other noise."""
+
+
 class SamplingPlanner(Planner):
     """A planner whose iteration is one run of the sampling loop over the whole team."""
 
@@ -106,15 +110,22 @@ class SamplingPlanner(Planner):
         del search
         return int(self.config.num_samples)
 
+    def stages(self, search: Search) -> list[tuple[FloatArray, int]]:
+        """The steps of an iteration, in parts that each have their number of samples: ``(noise scale, M)``."""
+        return [(self.noise_scale(), self.num_samples(search))]
+
     def iterate(self, search: Search) -> Iteration:
         """See :meth:`Planner.iterate`."""
         base, mean = self.initial(search)
-        task, rules, noise_scale = self.task(search, base), self.rules(), self.noise_scale()
-        num_samples = self.num_samples(search)
-        with search.watch.paused():
-            search.engine.prepare(task, rules, noise_scale, num_samples)
-        result = search.engine.denoise(task, rules, mean, noise_scale, num_samples, search.iteration_seed())
-        return Iteration(base + result.mean, len(noise_scale), result.excluded)
+        task, rules = self.task(search, base), self.rules()
+        num_steps = excluded = 0
+        for stage, (noise_scale, num_samples) in enumerate(self.stages(search)):
+            with search.watch.paused():
+                search.engine.prepare(task, rules, noise_scale, num_samples)
+            seed = search.iteration_seed(stage * STAGE_STREAM)
+            result = search.engine.denoise(task, rules, mean, noise_scale, num_samples, seed)
+            mean, num_steps, excluded = result.mean, num_steps + len(noise_scale), excluded + result.excluded
+        return Iteration(base + mean, num_steps, excluded)
 
 
 def standard_normal(search: Search, shape: tuple[int, ...], stream: int) -> FloatArray:

@@ -15,7 +15,7 @@ class SoftmaxWeights:
     Attributes:
         temperature: ``lambda``; smaller values follow the best samples more closely.
         cutoff: Weights below this share of the largest are dropped. What they would add is less than the sampling
-            error, and the engine need not average over their samples.
+            error.
     """
 
     temperature: float
