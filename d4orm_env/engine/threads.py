@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
+from queue import SimpleQueue
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -30,9 +31,29 @@ def available_cores() -> int:
 
 
 @lru_cache(maxsize=8)
-def _pool(num_threads: int, process: int) -> ThreadPoolExecutor:
-    """Shared by all engines of a process; a forked child gets its own."""
-    return ThreadPoolExecutor(num_threads, thread_name_prefix="d4orm")
+def _queue(num_threads: int, process: int) -> SimpleQueue[Any]:
+    """What threads shared by all engines of a process wait for work at; a forked child gets its own.
+
+    A denoising step hands out work twice, and an executor takes twice as long to.
+    """
+    todo: SimpleQueue[Any] = SimpleQueue()
+    for _ in range(num_threads):
+        Thread(target=_work, args=(todo,), name="d4orm", daemon=True).start()
+    return todo
+
+
+def _work(todo: SimpleQueue[Any]) -> None:
+    while True:
+        work, part, done = todo.get()
+        error = None
+        try:
+            work(part)
+        except BaseException as raised:
+            # Whoever waits raises it.
+            error = raised
+        done.put(error)
+        # Waiting keeps nothing alive.
+        del work, part, done, error
 
 
 class Threads:
@@ -48,9 +69,12 @@ class Threads:
         if parts == 1:
             work(edges)
             return
-        # Engines that share the cores, each in a thread of its own, share this pool too.
-        pool = _pool(max(self.num_threads, available_cores()) - 1, os.getpid())
-        futures = [pool.submit(work, edges[i : i + 2]) for i in range(1, parts)]
+        # Engines that share the cores, each in a thread of its own, share these threads too.
+        todo = _queue(max(self.num_threads, available_cores()) - 1, os.getpid())
+        done: SimpleQueue[BaseException | None] = SimpleQueue()
+        for i in range(1, parts):
+            todo.put((work, edges[i : i + 2], done))
         work(edges[:2])
-        for future in futures:
-            future.result()
+        for error in [done.get() for _ in range(1, parts)]:
+            if error is not None:
+                raise error
