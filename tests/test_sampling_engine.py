@@ -11,12 +11,14 @@ import pytest
 from engine_support import ENGINE_NAMES, RecordedWeights, SameWeights, cpu_rewards, engine_noise, toward_goals
 from env_support import mixed_problem
 
+from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.engine.base import MovingObstacles, SamplingResult, SamplingRules, SamplingTask, get_engine
 from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.engine.jax import JaxEngine
+from d4orm_env.engine.sampling import score_kernel
 from d4orm_env.scenarios import list_scenarios, make_problem
 from d4orm_planners.sampling.schedule import annealed
 from d4orm_planners.sampling.weights import EliteWeights, SoftmaxWeights
@@ -503,3 +505,12 @@ def test_a_robot_without_a_usable_sample_keeps_its_mean_and_the_others_go_on(eng
     assert (np.abs(result.mean[:, [0, 1, 3, 4]] - 0.25).max(axis=(0, 2)) > 0.1).all()
     assert np.isfinite(result.mean).all()
     assert result.excluded == 200
+
+
+def test_kernels_of_different_models_share_no_file() -> None:
+    teams = [*((name,) for name in MODELS), ("holonomic2d", "differential_drive")]
+    files = [score_kernel(models)._cache._impl.filename_base for models in teams]
+    assert len(set(files)) == len(files)
+    # All planar models are in the kernel of mixed teams, whoever they are.
+    assert score_kernel(("velocity2d", "holonomic2d")) is score_kernel(teams[-1])
+    assert score_kernel(("holonomic2d",) * 5) is score_kernel(("holonomic2d",))

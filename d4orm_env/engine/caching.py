@@ -31,14 +31,18 @@ class _SourceKeyedCache(FunctionCache):
         return sig, codegen.magic_tuple(), self._source_key
 
 
-def cached_kernel(key: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+def cached_kernel(key: str, variant: str = "", **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Decorator: compile with numba on first call, and keep the result on disk under ``key``.
+
+    The kernels of a factory need a ``variant`` each, which names their files: processes that compile two of them at the
+    same time would otherwise write to the same ones, and one might be loaded for the other.
 
     Where neither the package's folder nor the user's cache folder can be written, kernels are compiled anew in every
     process; set ``NUMBA_CACHE_DIR`` to a folder that can.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
+        function.__qualname__ += variant and f"_{variant}"
         dispatcher = numba.njit(nogil=True, **options)(function)
         with suppress(RuntimeError):
             dispatcher._cache = _SourceKeyedCache(function, key)

@@ -440,7 +440,7 @@ def score_kernel(models: tuple[str, ...]) -> Any:
 def _score_kernel(models: tuple[str, ...]) -> Any:
     run_robot = _any_runner(models)
 
-    @cached_kernel(SOURCES + ",".join(models), **OPTIONS)
+    @cached_kernel(SOURCES, variant="_".join(models), **OPTIONS)
     def score_tiles(
         arrays: Any, offset: Any, scale: Any, docked: Any, collisions: Any, penalty: Any, moving: Any,
         moving_radius: Any, body_boxes: Any, static: Any, seed: Any, step: Any, tile_range: Any, space: Any,

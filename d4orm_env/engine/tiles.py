@@ -39,8 +39,8 @@ beyond 1e19, whose squares overflow, count as not finite; otherwise NaN and infi
 
 UNCOUNTED: dict[str, Any] = OPTIONS | {"_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 """For everything that kernels call: without numba's reference counts, which would cost more than the sums they
-surround, and without what Python would call them by, which takes a third of the time of compiling them. Such functions
-cannot make arrays, and a call from Python ends the process: tests call them from compiled functions of their own."""
+surround, and without what Python would call them by, which takes a fifth to a third of the time of compiling. Such
+functions cannot make arrays, and a call from Python ends the process: tests call them from compiled functions."""
 
 compiled = numba.njit(nogil=True, **UNCOUNTED)
 
