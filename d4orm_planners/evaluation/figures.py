@@ -55,8 +55,9 @@ def _team_size() -> Figure:
             ("2D Holonomic", "mppi", "runtime"): {"16": "nearly twice that of d4orm"},
         },
         remarks=(
-            "Methods have a budget of samples, 20 iterations of 100 steps of 1024 (the defaults of d4orm: 80, of 256 and "
-            "later 128), instead of a deadline; MBD has its 10,000 steps in one iteration, and is judged after the last one only.",
+            "Methods have a budget of samples, 20 iterations of 100 steps of 1024 (the defaults of d4orm: 80, of 256 "
+            "and later 128), instead of a deadline; MBD has its 10,000 steps in one iteration, and is judged after the "
+            "last one only.",
             "The anytime reward is drawn against seconds; the paper counts steps.",
         ),
     )  # fmt: skip
