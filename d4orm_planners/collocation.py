@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from d4orm_env.core.collision import axis_gap
 from d4orm_env.core.dynamics import SPEED, Ops
 from d4orm_env.core.problem import Problem, inverse_initial_distance
-from d4orm_env.core.transition import TimeStep, rk4
+from d4orm_env.core.transition import TimeStep
 
 OBJECTIVE_SCALE = 10.0
 """Of the mean cost of a step, so that IPOPT's tolerance tells good motions from bad ones."""
@@ -210,7 +210,7 @@ class TeamProgram:
         step = TimeStep(*(self.problem.dt / part for part in (1, 2, 3, 6)))
         for robot, model in enumerate(self.models):
             x, u = ca.SX.sym("x", model.state_size), ca.SX.sym("u", model.control_size)
-            after = rk4(model.functions, ca.vertsplit(x), ca.vertsplit(u), step, self.ops)
+            after = model.functions.integrate(ca.vertsplit(x), ca.vertsplit(u), step, self.ops)
             advance = ca.Function("advance", [x, u], [ca.vertcat(*after)]).map(self.problem.horizon)
             yield self.states[robot] - advance(self.paths[robot][:, :-1], self.controls[robot]), 0.0, 0.0
             for values, components, limit in self._limited(robot):

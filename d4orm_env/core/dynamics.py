@@ -42,8 +42,10 @@ class ModelFunctions(NamedTuple):
     """``(x, u, ops) -> `` velocity vector in the world frame [m/s]."""
     rest: Callable[..., Any]
     """``(x, zero) -> x`` standing still at the same place and heading."""
-    add_scaled: Callable[..., Any]
-    """``(x, s, k) -> x + s * k`` for tuples of this model's state size."""
+    integrate: Callable[..., Any]
+    """``(x, u, h, ops) -> x`` after a :class:`~d4orm_env.core.transition.TimeStep`: what classical Runge-Kutta makes of
+    the derivative with the control held constant, written out without the terms that cancel.
+    """
 
 
 @dataclass(frozen=True)
@@ -79,25 +81,6 @@ class Model:
         return len(self.control_names)
 
 
-def add_scaled_2(x: Any, s: Any, k: Any) -> Any:
-    return (x[0] + s * k[0], x[1] + s * k[1])
-
-
-def add_scaled_4(x: Any, s: Any, k: Any) -> Any:
-    return (x[0] + s * k[0], x[1] + s * k[1], x[2] + s * k[2], x[3] + s * k[3])
-
-
-def add_scaled_6(x: Any, s: Any, k: Any) -> Any:
-    return (
-        x[0] + s * k[0],
-        x[1] + s * k[1],
-        x[2] + s * k[2],
-        x[3] + s * k[3],
-        x[4] + s * k[4],
-        x[5] + s * k[5],
-    )
-
-
 def norm_scale_2(a: Any, b: Any, limit: Any, ops: Ops) -> Any:
     """Factor that brings the vector ``(a, b)`` to at most ``limit``; the maximum keeps the gradient finite at zero."""
     return limit / ops.sqrt(ops.maximum(a * a + b * b, limit * limit))
@@ -117,6 +100,18 @@ def clip(value: Any, limit: Any, ops: Ops) -> Any:
 
 def holonomic2d_derivative(x: Any, u: Any, ops: Ops) -> Any:
     return (x[2], x[3], u[0], u[1])
+
+
+# A constant acceleration gives a parabola, which Runge-Kutta follows exactly.
+
+
+def holonomic2d_integrate(x: Any, u: Any, h: Any, ops: Ops) -> Any:
+    return (
+        x[0] + h.full * (x[2] + h.half * u[0]),
+        x[1] + h.full * (x[3] + h.half * u[1]),
+        x[2] + h.full * u[0],
+        x[3] + h.full * u[1],
+    )
 
 
 def holonomic2d_limit_control(u: Any, limits: Any, ops: Ops) -> Any:
@@ -144,6 +139,17 @@ def holonomic3d_derivative(x: Any, u: Any, ops: Ops) -> Any:
     return (x[3], x[4], x[5], u[0], u[1], u[2])
 
 
+def holonomic3d_integrate(x: Any, u: Any, h: Any, ops: Ops) -> Any:
+    return (
+        x[0] + h.full * (x[3] + h.half * u[0]),
+        x[1] + h.full * (x[4] + h.half * u[1]),
+        x[2] + h.full * (x[5] + h.half * u[2]),
+        x[3] + h.full * u[0],
+        x[4] + h.full * u[1],
+        x[5] + h.full * u[2],
+    )
+
+
 def holonomic3d_limit_control(u: Any, limits: Any, ops: Ops) -> Any:
     scale = norm_scale_3(u[0], u[1], u[2], limits[ACCELERATION], ops)
     return (u[0] * scale, u[1] * scale, u[2] * scale)
@@ -169,6 +175,10 @@ def velocity2d_derivative(x: Any, u: Any, ops: Ops) -> Any:
     return (u[0], u[1])
 
 
+def velocity2d_integrate(x: Any, u: Any, h: Any, ops: Ops) -> Any:
+    return (x[0] + h.full * u[0], x[1] + h.full * u[1])
+
+
 def velocity2d_limit_control(u: Any, limits: Any, ops: Ops) -> Any:
     scale = norm_scale_2(u[0], u[1], limits[SPEED], ops)
     return (u[0] * scale, u[1] * scale)
@@ -191,6 +201,24 @@ def velocity2d_rest(x: Any, zero: Any) -> Any:
 
 def differential_drive_derivative(x: Any, u: Any, ops: Ops) -> Any:
     return (x[3] * ops.cos(x[2]), x[3] * ops.sin(x[2]), u[0], u[1])
+
+
+def differential_drive_integrate(x: Any, u: Any, h: Any, ops: Ops) -> Any:
+    # The heading turns evenly, so that two of the four stages are the same, and what remains is Simpson's rule. The
+    # headings half-way and at the end come from the first one, turned twice by the same angle.
+    turn = h.half * u[0]
+    turn_x, turn_y = ops.cos(turn), ops.sin(turn)
+    x0, y0 = ops.cos(x[2]), ops.sin(x[2])
+    x1, y1 = x0 * turn_x - y0 * turn_y, y0 * turn_x + x0 * turn_y
+    x2, y2 = x1 * turn_x - y1 * turn_y, y1 * turn_x + x1 * turn_y
+    speed1, speed2 = x[3] + h.half * u[1], x[3] + h.full * u[1]
+    twice = speed1 + speed1
+    return (
+        x[0] + (h.sixth * (x[3] * x0 + speed2 * x2) + h.third * (twice * x1)),
+        x[1] + (h.sixth * (x[3] * y0 + speed2 * y2) + h.third * (twice * y1)),
+        x[2] + h.full * u[0],
+        speed2,
+    )
 
 
 def differential_drive_limit_control(u: Any, limits: Any, ops: Ops) -> Any:
@@ -226,7 +254,7 @@ MODELS: dict[str, Model] = {
                 holonomic2d_limit_state,
                 holonomic2d_velocity,
                 holonomic2d_rest,
-                add_scaled_4,
+                holonomic2d_integrate,
             ),
         ),
         Model(
@@ -243,7 +271,7 @@ MODELS: dict[str, Model] = {
                 holonomic3d_limit_state,
                 holonomic3d_velocity,
                 holonomic3d_rest,
-                add_scaled_6,
+                holonomic3d_integrate,
             ),
         ),
         Model(
@@ -260,7 +288,7 @@ MODELS: dict[str, Model] = {
                 velocity2d_limit_state,
                 velocity2d_velocity,
                 velocity2d_rest,
-                add_scaled_2,
+                velocity2d_integrate,
             ),
         ),
         Model(
@@ -277,7 +305,7 @@ MODELS: dict[str, Model] = {
                 differential_drive_limit_state,
                 differential_drive_velocity,
                 differential_drive_rest,
-                add_scaled_4,
+                differential_drive_integrate,
             ),
         ),
     )

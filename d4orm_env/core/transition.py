@@ -13,7 +13,7 @@ from d4orm_env.core.dynamics import ModelFunctions, Ops
 
 
 class TimeStep(NamedTuple):
-    """``dt`` and the fractions of it that RK4 needs, in the caller's precision."""
+    """``dt`` and the fractions of it that Runge-Kutta needs, in the caller's precision."""
 
     full: Any
     half: Any
@@ -21,21 +21,9 @@ class TimeStep(NamedTuple):
     sixth: Any
 
 
-def rk4(model: ModelFunctions, x: Any, u: Any, h: TimeStep, ops: Ops) -> Any:
-    """Classical fourth-order Runge-Kutta over one step with the control held constant."""
-    k1 = model.derivative(x, u, ops)
-    k2 = model.derivative(model.add_scaled(x, h.half, k1), u, ops)
-    k3 = model.derivative(model.add_scaled(x, h.half, k2), u, ops)
-    k4 = model.derivative(model.add_scaled(x, h.full, k3), u, ops)
-    x = model.add_scaled(x, h.sixth, k1)
-    x = model.add_scaled(x, h.third, k2)
-    x = model.add_scaled(x, h.third, k3)
-    return model.add_scaled(x, h.sixth, k4)
-
-
 def advance(model: ModelFunctions, x: Any, u: Any, limits: Any, h: TimeStep, ops: Ops) -> Any:
     """The state after one step under a control that :meth:`ModelFunctions.limit_control` has clipped."""
-    return model.limit_state(rk4(model, x, u, h, ops), limits, ops)
+    return model.limit_state(model.integrate(x, u, h, ops), limits, ops)
 
 
 def arrives(squared_distance: Any, squared_speed: Any, squared_goal_radius: Any, squared_goal_speed: Any) -> Any:

@@ -59,8 +59,8 @@ def _squared_gap(builder: Any, pairs: list[tuple[Any, Any]]) -> Any:
     total = None
     for a, b in pairs:
         gap = builder.fsub(a, b)
-        square = builder.fmul(gap, gap, flags=("contract",))
-        total = square if total is None else builder.fadd(total, square, flags=("contract",))
+        square = builder.fmul(gap, gap)
+        total = square if total is None else builder.fadd(total, square)
     return total
 
 
@@ -218,18 +218,18 @@ def _add_turned(power: int) -> Any:
                 return _load(context, builder, signature.args[array], arguments[array], arguments[array + 1], row)
 
             def multiply(x: Any, y: Any) -> Any:
-                return builder.fmul(x, y, flags=("contract",))
+                return builder.fmul(x, y)
 
             x, y = load(2, 0), load(2, CHUNK)
             if power == 2:
                 x, y = multiply(x, x), multiply(y, y)
             along, across = load(4, 0), load(6, 0)
             first, second = load(0, 0), load(0, CHUNK)
-            first = builder.fadd(first, multiply(along, x), flags=("contract",))
-            second = builder.fadd(second, multiply(along, y), flags=("contract",))
+            first = builder.fadd(first, multiply(along, x))
+            second = builder.fadd(second, multiply(along, y))
             fold = builder.fsub if power == 1 else builder.fadd
-            first = fold(first, multiply(across, y), flags=("contract",))
-            second = builder.fadd(second, multiply(across, x), flags=("contract",))
+            first = fold(first, multiply(across, y))
+            second = builder.fadd(second, multiply(across, x))
             for row, value in enumerate((first, second)):
                 place = _place(context, builder, signature.args[0], arguments[0], arguments[1], row * CHUNK)
                 builder.store(value, place, align=4)

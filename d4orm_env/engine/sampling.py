@@ -462,10 +462,14 @@ def _sum_lanes(sums: Any, time_range: Any, k: Any, moment: Any) -> None:
     rows = num_controls + num_controls % 2
     for t in range(time_range[0], time_range[1]):
         for i in range(num_controls):
-            total, begin = ZERO, ((t - time_range[0]) * rows + i) * DRAWS
-            for lane in range(DRAWS):
-                total += sums[begin + lane]
-            moment[t, k, i] = total
+            begin = ((t - time_range[0]) * rows + i) * DRAWS
+            # Halves upon halves: an order of summation that does not depend on the width of registers.
+            half = DRAWS // 2
+            while half > 0:
+                for lane in range(begin, begin + half):
+                    sums[lane] += sums[lane + half]
+                half //= 2
+            moment[t, k, i] = sums[begin]
 
 
 @cached_kernel(SOURCES, **OPTIONS)

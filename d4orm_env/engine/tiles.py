@@ -32,10 +32,10 @@ STRIDE = ROWS * TILE
 ROBOT, OBSTACLE = 0, 1
 NOWHERE = np.uint64(0)
 
-OPTIONS: dict[str, Any] = {"fastmath": {"contract", "nsz", "reassoc", "arcp", "afn"}, "error_model": "numpy"}
-"""Multiply-adds may fuse and sums be regrouped, which removes half the work of a Runge-Kutta step, and one over a root
-may be an estimate with a Newton step behind it, good to the last bit or two. Of infinity that is NaN, so that controls
-beyond 1e19, whose squares overflow, count as not finite; otherwise NaN and infinity mean what they always do."""
+OPTIONS: dict[str, Any] = {"error_model": "numpy"}
+"""No fast mathematics: only what IEEE 754 defines to the bit, in the order in which it is written. Multiply-adds do not
+fuse, sums are not regrouped, nothing is estimated; so a kernel gives the same bits on every processor, however wide its
+registers. This costs some 10%, which is measured in docs/performance.md."""
 
 UNCOUNTED: dict[str, Any] = OPTIONS | {"_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 """For everything that kernels call: without numba's reference counts, which would cost more than the sums they
@@ -54,7 +54,6 @@ for _function in (
     dynamics.norm_scale_2,
     dynamics.norm_scale_3,
     dynamics.clip,
-    transition.rk4,
     transition.advance,
     transition.arrives,
     collision.axis_gap,
@@ -98,8 +97,7 @@ _S1, _S2, _S3 = np.float32(-1.6666654611e-1), np.float32(8.3321608736e-3), np.fl
 _C1, _C2, _C3 = np.float32(4.166664568298827e-2), np.float32(-1.388731625493765e-3), np.float32(2.443315711809948e-5)
 
 
-# The order of these operations is what makes them accurate.
-@numba.njit(nogil=True, **UNCOUNTED | {"fastmath": {"contract", "nsz"}})
+@compiled
 def _shifted_sine(x: Any, quarters: Any) -> Any:
     """``sin(x + quarters * pi / 2)``."""
     nearest = np.floor(x * _TWO_OVER_PI + _HALF)
