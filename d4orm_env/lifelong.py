@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
-from d4orm_env.core.dynamics import Ops
+from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.transition import arrives
-
-_OPS = Ops(np.cos, np.sin, np.sqrt, np.minimum, np.maximum)
 
 _BATCH = 256
 _ATTEMPTS = 20
@@ -40,7 +38,7 @@ def reached_goals(problem: Problem, goals: FloatArray, states: FloatArray, contr
     squared_speed = np.zeros(len(states), np.float32)
     if problem.goal_speed is not None:
         for robot, model in enumerate(problem.team.robot_models):
-            velocity = model.functions.velocity(states[robot], controls[robot], _OPS)
+            velocity = model.functions.velocity(states[robot], controls[robot], NUMPY_OPS)
             squared_speed[robot] = sum(component * component for component in velocity)
     arrays = problem.arrays
     reached: BoolArray = arrives(

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray, positive_number, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
@@ -259,7 +260,7 @@ class _Repair:
         vain = search.memory["vain"]
         tired = search.memory.setdefault("tired", np.zeros(self.problem.num_robots))
         random = np.random.default_rng(search.iteration_seed(0)).random(len(tired))
-        order = np.argsort(tired + random - 0.2 * self.graph.sum(axis=1))
+        order = np.argsort(tired + random - 0.2 * self.graph.sum(axis=1), kind="stable")
         if search.iteration % JOINTLY == 0:
             stuck = [
                 group
@@ -320,7 +321,7 @@ class _Repair:
         paths = self.positions.copy()
         paths[:, robots] = trajectory.positions
         controls, positions = trajectory.controls.copy(), trajectory.positions.copy()
-        for i in np.argsort(-nearest):
+        for i in np.argsort(-nearest, kind="stable"):
             robot = robots[int(i)]
             own = ways.of(int(i))
             cost = self.costs(robot, own, paths)
@@ -338,11 +339,11 @@ class _Repair:
         start, goal = alone.start[0, : alone.dimension], alone.goal[0]
         random = np.random.default_rng(self.search.iteration_seed(1000 + self.stream))
         self.stream += 1
-        spread = 0.5 * np.linalg.norm(goal - start) + 1
+        spread = 0.5 * np.linalg.norm((goal - start)[None], axis=1) + 1
         vias = (
             start
             + random.random((DETOURS, 1)) * (goal - start)
-            + spread * random.normal(size=(DETOURS, alone.dimension))
+            + spread * portable.standard_normal(random, (DETOURS, alone.dimension))
         )
         return ways.joined(detours(alone, vias[None].astype(np.float32)).of(0))
 

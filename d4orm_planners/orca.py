@@ -12,10 +12,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, positive_number, whole_number
+from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.joint_state import JointState
 from d4orm_planners.policy import Policy
-from d4orm_planners.steering import NUMPY_OPS, preferred_velocities, track_velocities
+from d4orm_planners.steering import preferred_velocities, track_velocities
 
 CORNERS = 16
 """Of the polygons that stand for round obstacles and docked robots."""

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from d4orm_env.core import portable
 from d4orm_env.core.arrays import BoolArray, FloatArray
-from d4orm_env.core.dynamics import MODELS, TURN_RATE, Model, Ops
+from d4orm_env.core.dynamics import MODELS, TURN_RATE, Model
+from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.transition import TimeStep, advance, arrives
-
-NUMPY_OPS = Ops(np.cos, np.sin, np.sqrt, np.minimum, np.maximum)
 
 VIA_RADIUS = 0.5
 """How near to a point on its way a robot turns to its goal [m]."""
@@ -114,10 +114,10 @@ def track(model: Model, states: FloatArray, velocities: FloatArray, limits: Floa
     if model.heading_index is None:
         return (velocities - states[:, list(model.speed_indices)]) / dt
     turn_rate, speed = limits[:, TURN_RATE], np.sqrt((velocities * velocities).sum(axis=1))
-    turn = np.arctan2(velocities[:, 1], velocities[:, 0]) - states[:, model.heading_index]
+    turn = portable.arctan2(velocities[:, 1], velocities[:, 0]) - states[:, model.heading_index]
     # To stand still no heading is better than the present one.
     turn = np.where(speed > 0, (turn + np.pi) % (2 * np.pi) - np.pi, 0)
-    push = (speed * np.maximum(np.cos(turn), 0) - states[:, model.speed_indices[0]]) / dt
+    push = (speed * np.maximum(portable.cos(turn), 0) - states[:, model.speed_indices[0]]) / dt
     return np.stack([np.clip(turn / dt, -turn_rate, turn_rate), push], axis=1)
 
 
@@ -225,7 +225,7 @@ def _drive(
         velocity = model.functions.velocity(tuple(x[t, :, :n].T), tuple(u[t - 1, :, :m].T), NUMPY_OPS)
         gap2 = ((x[t, :, :d] - goals[:, :d]) ** 2).sum(axis=1)
         speed2 = sum(np.square(part) for part in velocity)
-        return arrives(gap2, speed2, problem.goal_radius**2, goal_speed**2)
+        return arrives(gap2, speed2, problem.goal_radius * problem.goal_radius, goal_speed * goal_speed)
 
     first = int(switch.min())
     arrived = home(first) if first > 0 else np.zeros(len(switch), bool)
@@ -234,7 +234,7 @@ def _drive(
             x[t + 1 :, :, :n] = x[t, :, :n]
             u[t:, :, :m] = 0
             break
-        passed = ((x[t, :, :d] - targets[:, :d]) ** 2).sum(axis=1) < VIA_RADIUS**2
+        passed = ((x[t, :, :d] - targets[:, :d]) ** 2).sum(axis=1) < VIA_RADIUS * VIA_RADIUS
         targets = np.where(passed[:, None], goals, targets)
         steered = steer(model, x[t, :, :n], targets[:, :d], limits, problem.dt)
         wanted = np.where((t >= switch)[:, None], steered, u[t, :, :m]).astype(np.float32)

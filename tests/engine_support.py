@@ -139,3 +139,16 @@ def cpu_rewards(engine: Engine, task: SamplingTask, sigma: float, num_samples: i
     mean = np.zeros_like(task.base)
     engine.denoise(task, SamplingRules(recorded), mean, np.array([sigma], np.float32), num_samples, seed)
     return recorded.rewards[0]
+
+
+def rk4(derivative: Callable[..., Any], x: Any, u: Any, dt: Any, ops: Ops) -> tuple[Any, ...]:
+    """Classical fourth-order Runge-Kutta as textbooks have it, over one step with the control held constant."""
+
+    def moved(share: Any, k: Any) -> tuple[Any, ...]:
+        return tuple(component + share * slope for component, slope in zip(x, k, strict=True))
+
+    k1 = derivative(x, u, ops)
+    k2 = derivative(moved(dt / 2, k1), u, ops)
+    k3 = derivative(moved(dt / 2, k2), u, ops)
+    k4 = derivative(moved(dt, k3), u, ops)
+    return moved(dt / 6, tuple(a + 2 * b + 2 * c + d for a, b, c, d in zip(k1, k2, k3, k4, strict=True)))

@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from engine_support import ENGINE_NAMES, NUMPY_OPS
+from engine_support import ENGINE_NAMES, NUMPY_OPS, rk4
+from hypothesis import given
+from hypothesis import strategies as st
 
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
-from d4orm_env.core.transition import TimeStep, advance, arrives, rk4
+from d4orm_env.core.transition import TimeStep, advance, arrives
 from d4orm_env.engine.base import StepResult, get_engine
 
 DIFFERENTIAL_DRIVE = MODELS["differential_drive"].functions
@@ -25,7 +27,7 @@ def time_step(dt: float) -> TimeStep:
 
 def integrate(x: tuple[float, ...], u: tuple[float, ...], duration: float, steps: int) -> np.ndarray:
     for _ in range(steps):
-        x = rk4(DIFFERENTIAL_DRIVE, x, u, time_step(duration / steps), NUMPY_OPS)
+        x = DIFFERENTIAL_DRIVE.integrate(x, u, time_step(duration / steps), NUMPY_OPS)
     return np.array(x)
 
 
@@ -42,7 +44,7 @@ def exact_drive(x: tuple[float, ...], u: tuple[float, ...], t: float) -> np.ndar
     return np.array([px + along, py + across, angle, speed])
 
 
-def test_rk4_converges_at_order_four() -> None:
+def test_the_step_converges_at_order_four() -> None:
     x, u, duration = (0.3, -0.2, 0.4, 0.5), (1.5, 0.7), 2.0
     exact = exact_drive(x, u, duration)
     steps = np.array([4, 8, 16, 32, 64])
@@ -53,9 +55,20 @@ def test_rk4_converges_at_order_four() -> None:
     assert orders[-1] == pytest.approx(4, abs=0.02)
 
 
+@pytest.mark.parametrize("name", MODELS)
+@given(data=st.data())
+def test_a_step_is_runge_kutta_on_the_derivative(name: str, data: st.DataObject) -> None:
+    model, number = MODELS[name], st.floats(-3, 3)
+    x = data.draw(st.tuples(*[number] * model.state_size))
+    u = data.draw(st.tuples(*[number] * model.control_size))
+    dt = data.draw(st.floats(1e-3, 1.0))
+    textbook = rk4(model.functions.derivative, x, u, dt, NUMPY_OPS)
+    np.testing.assert_allclose(model.functions.integrate(x, u, time_step(dt), NUMPY_OPS), textbook, atol=1e-13)
+
+
 def test_a_double_integrator_moves_exactly() -> None:
     # p + v t + a t^2 / 2 after half a second from (1, 2) at (0.5, -0.25) under (0.2, 0.4).
-    x = rk4(HOLONOMIC, (1.0, 2.0, 0.5, -0.25), (0.2, 0.4), time_step(0.5), NUMPY_OPS)
+    x = HOLONOMIC.integrate((1.0, 2.0, 0.5, -0.25), (0.2, 0.4), time_step(0.5), NUMPY_OPS)
     assert x == pytest.approx((1.275, 1.925, 0.6, -0.05), abs=1e-14)
 
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from d4orm_env.core.dynamics import Ops
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
-from d4orm_env.core.transition import TimeStep, rk4
+from d4orm_env.core.transition import TimeStep
 from d4orm_env.core.world import World
 from d4orm_env.verify import VerificationReport, Violation, verify
 
@@ -444,7 +444,7 @@ def sampled_positions(problem, controls, pieces):
             u = model.functions.limit_control(tuple(controls[step, robot].tolist()), limits, ops)
             for _ in range(pieces):
                 if arrival == math.inf:
-                    x = rk4(model.functions, x, u, pace, ops)
+                    x = model.functions.integrate(x, u, pace, ops)
                 track.append(x[:2])
             x = model.functions.limit_state(x, limits, ops)
             if arrival == math.inf and math.dist(x[:2], goal) <= problem.goal_radius:

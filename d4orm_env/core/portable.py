@@ -21,6 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from d4orm_env.core.dynamics import Ops
+
 Floats = NDArray[np.float64]
 
 _TWO_OVER_PI = 6.36619772367581382433e-01
@@ -171,6 +173,17 @@ def log(x: Any) -> Any:
     result = exponent * _LN2_HIGH - ((half_square - (s * (half_square + series) + exponent * _LN2_LOW)) - f)
     result = np.where(x == 0, -np.inf, np.where(x < 0, np.nan, result))
     return np.where(np.isposinf(x), x, result)[()]
+
+
+def standard_normal(generator: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Standard normal numbers of this shape, by the transform of Box and Muller from the generator's uniform ones."""
+    uniform = generator.random((2, *shape))
+    normal = np.sqrt(-2 * log(1 - uniform[0])) * cos(2 * _PI * uniform[1])
+    return np.asarray(normal, np.float32)
+
+
+NUMPY_OPS = Ops(cos, sin, np.sqrt, np.minimum, np.maximum)
+"""What the robot models need, over NumPy arrays."""
 
 
 def _polynomial(x: Any, coefficients: tuple[float, ...]) -> Any:

@@ -234,8 +234,8 @@ class _Sampling:
         centre: FloatArray = np.zeros((num_steps, num_robots, 2 * pairs), np.float32)
         centre[:, :, : mean.shape[2]] = (self.base + mean) / scale
         centre = centre.reshape(num_steps, num_robots, pairs, 2)
-        along = np.einsum("tkpi,nktpim->knm", centre, self.kept)
-        across = np.einsum("tkpi,nktpim->knm", np.stack([centre[..., 1], -centre[..., 0]], axis=-1), self.kept)
+        along, across = np.empty((2, num_robots, len(self.kept), DRAWS), np.float32)
+        sampling.project_noise(self.kept, centre, along, across)
         turns = np.stack([along, -along, across, -across], axis=2)
         samples = turns.reshape(num_robots, -1)[:, : self.rewards.shape[1]]
         return -(samples.sum(axis=0, keepdims=True) if self.task.credit == "team" else samples)

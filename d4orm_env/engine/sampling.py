@@ -506,3 +506,27 @@ def average_noise(kept: Any, odd: Any, even: Any, time_range: Any, first_moment:
         _sum_lanes(sums, time_range, k, first_moment)
         if second_moment.size > 0:
             _sum_lanes(squares, time_range, k, second_moment)
+
+
+@cached_kernel(SOURCES, **OPTIONS)
+def project_noise(kept: Any, centre: Any, along: Any, across: Any) -> None:
+    """Inner products of every draw with a direction, and with that direction turned by 90 degrees.
+
+    Args:
+        kept: The noise that :func:`score_tiles` kept.
+        centre: ``(H, K, P, 2)`` the direction.
+        along: ``(K, T, DRAWS)``, output.
+        across: ``(K, T, DRAWS)``, output.
+    """
+    num_tiles, num_robots, num_steps, num_pairs = kept.shape[0], kept.shape[1], kept.shape[2], kept.shape[3]
+    along[:] = ZERO
+    across[:] = ZERO
+    for k in range(num_robots):
+        for tile in range(num_tiles):
+            for t in range(num_steps):
+                for pair in range(num_pairs):
+                    x, y = centre[t, k, pair, 0], centre[t, k, pair, 1]
+                    for s in range(DRAWS):
+                        first, second = kept[tile, k, t, pair, 0, s], kept[tile, k, t, pair, 1, s]
+                        along[k, tile, s] += x * first + y * second
+                        across[k, tile, s] += y * first - x * second

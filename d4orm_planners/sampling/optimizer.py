@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray, positive_number, whole_number
 from d4orm_env.engine.base import SamplingRules, SamplingTask
 from d4orm_planners.base import Iteration, Planner, PlannerConfig, Search
@@ -131,4 +132,4 @@ class SamplingPlanner(Planner):
 def standard_normal(search: Search, shape: tuple[int, ...], stream: int) -> FloatArray:
     """Standard normal numbers of this iteration in this shape."""
     generator = np.random.default_rng(search.iteration_seed(stream))
-    return generator.standard_normal(shape, dtype=np.float32)
+    return portable.standard_normal(generator, shape)

@@ -16,8 +16,10 @@ REFERENCE_STEPS = 100
 def alpha_bar(num_steps: int, beta_start: float, beta_end: float) -> np.ndarray:
     """``(num_steps,)`` cumulative products of ``1 - beta``, for steps ``i = 1`` to ``num_steps``."""
     cumulative = np.cumprod(1 - np.linspace(beta_start, beta_end, REFERENCE_STEPS))
-    fraction = np.arange(REFERENCE_STEPS + 1) / REFERENCE_STEPS
-    return np.interp(np.arange(1, num_steps + 1) / num_steps, fraction, np.concatenate([[1.0], cumulative]))
+    values = np.concatenate([[1.0], cumulative, cumulative[-1:]])
+    # Not numpy.interp, in which compilers may fuse a multiplication with an addition.
+    whole, rest = np.divmod(np.arange(1, num_steps + 1) * REFERENCE_STEPS, num_steps)
+    return values[whole] + (values[whole + 1] - values[whole]) * (rest / num_steps)
 
 
 def annealed(num_steps: int, beta_start: float, beta_end: float) -> FloatArray:

@@ -5,6 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from d4orm_env.engine.softmax import softmax_weights
+
 
 @dataclass(frozen=True)
 class SoftmaxWeights:
@@ -25,6 +29,8 @@ class SoftmaxWeights:
         """Weights of ``rewards`` ``(..., M)``, times ``exp(log_ratio)`` where given; a sample at minus infinity gets
         none.
         """
+        if xp is np:
+            return softmax_weights(rewards, self.temperature, self.cutoff, log_ratio)
         usable = rewards > -xp.inf
         count = xp.maximum(usable.sum(-1, keepdims=True), 1).astype(rewards.dtype)
         mean = xp.where(usable, rewards, 0).sum(-1, keepdims=True) / count

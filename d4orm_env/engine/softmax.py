@@ -1,0 +1,136 @@
+"""The softmax over rewards as one compiled pass, with the same bits on every processor.
+
+In NumPy it takes a dozen calls, which for few samples cost more than what they compute, and the last bits of NumPy's
+exponential depend on the processor.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.engine import tiles
+from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.tiles import ONE, OPTIONS, ZERO, compiled
+
+LANES = 16
+"""Sums run over as many parts side by side, whatever the width of registers."""
+
+# exp(x) = 2^n exp(r), with n the nearest whole number to x / ln 2 and a minimax polynomial for r (Cephes, expf).
+_LOWEST = np.float32(-87)
+_ONE_OVER_LN2, _LN2_HIGH, _LN2_LOW = np.float32(1.44269504), np.float32(0.693359375), np.float32(-2.12194440e-4)
+_E2, _E3, _E4 = np.float32(5.0000001201e-1), np.float32(1.6666665459e-1), np.float32(4.1665795894e-2)
+_E5, _E6, _E7 = np.float32(8.3334519073e-3), np.float32(1.3981999507e-3), np.float32(1.9875691500e-4)
+_HALF, _BIAS, _MANTISSA = np.float32(0.5), np.int32(127), np.int32(23)
+
+_LEAST_SPREAD = np.float32(1e-6)
+"""Below this spread all samples are as good as equal, and amplifying rounding would be noise."""
+_LEAST_SUM = np.float32(1e-30)
+_NOTHING = np.float32(-np.inf)
+
+
+@compiled
+def _exponential(x: Any) -> Any:
+    """``exp(x)`` of ``x`` from -87 to 0, and zero below."""
+    n = np.floor(x * _ONE_OVER_LN2 + _HALF)
+    r = (x - n * _LN2_HIGH) - n * _LN2_LOW
+    tail = _E2 + r * (_E3 + r * (_E4 + r * (_E5 + r * (_E6 + r * _E7))))
+    power = np.int32(np.int32(np.int32(n) + _BIAS) << _MANTISSA).view(np.float32)
+    return (ONE + (r + r * r * tail)) * power if x >= _LOWEST else ZERO
+
+
+@compiled
+def _total(values: Any, sums: Any) -> Any:
+    """The sum of ``values``, lane by lane and then by halves; ``sums`` ``(LANES,)`` is overwritten."""
+    for lane in range(LANES):
+        sums[lane] = ZERO
+    whole = values.shape[0] // LANES * LANES
+    for first in range(0, whole, LANES):
+        for lane in range(LANES):
+            sums[lane] += values[first + lane]
+    for i in range(whole, values.shape[0]):
+        sums[i - whole] += values[i]
+    half = LANES // 2
+    while half > 0:
+        for lane in range(half):
+            sums[lane] += sums[lane + half]
+        half //= 2
+    return sums[0]
+
+
+@compiled
+def _largest(values: Any) -> Any:
+    """The largest of ``values``, or zero where none is more than minus infinity."""
+    best = _NOTHING
+    for i in range(values.shape[0]):
+        best = values[i] if values[i] > best else best
+    return best if best > _NOTHING else ZERO
+
+
+@compiled
+def _spread(rewards: Any, row: Any, sums: Any) -> Any:
+    """Standard deviation of the rewards that are more than minus infinity; ``row`` is overwritten."""
+    count = np.float32(0)
+    for i in range(row.shape[0]):
+        usable = rewards[i] > _NOTHING
+        row[i] = rewards[i] if usable else ZERO
+        count += ONE if usable else ZERO
+    count = max(count, ONE)
+    mean = _total(row, sums) / count
+    for i in range(row.shape[0]):
+        deviation = rewards[i] - mean if rewards[i] > _NOTHING else ZERO
+        row[i] = deviation * deviation
+    return max(np.sqrt(_total(row, sums) / count), _LEAST_SPREAD)
+
+
+@compiled
+def _weigh(rewards: Any, log_ratio: Any, scale: Any, cutoff: Any, row: Any, sums: Any) -> None:
+    """Fill ``row`` with the weights of one row of rewards, whose logarithms are ``scale`` times them."""
+    best = _largest(rewards)
+    for i in range(row.shape[0]):
+        row[i] = (rewards[i] - best) * scale
+    if log_ratio.shape[0] > 0:
+        for i in range(row.shape[0]):
+            row[i] = row[i] + log_ratio[i] if rewards[i] > _NOTHING else _NOTHING
+        best = _largest(row)
+        for i in range(row.shape[0]):
+            row[i] -= best
+    for i in range(row.shape[0]):
+        weight = _exponential(row[i])
+        row[i] = weight if weight >= cutoff else ZERO
+    share = ONE / max(_total(row, sums), _LEAST_SUM)
+    for i in range(row.shape[0]):
+        row[i] *= share
+
+
+@cached_kernel(fingerprint((tiles,)), **OPTIONS)
+def _softmax(rewards: Any, log_ratio: Any, temperature: Any, cutoff: Any, weights: Any) -> None:
+    sums = np.empty(LANES, np.float32)
+    for k in range(rewards.shape[0]):
+        scale = ONE / (temperature * _spread(rewards[k], weights[k], sums))
+        _weigh(rewards[k], log_ratio[min(k, log_ratio.shape[0] - 1)], scale, cutoff, weights[k], sums)
+
+
+def softmax_weights(rewards: Any, temperature: float, cutoff: float, log_ratio: Any = None) -> FloatArray:
+    """``exp(reward / (temperature * standard deviation) + log_ratio)``, normalised to sum to one.
+
+    Args:
+        rewards: ``(..., M)``; samples at minus infinity get no weight.
+        temperature: ``lambda``.
+        cutoff: Weights below this share of the largest are zero.
+        log_ratio: ``(..., M)`` added to the logarithm of the weights, or ``None``.
+
+    Returns:
+        ``(..., M)`` float32 weights; all zero where no sample is more than minus infinity.
+    """
+    rows = np.ascontiguousarray(rewards, np.float32)
+    num_samples = rows.shape[-1]
+    added = np.empty((1, 0)) if log_ratio is None else np.broadcast_to(log_ratio, rows.shape).reshape(-1, num_samples)
+    weights = np.empty((rows.size // num_samples, num_samples), np.float32)
+    _softmax(
+        rows.reshape(weights.shape), np.ascontiguousarray(added, np.float32), np.float32(temperature),
+        np.float32(cutoff), weights,
+    )  # fmt: skip
+    return weights.reshape(rows.shape)
