@@ -15,16 +15,19 @@ export PIP_DISABLE_PIP_VERSION_CHECK ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test lint docs bench format clean
+.PHONY: help demo test portability lint docs bench format clean
 
 help: ## List the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
 demo: $(CORE_STAMP) ## Plan 16 robots across a circle, execute the plan, write pictures to demo/
 	$(BIN)/d4orm demo --out demo
 
 test: $(DEV_STAMP) ## Run the whole test suite; PYTEST_ARGS='-m "not slow"' for the quick part
 	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal $(PYTEST_ARGS)
+
+portability: $(DEV_STAMP) ## Plan under the instruction sets of other processors and compare to the bit
+	$(BIN)/python tests/portability/processors.py --quick
 
 lint: $(DEV_STAMP) ## Check style, formatting, types and the layers
 	$(BIN)/ruff check .

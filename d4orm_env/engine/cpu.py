@@ -146,7 +146,7 @@ class CpuEngine:
         """See :meth:`d4orm_env.engine.base.Engine.prepare`; one compilation serves all teams of the same models."""
         del noise_scale, num_samples
         if not (sampling.score_kernel(task.problem.team.models).signatures and sampling.average_noise.signatures):
-            self.denoise(task, rules, task.base, np.zeros(1, np.float32), TILE, 0)
+            self.denoise(task, rules, task.base, np.ones(1, np.float32), TILE, 0)
 
     def denoise(
         self,

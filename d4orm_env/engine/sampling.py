@@ -15,7 +15,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from d4orm_env.core import collision, dynamics, reward, transition
-from d4orm_env.core.dynamics import MODEL_CODES, MODELS, Model
+from d4orm_env.core.dynamics import MODELS, Model
 from d4orm_env.engine import lanes, noise, proximity, tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.lanes import (
@@ -248,31 +248,6 @@ def _runner(model: Model) -> Any:
 _RUN = {name: _runner(model) for name, model in MODELS.items()}
 
 
-def _any_runner(models: tuple[str, ...]) -> Any:
-    """A function that moves a robot of any of these models, told by its code, with the arguments of :func:`_runner`."""
-    first, first_code = _RUN[models[0]], MODEL_CODES[models[0]]
-    others: Any = _any_runner(models[1:]) if len(models) > 1 else None
-
-    @inlined
-    def run_only(
-        code: Any, limits: Any, h: Any, docking: Any, goal: Any, inverse: Any, offset: Any, scale: Any, draws: Any,
-        controls: Any, places: Any, w: Any,
-    ) -> None:  # fmt: skip
-        first(limits, h, docking, goal, inverse, offset, scale, draws, controls, places, w)
-
-    @inlined
-    def run_any(
-        code: Any, limits: Any, h: Any, docking: Any, goal: Any, inverse: Any, offset: Any, scale: Any, draws: Any,
-        controls: Any, places: Any, w: Any,
-    ) -> None:  # fmt: skip
-        if code == first_code:
-            first(limits, h, docking, goal, inverse, offset, scale, draws, controls, places, w)
-        else:
-            others(code, limits, h, docking, goal, inverse, offset, scale, draws, controls, places, w)
-
-    return run_only if others is None else run_any
-
-
 @inlined
 def _add_standing(goal: Any, inverse: Any, count: Any, w: Any) -> None:
     """Add the reward, violations aside, of ``count`` steps in which the robot does not move."""
@@ -438,7 +413,7 @@ def score_kernel(models: tuple[str, ...]) -> Any:
 
 @cache
 def _score_kernel(models: tuple[str, ...]) -> Any:
-    run_robot = _any_runner(models)
+    run_robot = tiles.dispatch({name: _RUN[name] for name in models})
 
     @cached_kernel(SOURCES, variant="_".join(models), **OPTIONS)
     def score_tiles(

@@ -127,10 +127,9 @@ def softmax_weights(rewards: Any, temperature: float, cutoff: float, log_ratio: 
     """
     rows = np.ascontiguousarray(rewards, np.float32)
     num_samples = rows.shape[-1]
-    added = np.empty((1, 0)) if log_ratio is None else np.broadcast_to(log_ratio, rows.shape).reshape(-1, num_samples)
+    added = np.empty((1, 0), np.float32)
+    if log_ratio is not None:
+        added = np.array(np.broadcast_to(log_ratio, rows.shape), np.float32).reshape(-1, num_samples)
     weights = np.empty((rows.size // num_samples, num_samples), np.float32)
-    _softmax(
-        rows.reshape(weights.shape), np.ascontiguousarray(added, np.float32), np.float32(temperature),
-        np.float32(cutoff), weights,
-    )  # fmt: skip
+    _softmax(rows.reshape(weights.shape), added, np.float32(temperature), np.float32(cutoff), weights)
     return weights.reshape(rows.shape)

@@ -10,6 +10,7 @@ Who is near what is kept apart, in ``near`` ``(K, 2)``: a bit for every world.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numba
@@ -277,12 +278,34 @@ def _mover(model: Model) -> Any:
     return run
 
 
-HOLONOMIC2D, HOLONOMIC3D = MODEL_CODES["holonomic2d"], MODEL_CODES["holonomic3d"]
-VELOCITY2D = MODEL_CODES["velocity2d"]
-_move_holonomic2d = _mover(MODELS["holonomic2d"])
-_move_holonomic3d = _mover(MODELS["holonomic3d"])
-_move_velocity2d = _mover(MODELS["velocity2d"])
-_move_differential_drive = _mover(MODELS["differential_drive"])
+def dispatch(branches: Mapping[str, Any]) -> Any:
+    """``call(code, *arguments)``: the compiled function of the model with that code, of a table by models' names.
+
+    The codes are those of :data:`~d4orm_env.core.dynamics.MODEL_CODES`; nothing is done for one not in the table.
+    """
+    (name, branch), *others = branches.items()
+    own_code = MODEL_CODES[name]
+    if not others:
+
+        @inlined
+        def call_only(code: Any, *arguments: Any) -> None:
+            if code == own_code:
+                branch(*arguments)
+
+        return call_only
+    rest = dispatch(dict(others))
+
+    @inlined
+    def call(code: Any, *arguments: Any) -> None:
+        if code == own_code:
+            branch(*arguments)
+        else:
+            rest(code, *arguments)
+
+    return call
+
+
+_move = dispatch({name: _mover(model) for name, model in MODELS.items()})
 
 
 @inlined
@@ -291,15 +314,7 @@ def move_robot(arrays: Any, k: Any, w: Any) -> None:
     h = transition.TimeStep(arrays.time_step[0], arrays.time_step[1], arrays.time_step[2], arrays.time_step[3])
     limits = (arrays.limits[k, 0], arrays.limits[k, 1], arrays.limits[k, 2])
     docking = (arrays.squared_goal_radius, arrays.squared_goal_speed)
-    code = arrays.model_codes[k]
-    if code == HOLONOMIC2D:
-        _move_holonomic2d(limits, h, docking, w[k * STRIDE : (k + 1) * STRIDE])
-    elif code == HOLONOMIC3D:
-        _move_holonomic3d(limits, h, docking, w[k * STRIDE : (k + 1) * STRIDE])
-    elif code == VELOCITY2D:
-        _move_velocity2d(limits, h, docking, w[k * STRIDE : (k + 1) * STRIDE])
-    else:
-        _move_differential_drive(limits, h, docking, w[k * STRIDE : (k + 1) * STRIDE])
+    _move(arrays.model_codes[k], limits, h, docking, w[k * STRIDE : (k + 1) * STRIDE])
 
 
 @inlined
@@ -400,10 +415,7 @@ def _motion_reader(model: Model) -> Any:
     return read
 
 
-_velocity_holonomic2d = _motion_reader(MODELS["holonomic2d"])
-_velocity_holonomic3d = _motion_reader(MODELS["holonomic3d"])
-_velocity_velocity2d = _motion_reader(MODELS["velocity2d"])
-_velocity_differential_drive = _motion_reader(MODELS["differential_drive"])
+_read_velocity = dispatch({name: _motion_reader(model) for name, model in MODELS.items()})
 _HEADING = np.array([-1 if model.heading_index is None else model.heading_index for model in MODELS.values()])
 
 
@@ -411,14 +423,7 @@ _HEADING = np.array([-1 if model.heading_index is None else model.heading_index 
 def read_motion(arrays: Any, k: Any, s: Any, w: Any, velocity: Any, heading: Any) -> None:
     """Fill the velocity ``(d,)`` and the heading's cosine and sine ``(2,)`` of robot ``k`` in world ``s``."""
     code = arrays.model_codes[k]
-    if code == HOLONOMIC2D:
-        _velocity_holonomic2d(k * STRIDE, s, w, velocity)
-    elif code == HOLONOMIC3D:
-        _velocity_holonomic3d(k * STRIDE, s, w, velocity)
-    elif code == VELOCITY2D:
-        _velocity_velocity2d(k * STRIDE, s, w, velocity)
-    else:
-        _velocity_differential_drive(k * STRIDE, s, w, velocity)
+    _read_velocity(code, k * STRIDE, s, w, velocity)
     index = _HEADING[code]
     heading[0] = cosine(w[k * STRIDE + index * TILE + s]) if index >= 0 else ZERO
     heading[1] = sine(w[k * STRIDE + index * TILE + s]) if index >= 0 else ZERO

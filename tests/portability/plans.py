@@ -1,0 +1,66 @@
+"""Plans that must come out the same, to the bit, on every processor: prints a digest of each as JSON.
+
+`digests.json` beside this file holds what they are. A change of the planners or of the physics changes them: then
+`python tests/portability/plans.py > tests/portability/digests.json`, and say so in the changelog.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from d4orm_env import make_problem
+from d4orm_planners import make_planner
+
+
+class Case(NamedTuple):
+    """What to plan."""
+
+    planner: str
+    settings: dict[str, Any]
+    scenario: str
+    arguments: dict[str, Any]
+    max_iterations: int = 2
+
+
+CASES = {
+    "d4orm": Case("d4orm", {}, "circle", {"num_robots": 8}),
+    "d4orm among obstacles": Case("d4orm", {}, "four_obstacles", {"num_robots": 8}, 4),
+    "d4orm of the paper": Case(
+        "d4orm", {"preset": "paper", "num_steps": 10, "random_start": True}, "circle", {"num_robots": 4}
+    ),
+    "d4orm-d": Case("d4orm-d", {}, "random", {"num_robots": 24, "size": 6.0}, 30),
+    "d4orm-d of the paper": Case("d4orm-d", {"preset": "paper", "num_steps": 10}, "random", {"num_robots": 8}, 4),
+    "d-d4orm": Case("d-d4orm", {}, "circle", {"num_robots": 6}),
+    "mppi": Case("mppi", {"num_steps": 10, "importance": 0.01}, "circle", {"num_robots": 4}),
+    "cem": Case("cem", {"num_steps": 10, "adapt_variance": True}, "circle", {"num_robots": 4}),
+    "mbd": Case("mbd", {"num_steps": 20}, "swap", {"num_robots": 4}),
+    "i-mbd": Case("i-mbd", {"num_steps": 10}, "swap", {"num_robots": 4}),
+    "mixed models": Case("d4orm", {}, "heterogeneous", {"num_robots": 6}),
+    "differential drives": Case("d4orm-d", {}, "random", {"num_robots": 8, "model": "differential_drive"}, 30),
+    "first-order robots": Case("d4orm", {}, "circle", {"num_robots": 6, "model": "velocity2d"}),
+    "in space": Case("d4orm", {}, "sphere", {"num_robots": 8}),
+}
+
+QUICK = ("d4orm", "d4orm-d", "mppi", "cem", "mixed models")
+"""Cases that compile two sampling kernels only, and run through everything else."""
+
+
+def digest(case: Case) -> str:
+    """The problem, the controls and the states that they lead to, as 16 hexadecimal digits."""
+    problem = make_problem(case.scenario, seed=0, **case.arguments)
+    planner = make_planner(case.planner, engine="cpu", **case.settings)
+    plan = planner.solve(problem, seed=1, max_iterations=case.max_iterations)
+    arrays = (problem.start, problem.goal, plan.controls, plan.trajectory.states, plan.trajectory.rewards)
+    content = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+if __name__ == "__main__":
+    names = QUICK if "--quick" in sys.argv[1:] else tuple(CASES)
+    json.dump({name: digest(CASES[name]) for name in names}, sys.stdout, indent=2)
+    print()

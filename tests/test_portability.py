@@ -1,0 +1,68 @@
+"""One seed, one plan, on every processor: this one's plans, and what its kernels are made of."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+
+from d4orm_env import make_problem, rollout
+from d4orm_env.engine import sampling, softmax, worlds
+from d4orm_env.engine.softmax import softmax_weights
+from d4orm_env.engine.tiles import OPTIONS
+
+PORTABILITY = Path(__file__).parent / "portability"
+sys.path.insert(0, str(PORTABILITY))
+import plans  # noqa: E402
+
+DIGESTS = json.loads((PORTABILITY / "digests.json").read_text())
+
+ESTIMATE = re.compile(r"\bv?(rsqrt|rcp)(14|28)?[ps][sdh]\b|\bfr(sqrt|ecp)[esx]\b")
+FUSED = re.compile(r"\bvf(n?m(add|sub)|msubadd|maddsub)\w*|\bfn?m(add|sub|la|ls)\b")
+ROOT = re.compile(r"\bv?sqrt[ps]s\b|\bfsqrt\b")
+
+
+def test_every_case_has_a_digest() -> None:
+    assert list(DIGESTS) == list(plans.CASES)
+    assert set(plans.QUICK) <= set(plans.CASES)
+
+
+@pytest.mark.parametrize("name", plans.CASES)
+def test_plans_are_the_same_here_as_everywhere(name: str) -> None:
+    assert plans.digest(plans.CASES[name]) == DIGESTS[name]
+
+
+def kernels() -> Iterator[tuple[str, Any]]:
+    """Kernels of the CPU engine by name, each called at least once."""
+    problem = make_problem("circle", num_robots=2, seed=0)
+    plans.digest(plans.CASES["mppi"])
+    rollout(problem, np.zeros((problem.horizon, 2, 2), np.float32), engine="cpu")
+    softmax_weights(np.zeros((1, 4)), 1.0, 0.0)
+    yield "score", sampling.score_kernel(("differential_drive",))
+    yield "average", sampling.average_noise
+    yield "project", sampling.project_noise
+    yield "softmax", softmax._softmax
+    yield "roll out", worlds.roll_out
+
+
+@pytest.mark.slow
+def test_kernels_estimate_nothing_and_fuse_nothing() -> None:
+    plans.digest(plans.CASES["differential drives"])
+    rooted = 0
+    for name, kernel in kernels():
+        # What comes from the cache has no assembly to show.
+        fresh = numba.njit(nogil=True, **OPTIONS)(kernel.py_func)
+        fresh.compile(kernel.signatures[0])
+        assembly = fresh.inspect_asm(fresh.signatures[0])
+        for pattern in (ESTIMATE, FUSED):
+            found = pattern.search(assembly)
+            assert found is None, f"kernel {name} has the instruction {found and found.group()}"
+        rooted += ROOT.search(assembly) is not None
+    assert rooted >= 3  # the patterns match what the assembler writes on this processor
