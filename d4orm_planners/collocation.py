@@ -68,7 +68,7 @@ class TeamProgram:
     def __init__(self, problem: Problem, clearance: float) -> None:
         self.casadi = ca = load_casadi()
         self.problem, self.clearance = problem, clearance
-        self.ops = Ops(ca.cos, ca.sin, ca.sqrt, ca.fmin, ca.fmax)
+        self.ops = Ops(ca.cos, ca.sin, ca.sqrt, ca.fmin, ca.fmax, ca.atan2, ca.if_else)
         self.models = problem.team.robot_models
         self.limits, self.radius = problem.team.limits.astype(float), np.asarray(problem.team.radius, float)
         self.obstacles = list(self._obstacles())

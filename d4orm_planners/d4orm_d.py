@@ -17,7 +17,7 @@ from d4orm_planners.base import Iteration, Search
 from d4orm_planners.d4orm import D4orm, D4ormConfig
 from d4orm_planners.grouping import components, conflicts, failure_groups, independent_robots, reconnected
 from d4orm_planners.sampling.schedule import annealed
-from d4orm_planners.steering import Drives, closing_stretches, detours, straight_drives
+from d4orm_planners.steering import Drives, closing_stretches, detours, prepare_drives, straight_drives
 
 DECOUPLINGS = ("independent", "groups")
 STARTS = ("auto", "team", "straight")
@@ -113,6 +113,8 @@ class D4ormD(D4orm):
 
     def iterate(self, search: Search) -> Iteration:
         """See :meth:`Planner.iterate`: the whole team at first and once nobody fails, the failed robots in between."""
+        with search.watch.paused():
+            prepare_drives(search.problem)
         if search.iteration == 0 and not search.current.controls.any():
             drives = self.straight_start(search.problem)
             return self.whole_team(search) if drives is None else Iteration(drives, 0)

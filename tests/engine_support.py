@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +21,8 @@ MODEL_NAMES = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive")
 STANDING = {2: "velocity2d", 3: "holonomic3d"}
 """A model that stays where it is under zero control, by dimension."""
 
-NUMPY_OPS = Ops(np.cos, np.sin, np.sqrt, np.minimum, np.maximum)
+NUMPY_OPS = Ops(np.cos, np.sin, np.sqrt, np.minimum, np.maximum, np.arctan2, np.where)
+PYTHON_OPS = Ops(math.cos, math.sin, math.sqrt, min, max, math.atan2, lambda condition, a, b: a if condition else b)
 NUMPY_BITS = noise.BitOps(
     uint32=lambda x: np.asarray(x).astype(np.uint32),
     int32=lambda x: np.asarray(x).astype(np.int32),

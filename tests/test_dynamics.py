@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from engine_support import ENGINE_NAMES, MODEL_NAMES, NUMPY_OPS
+from engine_support import ENGINE_NAMES, MODEL_NAMES, NUMPY_OPS, PYTHON_OPS
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -18,8 +18,7 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.transition import TimeStep, advance
 from d4orm_env.engine.base import get_engine
 
-PYTHON_OPS = Ops(math.cos, math.sin, math.sqrt, min, max)
-JAX_OPS = Ops(jnp.cos, jnp.sin, jnp.sqrt, jnp.minimum, jnp.maximum)
+JAX_OPS = Ops(jnp.cos, jnp.sin, jnp.sqrt, jnp.minimum, jnp.maximum, jnp.arctan2, jnp.where)
 LIMITS = (2.0, 1.0, 0.5)
 """Speed, acceleration, turn rate: all different, so that none can stand for another."""
 

@@ -9,10 +9,10 @@ import sys
 
 import numpy as np
 import pytest
+from engine_support import PYTHON_OPS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from d4orm_env.core.dynamics import Ops
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.transition import TimeStep
@@ -432,7 +432,6 @@ def test_order_of_the_robots_does_not_matter(seed, order):
 
 def sampled_positions(problem, controls, pieces):
     """``(H * pieces + 1, K, 2)`` positions and arrival times, by the models of the core in float64, at a fine pace."""
-    ops = Ops(math.cos, math.sin, math.sqrt, min, max)
     h = problem.dt / pieces
     pace = TimeStep(h, h / 2, h / 3, h / 6)
     tracks, arrivals = [], []
@@ -441,12 +440,12 @@ def sampled_positions(problem, controls, pieces):
         x = tuple(float(value) for value in problem.start[robot, : model.state_size])
         goal, track, arrival = problem.goal[robot].astype(float), [x[:2]], math.inf
         for step in range(problem.horizon):
-            u = model.functions.limit_control(tuple(controls[step, robot].tolist()), limits, ops)
+            u = model.functions.limit_control(tuple(controls[step, robot].tolist()), limits, PYTHON_OPS)
             for _ in range(pieces):
                 if arrival == math.inf:
-                    x = model.functions.integrate(x, u, pace, ops)
+                    x = model.functions.integrate(x, u, pace, PYTHON_OPS)
                 track.append(x[:2])
-            x = model.functions.limit_state(x, limits, ops)
+            x = model.functions.limit_state(x, limits, PYTHON_OPS)
             if arrival == math.inf and math.dist(x[:2], goal) <= problem.goal_radius:
                 arrival = (step + 1) * problem.dt
         tracks.append(track)

@@ -27,6 +27,9 @@ class Ops(NamedTuple):
     sqrt: Callable[..., Any]
     minimum: Callable[..., Any]
     maximum: Callable[..., Any]
+    arctan2: Callable[..., Any]
+    where: Callable[..., Any]
+    """``(condition, a, b) -> a`` where the condition holds, ``b`` elsewhere."""
 
 
 class ModelFunctions(NamedTuple):
@@ -45,6 +48,11 @@ class ModelFunctions(NamedTuple):
     integrate: Callable[..., Any]
     """``(x, u, h, ops) -> x`` after a :class:`~d4orm_env.core.transition.TimeStep`: what classical Runge-Kutta makes of
     the derivative with the control held constant, written out without the terms that cancel.
+    """
+    approach: Callable[..., Any]
+    """``(x, goal, limits, h, ops) -> `` fastest velocity straight to the goal from which it can stop there [m/s]."""
+    track: Callable[..., Any]
+    """``(x, velocity, limits, h, ops) -> u`` that would bring it to a velocity within a step; it may exceed the limits.
     """
 
 
@@ -95,6 +103,19 @@ def clip(value: Any, limit: Any, ops: Ops) -> Any:
     return ops.maximum(-limit, ops.minimum(limit, value))
 
 
+def stopping_speed(distance: Any, limits: Any, h: Any, ops: Ops) -> Any:
+    """Fastest speed from which a robot with a limited acceleration stops within a distance."""
+    acceleration = limits[ACCELERATION]
+    # Braking begins with the next step.
+    lost = acceleration * h.half
+    return ops.minimum(limits[SPEED], ops.sqrt((acceleration + acceleration) * distance + lost * lost) - lost)
+
+
+def share(part: Any, whole: Any, other: Any, ops: Ops) -> Any:
+    """``part / whole``, and no division by zero where both are: ``other`` is any number but zero."""
+    return part / ops.where(whole > 0, whole, other)
+
+
 # Double integrator in the plane: x = [px, py, vx, vy], u = [ax, ay].
 
 
@@ -130,6 +151,17 @@ def holonomic2d_velocity(x: Any, u: Any, ops: Ops) -> Any:
 
 def holonomic2d_rest(x: Any, zero: Any) -> Any:
     return (x[0], x[1], zero, zero)
+
+
+def holonomic2d_approach(x: Any, goal: Any, limits: Any, h: Any, ops: Ops) -> Any:
+    gap_x, gap_y = goal[0] - x[0], goal[1] - x[1]
+    distance = ops.sqrt(gap_x * gap_x + gap_y * gap_y)
+    pace = share(stopping_speed(distance, limits, h, ops), distance, h.full, ops)
+    return (gap_x * pace, gap_y * pace)
+
+
+def holonomic2d_track(x: Any, velocity: Any, limits: Any, h: Any, ops: Ops) -> Any:
+    return ((velocity[0] - x[2]) / h.full, (velocity[1] - x[3]) / h.full)
 
 
 # Double integrator in space: x = [px, py, pz, vx, vy, vz], u = [ax, ay, az].
@@ -168,6 +200,17 @@ def holonomic3d_rest(x: Any, zero: Any) -> Any:
     return (x[0], x[1], x[2], zero, zero, zero)
 
 
+def holonomic3d_approach(x: Any, goal: Any, limits: Any, h: Any, ops: Ops) -> Any:
+    gap_x, gap_y, gap_z = goal[0] - x[0], goal[1] - x[1], goal[2] - x[2]
+    distance = ops.sqrt(gap_x * gap_x + gap_y * gap_y + gap_z * gap_z)
+    pace = share(stopping_speed(distance, limits, h, ops), distance, h.full, ops)
+    return (gap_x * pace, gap_y * pace, gap_z * pace)
+
+
+def holonomic3d_track(x: Any, velocity: Any, limits: Any, h: Any, ops: Ops) -> Any:
+    return ((velocity[0] - x[3]) / h.full, (velocity[1] - x[4]) / h.full, (velocity[2] - x[5]) / h.full)
+
+
 # First-order holonomic: x = [px, py], u = [vx, vy].
 
 
@@ -194,6 +237,18 @@ def velocity2d_velocity(x: Any, u: Any, ops: Ops) -> Any:
 
 def velocity2d_rest(x: Any, zero: Any) -> Any:
     return x
+
+
+def velocity2d_approach(x: Any, goal: Any, limits: Any, h: Any, ops: Ops) -> Any:
+    gap_x, gap_y = goal[0] - x[0], goal[1] - x[1]
+    distance = ops.sqrt(gap_x * gap_x + gap_y * gap_y)
+    # It stops at once, and need only not overshoot within a step.
+    pace = share(ops.minimum(limits[SPEED], distance / h.full), distance, h.full, ops)
+    return (gap_x * pace, gap_y * pace)
+
+
+def velocity2d_track(x: Any, velocity: Any, limits: Any, h: Any, ops: Ops) -> Any:
+    return velocity
 
 
 # Differential drive: x = [px, py, heading, speed], u = [turn rate, acceleration].
@@ -237,6 +292,17 @@ def differential_drive_rest(x: Any, zero: Any) -> Any:
     return (x[0], x[1], x[2], zero)
 
 
+def differential_drive_track(x: Any, velocity: Any, limits: Any, h: Any, ops: Ops) -> Any:
+    """Turn to the wanted direction, and drive as fast as it faces that way."""
+    facing_x, facing_y = ops.cos(x[2]), ops.sin(x[2])
+    along = facing_x * velocity[0] + facing_y * velocity[1]
+    across = facing_x * velocity[1] - facing_y * velocity[0]
+    none = along - along
+    # To stand still no heading is better than the present one.
+    turn = ops.where(along * along + across * across > 0, ops.arctan2(across, along), none)
+    return (clip(turn / h.full, limits[TURN_RATE], ops), (ops.maximum(along, none) - x[3]) / h.full)
+
+
 MODELS: dict[str, Model] = {
     model.name: model
     for model in (
@@ -255,6 +321,8 @@ MODELS: dict[str, Model] = {
                 holonomic2d_velocity,
                 holonomic2d_rest,
                 holonomic2d_integrate,
+                holonomic2d_approach,
+                holonomic2d_track,
             ),
         ),
         Model(
@@ -272,6 +340,8 @@ MODELS: dict[str, Model] = {
                 holonomic3d_velocity,
                 holonomic3d_rest,
                 holonomic3d_integrate,
+                holonomic3d_approach,
+                holonomic3d_track,
             ),
         ),
         Model(
@@ -289,6 +359,8 @@ MODELS: dict[str, Model] = {
                 velocity2d_velocity,
                 velocity2d_rest,
                 velocity2d_integrate,
+                velocity2d_approach,
+                velocity2d_track,
             ),
         ),
         Model(
@@ -306,6 +378,8 @@ MODELS: dict[str, Model] = {
                 differential_drive_velocity,
                 differential_drive_rest,
                 differential_drive_integrate,
+                holonomic2d_approach,
+                differential_drive_track,
             ),
         ),
     )

@@ -182,7 +182,7 @@ def standard_normal(generator: np.random.Generator, shape: tuple[int, ...]) -> N
     return np.asarray(normal, np.float32)
 
 
-NUMPY_OPS = Ops(cos, sin, np.sqrt, np.minimum, np.maximum)
+NUMPY_OPS = Ops(cos, sin, np.sqrt, np.minimum, np.maximum, arctan2, np.where)
 """What the robot models need, over NumPy arrays."""
 
 

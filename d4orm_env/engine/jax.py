@@ -28,7 +28,7 @@ from d4orm_env.engine.base import (
     checked_controls,
 )
 
-OPS = Ops(jnp.cos, jnp.sin, jnp.sqrt, jnp.minimum, jnp.maximum)
+OPS = Ops(jnp.cos, jnp.sin, jnp.sqrt, jnp.minimum, jnp.maximum, jnp.arctan2, jnp.where)
 BIT_OPS = noise.BitOps(
     uint32=lambda x: x.astype(jnp.uint32),
     int32=lambda x: x.astype(jnp.int32),

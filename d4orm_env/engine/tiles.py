@@ -55,6 +55,8 @@ for _function in (
     dynamics.norm_scale_2,
     dynamics.norm_scale_3,
     dynamics.clip,
+    dynamics.stopping_speed,
+    dynamics.share,
     transition.advance,
     transition.arrives,
     collision.axis_gap,
@@ -121,7 +123,33 @@ def cosine(x: Any) -> Any:
     return _shifted_sine(x, np.int32(1))
 
 
-OPS = Ops(cosine, sine, _sqrt, _minimum, _maximum)
+_TAN_PI_8, _QUARTER_PI = np.float32(np.sqrt(2) - 1), np.float32(np.pi / 4)
+_HALF_PI, _PI = np.float32(np.pi / 2), np.float32(np.pi)
+_A1, _A2, _A3, _A4 = (np.float32(a) for a in (-3.33329491539e-1, 1.99777106478e-1, -1.38776856032e-1, 8.05374449538e-2))
+
+
+@compiled
+def arctan2(y: Any, x: Any) -> Any:
+    """Angle of the point ``(x, y)`` to 3e-7 (Cephes, atanf); zero for the origin."""
+    wide, tall = abs(x), abs(y)
+    larger, smaller = max(wide, tall), min(wide, tall)
+    tangent = smaller / (larger if larger > ZERO else ONE)
+    beyond = tangent > _TAN_PI_8
+    t = (tangent - ONE) / (tangent + ONE) if beyond else tangent
+    t2 = t * t
+    angle = t + t * t2 * (_A1 + t2 * (_A2 + t2 * (_A3 + t2 * _A4)))
+    angle = _QUARTER_PI + angle if beyond else angle
+    angle = _HALF_PI - angle if tall > wide else angle
+    angle = _PI - angle if x < ZERO else angle
+    return -angle if y < ZERO else angle
+
+
+@compiled
+def _where(condition: Any, a: Any, b: Any) -> Any:
+    return a if condition else b
+
+
+OPS = Ops(cosine, sine, _sqrt, _minimum, _maximum, arctan2, _where)
 
 
 # Tuples of two to six numbers: consecutive rows of the workspace from offset ``o``, in world ``s``. Written out,
@@ -217,7 +245,7 @@ READ = {2: _read2, 3: _read3, 4: _read4, 6: _read6}
 WRITE = {2: _write2, 3: _write3, 4: _write4, 6: _write6}
 _PICK = {2: _pick2, 3: _pick3, 4: _pick4, 6: _pick6}
 _SQUARED_NORM = {2: _squared_norm2, 3: _squared_norm3}
-_SQUARED_GAP = {2: _squared_gap2, 3: _squared_gap3}
+SQUARED_GAP = {2: _squared_gap2, 3: _squared_gap3}
 
 
 def make_stepper(model: Model) -> tuple[Any, Any]:
@@ -228,7 +256,7 @@ def make_stepper(model: Model) -> tuple[Any, Any]:
     """
     functions = ModelFunctions(*(inlined(function) for function in model.functions))
     pick_x = _PICK[model.state_size]
-    squared_norm, squared_gap = _SQUARED_NORM[model.dimension], _SQUARED_GAP[model.dimension]
+    squared_norm, squared_gap = _SQUARED_NORM[model.dimension], SQUARED_GAP[model.dimension]
 
     @inlined
     def move(standing: Any, x: Any, u: Any, limits: Any, h: Any) -> Any:

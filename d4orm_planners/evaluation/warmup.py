@@ -25,6 +25,7 @@ from d4orm_env.core.team import Team
 from d4orm_env.engine.base import SamplingRules, SamplingTask, get_engine
 from d4orm_env.engine.caching import has_to_be_compiled
 from d4orm_planners.sampling.weights import SoftmaxWeights
+from d4orm_planners.steering import prepare_drives
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,7 @@ def sample_once(teams: tuple[tuple[str, ...], ...]) -> None:
         task = SamplingTask(problem, _no_controls(problem))
         rules = SamplingRules(weights=SoftmaxWeights(1.0))
         get_engine("cpu").prepare(task, rules, np.ones(1, np.float32), 2)
+        prepare_drives(problem)
 
 
 def warm_up() -> WarmupReport:
@@ -154,10 +156,11 @@ def _kernels() -> list[Any]:
     from numba.core.dispatcher import Dispatcher
 
     from d4orm_env import engine
+    from d4orm_env.engine.drives import drive_kernel
     from d4orm_env.engine.sampling import score_kernel
 
     modules = [import_module(f"{engine.__name__}.{module.name}") for module in pkgutil.iter_modules(engine.__path__)
                if module.name != "jax"]  # fmt: skip
     found = {name: value for module in modules for name, value in vars(module).items() if isinstance(value, Dispatcher)}
-    kernels = [*found.values(), *(score_kernel(models) for models in TEAMS)]
+    kernels = [*found.values(), *map(score_kernel, TEAMS), *map(drive_kernel, MODELS)]
     return [kernel for kernel in kernels if kernel.stats.cache_path is not None]
