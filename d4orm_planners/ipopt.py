@@ -10,7 +10,7 @@ import numpy as np
 from d4orm_env.core.arrays import positive_number, whole_number
 from d4orm_planners.base import Candidate, Iteration, Planner, PlannerConfig, Search, evaluate_controls
 from d4orm_planners.collocation import Contacts, Motion, TeamProgram, load_casadi
-from d4orm_planners.steering import straight_drives
+from d4orm_planners.steering import prepare_drives, straight_drives
 
 FOUND = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 """IPOPT's words for a solution of the program."""
@@ -115,6 +115,8 @@ class Ipopt(Planner):
         if search.current.controls.any():
             return _motion(search.current)
         problem = search.problem
+        with search.watch.paused():
+            prepare_drives(problem)
         straight = evaluate_controls(search.engine, problem, straight_drives(problem).controls[:, :, 0])
         docks = np.full(problem.num_robots, problem.horizon)
         program: TeamProgram = search.memory["program"]
