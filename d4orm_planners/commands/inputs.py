@@ -8,22 +8,24 @@ from typing import Any
 
 
 def parse_settings(settings: list[str] | None, option: str = "--set") -> dict[str, Any]:
-    """``name=value`` texts, given to an option, as a dictionary, the values read as YAML.
+    """``name=value`` texts, given to an option, as a dictionary, the values read as YAML 1.2.
 
     Raises:
-        ValueError: If a text has another form.
+        ValueError: If a text has another form, or gives a name again.
     """
-    import yaml
+    from d4orm_env.core.yaml_text import parse_yaml
 
-    values = {}
+    values: dict[str, Any] = {}
     for setting in settings or []:
         name, separator, text = setting.partition("=")
         if not separator or not name:
             raise ValueError(f"{option} {setting!r} is not of the form name=value, as num_samples=512")
+        if name in values:
+            raise ValueError(f"{option} gives {name!r} twice; give it once")
         try:
-            values[name] = yaml.safe_load(text)
-        except yaml.YAMLError:
-            raise ValueError(f"{option} {setting!r}: the value cannot be read") from None
+            values[name] = parse_yaml(text) if text.strip() else None
+        except ValueError as error:
+            raise ValueError(f"{option} {setting!r}: the value {error}") from None
     return values
 
 
