@@ -16,7 +16,7 @@ from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.core.yaml_text import read_yaml
+from d4orm_env.core.yaml_text import parse_yaml
 from d4orm_env.scenarios import list_scenarios, load_problem, make_problem, save_problem
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "scenarios" / "mixed_team.yaml"
@@ -373,22 +373,15 @@ def test_more_than_memory_holds_is_refused_before_it_is_read(tmp_path: Path, tex
     assert len(str(caught.value)) < 300
 
 
-def test_the_largest_teams_of_the_scenarios_fit_into_a_file(tmp_path: Path) -> None:
+def test_the_largest_teams_of_the_scenarios_fit_into_a_file() -> None:
     row = "{model: differential_drive, start: [%d, 0], goal: [%d, 5], heading: 0, speed: 0, radius: 0.1, "
     limits = "max_speed: 1, max_acceleration: 1, max_turn_rate: 1}"
-    robots = "\n".join(f"  - {row % (k, k)}{limits}" for k in range(0, 10_000))
-    tree = read(tmp_path, f"version: 1\nrobots:\n{robots}\n")
-    assert len(tree["robots"]) == 10_000
+    robots = "\n".join(f"  - {row % (k, k)}{limits}" for k in range(10_000))
+    assert len(parse_yaml(f"version: 1\nrobots:\n{robots}\n")["robots"]) == 10_000
 
 
-def read(tmp_path: Path, text: str) -> Any:
-    path = tmp_path / "file.yaml"
-    path.write_text(text)
-    return read_yaml(path)
-
-
-def test_numbers_are_those_of_yaml_1_2(tmp_path: Path) -> None:
+def test_numbers_are_those_of_yaml_1_2() -> None:
     text = "[1e-4, -1E5, .5, 5., 1e21, 12, 0x1F, 0o17, 1:30, on, yes, true, ~, '1e-4', 1_000]"
-    assert read(tmp_path, text) == [
+    assert parse_yaml(text) == [
         1e-4, -1e5, 0.5, 5.0, 1e21, 12, "0x1F", "0o17", "1:30", "on", "yes", True, None, "1e-4", "1_000",
     ]  # fmt: skip

@@ -21,8 +21,8 @@ def load_problem(path: str | os.PathLike[str]) -> Problem:
     """Read a scenario file.
 
     Args:
-        path: A YAML file of at most 10 MB, 10,000 robots and 10^8 robots times steps, in the explicit form (every robot
-            listed) or the short form (a scenario and its arguments).
+        path: A YAML file of at most 10 MB, 10,000 robots and 5 * 10^7 robots times steps, in the explicit form (every
+            robot listed) or the short form (a scenario and its arguments).
 
     Raises:
         ValueError: If the file cannot be read, is not YAML, breaks the schema, or makes no valid problem. One line that

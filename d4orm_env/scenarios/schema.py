@@ -22,7 +22,7 @@ VERSION = 1
 SQUARED_MAX = 1e18
 """Largest magnitude whose square, and a sum of such squares, float32 still holds."""
 
-MAX_ROBOT_STEPS = 10**8
+MAX_ROBOT_STEPS = 5 * 10**7
 """Robots times steps; a plan of that many takes gigabytes."""
 
 Number = Annotated[float, Field(ge=-FLOAT32_MAX, le=FLOAT32_MAX)]
@@ -154,7 +154,8 @@ class ProblemFile(Entry):
         limits = ("radius", "max_speed", "max_acceleration", "max_turn_rate")
         columns: dict[str, Any] = {name: [getattr(robot, name) for robot in self.robots] for name in limits}
         team = Team(tuple(robot.model for robot in self.robots), **columns)
-        start = [robot.state + [0.0] * (team.state_size - len(robot.state)) for robot in self.robots]
+        size = team.state_size  # asks every robot
+        start = [state + [0.0] * (size - len(state)) for state in (robot.state for robot in self.robots)]
         return Problem(
             team=team,
             start=start,
