@@ -79,7 +79,7 @@ class TrainingSettings(Settings):
         super().__post_init__()
         for name, own in (("num_robots", "robots"), ("seed", "seed"), ("model", "model")):
             if name in self.scenario_settings:
-                raise ValueError(f"scenario_settings has {name!r}; give the training's own setting {own!r} instead")
+                raise ValueError(f"scenario_settings has {name!r}; give {own!r} (--{own}) itself instead")
         make_problem(self.scenario, num_robots=self.robots, model=self.model, **self.scenario_settings)
 
     @property
