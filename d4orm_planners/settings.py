@@ -135,6 +135,8 @@ _EXPECTED = {
     "finite_number": "finite",
     "int_type": "a whole number",
     "float_type": "a number",
+    "dict_type": "a mapping",
+    "mapping_type": "a mapping",
     "bool_type": "True or False",
     "string_type": "text",
 }
