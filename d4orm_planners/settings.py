@@ -124,7 +124,8 @@ def _schema(kind: Any) -> type[BaseModel]:
     """The types of all settings, as pydantic checks them."""
     types = get_type_hints(kind, include_extras=True)
     wanted: dict[str, Any] = {name: (types[name], ...) for name in kind.setting_names()}
-    return create_model(kind.__name__, __config__=ConfigDict(strict=True, allow_inf_nan=False), **wanted)
+    config = ConfigDict(strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
+    return create_model(kind.__name__, __config__=config, **wanted)
 
 
 _EXPECTED = {
@@ -136,11 +137,10 @@ _EXPECTED = {
     "int_type": "a whole number",
     "float_type": "a number",
     "dict_type": "a mapping",
-    "mapping_type": "a mapping",
     "bool_type": "True or False",
     "string_type": "text",
 }
-"""By pydantic's kinds of errors."""
+"""By pydantic's kinds of errors; others keep its own words."""
 
 _PLAIN = {"above 0": "positive", "at least 0": "zero or more"}
 
@@ -151,6 +151,8 @@ def _explain(error: ValidationError) -> str:
     name, kind, value = str(first["loc"][0]), first["type"], first["input"]
     if kind == "value_error":
         return f"{name} {first['ctx']['error']}"
+    if kind not in _EXPECTED:
+        return f"{name}: {first['msg']}, not {shown(value)}"
     expected = _EXPECTED[kind].format(**first.get("ctx", {}))
     if kind.endswith("_type"):
         return f"{name} must be {expected}, not {shown(value)}"
