@@ -142,6 +142,7 @@ BAD = [
     (("reproduce", "--quick"), "--quick does not go with the list of figures"),
     (("reproduce", "--seeds", "99999999999"), "1000000"),
     (("bench", "--seeds", "99999999999"), "1000000"),
+    (("bench", "--robots", "4,99999"), "robots is 99999; it must be at most 10000"),
     (("run", "--noise", "-1"), "control_noise_std is -1"),
     (("run", "--policy", "nope"), "policy 'nope' is unknown"),
     (("demo", "--out", "good.yaml"), "good.yaml"),
