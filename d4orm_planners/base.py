@@ -6,7 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,6 +18,7 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.base import Engine, checked_controls, get_engine
 from d4orm_env.verify import verify
 from d4orm_planners.plan import IterationRecord, Plan
+from d4orm_planners.settings import Count, EngineName, Settings
 
 Callback = Callable[[IterationRecord], Any]
 
@@ -60,7 +61,7 @@ class Stopwatch:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlannerConfig:
+class PlannerConfig(Settings):
     """Settings that every planner takes.
 
     Attributes:
@@ -70,20 +71,9 @@ class PlannerConfig:
             first solution ends the search.
     """
 
-    engine: str = "auto"
-    max_iterations: int = 50
+    engine: EngineName = "auto"
+    max_iterations: Count = 50
     improve: bool = False
-
-    def __post_init__(self) -> None:
-        whole_number(self.max_iterations, "max_iterations", 1)
-        if not isinstance(self.improve, bool):
-            raise ValueError(f"improve must be True or False, not {self.improve!r}")
-        get_engine(self.engine)
-
-    @classmethod
-    def setting_names(cls) -> tuple[str, ...]:
-        """Names of all settings, in order."""
-        return tuple(field.name for field in fields(cls))
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, positive_number
+from d4orm_env.core.arrays import FloatArray
 from d4orm_env.engine.base import SamplingRules
 from d4orm_planners.base import Search
 from d4orm_planners.sampling.optimizer import PAPER, SamplingConfig, SamplingPlanner
 from d4orm_planners.sampling.schedule import constant
 from d4orm_planners.sampling.weights import EliteWeights
+from d4orm_planners.settings import Positive, Share
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,19 +27,10 @@ class CEMConfig(SamplingConfig):
         sigma_floor: Smallest standard deviation that the adaptation may reach.
     """
 
-    elite_fraction: float = 0.05
-    sigma: float = 1.0
+    elite_fraction: Share = 0.05
+    sigma: Positive = 1.0
     adapt_variance: bool = False
-    sigma_floor: float = 0.05
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        positive_number(self.sigma, "sigma")
-        positive_number(self.sigma_floor, "sigma_floor")
-        if positive_number(self.elite_fraction, "elite_fraction") > 1:
-            raise ValueError(f"elite_fraction is {self.elite_fraction:g}; it must be at most 1")
-        if not isinstance(self.adapt_variance, bool):
-            raise ValueError(f"adapt_variance must be True or False, not {self.adapt_variance!r}")
+    sigma_floor: Positive = 0.05
 
 
 @dataclass(frozen=True)
@@ -67,8 +59,8 @@ class CEM(SamplingPlanner):
     def rules(self) -> SamplingRules:
         """See :meth:`SamplingPlanner.rules`."""
         config = self.config
-        adapt = EliteDeviation(float(config.sigma), float(config.sigma_floor)) if config.adapt_variance else None
-        return SamplingRules(weights=EliteWeights(float(config.elite_fraction)), adapt=adapt)
+        adapt = EliteDeviation(config.sigma, config.sigma_floor) if config.adapt_variance else None
+        return SamplingRules(weights=EliteWeights(config.elite_fraction), adapt=adapt)
 
     def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
         """See :meth:`SamplingPlanner.initial`."""

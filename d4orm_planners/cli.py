@@ -6,6 +6,7 @@ Heavy imports happen inside the commands, so that ``--help`` is quick.
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
 import sys
 from pathlib import Path
@@ -14,7 +15,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from d4orm_planners.commands.evaluate import evaluate, leaderboard
-from d4orm_planners.commands.inputs import check_target, make_folder, names, numbers, parse_settings
+from d4orm_planners.commands.inputs import (
+    MOST_SEEDS,
+    check_target,
+    make_folder,
+    names,
+    numbers,
+    parse_settings,
+    refuse_options,
+)
 from d4orm_planners.commands.node import node
 from d4orm_planners.commands.reproduce import reproduce
 from d4orm_planners.commands.robustness import robustness
@@ -29,8 +38,6 @@ ClickException: Any = next(kind for kind in typer.BadParameter.__mro__ if kind._
 
 app = typer.Typer(
     name="d4orm",
-    help="Plan and run teams of robots that cross each other's way without touching.",
-    no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -38,6 +45,25 @@ app = typer.Typer(
 
 for command in (evaluate, leaderboard, node, reproduce, robustness, train):
     app.command()(command)
+
+
+def _tell_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"d4orm {importlib.metadata.version('d4orm-env')}")
+        raise typer.Exit
+
+
+@app.callback(invoke_without_command=True)
+def options(
+    context: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Plan and run teams of robots that cross each other's way without touching."""
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
 
 Scenario = Annotated[
     str, typer.Option("--scenario", "-s", help="Scenario name (see `d4orm scenarios`) or a YAML file.")
@@ -67,7 +93,7 @@ def demo(
 
     make_folder(out)
     problem = _problem("circle", robots, None, None, seed)
-    plan = _solve(problem, "d4orm", None, None, engine, seed, None, None, quiet=False)
+    plan = _solve(problem, "d4orm", {"engine": engine}, seed, None, None, quiet=False)
     _print_plan(plan)
     _require_solved(plan)
     episode = _execute(plan, seed)
@@ -84,6 +110,7 @@ def demo(
 
 @app.command("plan")
 def plan_command(
+    context: typer.Context,
     scenario: Scenario = "circle",
     robots: Robots = None,
     model: Model = None,
@@ -103,8 +130,12 @@ def plan_command(
     """Plan for a team; write the plan, a picture or an animation."""
     for path, suffixes in ((out, (".npz",)), (picture, (".png", ".svg", ".pdf")), (animation, (".gif", ".mp4"))):
         check_target(path, suffixes)
+    chosen = parse_settings(settings)
+    for name in {"engine", "preset", "max_iterations"}.intersection(chosen):
+        refuse_options(context, (name,), f"and --set {name} say the same; give one of them")
+    chosen = {"engine": engine, "preset": preset, **chosen}
     problem = _problem(scenario, robots, model, obstacles, seed)
-    plan = _solve(problem, planner, preset, settings, engine, seed, time_limit, max_iterations, quiet)
+    plan = _solve(problem, planner, chosen, seed, time_limit, max_iterations, quiet)
     if not quiet:
         _print_plan(plan)
     if out is not None:
@@ -118,6 +149,7 @@ def plan_command(
 
 @app.command()
 def run(
+    context: typer.Context,
     plan_file: Annotated[Path | None, typer.Argument(help="Plan to execute; plans anew without one.")] = None,
     scenario: Scenario = "circle",
     robots: Robots = None,
@@ -140,6 +172,11 @@ def run(
     for path, suffixes in ((picture, (".png", ".svg", ".pdf")), (animation, (".gif", ".mp4"))):
         check_target(path, suffixes)
     if plan_file is not None:
+        refuse_options(
+            context,
+            ("scenario", "robots", "model", "obstacles", "policy"),
+            f"does not go with a plan file; {plan_file} has a problem and controls of its own",
+        )
         plan = Plan.load(plan_file)
         problem: Problem = plan.problem
         actor: Policy = OpenLoop(plan=plan)
@@ -164,7 +201,9 @@ def bench(
     robots: Annotated[str | None, typer.Option("--robots", "-k", help="Team sizes, as 4,8,16.")] = None,
     models: Annotated[str | None, typer.Option("--models", help="Robot models, separated by commas.")] = None,
     engines: Annotated[str | None, typer.Option("--engines", help="Of cpu, jax and plain, with commas.")] = None,
-    seeds: Annotated[int | None, typer.Option("--seeds", help="Seeds for the first feasible plan.")] = None,
+    seeds: Annotated[
+        int | None, typer.Option("--seeds", max=MOST_SEEDS, help="Seeds for the first feasible plan.")
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Measure the engines, the environments and the planner on this machine."""
@@ -240,9 +279,7 @@ def _problem(scenario: str, robots: int | None, model: str | None, obstacles: in
 def _solve(
     problem: Problem,
     planner: str,
-    preset: str | None,
-    settings: list[str] | None,
-    engine: str,
+    settings: dict[str, Any],
     seed: int,
     time_limit: float | None,
     max_iterations: int | None,
@@ -253,7 +290,7 @@ def _solve(
     from d4orm_planners.progress import SolveProgress
     from d4orm_planners.registry import make_planner
 
-    chosen = make_planner(planner, preset=preset, **{"engine": engine, **parse_settings(settings)})
+    chosen = make_planner(planner, **settings)
     if get_engine(chosen.config.engine).name == "cpu":
         compile_for_planning(problem.team.models, lambda: typer.echo("compiling, once per installation ...", err=True))
     limit = max_iterations if max_iterations is not None else chosen.config.max_iterations

@@ -7,10 +7,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, positive_number
+from d4orm_env.core.arrays import FloatArray
 from d4orm_planners.base import Search
-from d4orm_planners.sampling.optimizer import PAPER, SamplingConfig, SamplingPlanner, standard_normal
+from d4orm_planners.sampling.optimizer import PAPER, Credit, SamplingConfig, SamplingPlanner, standard_normal
 from d4orm_planners.sampling.schedule import alpha_bar, annealed
+from d4orm_planners.settings import Samples, Share, ShareOrNone, Steps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,22 +31,13 @@ class D4ormConfig(SamplingConfig):
             The code that the paper's authors published starts from zero, and so does the preset: it solves more.
     """
 
-    num_samples: int = 256
-    num_steps: int = 100
-    credit: str = "alternate"
+    num_samples: Samples = 256
+    num_steps: Steps = 100
+    credit: Credit = "alternate"
     clip_between_iterations: bool = True
-    late_steps: float = 0.7
-    late_samples: float = 0.5
+    late_steps: ShareOrNone = 0.7
+    late_samples: Share = 0.5
     random_start: bool = False
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("late_steps", "late_samples"):
-            share = positive_number(getattr(self, name), name, zero_allowed=name == "late_steps")
-            if share > 1:
-                raise ValueError(f"{name} is {share:g}; it is a share, and must not be above 1")
-        if not isinstance(self.random_start, bool):
-            raise ValueError(f"random_start must be True or False, not {self.random_start!r}")
 
 
 class D4orm(SamplingPlanner):

@@ -9,11 +9,11 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, positive_number, whole_number
+from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.base import SamplingRules, SamplingTask, get_engine
@@ -32,9 +32,21 @@ from d4orm_planners.guidance import (
 from d4orm_planners.policy import Policy
 from d4orm_planners.sampling.schedule import annealed
 from d4orm_planners.sampling.weights import SoftmaxWeights
+from d4orm_planners.settings import (
+    Count,
+    EngineName,
+    NotNegative,
+    Positive,
+    Samples,
+    Settings,
+    Steps,
+    Variance,
+    one_of,
+)
 from d4orm_planners.steering import straight_drives, track_velocities
 
-REFINEMENTS = ("background", "sync", "off")
+Credit = Annotated[str, one_of(("robot", "team"))]
+Refinement = Annotated[str, one_of(("background", "sync", "off"))]
 
 NOT_AT_SUBGOALS = 1e-6
 """Goal radius while everyone is on the way: a robot drives through its subgoal [m]."""
@@ -50,7 +62,7 @@ NEARER = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
-class D4ormC2FConfig:
+class D4ormC2FConfig(Settings):
     """Settings of :class:`D4ormC2F`.
 
     Attributes:
@@ -86,68 +98,41 @@ class D4ormC2FConfig:
         ValueError: If a value makes no sense; the message names it.
     """
 
-    engine: str = "auto"
-    coarse_factor: int = 2
-    check_interval: int = 1
-    coarse_samples: int = 256
-    coarse_steps: int = 50
-    coarse_repair_steps: int = 20
-    coarse_iterations: int = 20
-    replan_iterations: int = 2
-    predict_horizon: int = 20
-    execute_horizon: int = 1
-    subgoal_offset: int = 15
-    num_samples: int = 128
-    num_steps: int = 20
-    temperature: float = 0.3
-    beta_start: float = 1e-4
-    beta_end: float = 2e-2
-    credit: str = "robot"
-    penalty: float = 10.0
-    extra_margin: float = 0.0
-    refine: str = "background"
-    refine_every: int = 5
-    replan_distance: float = 1.0
-    patience: int = 15
-    deadline: float | None = None
-    control_noise_std: float = 0.0
+    engine: EngineName = "auto"
+    coarse_factor: Steps = 2
+    check_interval: Steps = 1
+    coarse_samples: Samples = 256
+    coarse_steps: Steps = 50
+    coarse_repair_steps: Steps = 20
+    coarse_iterations: Count = 20
+    replan_iterations: Count = 2
+    predict_horizon: Steps = 20
+    execute_horizon: Steps = 1
+    subgoal_offset: Steps = 15
+    num_samples: Samples = 128
+    num_steps: Steps = 20
+    temperature: Positive = 0.3
+    beta_start: Variance = 1e-4
+    beta_end: Variance = 2e-2
+    credit: Credit = "robot"
+    penalty: Positive = 10.0
+    extra_margin: NotNegative = 0.0
+    refine: Refinement = "background"
+    refine_every: Count = 5
+    replan_distance: Positive = 1.0
+    patience: Count = 15
+    deadline: Positive | None = None
+    control_noise_std: NotNegative = 0.0
 
     def __post_init__(self) -> None:
-        for name, least in (
-            ("coarse_factor", 1),
-            ("check_interval", 1),
-            ("coarse_samples", 2),
-            ("coarse_steps", 1),
-            ("coarse_repair_steps", 1),
-            ("coarse_iterations", 1),
-            ("replan_iterations", 1),
-            ("predict_horizon", 1),
-            ("execute_horizon", 1),
-            ("subgoal_offset", 1),
-            ("num_samples", 2),
-            ("num_steps", 1),
-            ("refine_every", 1),
-            ("patience", 1),
-        ):
-            whole_number(getattr(self, name), name, least)
-        for name in ("temperature", "beta_start", "beta_end", "penalty", "replan_distance"):
-            positive_number(getattr(self, name), name)
-        for name in ("extra_margin", "control_noise_std"):
-            positive_number(getattr(self, name), name, zero_allowed=True)
-        if not self.beta_start <= self.beta_end < 1:
-            raise ValueError(f"beta_end is {self.beta_end:g}; it must lie between beta_start {self.beta_start:g} and 1")
+        super().__post_init__()
+        if self.beta_start > self.beta_end:
+            raise ValueError(f"beta_start {self.beta_start:g} is above beta_end {self.beta_end:g}; swap them")
         if self.execute_horizon > self.predict_horizon:
             raise ValueError(
                 f"execute_horizon is {self.execute_horizon}, more than the {self.predict_horizon} steps predicted; "
                 "raise predict_horizon"
             )
-        if self.credit not in ("robot", "team"):
-            raise ValueError(f"credit {self.credit!r} is unknown; choose one of robot, team")
-        if self.refine not in REFINEMENTS:
-            raise ValueError(f"refine {self.refine!r} is unknown; choose one of {', '.join(REFINEMENTS)}")
-        if self.deadline is not None:
-            positive_number(self.deadline, "deadline")
-        get_engine(self.engine)
 
 
 @dataclass(frozen=True)
@@ -185,13 +170,13 @@ class D4ormC2F(Policy):
     """
 
     name = "d4orm-c2f"
-    config_class: ClassVar[type | None] = D4ormC2FConfig
+    config_class: ClassVar[type[Settings] | None] = D4ormC2FConfig
     guidance: Guidance
 
     def __init__(self, config: D4ormC2FConfig | None = None) -> None:
         self.config = config or D4ormC2FConfig()
         self._engine = get_engine(self.config.engine)
-        self._rules = SamplingRules(SoftmaxWeights(float(self.config.temperature), 1e-3))
+        self._rules = SamplingRules(SoftmaxWeights(self.config.temperature, 1e-3))
         self._noise_scale = annealed(self.config.num_steps, self.config.beta_start, self.config.beta_end)
         self._planner = D4ormD(
             D4ormDConfig(

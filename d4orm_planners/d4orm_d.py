@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
 from d4orm_env.core import portable
-from d4orm_env.core.arrays import FloatArray, positive_number, whole_number
+from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.base import MovingObstacles, SamplingTask
@@ -17,10 +17,11 @@ from d4orm_planners.base import Iteration, Search
 from d4orm_planners.d4orm import D4orm, D4ormConfig
 from d4orm_planners.grouping import components, conflicts, failure_groups, independent_robots, reconnected
 from d4orm_planners.sampling.schedule import annealed
+from d4orm_planners.settings import Count, Positive, Samples, Steps, one_of
 from d4orm_planners.steering import Drives, closing_stretches, detours, prepare_drives, straight_drives
 
-DECOUPLINGS = ("independent", "groups")
-STARTS = ("auto", "team", "straight")
+Decoupling = Annotated[str, one_of(("independent", "groups"))]
+Start = Annotated[str, one_of(("auto", "team", "straight"))]
 
 WIDER = (1.0, 2.0)
 """Factors on the noise of successive repairs: what ordinary noise does not get around, wider noise may."""
@@ -72,26 +73,13 @@ class D4ormDConfig(D4ormConfig):
             past a robot than to wait for it.
     """
 
-    big_team: int | None = 32
-    decoupling: str = "independent"
-    start: str = "auto"
+    big_team: Count | None = 32
+    decoupling: Decoupling = "independent"
+    start: Start = "auto"
     first_collisions: bool = True
-    repair_samples: int = 128
-    repair_steps: int = 50
-    penalty: float = 3.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name, choices in (("decoupling", DECOUPLINGS), ("start", STARTS)):
-            if getattr(self, name) not in choices:
-                raise ValueError(f"{name} {getattr(self, name)!r} is unknown; choose one of {', '.join(choices)}")
-        if not isinstance(self.first_collisions, bool):
-            raise ValueError(f"first_collisions must be True or False, not {self.first_collisions!r}")
-        if self.big_team is not None:
-            whole_number(self.big_team, "big_team", 1)
-        whole_number(self.repair_samples, "repair_samples", 2)
-        whole_number(self.repair_steps, "repair_steps", 1)
-        positive_number(self.penalty, "penalty")
+    repair_samples: Samples = 128
+    repair_steps: Steps = 50
+    penalty: Positive = 3.0
 
 
 class D4ormD(D4orm):

@@ -5,9 +5,10 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
-from d4orm_env.core.arrays import positive_number, whole_number
+from pydantic import Field, SkipValidation
+
 from d4orm_env.engine.base import get_engine
 from d4orm_env.engine.threads import available_cores
 from d4orm_planners.base import Iteration, Planner, Search
@@ -23,9 +24,13 @@ from d4orm_planners.distributed.ray_planner import ray_planners
 from d4orm_planners.distributed.selection import SELECTIONS, shares
 from d4orm_planners.distributed.transport import TRANSPORTS, LocalNetwork
 from d4orm_planners.distributed.zenoh_transport import ZenohSettings, ZenohTransport
+from d4orm_planners.settings import Count, NotNegative, Whole, one_of
 
 INNER = MappingProxyType({kind.name: kind for kind in (D4orm, D4ormD)})
 """The planners that a node can run."""
+
+MOST_NODES = 1024
+"""Each is a thread or a process with a candidate of its own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +40,7 @@ class DD4ormConfig(D4ormDConfig):
     Attributes:
         num_samples: ``M`` of all nodes together; so is ``repair_samples``. Each node gets an equal share.
         planner: What every node refines its candidate with, ``"d4orm"`` or ``"d4orm-d"``.
-        nodes: How many; ``None`` for one per robot, as where the robots themselves are the nodes.
+        nodes: How many, at most 1024; ``None`` for one per robot, as where the robots themselves are the nodes.
         selection: What a node goes on from: one of the ``k`` candidates of most reward (``"top-k"``), the best one
             (``"max"``), or one of the best of ``k`` clusters (``"k-means"``).
         k: How many candidates it draws from.
@@ -52,32 +57,21 @@ class DD4ormConfig(D4ormDConfig):
             mapping of them; over a network only.
     """
 
-    planner: str = "d4orm"
-    nodes: int | None = 2
-    selection: str = "top-k"
-    k: int = 4
-    mode: str = "sync"
-    patience: float = 1.0
-    transport: str = "local"
-    node: int | None = None
-    zenoh: ZenohSettings | None = None
+    planner: Annotated[str, one_of(INNER)] = "d4orm"
+    nodes: Annotated[Count, Field(le=MOST_NODES)] | None = 2
+    selection: Annotated[str, one_of(SELECTIONS)] = "top-k"
+    k: Count = 4
+    mode: Annotated[str, one_of(MODES)] = "sync"
+    patience: NotNegative = 1.0
+    transport: Annotated[str, one_of(TRANSPORTS)] = "local"
+    node: Annotated[Whole, Field(ge=0)] | None = None
+    zenoh: Annotated[ZenohSettings | None, SkipValidation] = None  # checked once it is known to be of use
     address: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, choices in (
-            ("planner", tuple(INNER)),
-            ("selection", SELECTIONS),
-            ("mode", MODES),
-            ("transport", TRANSPORTS),
-        ):
-            if getattr(self, name) not in choices:
-                raise ValueError(f"{name} {getattr(self, name)!r} is unknown; choose one of {', '.join(choices)}")
         if self.nodes is not None:
-            whole_number(self.nodes, "nodes", 1)
             self.node_settings(self.nodes)
-        whole_number(self.k, "k", 1)
-        positive_number(self.patience, "patience", zero_allowed=True)
         if self.address is not None:
             if self.transport != "ray":
                 raise ValueError(f"address {self.address!r} goes with transport 'ray', not {self.transport!r}")
@@ -95,7 +89,6 @@ class DD4ormConfig(D4ormDConfig):
             raise ValueError(f"mode is {self.mode!r}; over a network it must be 'async', as there are no common rounds")
         if self.node is None:
             raise ValueError("node is None; over a network it must say which of the nodes this process is, from 0")
-        whole_number(self.node, "node", 0)
         if self.nodes is not None:
             self.check_node(self.nodes)
 

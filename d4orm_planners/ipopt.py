@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
+from pydantic import Field
 
-from d4orm_env.core.arrays import positive_number, whole_number
 from d4orm_planners.base import Candidate, Iteration, Planner, PlannerConfig, Search, evaluate_controls
 from d4orm_planners.collocation import Contacts, Motion, TeamProgram, load_casadi
+from d4orm_planners.settings import Count, NotNegative, Positive
 from d4orm_planners.steering import prepare_drives, straight_drives
 
 FOUND = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
@@ -17,6 +18,9 @@ FOUND = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 NEARLY_SOLVED = 1e-2
 """IPOPT's first barrier parameter in a round that begins where the last one ended."""
+
+
+SolverIterations = Annotated[Count, Field(le=2**31 - 1)]  # IPOPT's own counter
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,25 +43,14 @@ class IpoptConfig(PlannerConfig):
         ValueError: If a value makes no sense; the message names it.
     """
 
-    max_iterations: int = 20
-    perturbation: float = 0.1
-    lookout: float | None = 0.5
-    rounds: int = 8
-    clearance: float = 2e-3
-    tolerance: float = 1e-3
-    barrier: float = 1.0
-    solver_iterations: int = 1000
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        positive_number(self.perturbation, "perturbation", zero_allowed=True)
-        positive_number(self.clearance, "clearance", zero_allowed=True)
-        if self.lookout is not None:
-            positive_number(self.lookout, "lookout", zero_allowed=True)
-        for name in ("tolerance", "barrier"):
-            positive_number(getattr(self, name), name)
-        for name in ("rounds", "solver_iterations"):
-            whole_number(getattr(self, name), name, 1)
+    max_iterations: Count = 20
+    perturbation: NotNegative = 0.1
+    lookout: NotNegative | None = 0.5
+    rounds: Count = 8
+    clearance: NotNegative = 2e-3
+    tolerance: Positive = 1e-3
+    barrier: Positive = 1.0
+    solver_iterations: SolverIterations = 1000
 
 
 class Ipopt(Planner):

@@ -11,6 +11,7 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_planners.base import Search
 from d4orm_planners.sampling.optimizer import PAPER, SamplingConfig, SamplingPlanner, standard_normal
 from d4orm_planners.sampling.schedule import alpha_bar, annealed
+from d4orm_planners.settings import Count, Steps
 
 
 class _DirectDenoising(SamplingPlanner):
@@ -36,8 +37,8 @@ class _DirectDenoising(SamplingPlanner):
 class MBDConfig(SamplingConfig):
     """Settings of model-based diffusion: one run of many steps."""
 
-    num_steps: int = 10_000
-    max_iterations: int = 1
+    num_steps: Steps = 10_000
+    max_iterations: Count = 1
 
 
 class MBD(_DirectDenoising):

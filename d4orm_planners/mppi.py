@@ -7,11 +7,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, positive_number
+from d4orm_env.core.arrays import FloatArray
 from d4orm_env.engine.base import SamplingRules
 from d4orm_planners.base import Search
 from d4orm_planners.sampling.optimizer import PAPER, SamplingConfig, SamplingPlanner
 from d4orm_planners.sampling.schedule import constant
+from d4orm_planners.settings import Positive, ShareOrNone
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,14 +26,8 @@ class MPPIConfig(SamplingConfig):
             nothing of most samples (the paper calls it unstable and does without).
     """
 
-    sigma: float = 1.0
-    importance: float = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        positive_number(self.sigma, "sigma")
-        if positive_number(self.importance, "importance", zero_allowed=True) > 1:
-            raise ValueError(f"importance is {self.importance:g}; it must be at most 1")
+    sigma: Positive = 1.0
+    importance: ShareOrNone = 0.0
 
 
 class MPPI(SamplingPlanner):
@@ -47,7 +42,7 @@ class MPPI(SamplingPlanner):
 
     def rules(self) -> SamplingRules:
         """See :meth:`SamplingPlanner.rules`."""
-        return super().rules()._replace(importance=float(self.config.importance))
+        return super().rules()._replace(importance=self.config.importance)
 
     def noise_scale(self) -> FloatArray:
         """See :meth:`SamplingPlanner.noise_scale`."""

@@ -7,23 +7,28 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
+from pydantic import Field
 
-from d4orm_env.core.arrays import FloatArray, positive_number, whole_number
+from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.joint_state import JointState
 from d4orm_planners.policy import Policy
+from d4orm_planners.settings import NotNegative, Positive, Settings, Whole
 from d4orm_planners.steering import preferred_velocities, track_velocities
 
 CORNERS = 16
 """Of the polygons that stand for round obstacles and docked robots."""
 
 
+Neighbors = Annotated[Whole, Field(ge=0, le=10**6)]
+
+
 @dataclass(frozen=True, kw_only=True)
-class OrcaConfig:
+class OrcaConfig(Settings):
     """Settings of :class:`Orca`.
 
     Attributes:
@@ -40,20 +45,12 @@ class OrcaConfig:
         ValueError: If a value makes no sense; the message names it.
     """
 
-    time_horizon: float = 1.0
-    obstacle_time_horizon: float = 1.0
-    neighbor_distance: float = 10.0
-    max_neighbors: int = 10
-    clearance: float | None = None
-    deviation: float = 0.1
-
-    def __post_init__(self) -> None:
-        for name in ("time_horizon", "obstacle_time_horizon", "neighbor_distance"):
-            positive_number(getattr(self, name), name)
-        whole_number(self.max_neighbors, "max_neighbors", 0)
-        positive_number(self.deviation, "deviation", zero_allowed=True)
-        if self.clearance is not None:
-            positive_number(self.clearance, "clearance", zero_allowed=True)
+    time_horizon: Positive = 1.0
+    obstacle_time_horizon: Positive = 1.0
+    neighbor_distance: Positive = 10.0
+    max_neighbors: Neighbors = 10
+    clearance: NotNegative | None = None
+    deviation: NotNegative = 0.1
 
 
 class Orca(Policy):
@@ -65,7 +62,7 @@ class Orca(Policy):
     """
 
     name = "orca"
-    config_class: ClassVar[type | None] = OrcaConfig
+    config_class: ClassVar[type[Settings] | None] = OrcaConfig
 
     def __init__(self, config: OrcaConfig | None = None) -> None:
         self.config = config or OrcaConfig()

@@ -12,6 +12,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_planners.base import Planner
 from d4orm_planners.plan import Plan
+from d4orm_planners.settings import Settings
 from d4orm_planners.steering import drive_to_goal
 
 Actions = dict[str, FloatArray]
@@ -22,12 +23,12 @@ class Policy(ABC):
 
     Attributes:
         name: Registry name.
-        config_class: Frozen dataclass of the policy's settings, of which the constructor takes an instance; ``None``
-            for a policy without settings, whose constructor takes nothing.
+        config_class: :class:`~d4orm_planners.settings.Settings` of the policy, of which the constructor takes an
+            instance; ``None`` for a policy without settings, whose constructor takes nothing.
     """
 
     name: ClassVar[str]
-    config_class: ClassVar[type | None] = None
+    config_class: ClassVar[type[Settings] | None] = None
 
     def reset(self, env: Any, seed: int = 0) -> None:
         """Get ready for an episode that ``env.reset()`` has begun.

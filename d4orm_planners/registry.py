@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from types import MappingProxyType
 from typing import Any
 
+from d4orm_env.core.arrays import positive_number, shown
 from d4orm_planners.base import Planner
 from d4orm_planners.cem import CEM
 from d4orm_planners.d4orm import D4orm
@@ -19,6 +20,7 @@ from d4orm_planners.mppi import MPPI
 from d4orm_planners.orca import Orca
 from d4orm_planners.policy import DriveToGoal, OpenLoop, Policy, RandomControls
 from d4orm_planners.rl.learned import PPO, SAC
+from d4orm_planners.settings import UnknownSettingError
 
 PLANNERS: Mapping[str, type[Planner]] = MappingProxyType(
     {planner.name: planner for planner in (D4orm, D4ormD, DD4orm, MPPI, CEM, MBD, IterativeMBD, Ipopt)}
@@ -60,13 +62,12 @@ def make_planner(name: str, *, preset: str | None = None, **config: Any) -> Plan
         **config: Settings that differ from the preset; see the planner's configuration class.
 
     Raises:
-        ValueError: For an unknown planner, preset or setting, or a setting that makes no sense.
+        ValueError: For an unknown planner or preset, or a setting that makes no sense.
+        TypeError: For an unknown setting.
     """
     kind = _find(name, PLANNERS, "planner")
-    if preset is not None and preset not in kind.presets:
-        raise ValueError(f"preset {preset!r} of planner {name!r} is unknown; choose one of {', '.join(kind.presets)}")
-    _check_settings(kind.config_class, config, f"planner {name!r}")
-    settings = kind.presets[preset] if preset is not None else {}
+    settings = {} if preset is None else _find(preset, kind.presets, "preset", f" of planner {name!r}")
+    kind.config_class.check_names(config, f"planner {name!r}")
     return kind(kind.config_class(**{**settings, **config}))
 
 
@@ -79,11 +80,12 @@ def make_policy(name: str, **config: Any) -> Policy:
             ``max_iterations``); for a policy, its own settings.
 
     Raises:
-        ValueError: For an unknown name or setting.
+        ValueError: For an unknown name, or a setting that makes no sense.
+        TypeError: For an unknown setting.
     """
-    if name in PLANNERS:
-        budget = {key: config.pop(key) for key in ("time_limit",) if key in config}
-        return OpenLoop(make_planner(name, **config), **budget)
+    if isinstance(name, str) and name in PLANNERS:
+        time_limit = _time_limit(config)
+        return OpenLoop(make_planner(name, **config), time_limit=time_limit)
     config_instance = _policy_config(name, config)
     kind: Any = POLICIES[name]
     return kind() if config_instance is None else kind(config_instance)
@@ -93,10 +95,10 @@ def policy_settings(name: str, **config: Any) -> dict[str, Any]:
     """All settings of ``make_policy(name, **config)``, defaults filled in; a preset has become its settings.
 
     Raises:
-        ValueError: As :func:`make_policy`.
+        ValueError, TypeError: As :func:`make_policy`.
     """
-    if name in PLANNERS:
-        time_limit = config.pop("time_limit", None)
+    if isinstance(name, str) and name in PLANNERS:
+        time_limit = _time_limit(config)
         return {**asdict(make_planner(name, **config).config), "time_limit": time_limit}
     config_instance = _policy_config(name, config)
     return {} if config_instance is None else asdict(config_instance)
@@ -106,23 +108,22 @@ def _policy_config(name: str, config: Mapping[str, Any]) -> Any:
     """The configuration of a policy that is no planner; ``None`` for one without settings."""
     kind = _find(name, {**PLANNERS, **POLICIES}, "policy")
     if kind.config_class is not None:
-        _check_settings(kind.config_class, config, f"policy {name!r}")
+        kind.config_class.check_names(config, f"policy {name!r}")
         return kind.config_class(**config)
     if config:
-        raise ValueError(f"policy {name!r} takes no settings, but was given {', '.join(config)}")
+        raise UnknownSettingError(f"policy {name!r} takes no settings, but was given {', '.join(config)}")
     return None
 
 
-def _check_settings(config_class: type, config: Mapping[str, Any], owner: str) -> None:
-    known = [field.name for field in fields(config_class)]
-    for setting in config:
-        if setting not in known:
-            raise ValueError(f"{setting!r} is no setting of {owner}; it takes {', '.join(known)}")
+def _time_limit(config: dict[str, Any]) -> float | None:
+    """Take the budget of the solve out of a planner's settings."""
+    limit = config.pop("time_limit", None)
+    return None if limit is None else positive_number(limit, "time_limit")
 
 
-def _find(name: str, table: Mapping[str, Any], what: str) -> Any:
-    if name not in table:
-        raise ValueError(f"{what} {name!r} is unknown; choose one of {', '.join(table)}")
+def _find(name: Any, table: Mapping[str, Any], what: str, owner: str = "") -> Any:
+    if not isinstance(name, str) or name not in table:
+        raise ValueError(f"{what} {shown(name)}{owner} is unknown; choose one of {', '.join(table)}")
     return table[name]
 
 

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from outputs import argument_parser, count, save_table
+from outputs import argument_parser, count, require, save_table
 
 from d4orm_env import make_problem
 from d4orm_env.engine.base import get_engine
@@ -79,6 +79,7 @@ def main() -> None:
     parser = argument_parser(__doc__)
     parser.add_argument("--repetitions", type=count, default=300)
     arguments = parser.parse_args()
+    require("zenoh", "zenoh")
     repetitions, teams = (20, (4,)) if arguments.quick else (arguments.repetitions, (8, 16, 32))
     network, peers = LocalNetwork(), zenoh_pair()
     transports: dict[str, tuple[Transport, Transport]] = {"local": (network.join(), network.join()), "zenoh": peers}

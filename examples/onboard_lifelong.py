@@ -29,7 +29,7 @@ from onboard.picture import draw
 from onboard.results import Row, film, robot_rows, run_row, timeline
 from onboard.robot import Robot
 from onboard.world import World
-from outputs import argument_parser, count, save_figure, save_gif, save_table
+from outputs import argument_parser, count, require, save_figure, save_gif, save_table
 
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.distributed.transport import LocalNetwork
@@ -65,6 +65,7 @@ def main() -> int:
     parser.add_argument("--kill", type=kill_order, action="append", default=[], metavar="ROBOT:SECONDS")
     parser.add_argument("--film", type=float, default=30.0, help="seconds of the animation")
     arguments = parser.parse_args()
+    require("zenoh", "zenoh")
     robots, minutes = arguments.robots, arguments.minutes
     if arguments.quick:
         robots, minutes = 3, 0.1

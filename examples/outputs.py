@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import csv
+import sys
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,18 @@ COLOURS = {"d4orm": "#0072B2", "default": "#56B4E9", "mppi": "#D55E00", "cem": "
 
 plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True})
 plt.rcParams.update({"grid.alpha": 0.25, "legend.frameon": False, "figure.dpi": 110})
+
+
+def require(extra: str, *modules: str) -> None:
+    """End with one line that names the extra to install, unless these modules can be imported."""
+    for module in modules:
+        try:
+            import_module(module)
+        except ModuleNotFoundError as error:
+            print(
+                f"this example needs {error.name}; install it with: pip install 'd4orm-env[{extra}]'", file=sys.stderr
+            )
+            raise SystemExit(2) from None
 
 
 def argument_parser(description: str | None) -> argparse.ArgumentParser:

@@ -4,7 +4,7 @@
     python examples/read_results.py --results evaluation
 
 Without `--results` it makes a small evaluation of its own. `--format` chooses which of the files is read; all hold the
-same rows, described in docs/evaluation.md. Needs pandas, and pyarrow for Parquet.
+same rows, described in docs/evaluation.md. Needs pandas, pyarrow for Parquet, and pyrvo for its own evaluation.
 """
 
 from __future__ import annotations
@@ -14,8 +14,10 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
+from outputs import argument_parser, plt, require, save_figure, save_table
+
+require("dev", "pandas")
 import pandas as pd
-from outputs import argument_parser, plt, save_figure, save_table
 
 from d4orm_planners import evaluate
 from d4orm_planners.evaluation.store import TrialStore
@@ -72,8 +74,11 @@ def main() -> None:
     parser.add_argument("--results", type=Path, help="folder that `d4orm evaluate` wrote to")
     parser.add_argument("--format", choices=("parquet", "csv", "sqlite"), default="parquet")
     arguments = parser.parse_args()
+    if arguments.format == "parquet":
+        require("evaluate", "pyarrow")
     folder = arguments.results
     if folder is None:
+        require("orca", "pyrvo")
         folder = arguments.out / "evaluation"
         seeds = range(2 if arguments.quick else 10)
         evaluate(POLICIES, ["circle", "random"], num_robots=4, seeds=seeds, time_limit=1.0, out=folder, workers=1)

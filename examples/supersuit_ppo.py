@@ -12,8 +12,10 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+from outputs import argument_parser, count, require, save_table
+
+require("rl", "supersuit", "stable_baselines3")
 import supersuit
-from outputs import argument_parser, count, save_table
 from stable_baselines3 import PPO
 from stable_baselines3.common.utils import set_random_seed
 

@@ -8,7 +8,10 @@ was: the training from its last checkpoint, the comparison after its last trial.
 
 from __future__ import annotations
 
-from outputs import argument_parser, count, save_table
+from outputs import argument_parser, count, require, save_table
+
+require("orca", "pyrvo")
+require("rl", "stable_baselines3", "tensorboard")
 
 from d4orm_planners.evaluation.robustness import robustness
 from d4orm_planners.evaluation.robustness_report import write_robustness

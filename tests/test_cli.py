@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from d4orm_planners import cli
@@ -108,6 +110,18 @@ BAD = [
     (("plan", "--set", "num_samples"), "name=value"),
     (("plan", "--set", "num_samples=1"), "num_samples is 1"),
     (("plan", "--set", "nonsense=1"), "nonsense"),
+    (("plan", "--set", "num_samples=64", "--set", "num_samples=65"), "--set gives 'num_samples' twice"),
+    (("plan", "--set", "temperature=[1"), "the value is not YAML"),
+    (("plan", "--set", "temperature=!!python/name:os.system"), "tags are not supported"),
+    (("plan", "--set", "temperature=1e400"), "temperature is inf"),
+    (("plan", "--set", "improve=yes"), "improve must be True or False, not 'yes'"),
+    (("plan", "--engine", "cpu", "--set", "engine=jax"), "--engine and --set engine say the same"),
+    (("plan", "--engine", "auto", "--set", "engine=cpu"), "--engine and --set engine say the same"),
+    (("plan", "--preset", "paper", "--set", "preset=paper"), "--preset and --set preset say the same"),
+    (("plan", "--max-iterations", "2", "--set", "max_iterations=3"), "--max-iterations and --set max_iterations"),
+    (("plan", "--planner", "d-d4orm", "--set", "nodes=100000000"), "nodes is 100000000; it must be at most 1024"),
+    (("plan", "--planner", "d-d4orm", "--set", "num_samples=1e21"), "num_samples must be a whole number, not 1e+21"),
+    (("plan", "--scenario", "endless.yaml"), "horizon is 100000000"),
     (("plan", "--seed", "-1"), "seed is -1"),
     (("plan", "--time-limit", "0"), "time_limit is 0"),
     (("plan", "--max-iterations", "0"), "max_iterations is 0"),
@@ -117,6 +131,18 @@ BAD = [
     (("plan", "--no-such-option",), "--no-such-option"),
     (("run", "truncated.npz"), "truncated.npz is not a readable plan"),
     (("run", "absent.npz"), "absent.npz"),
+    *(
+        (("run", "whole.npz", option, value), f"{option} does not go with a plan file; whole.npz has a problem")
+        for option, value in (
+            ("--scenario", "circle"), ("--robots", "2"), ("--model", "velocity2d"), ("--obstacles", "0"),
+            ("--policy", "d4orm"),
+        )
+    ),
+    (("reproduce", "--list", "circle"), "figure does not go with the list of figures"),
+    (("reproduce", "--quick"), "--quick does not go with the list of figures"),
+    (("reproduce", "--seeds", "99999999999"), "1000000"),
+    (("bench", "--seeds", "99999999999"), "1000000"),
+    (("bench", "--robots", "4,99999"), "robots is 99999; it must be at most 10000"),
     (("run", "--noise", "-1"), "control_noise_std is -1"),
     (("run", "--policy", "nope"), "policy 'nope' is unknown"),
     (("demo", "--out", "good.yaml"), "good.yaml"),
@@ -131,6 +157,7 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
     robot = "  - {model: velocity2d, start: [%s, 0], goal: [%s, 1]}\n"
     (tmp_path / "good.yaml").write_text(line + robot % (0, 0))
     (tmp_path / "nan.yaml").write_text(line + robot % (".nan", 0))
+    (tmp_path / "endless.yaml").write_text(line + robot % (0, 0) + "horizon: 100000000\n")
     (tmp_path / "overlap.yaml").write_text(line + robot % (0, 0) + robot % (0.1, 5))
     assert d4orm("plan", "--scenario", "good.yaml", "--quiet", *QUICK, "--out", "whole.npz").status in (0, 1)
     (tmp_path / "truncated.npz").write_bytes((tmp_path / "whole.npz").read_bytes()[:500])
@@ -142,6 +169,28 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
     assert message in outcome.err
     # A folder made for the demo is no half-written file.
     assert [path for path in sorted(tmp_path.rglob("*")) if path.name != "demo"] == before
+
+
+@pytest.mark.parametrize("setting", ["beta_start=1e-4", "beta_end=2E-2", "late_steps=7e-1", "late_samples=.5"])
+def test_numbers_may_have_an_exponent_without_a_point(d4orm, setting: str) -> None:
+    default = d4orm("plan", "--robots", "2", *QUICK, "--out", "default.npz", "--quiet")
+    given = d4orm("plan", "--robots", "2", *QUICK, "--set", setting, "--out", "given.npz", "--quiet")
+    assert given.status == default.status
+    np.testing.assert_array_equal(Plan.load(Path("given.npz")).controls, Plan.load(Path("default.npz")).controls)
+
+
+def test_settings_have_an_option_of_their_own_or_set(d4orm) -> None:
+    settings = ("--set", "engine=cpu", "--set", "preset=paper", "--set", "max_iterations=1")
+    assert d4orm("plan", "--robots", "2", *QUICK[:4], *settings, "--quiet").status in (0, 1)
+
+
+def test_version(d4orm) -> None:
+    outcome = d4orm("--version")
+    assert (outcome.status, outcome.out) == (0, f"d4orm {importlib.metadata.version('d4orm-env')}\n")
+
+
+def test_no_command_shows_the_help(d4orm) -> None:
+    assert d4orm().out == d4orm("--help").out
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs a folder that not even root can write to")

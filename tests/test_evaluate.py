@@ -15,6 +15,7 @@ from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from planner_support import program
 from scipy import stats
@@ -29,6 +30,7 @@ from d4orm_planners.evaluation.statistics import mean_interval, t_quantile, wils
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
 from d4orm_planners.evaluation.summary import solved_after, success_by, success_rate
 from d4orm_planners.evaluation.tables import markdown
+from d4orm_planners.evaluation.trials import Configuration
 
 QUICK = {"engine": "cpu", "num_samples": 64, "num_steps": 5, "max_iterations": 3}
 TINY: dict[str, Any] = {"num_robots": 2, "seeds": range(2), "workers": 1}
@@ -477,6 +479,29 @@ def test_bad_input_to_the_leaderboard(d4orm, tmp_path: Path, arguments: tuple[st
     assert not list((tmp_path / "empty").iterdir())
 
 
+def test_evaluating_nothing_but_errors_ends_with_status_one(d4orm, tmp_path: Path) -> None:
+    arguments = ("-k", "2", "-n", "2", "-j", "1", "-m", "differential_drive", "--out", "out")
+    status, out, err = d4orm("evaluate", "-p", "ppo", *arguments)
+    assert status == 1
+    assert "ppo" in out
+    assert "every trial (2) ended with an error; the first: ValueError: the policy in ppo.safetensors" in err
+    assert {path.name for path in (tmp_path / "out").iterdir()} >= {"trials.sqlite", "table.md"}
+    assert d4orm("evaluate", "-p", "ppo,goal", *arguments)[0] == 0, "one policy that runs is a result"
+
+
+def test_the_same_setting_in_another_spelling_is_the_same_configuration(tmp_path: Path) -> None:
+    policies = [Configuration("d4orm", "d4orm", settings).config for settings in SPELLINGS]
+    assert policies == [policies[0]] * len(SPELLINGS)
+    with pytest.raises(ValueError, match="one policy with the same settings"):
+        evaluate({"a": {"policy": "mppi", "sigma": 1}, "b": {"policy": "mppi", "sigma": "1.0"}}, out=tmp_path / "out")
+
+
+SPELLINGS: tuple[dict[str, Any], ...] = (
+    {"temperature": 0.1, "time_limit": 1.0}, {"temperature": "1e-1", "time_limit": "1"},
+    {"temperature": np.float64(0.1), "time_limit": 1},
+)  # fmt: skip
+
+
 # Bad input.
 
 BAD = [
@@ -497,6 +522,8 @@ BAD = [
     (("-n", "few"), "--seeds 'few' is neither a number"),
     (("-n", "5-1"), "seeds is empty"),
     (("-n", "-1,2"), "seed is -1"),
+    (("-n", "9223372036854775808"), "--seeds '9223372036854775808' asks for more than 1000000 seeds"),
+    (("-n", "0-1000000"), "--seeds '0-1000000' asks for more than"),
     (("-j", "0"), "workers is 0"),
     (("--time-limit", "0"), "time_limit is 0"),
     (("--time-limit", "1", "-p", "goal"), "none of the policies is one"),
@@ -527,6 +554,11 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
             {"policies": {"orca": {}, "same": {"policy": "orca"}}},
             "'orca' and 'same' are one policy with the same settings",
         ),
+        ({"policies": {"mine": object()}}, r"policies\['mine'\] is <object .*; give the settings of a policy, as {}"),
+        ({"policies": {"mine": "d4orm"}}, r"policies\['mine'\] is 'd4orm'; give the settings"),
+        ({"policies": object()}, "policy <object object at .* is no name; give one of d4orm"),
+        ({"policies": [{"policy": "goal"}]}, "policy {'policy': 'goal'} is no name"),
+        ({"policies": {3: {}}}, "policy 3 is no name"),
         ({"scenarios": []}, "scenarios or num_robots is empty"),
         ({"num_robots": []}, "scenarios or num_robots is empty"),
         ({"seeds": []}, "seeds is empty"),

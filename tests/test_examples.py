@@ -50,6 +50,42 @@ def completed(name: str, out: Path) -> None:
     assert not [path for path in out.iterdir() if path.name.startswith(".")], "a temporary file was left behind"
 
 
+@pytest.mark.parametrize(
+    ("name", "module", "extra"),
+    [
+        ("supersuit_ppo", "supersuit", "rl"),
+        ("train_and_compare", "stable_baselines3", "rl"),
+        ("train_and_compare", "pyrvo", "orca"),
+        ("read_results", "pandas", "dev"),
+        ("read_results", "pyarrow", "evaluate"),
+        ("onboard_lifelong", "zenoh", "zenoh"),
+    ],
+)
+def test_an_example_says_which_extra_is_missing(name: str, module: str, extra: str, tmp_path: Path) -> None:
+    code = (
+        f"import runpy, sys; sys.modules[{module!r}] = None; sys.argv = ['x', '--quick']\n"
+        f"sys.path.insert(0, {str(EXAMPLES)!r})\n"
+        f"runpy.run_path({str(EXAMPLES / name)!r} + '.py', run_name='__main__')"
+    )
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    result = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True, text=True, check=False, cwd=tmp_path, env={**os.environ, "PYTHONPATH": path},
+    )  # fmt: skip
+    assert result.returncode == 2
+    assert result.stderr == f"this example needs {module}; install it with: pip install 'd4orm-env[{extra}]'\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_first_snippet_of_the_readme_succeeds(capsys: pytest.CaptureFixture[str]) -> None:
+    snippet = (ROOT / "README.md").read_text().split("```python\n")[1].partition("```")[0]
+    exec(compile(snippet, "README.md", "exec"), {})
+    plan, episode = capsys.readouterr().out.splitlines()
+    assert plan.startswith("True ")
+    assert plan.endswith(" True")
+    assert episode.startswith("1.0 ")
+
+
 def test_annealed_noise_beats_constant_noise_in_one_dimension(tmp_path: Path) -> None:
     out = tmp_path / "out"
     completed("one_dimension", out)

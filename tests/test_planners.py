@@ -584,8 +584,8 @@ def test_late_steps_go_on_with_fewer_samples(late: Any, parts: Any, monkeypatch:
 @pytest.mark.parametrize(
     ("setting", "value", "message"),
     [
-        ("late_steps", 1.5, "late_steps is 1.5.*above 1"), ("late_steps", -0.1, "late_steps"),
-        ("late_samples", 0, "late_samples"), ("late_samples", 2, "late_samples is 2.*above 1"),
+        ("late_steps", 1.5, "late_steps is 1.5.*at most 1"), ("late_steps", -0.1, "late_steps"),
+        ("late_samples", 0, "late_samples"), ("late_samples", 2, "late_samples is 2.*at most 1"),
         ("late_samples", "half", "late_samples"),
     ],
 )  # fmt: skip

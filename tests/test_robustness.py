@@ -343,7 +343,7 @@ def test_settings_reach_the_policies_that_have_them(d4orm, monkeypatch: pytest.M
         raise ValueError("enough")
 
     monkeypatch.setattr(robustness_module, "robustness", measure)
-    settings = ("--set", "num_samples=64", "--set", "orca.time_horizon=2", "--set", "cem.num_samples=32")
+    settings = ("--set", "cem.num_samples=32", "--set", "num_samples=64", "--set", "orca.time_horizon=2")
     d4orm("--policies", "d4orm,cem,orca", *settings, "--set", "preset=paper")
     assert seen == {
         "d4orm": {"num_samples": 64, "preset": "paper"},
@@ -367,6 +367,7 @@ def test_settings_reach_the_policies_that_have_them(d4orm, monkeypatch: pytest.M
         (("--noise", "0,nan"), "noise is nan"),
         (("--noise", "none"), "--noise 'none' is not a list of numbers"),
         (("--trials", "0"), "trials is 0"),
+        (("--trials", "99999999999"), "1000000"),
         (("--workers", "0"), "workers is 0"),
         (("--set", "speed=1"), "'speed' is a setting of none of the policies goal"),
         (("--set", "orca.time_horizon=1"), "'orca' is not among the policies"),

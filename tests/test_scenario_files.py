@@ -16,6 +16,7 @@ from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
+from d4orm_env.core.yaml_text import parse_yaml
 from d4orm_env.scenarios import list_scenarios, load_problem, make_problem, save_problem
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "scenarios" / "mixed_team.yaml"
@@ -102,7 +103,7 @@ def problems(draw: st.DrawFn) -> Problem:
         goal=places[1],
         world=draw(worlds(dimension, 2.0 * count)),
         dt=draw(st.floats(1e-6, 10)),
-        horizon=draw(st.integers(1, 10**9)),
+        horizon=draw(st.integers(1, 10**6)),
         margin=draw(st.floats(0, 10)),
         goal_radius=draw(st.floats(1e-6, 10)),
         goal_speed=draw(st.none() | st.floats(0, 1e6)),
@@ -346,3 +347,41 @@ def test_any_value_in_an_otherwise_good_file(field: str, value: Any, where: str)
     part = {"robot": content["robots"][3], "world": content["world"]["circles"][0], "top": content}[where]
     part[field] = value
     valid_or_explained(yaml.safe_dump(content))
+
+
+# Files that ask for too much.
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (MINIMAL + "horizon: 100000000", "horizon is 100000000 steps for 1 robots; a file may ask for at most"),
+        (MINIMAL + "horizon: 999999999999", "horizon is 999999999999"),
+        ("version: 1\nscenario: circle\nhorizon: 100000000", "horizon is 100000000"),
+        ("version: 1\nrobots: [" + "1," * 4_400_000 + "1]", "has a list of more than 10000 entries in line 2"),
+        ("version: 1\nrobots: [" + "[1,1,1]," * 900_000 + "1]", "has a list of more than 10000 entries in line 2"),
+        ("a: [" + ("[" + "1," * 9_999 + "1],") * 60 + "1]", "holds more than 500000 values"),
+    ],
+    ids=["horizon", "endless", "short form", "flat", "nested", "many lists"],
+)
+def test_more_than_memory_holds_is_refused_before_it_is_read(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "huge.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message) as caught:
+        load_problem(path)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 300
+
+
+def test_the_largest_teams_of_the_scenarios_fit_into_a_file() -> None:
+    row = "{model: differential_drive, start: [%d, 0], goal: [%d, 5], heading: 0, speed: 0, radius: 0.1, "
+    limits = "max_speed: 1, max_acceleration: 1, max_turn_rate: 1}"
+    robots = "\n".join(f"  - {row % (k, k)}{limits}" for k in range(10_000))
+    assert len(parse_yaml(f"version: 1\nrobots:\n{robots}\n")["robots"]) == 10_000
+
+
+def test_numbers_are_those_of_yaml_1_2() -> None:
+    text = "[1e-4, -1E5, .5, 5., 1e21, 12, 0x1F, 0o17, 1:30, on, yes, true, ~, '1e-4', 1_000]"
+    assert parse_yaml(text) == [
+        1e-4, -1e5, 0.5, 5.0, 1e21, 12, "0x1F", "0o17", "1:30", "on", "yes", True, None, "1e-4", "1_000",
+    ]  # fmt: skip

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from d4orm_env import make_problem, navigation_v0
-from d4orm_planners import make_policy, run_episode
+from d4orm_planners import cli, make_policy, run_episode
 from d4orm_planners.rl.curriculum import Lesson, common_batch, make_lessons, team_sizes
 from d4orm_planners.rl.network import MAX_BYTES, load_network
 
@@ -182,11 +182,40 @@ def test_other_settings_in_the_same_folder_are_refused(trained: tuple[TrainingSe
         ({"steps": 0}, "steps"),
         ({"scenario": "maze"}, "maze"),
         ({"num_envs": -1}, "num_envs"),
+        ({"num_envs": 99_999_999_999}, "num_envs is 99999999999; it must be at most 100000"),
+        ({"steps": 10**400}, "steps is about 1e400; it must be at most"),
+        ({"steps": 1e6}, "steps must be a whole number, not 1000000.0"),
+        ({"seed": 2**32}, "seed is 4294967296; it must be at most 4000"),
+        ({"scenario_settings": {"num_robots": 3}}, "scenario_settings has 'num_robots'; give 'robots'"),
+        ({"scenario_settings": {"seed": 3}}, "scenario_settings has 'seed'; give 'seed'"),
+        ({"scenario_settings": [3]}, "scenario_settings"),
     ],
 )
 def test_bad_settings_are_refused(change: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         replace(TINY, **change)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--steps", "inf"), "--steps is inf; it must be a whole number of at least 1"),
+        (("--steps", "nan"), "--steps is nan; it must be"),
+        (("--steps", "1e300"), "steps is about 1e300; it must be at most"),
+        (("--steps", "0.5"), "--steps is 0.5"),
+        (("--set", "num_robots=3"), "give 'robots' (--robots) itself instead"),
+        (("--num-envs", "99999999999"), "num_envs is 99999999999; it must be at most 100000"),
+    ],
+)
+def test_bad_options_are_one_line_and_status_two(
+    arguments: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(["train", "ppo", "--out", str(tmp_path / "out"), *arguments])
+    assert exit_.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_policy_refuses_what_it_was_not_trained_for(trained: tuple[TrainingSettings, Path]) -> None:

@@ -67,6 +67,20 @@ def restore_frozen(instance: Any, state: dict[str, Any]) -> None:
 LARGEST = 1e18
 """Numbers must stay below it: float32 still holds their squares."""
 
+LARGEST_WHOLE = 2**63 - 1
+"""Whole numbers must stay below it: every library holds them."""
+
+
+def shown(value: Any) -> str:
+    """``value`` as it stands in an error: on one line and not too long, whatever it is."""
+    if isinstance(value, int) and abs(value) > LARGEST_WHOLE:
+        return f"about {'-' if value < 0 else ''}1e{int(value.bit_length() * np.log10(2))}"
+    try:
+        text = " ".join(repr(value).split())
+    except ValueError:  # a number of thousands of digits somewhere within
+        text = f"a {type(value).__name__}"
+    return text if len(text) <= 60 else text[:57] + "..."
+
 
 def positive_number(value: Any, name: str, *, zero_allowed: bool = False) -> float:
     """``value`` as a finite positive float.
@@ -76,9 +90,13 @@ def positive_number(value: Any, name: str, *, zero_allowed: bool = False) -> flo
             :data:`LARGEST`.
     """
     try:
+        if isinstance(value, bool | np.bool_):
+            raise TypeError("truth is no number")
         number = float(value)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be a number, not {value!r}") from error
+        raise ValueError(f"{name} must be a number, not {shown(value)}") from error
+    except OverflowError:
+        number = np.inf if value > 0 else -np.inf
     if not np.isfinite(number) or number < 0 or (number == 0 and not zero_allowed):
         raise ValueError(
             f"{name} is {number:g}; it must be {'zero or more' if zero_allowed else 'positive'} and finite"
@@ -95,7 +113,7 @@ def whole_number(value: Any, name: str, minimum: int) -> int:
         ValueError: If it is not a whole number or is too small.
     """
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
-        raise ValueError(f"{name} must be a whole number, not {value!r}")
+        raise ValueError(f"{name} must be a whole number, not {shown(value)}")
     if value < minimum:
-        raise ValueError(f"{name} is {value}; it must be at least {minimum}")
+        raise ValueError(f"{name} is {shown(int(value))}; it must be at least {minimum}")
     return int(value)

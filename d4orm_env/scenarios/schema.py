@@ -22,6 +22,9 @@ VERSION = 1
 SQUARED_MAX = 1e18
 """Largest magnitude whose square, and a sum of such squares, float32 still holds."""
 
+MAX_ROBOT_STEPS = 5 * 10**7
+"""Robots times steps; a plan of that many takes gigabytes."""
+
 Number = Annotated[float, Field(ge=-FLOAT32_MAX, le=FLOAT32_MAX)]
 Squared = Annotated[float, Field(ge=-SQUARED_MAX, le=SQUARED_MAX)]
 Place = Annotated[list[Squared], Field(min_length=2, max_length=3)]
@@ -151,7 +154,8 @@ class ProblemFile(Entry):
         limits = ("radius", "max_speed", "max_acceleration", "max_turn_rate")
         columns: dict[str, Any] = {name: [getattr(robot, name) for robot in self.robots] for name in limits}
         team = Team(tuple(robot.model for robot in self.robots), **columns)
-        start = [robot.state + [0.0] * (team.state_size - len(robot.state)) for robot in self.robots]
+        size = team.state_size  # asks every robot
+        start = [state + [0.0] * (size - len(state)) for state in (robot.state for robot in self.robots)]
         return Problem(
             team=team,
             start=start,
@@ -217,7 +221,13 @@ def parse(data: Any) -> Problem:
         raise ValueError(_explain(error)) from None
     # A value too large for float32 becomes infinite, and is then refused by name.
     with np.errstate(over="ignore"):
-        return content.build()
+        problem = content.build()
+    if problem.horizon * problem.num_robots > MAX_ROBOT_STEPS:
+        raise ValueError(
+            f"horizon is {problem.horizon} steps for {problem.num_robots} robots; a file may ask for at most "
+            f"{MAX_ROBOT_STEPS // problem.num_robots} for so many"
+        )
+    return problem
 
 
 def describe(problem: Problem) -> dict[str, Any]:

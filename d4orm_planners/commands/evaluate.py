@@ -7,7 +7,15 @@ from typing import Annotated, Any
 
 import typer
 
-from d4orm_planners.commands.inputs import decimals, make_folder, names, numbers, parse_settings
+from d4orm_planners.commands.inputs import (
+    MOST_SEEDS,
+    decimals,
+    make_folder,
+    names,
+    numbers,
+    parse_settings,
+    require_trials,
+)
 
 
 def evaluate(
@@ -74,6 +82,7 @@ def evaluate(
             typer.echo(f"wrote {path}")
     if out / "trials.parquet" not in written:
         typer.echo(PARQUET_HINT, err=True)
+    require_trials(rates)
 
 
 def leaderboard(
@@ -115,10 +124,11 @@ def _policies(texts: list[str]) -> dict[str, dict[str, Any]]:
 
 def _seeds(text: str) -> list[int]:
     try:
-        if "-" in text.strip()[1:]:
-            first, last = (int(number) for number in text.split("-"))
-            return list(range(first, last + 1))
-        listed = [int(number) for number in text.split(",")]
+        if "," in text:
+            return [int(number) for number in text.split(",")]
+        first, last = (int(number) for number in text.split("-")) if "-" in text.strip()[1:] else (0, int(text) - 1)
     except ValueError:
         raise ValueError(f"--seeds {text!r} is neither a number, as 50, nor a range, as 10-19, nor a list") from None
-    return listed if "," in text else list(range(listed[0]))
+    if last - first >= MOST_SEEDS:
+        raise ValueError(f"--seeds {text!r} asks for more than {MOST_SEEDS} seeds; give fewer")
+    return list(range(first, last + 1))

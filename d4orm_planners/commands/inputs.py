@@ -3,28 +3,64 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from d4orm_planners.evaluation.summary import SuccessRate
+
+MOST_SEEDS = 1_000_000
+"""Trials of one policy at most: a slip of the finger must not fill the memory."""
 
 
 def parse_settings(settings: list[str] | None, option: str = "--set") -> dict[str, Any]:
-    """``name=value`` texts, given to an option, as a dictionary, the values read as YAML.
+    """``name=value`` texts, given to an option, as a dictionary, the values read as YAML 1.2.
 
     Raises:
-        ValueError: If a text has another form.
+        ValueError: If a text has another form, or gives a name again.
     """
-    import yaml
+    from d4orm_env.core.yaml_text import parse_yaml
 
-    values = {}
+    values: dict[str, Any] = {}
     for setting in settings or []:
         name, separator, text = setting.partition("=")
         if not separator or not name:
             raise ValueError(f"{option} {setting!r} is not of the form name=value, as num_samples=512")
+        if name in values:
+            raise ValueError(f"{option} gives {name!r} twice; give it once")
         try:
-            values[name] = yaml.safe_load(text)
-        except yaml.YAMLError:
-            raise ValueError(f"{option} {setting!r}: the value cannot be read") from None
+            values[name] = parse_yaml(text) if text.strip() else None
+        except ValueError as error:
+            raise ValueError(f"{option} {setting!r}: the value {error}") from None
     return values
+
+
+def refuse_options(context: typer.Context, options: Iterable[str], reason: str) -> None:
+    """Refuse what was given on the command line although it would count for nothing.
+
+    Args:
+        context: Of the command.
+        options: Names of parameters of its function.
+        reason: What to say after the option.
+
+    Raises:
+        ValueError: If one of them was given.
+    """
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name or "")
+        if parameter.name in options and source is not None and source.name == "COMMANDLINE":
+            raise ValueError(f"{parameter.opts[0]} {reason}")
+
+
+def require_trials(rates: Sequence[SuccessRate]) -> None:
+    """Say so, and end with status 1, if every trial ended with an error."""
+    if all(rate.errors == rate.trials for rate in rates):
+        trials = sum(rate.trials for rate in rates)
+        typer.echo(f"every trial ({trials}) ended with an error; the first: {rates[0].error}", err=True)
+        raise typer.Exit(1)
 
 
 def names(text: str | None) -> tuple[str, ...] | None:

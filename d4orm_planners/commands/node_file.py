@@ -47,7 +47,7 @@ def load_node(path: str | os.PathLike[str]) -> NodeTask:
         ValueError: If it cannot be read, or something in it is missing, unknown or makes no sense; one line that names
             the file and the field.
     """
-    from d4orm_env.scenarios.files import read_yaml
+    from d4orm_env.core.yaml_text import read_yaml
 
     try:
         return _task(read_yaml(path), Path(path).parent)

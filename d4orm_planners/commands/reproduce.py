@@ -7,10 +7,11 @@ from typing import Annotated
 
 import typer
 
-from d4orm_planners.commands.inputs import make_folder
+from d4orm_planners.commands.inputs import MOST_SEEDS, make_folder, refuse_options
 
 
 def reproduce(
+    context: typer.Context,
     figure: Annotated[str | None, typer.Argument(help="Which; without it, what there is.")] = None,
     list_: Annotated[bool, typer.Option("--list", help="List the figures.")] = False,
     quick: Annotated[bool, typer.Option("--quick", help="Tiny sizes, to see that it works: under a minute.")] = False,
@@ -22,7 +23,10 @@ def reproduce(
         typer.Option("--policy", "-p", help="Only the policy of this label; repeatable, all by default."),
     ] = None,
     seeds: Annotated[
-        int | None, typer.Option("--seeds", "-n", help="Trials per row; the paper's 50 by default, 1 with --quick.")
+        int | None,
+        typer.Option(
+            "--seeds", "-n", max=MOST_SEEDS, help="Trials per row; the paper's 50 by default, 1 with --quick."
+        ),
     ] = None,
     workers: Annotated[
         int, typer.Option("--workers", "-j", help="Processes of one thread each; with 1, one trial on all cores.")
@@ -36,6 +40,11 @@ def reproduce(
     from d4orm_planners.evaluation.figures import FIGURES, find_figure
 
     if figure is None or list_:
+        refuse_options(
+            context,
+            ("figure", "quick", "sections", "policies", "seeds", "workers", "out", "quiet"),
+            "does not go with the list of figures; give a figure, and leave out --list",
+        )
         for chosen in FIGURES.values():
             typer.echo(f"{chosen.name:<15} {chosen.title} ({chosen.source})")
         return

@@ -8,7 +8,15 @@ from typing import Annotated, Any
 
 import typer
 
-from d4orm_planners.commands.inputs import decimals, make_folder, names, numbers, parse_settings
+from d4orm_planners.commands.inputs import (
+    MOST_SEEDS,
+    decimals,
+    make_folder,
+    names,
+    numbers,
+    parse_settings,
+    require_trials,
+)
 
 
 def robustness(
@@ -25,7 +33,9 @@ def robustness(
     noise: Annotated[
         str, typer.Option("--noise", help="Standard deviations of the execution noise, as 0,0.1.")
     ] = "0,0.05,0.1,0.2",
-    trials: Annotated[int, typer.Option("--trials", "-n", help="Trials per policy and level of noise.")] = 50,
+    trials: Annotated[
+        int, typer.Option("--trials", "-n", max=MOST_SEEDS, help="Trials per policy and level of noise.")
+    ] = 50,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="A setting of all policies that have it, or of one, as orca.time_horizon=2."),
@@ -65,6 +75,7 @@ def robustness(
         typer.echo(markdown(rates))
         for path in written:
             typer.echo(f"wrote {path}")
+    require_trials(rates)
 
 
 def _settings_by_policy(policies: Sequence[str], settings: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -73,7 +84,8 @@ def _settings_by_policy(policies: Sequence[str], settings: dict[str, Any]) -> di
 
     known = {policy: {*policy_settings(policy), *(("preset",) if policy in PLANNERS else ())} for policy in policies}
     chosen: dict[str, dict[str, Any]] = {policy: {} for policy in policies}
-    for name, value in settings.items():
+    # A setting of one policy counts more than one of all, whichever was given first.
+    for name, value in sorted(settings.items(), key=lambda setting: "." in setting[0]):
         policy, separator, setting = name.rpartition(".")
         if separator and policy not in chosen:
             raise ValueError(f"--set {name}: {policy!r} is not among the policies; they are {', '.join(policies)}")

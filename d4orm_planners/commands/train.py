@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import sys
 from pathlib import Path
@@ -35,7 +36,7 @@ def train(
 ) -> None:
     """Train a policy that all robots share, with Stable-Baselines3; run again to go on where it was broken off."""
     training = _training()
-    if not steps == int(steps) >= 1:
+    if not (math.isfinite(steps) and steps == int(steps) >= 1):
         raise ValueError(f"--steps is {steps:g}; it must be a whole number of at least 1")
     chosen = training.TrainingSettings(
         algorithm=algorithm,

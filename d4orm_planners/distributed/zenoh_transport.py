@@ -87,7 +87,7 @@ class ZenohSettings:
             raise ValueError(f"multicast must be true or false, not {self.multicast!r}")
         if self.config_file is not None:
             object.__setattr__(self, "config_file", str(self.config_file))
-        positive_number(self.linger, "linger", zero_allowed=True)
+        object.__setattr__(self, "linger", positive_number(self.linger, "linger", zero_allowed=True))
 
     @classmethod
     def of(cls, settings: Any) -> ZenohSettings:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
-from d4orm_env.core.arrays import positive_number, whole_number
 from d4orm_env.core.dynamics import get_model
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.base import SamplingTask, get_engine
@@ -17,14 +17,18 @@ from d4orm_env.scenarios import make_problem
 from d4orm_planners.evaluation.probes import measure_memory, measure_startup
 from d4orm_planners.evaluation.timing import Spread, measure
 from d4orm_planners.registry import make_planner
+from d4orm_planners.settings import Count, Positive, Samples, Settings, Steps, Whole
 
 ENGINES = ("cpu", "jax", "plain")
 MODELS = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive")
 PRESETS = (None, "paper")
 
+Robots = Annotated[Count, Field(le=10_000)]
+"""As many as scenarios make."""
+
 
 @dataclass(frozen=True, kw_only=True)
-class BenchmarkSettings:
+class BenchmarkSettings(Settings):
     """What to measure, and how long.
 
     Attributes:
@@ -49,34 +53,25 @@ class BenchmarkSettings:
         ValueError: If a value makes no sense; the message names it.
     """
 
-    robots: tuple[int, ...] = (4, 8, 16, 32, 64, 100)
+    robots: tuple[Robots, ...] = (4, 8, 16, 32, 64, 100)
     models: tuple[str, ...] = MODELS
     engines: tuple[str, ...] = ENGINES
-    num_samples: int = 1024
-    horizon: int = 100
-    num_steps: int = 100
-    repetitions: int = 20
-    time_limit: float = 2.0
-    iteration_limit: float = 20.0
-    most_robots_slow: int = 16
-    env_steps: int = 2000
-    num_worlds: int = 1024
-    plan_robots: tuple[int, ...] = (4, 8, 12, 16)
-    seeds: int = 20
-    plan_time_limit: float = 20.0
-    memory_robots: int = 64
+    num_samples: Samples = 1024
+    horizon: Steps = 100
+    num_steps: Steps = 100
+    repetitions: Count = 20
+    time_limit: Positive = 2.0
+    iteration_limit: Positive = 20.0
+    most_robots_slow: Annotated[Whole, Field(ge=0)] = 16
+    env_steps: Count = 2000
+    num_worlds: Steps = 1024
+    plan_robots: tuple[Robots, ...] = (4, 8, 12, 16)
+    seeds: Count = 20
+    plan_time_limit: Positive = 20.0
+    memory_robots: Robots = 64
 
     def __post_init__(self) -> None:
-        for name in ("robots", "plan_robots"):
-            for value in getattr(self, name):
-                whole_number(value, name, 1)
-        for name, minimum in (
-            ("num_samples", 2), ("horizon", 1), ("num_steps", 1), ("repetitions", 1), ("env_steps", 1),
-            ("num_worlds", 1), ("seeds", 1), ("memory_robots", 1), ("most_robots_slow", 0),
-        ):  # fmt: skip
-            whole_number(getattr(self, name), name, minimum)
-        for name in ("time_limit", "iteration_limit", "plan_time_limit"):
-            positive_number(getattr(self, name), name)
+        super().__post_init__()
         for model in self.models:
             get_model(model)
         for engine in self.engines:

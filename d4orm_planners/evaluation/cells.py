@@ -7,11 +7,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from d4orm_env.core.arrays import positive_number, whole_number
+from d4orm_env.core.arrays import positive_number, shown, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_planners.evaluation.trials import Configuration
-from d4orm_planners.registry import PLANNERS, make_policy
+from d4orm_planners.registry import PLANNERS, list_policies, make_policy
 
 Policies = str | Iterable[str] | Mapping[str, Mapping[str, Any]]
 
@@ -28,10 +28,11 @@ def configurations(policies: Policies, time_limit: float | None = None) -> list[
         ValueError: For an unknown name or setting, no policy, or a time limit that concerns none of them.
         ImportError: If a policy needs a library that is not installed.
     """
-    if not isinstance(policies, Mapping):
-        policies = {name: {} for name in several(policies)}
+    named: Iterable[tuple[Any, Any]] = (
+        policies.items() if isinstance(policies, Mapping) else ((name, {}) for name in several(policies))
+    )
     chosen = []
-    for label, given in policies.items():
+    for label, given in dict(_checked(label, given) for label, given in named).items():
         settings = dict(given)
         policy = settings.pop("policy", label)
         if time_limit is not None and policy in PLANNERS:
@@ -44,6 +45,17 @@ def configurations(policies: Policies, time_limit: float | None = None) -> list[
         raise ValueError(f"time_limit {time_limit:g} is for planners, and none of the policies is one; leave it out")
     _check_distinct(chosen)
     return chosen
+
+
+def _checked(label: Any, given: Any) -> tuple[str, Mapping[str, Any]]:
+    if not isinstance(label, str):
+        raise ValueError(f"policy {shown(label)} is no name; give one of {', '.join(list_policies())}")
+    if not isinstance(given, Mapping):
+        raise ValueError(
+            f"policies[{label!r}] is {shown(given)}; give the settings of a policy, as {{}} or "
+            "{'policy': 'd4orm', 'num_samples': 128}"
+        )
+    return label, given
 
 
 def _check_distinct(chosen: Sequence[Configuration]) -> None:

@@ -11,12 +11,13 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray
 from d4orm_planners.policy import Actions, Policy
 from d4orm_planners.rl.network import SUFFIX, Network, load_network
+from d4orm_planners.settings import PathText, Settings
 
 SHIPPED = Path(__file__).parent / "policies"
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearnedConfig:
+class LearnedConfig(Settings):
     """Settings of a learned policy.
 
     Attributes:
@@ -29,11 +30,12 @@ class LearnedConfig:
         ValueError: If the path ends in something else.
     """
 
-    path: str | None = None
+    path: PathText | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.path is not None and Path(self.path).suffix not in (SUFFIX, ".zip"):
-            raise ValueError(f"path {str(self.path)!r} must end in {SUFFIX} (of 'd4orm train') or .zip (of SB3)")
+            raise ValueError(f"path {self.path!r} must end in {SUFFIX} (of 'd4orm train') or .zip (of SB3)")
 
 
 class LearnedPolicy(Policy):
@@ -45,7 +47,7 @@ class LearnedPolicy(Policy):
         ImportError: For a ``.zip``, if Stable-Baselines3 is not installed.
     """
 
-    config_class: ClassVar[type | None] = LearnedConfig
+    config_class: ClassVar[type[Settings] | None] = LearnedConfig
 
     def __init__(self, config: LearnedConfig | None = None) -> None:
         self.config = config or LearnedConfig()

@@ -12,14 +12,14 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from pydantic import Field
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
-from d4orm_env.core.arrays import whole_number
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm
 from d4orm_planners.rl.checkpoints import Checkpoints
@@ -27,6 +27,7 @@ from d4orm_planners.rl.curriculum import Lesson, common_batch, make_lessons, tea
 from d4orm_planners.rl.curve import Evaluation, evaluate_network, write_curve
 from d4orm_planners.rl.network import CLIP, EPSILON, Network, network_of
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
+from d4orm_planners.settings import Count, Settings, Whole, one_of
 
 Progress = Callable[[str, int, int], Any]
 _VALIDATION_SEED = 0
@@ -35,9 +36,14 @@ _INSTANCES = 256
 _TRAINING_SEED = 1_000_000
 """Worlds are seeded one by one from these; a million apart, no instance is seen in training and in validation."""
 
+Many = Annotated[Count, Field(le=100_000)]
+"""Robots or worlds that act at once: beyond, their observations would fill the memory."""
+Seed = Annotated[Whole, Field(ge=0, le=4000)]
+"""A million worlds further on each, it must stay below 2**32, where NumPy's seeds end."""
+
 
 @dataclass(frozen=True, kw_only=True)
-class TrainingSettings:
+class TrainingSettings(Settings):
     """What to train on, and how long.
 
     Attributes:
@@ -57,26 +63,23 @@ class TrainingSettings:
         ValueError: If a value makes no sense; the message names it.
     """
 
-    algorithm: str = "ppo"
+    algorithm: Annotated[str, one_of(ALGORITHMS)] = "ppo"
     scenario: str = "random"
-    robots: int = 4
-    steps: int = 5_000_000
-    seed: int = 0
+    robots: Many = 4
+    steps: Annotated[Count, Field(le=10**15)] = 5_000_000
+    seed: Seed = 0
     model: str | None = None
-    num_envs: int | None = None
+    num_envs: Many | None = None
     curriculum: bool = False
-    lessons: int = 50
-    validation_worlds: int = 100
+    lessons: Annotated[Count, Field(le=1000)] = 50
+    validation_worlds: Many = 100
     scenario_settings: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.algorithm not in ALGORITHMS:
-            raise ValueError(f"algorithm {self.algorithm!r} is unknown; choose one of {', '.join(ALGORITHMS)}")
-        for name in ("robots", "steps", "lessons", "validation_worlds"):
-            whole_number(getattr(self, name), name, 1)
-        whole_number(self.seed, "seed", 0)
-        if self.num_envs is not None:
-            whole_number(self.num_envs, "num_envs", 1)
+        super().__post_init__()
+        for name, own in (("num_robots", "robots"), ("seed", "seed"), ("model", "model")):
+            if name in self.scenario_settings:
+                raise ValueError(f"scenario_settings has {name!r}; give {own!r} (--{own}) itself instead")
         make_problem(self.scenario, num_robots=self.robots, model=self.model, **self.scenario_settings)
 
     @property

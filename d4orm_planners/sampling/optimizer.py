@@ -10,17 +10,20 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from d4orm_env.core import portable
-from d4orm_env.core.arrays import FloatArray, positive_number, whole_number
+from d4orm_env.core.arrays import FloatArray
 from d4orm_env.engine.base import SamplingRules, SamplingTask
 from d4orm_planners.base import Iteration, Planner, PlannerConfig, Search
 from d4orm_planners.sampling.weights import SoftmaxWeights
+from d4orm_planners.settings import NotNegative, Positive, Samples, Steps, Variance, one_of
 
-CREDITS = ("team", "robot", "alternate")
+Credit = Annotated[str, one_of(("team", "robot", "alternate"))]
+Cutoff = Annotated[NotNegative, Field(lt=1)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,32 +44,19 @@ class SamplingConfig(PlannerConfig):
             as the last one left them. Either way they are zero once docked.
     """
 
-    num_samples: int = 1024
-    num_steps: int = 100
-    temperature: float = 0.3
-    weight_cutoff: float = 1e-3
-    beta_start: float = 1e-4
-    beta_end: float = 2e-2
-    credit: str = "team"
+    num_samples: Samples = 1024
+    num_steps: Steps = 100
+    temperature: Positive = 0.3
+    weight_cutoff: Cutoff = 1e-3
+    beta_start: Variance = 1e-4
+    beta_end: Variance = 2e-2
+    credit: Credit = "team"
     clip_between_iterations: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        whole_number(self.num_samples, "num_samples", 2)
-        whole_number(self.num_steps, "num_steps", 1)
-        positive_number(self.temperature, "temperature")
-        if positive_number(self.weight_cutoff, "weight_cutoff", zero_allowed=True) >= 1:
-            raise ValueError(f"weight_cutoff is {self.weight_cutoff:g}; it must be below 1")
-        for name in ("beta_start", "beta_end"):
-            beta = positive_number(getattr(self, name), name)
-            if beta >= 1:
-                raise ValueError(f"{name} is {beta:g}; it must lie between 0 and 1")
         if self.beta_start > self.beta_end:
             raise ValueError(f"beta_start {self.beta_start:g} is above beta_end {self.beta_end:g}; swap them")
-        if self.credit not in CREDITS:
-            raise ValueError(f"credit {self.credit!r} is unknown; choose one of {', '.join(CREDITS)}")
-        if not isinstance(self.clip_between_iterations, bool):
-            raise ValueError(f"clip_between_iterations must be True or False, not {self.clip_between_iterations!r}")
 
 
 PAPER = {"num_samples": 1024, "num_steps": 100, "weight_cutoff": 0.0, "clip_between_iterations": False}
@@ -88,7 +78,7 @@ class SamplingPlanner(Planner):
 
     def rules(self) -> SamplingRules:
         """The method's weights, and how it adapts its noise: the softmax, unless a method says otherwise."""
-        return SamplingRules(weights=SoftmaxWeights(float(self.config.temperature), float(self.config.weight_cutoff)))
+        return SamplingRules(weights=SoftmaxWeights(self.config.temperature, self.config.weight_cutoff))
 
     @abstractmethod
     def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:

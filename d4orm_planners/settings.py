@@ -1,0 +1,160 @@
+"""Settings as data: converted and checked once, when they are made, by the types of their fields.
+
+A field's type says what it may hold, as ``Annotated[Whole, Field(ge=1)]``; pydantic does the rest. Numbers may be given
+in any spelling that means one, text included, so that equal settings are equal and look alike wherever they are kept.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from functools import cache
+from typing import Annotated, Any, get_type_hints
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, create_model
+
+from d4orm_env.core.arrays import LARGEST, LARGEST_WHOLE, shown
+from d4orm_env.engine.base import ENGINES
+
+
+def _truth(value: Any) -> Any:
+    """NumPy's truth, which pydantic would take for a number, as Python's."""
+    return bool(value) if isinstance(value, np.bool_) else value
+
+
+def _whole(value: Any) -> Any:
+    """Text and NumPy's integers as an ``int``; anything else as it is, for pydantic to judge."""
+    try:
+        return int(value) if isinstance(value, str | np.integer) else _truth(value)
+    except ValueError:
+        return value
+
+
+def _number(value: Any) -> Any:
+    """Whatever means a number as a ``float``; anything else as it is, for pydantic to judge."""
+    value = _truth(value)
+    try:
+        return value if isinstance(value, bool) else float(value)
+    except OverflowError:
+        return float("inf")
+    except (TypeError, ValueError):
+        return value
+
+
+def _path(value: Any) -> Any:
+    return os.fspath(value) if isinstance(value, os.PathLike) else value
+
+
+def _variance(value: float) -> float:
+    if not 0 < value < 1:
+        raise ValueError(f"is {value:g}; it must lie between 0 and 1")
+    return value
+
+
+def one_of(choices: Iterable[str]) -> AfterValidator:
+    """Of a text: it must be one of these."""
+    known = tuple(choices)
+
+    def check(value: str) -> str:
+        if value not in known:
+            raise ValueError(f"{value!r} is unknown; choose one of {', '.join(known)}")
+        return value
+
+    return AfterValidator(check)
+
+
+Whole = Annotated[int, BeforeValidator(_whole), Field(le=LARGEST_WHOLE)]
+Count = Annotated[Whole, Field(ge=1)]
+Samples = Annotated[Whole, Field(ge=2, le=10**7)]
+Steps = Annotated[Whole, Field(ge=1, le=10**6)]
+"""Of samples and steps there are no more than memory and patience can hold."""
+Number = Annotated[float, BeforeValidator(_number), Field(le=LARGEST)]
+Positive = Annotated[Number, Field(gt=0)]
+NotNegative = Annotated[Number, Field(ge=0)]
+Share = Annotated[Number, Field(gt=0, le=1)]
+ShareOrNone = Annotated[Number, Field(ge=0, le=1)]
+Variance = Annotated[Number, AfterValidator(_variance)]
+PathText = Annotated[str, BeforeValidator(_path)]
+EngineName = Annotated[str, one_of(ENGINES)]
+
+
+class UnknownSettingError(TypeError, ValueError):
+    """A setting that does not exist: to Python an unexpected keyword, and bad input like any other."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What settings have in common; a subclass is a frozen dataclass with fields of the types above.
+
+    Raises:
+        ValueError: If a value makes no sense; one line that names the setting, the value and what was expected.
+    """
+
+    def __post_init__(self) -> None:
+        kind: Any = type(self)
+        try:
+            converted = _schema(kind)(**vars(self))
+        except ValidationError as error:
+            raise ValueError(_explain(error)) from None
+        for name in self.setting_names():
+            object.__setattr__(self, name, getattr(converted, name))
+
+    @classmethod
+    def setting_names(cls) -> tuple[str, ...]:
+        """Names of all settings, in order."""
+        return tuple(field.name for field in fields(cls))
+
+    @classmethod
+    def check_names(cls, given: Iterable[Any], owner: str) -> None:
+        """Refuse what is no setting.
+
+        Raises:
+            UnknownSettingError: One line that names it, whose setting it is not, and those that there are.
+        """
+        known = cls.setting_names()
+        for name in given:
+            if name not in known:
+                raise UnknownSettingError(f"{name!r} is no setting of {owner}; it takes {', '.join(known)}")
+
+
+@cache
+def _schema(kind: Any) -> type[BaseModel]:
+    """The types of all settings, as pydantic checks them."""
+    types = get_type_hints(kind, include_extras=True)
+    wanted: dict[str, Any] = {name: (types[name], ...) for name in kind.setting_names()}
+    config = ConfigDict(strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
+    return create_model(kind.__name__, __config__=config, **wanted)
+
+
+_EXPECTED = {
+    "greater_than": "above {gt:g}",
+    "greater_than_equal": "at least {ge:g}",
+    "less_than": "below {lt:g}",
+    "less_than_equal": "at most {le:g}",
+    "finite_number": "finite",
+    "int_type": "a whole number",
+    "float_type": "a number",
+    "dict_type": "a mapping",
+    "bool_type": "True or False",
+    "string_type": "text",
+}
+"""By pydantic's kinds of errors; others keep its own words."""
+
+_PLAIN = {"above 0": "positive", "at least 0": "zero or more"}
+
+
+def _explain(error: ValidationError) -> str:
+    """The first error as one line."""
+    first = error.errors(include_url=False)[0]
+    name, kind, value = str(first["loc"][0]), first["type"], first["input"]
+    if kind == "value_error":
+        return f"{name} {first['ctx']['error']}"
+    if kind not in _EXPECTED:
+        return f"{name}: {first['msg']}, not {shown(value)}"
+    expected = _EXPECTED[kind].format(**first.get("ctx", {}))
+    if kind.endswith("_type"):
+        return f"{name} must be {expected}, not {shown(value)}"
+    found = f"{value:g}" if isinstance(value, float) else shown(value)
+    return f"{name} is {found}; it must be {_PLAIN.get(expected, expected)}"
