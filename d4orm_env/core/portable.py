@@ -1,0 +1,265 @@
+"""Sine, cosine, arc tangent, exponential and logarithm with the same bits on every processor.
+
+NumPy and the C library choose among versions of these functions by the processor's instruction set, and their last
+bits differ. Where a result must be a function of its input alone, such as a verdict on a plan, these are used instead.
+They are made of NumPy's elementwise ``+ - * /``, rounding and comparison only, which IEEE 754 defines to the bit; each
+operation is a call of its own, so that no compiler can fuse two of them.
+
+All take arrays of any shape, or numbers, and compute in float64. Where every argument is a float32 array or number, the
+result is rounded to float32. They are accurate to about 1 ulp over the whole range, and keep IEEE's signs and special
+values; what is not finite or outside a function's domain gives infinity or NaN without a warning.
+
+The polynomials and the reduction of arguments are those of fdlibm (Sun Microsystems, 1993).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, wraps
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+_TWO_OVER_PI = 6.36619772367581382433e-01
+_HALF_PI = (
+    1.57079632673412561417e00,
+    6.07710050630396597660e-11,
+    2.02226624871116645580e-21,
+    8.47842766036889956997e-32,
+)
+"""pi/2 in parts; the first three have 33 bits, so that their products with a quadrant below 2**20 are exact."""
+_REDUCED_EXACTLY = 2.0**20
+"""From this magnitude on arguments are reduced in whole numbers, one by one."""
+_PI_BITS = 1200  # the largest float64 has 1024 bits before the point, and 176 are left behind it
+
+_SINE = (
+    -1.66666666666666324348e-01,
+    8.33333333332248946124e-03,
+    -1.98412698298579493134e-04,
+    2.75573137070700676789e-06,
+    -2.50507602534068634195e-08,
+    1.58969099521155010221e-10,
+)
+_COSINE = (
+    4.16666666666666019037e-02,
+    -1.38888888888741095749e-03,
+    2.48015872894767294178e-05,
+    -2.75573143513906633035e-07,
+    2.08757232129817482790e-09,
+    -1.13596475577881948265e-11,
+)
+_EXPONENTIAL = (
+    1.66666666666666019037e-01,
+    -2.77777777770155933842e-03,
+    6.61375632143793436117e-05,
+    -1.65339022054652515390e-06,
+    4.13813679705723846039e-08,
+)
+_LOGARITHM = (
+    6.666666666666735130e-01,
+    3.999999999940941908e-01,
+    2.857142874366239149e-01,
+    2.222219843214978396e-01,
+    1.818357216161805012e-01,
+    1.531383769920937332e-01,
+    1.479819860511658591e-01,
+)
+_ARC_TANGENT = (
+    3.33333333333329318027e-01,
+    -1.99999999998764832476e-01,
+    1.42857142725034663711e-01,
+    -1.11111104054623557880e-01,
+    9.09088713343650656196e-02,
+    -7.69187620504482999495e-02,
+    6.66107313738753120669e-02,
+    -5.83357013379057348645e-02,
+    4.97687799461593236017e-02,
+    -3.65315727442169155270e-02,
+    1.62858201153657823623e-02,
+)
+_LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
+_ONE_OVER_LN2 = 1.44269504088896338700e00
+_SQRT_HALF = 7.07106781186547524401e-01
+_PI, _PI_LOW = 3.14159265358979311600e00, 1.22464679914735317722e-16
+
+# The arc tangent of q >= 0 is that of a known point, high and low part, plus that of (a q + b) / (c q + d), which is
+# small. The points are 0, 1/2, 1, 3/2 and infinity.
+_ARC_LIMITS = (7 / 16, 11 / 16, 19 / 16, 39 / 16)
+_ARC_HIGH = np.array(
+    [0.0, 4.63647609000806093515e-01, 7.85398163397448278999e-01, 9.82793723247329054082e-01, 1.57079632679489655800e00]
+)
+_ARC_LOW = np.array(
+    [
+        0.0,
+        2.26987774529616870924e-17,
+        3.06161699786838301793e-17,
+        1.39033110312309984516e-17,
+        6.12323399573676603587e-17,
+    ]
+)
+_ARC_SHIFT = np.array([[1, 0, 0, 1], [2, -1, 1, 2], [1, -1, 1, 1], [1, -1.5, 1.5, 1], [0, -1, 1, 0]]).T
+
+
+def _in_float64(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compute in float64, in silence, and round to float32 what came in float32."""
+
+    @wraps(function)
+    def wrapper(*arguments: Any) -> Any:
+        arrays = [np.asarray(argument) for argument in arguments]
+        single = all(array.dtype == np.float32 for array in arrays)
+        with np.errstate(all="ignore"):
+            result = function(*(array.astype(np.float64, copy=False) for array in arrays))
+            return np.float32(result) if single else result
+
+    return wrapper
+
+
+@_in_float64
+def sin(x: Any) -> Any:
+    """Sine of ``x`` [rad]."""
+    quadrant, high, low = _reduced(x)
+    swapped = (quadrant & 1).astype(bool)
+    size = np.where(swapped, _cosine(high, low), _sine(high, low))
+    return np.where(x == 0, x, np.where(quadrant & 2, -size, size))[()]  # minus zero keeps its sign
+
+
+@_in_float64
+def cos(x: Any) -> Any:
+    """Cosine of ``x`` [rad]."""
+    quadrant, high, low = _reduced(x)
+    swapped = (quadrant & 1).astype(bool)
+    size = np.where(swapped, _sine(high, low), _cosine(high, low))
+    return np.where((quadrant + 1) & 2, -size, size)[()]
+
+
+@_in_float64
+def arctan2(y: Any, x: Any) -> Any:
+    """Angle of the point ``(x, y)`` [rad], from minus pi to pi."""
+    tall, wide = np.abs(y), np.abs(x)
+    alike = ((tall == 0) & (wide == 0)) | (np.isinf(tall) & np.isinf(wide))  # where the quotient has no value
+    quotient = np.where(alike, np.where(tall == 0, 0.0, 1.0), tall / wide)
+    angle = _arc_tangent(quotient)
+    angle = np.where(np.signbit(x), _PI - (angle - _PI_LOW), angle)
+    return np.copysign(angle, y)[()]
+
+
+@_in_float64
+def exp(x: Any) -> Any:
+    """The exponential of ``x``."""
+    x = np.minimum(np.maximum(x, -800.0), 800.0)  # beyond, the result is zero or infinite anyway; NaN stays
+    exponent = np.rint(x * _ONE_OVER_LN2)
+    high, low = x - exponent * _LN2_HIGH, exponent * _LN2_LOW
+    rest = high - low
+    remainder = rest - rest * rest * _polynomial(rest * rest, _EXPONENTIAL)
+    mantissa = 1.0 - ((low - (rest * remainder) / (2.0 - remainder)) - high)
+    return np.ldexp(mantissa, np.where(np.isnan(x), 0, exponent).astype(np.int32))
+
+
+@_in_float64
+def log(x: Any) -> Any:
+    """The natural logarithm of ``x``; minus infinity at zero, NaN below."""
+    mantissa, power = np.frexp(x)
+    small = mantissa < _SQRT_HALF
+    exponent = np.where(small, power - 1, power).astype(np.float64)
+    f = np.where(small, mantissa + mantissa, mantissa) - 1.0
+    s = f / (2.0 + f)
+    half_square = 0.5 * f * f
+    series = s * s * _polynomial(s * s, _LOGARITHM)
+    result = exponent * _LN2_HIGH - ((half_square - (s * (half_square + series) + exponent * _LN2_LOW)) - f)
+    result = np.where(x == 0, -np.inf, np.where(x < 0, np.nan, result))
+    return np.where(np.isposinf(x), x, result)[()]
+
+
+def _polynomial(x: Any, coefficients: tuple[float, ...]) -> Any:
+    """``coefficients[0] + coefficients[1] * x + ...``, by Horner's rule."""
+    total: Any = coefficients[-1]
+    for coefficient in coefficients[-2::-1]:
+        total = coefficient + x * total
+    return total
+
+
+def _sine(high: Any, low: Any) -> Any:
+    """Sine of ``high + low`` within a quarter of pi of zero."""
+    square = high * high
+    cube = square * high
+    rest = _polynomial(square, _SINE[1:])
+    return high - ((square * (0.5 * low - cube * rest) - low) - cube * _SINE[0])
+
+
+def _cosine(high: Any, low: Any) -> Any:
+    """Cosine of ``high + low`` within a quarter of pi of zero."""
+    square = high * high
+    half = 0.5 * square
+    head = 1.0 - half
+    return head + (((1.0 - head) - half) + (square * (square * _polynomial(square, _COSINE)) - high * low))
+
+
+def _arc_tangent(q: Any) -> Any:
+    """Arc tangent of ``q >= 0``."""
+    q = np.minimum(q, 1e300)  # keeps zero times infinity out of the shift
+    index = sum((q >= limit).astype(np.intp) for limit in _ARC_LIMITS)
+    a, b, c, d = (column[index] for column in _ARC_SHIFT)
+    x = (a * q + b) / (c * q + d)
+    square = x * x
+    return _ARC_HIGH[index] - ((x * (square * _polynomial(square, _ARC_TANGENT)) - _ARC_LOW[index]) - x)
+
+
+def _reduced(x: Any) -> tuple[Any, Any, Any]:
+    """Nearest multiple of pi/2 as a number of quadrants from 0 to 3, and what is left over, high and low part."""
+    huge = ~(np.abs(x) < _REDUCED_EXACTLY)  # NaN too
+    some_huge = huge.any()
+    small = np.where(huge, 0.0, x) if some_huge else x
+    multiple = np.rint(small * _TWO_OVER_PI)
+    rest, first = _difference(small - multiple * _HALF_PI[0], multiple * _HALF_PI[1])
+    rest, second = _difference(rest, multiple * _HALF_PI[2])
+    error = (first + second) - multiple * _HALF_PI[3]
+    high = rest + error
+    low = (rest - high) + error
+    quadrant = multiple.astype(np.int64) & 3
+    if some_huge:
+        quadrant, high, low = (np.array(part) for part in (quadrant, high, low))
+        for place in zip(*np.nonzero(np.atleast_1d(huge)), strict=True):
+            where = place if np.ndim(x) else ()
+            quadrant[where], high[where], low[where] = _reduced_exactly(float(x[where]))
+    return quadrant, high, low
+
+
+def _difference(a: Any, b: Any) -> tuple[Any, Any]:
+    """``a - b`` rounded, and what rounding lost (Knuth)."""
+    result = a - b
+    part = result - a
+    return result, (a - (result - part)) - (b + part)
+
+
+def _reduced_exactly(x: float) -> tuple[int, float, float]:
+    """As :func:`_reduced`, for one number of any magnitude, in whole numbers."""
+    if not np.isfinite(x):
+        return 0, np.nan, 0.0
+    numerator, denominator = x.as_integer_ratio()
+    half_pi = _scaled_pi() // 2
+    scaled = (numerator << _PI_BITS) // denominator
+    multiple = (2 * scaled + half_pi) // (2 * half_pi)
+    rest = scaled - multiple * half_pi
+    high = rest / (1 << _PI_BITS)
+    above, below = high.as_integer_ratio()
+    return multiple & 3, high, (rest - (above << _PI_BITS) // below) / (1 << _PI_BITS)
+
+
+@cache
+def _scaled_pi() -> int:
+    """``floor(pi * 2**_PI_BITS)``, but for the last bits of it, by Machin's formula."""
+    guard = 32
+    one = 1 << (_PI_BITS + guard)
+    return (16 * _scaled_arc_cotangent(5, one) - 4 * _scaled_arc_cotangent(239, one)) >> guard
+
+
+def _scaled_arc_cotangent(n: int, one: int) -> int:
+    power, total, k = one // n, 0, 1
+    while power:
+        total += power // k if k % 4 == 1 else -(power // k)
+        power //= n * n
+        k += 2
+    return total
