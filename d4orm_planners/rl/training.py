@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from d4orm_env.core.arrays import whole_number
 from d4orm_env.scenarios import make_problem
+from d4orm_env.scenarios.registry import unknown_argument
 from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm
 from d4orm_planners.rl.checkpoints import Checkpoints
 from d4orm_planners.rl.curriculum import Lesson, common_batch, make_lessons, team_sizes
@@ -77,6 +78,9 @@ class TrainingSettings:
         whole_number(self.seed, "seed", 0)
         if self.num_envs is not None:
             whole_number(self.num_envs, "num_envs", 1)
+        complaint = unknown_argument(self.scenario, self.scenario_settings)
+        if complaint:
+            raise ValueError(f"scenario_settings: {complaint}")
         make_problem(self.scenario, num_robots=self.robots, model=self.model, **self.scenario_settings)
 
     @property
