@@ -7,9 +7,17 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, as_float32
 from d4orm_env.core.problem import Problem
-from d4orm_env.simulation import Simulation, TeamStep, agent_infos, make_simulation
+from d4orm_env.simulation import (
+    MAX_ACTION,
+    Simulation,
+    TeamStep,
+    agent_infos,
+    check_options,
+    make_simulation,
+    usable,
+)
 from d4orm_env.viewer import RENDER_MODES, Viewer
 
 ENV_ID = "d4orm/Navigation-v0"
@@ -26,6 +34,7 @@ class JointNavigationEnv(gymnasium.Env[FloatArray, FloatArray]):
     The arguments are those of :class:`d4orm_env.navigation_v0.parallel_env`.
 
     Raises:
+        TypeError: For an argument that neither the environment nor the scenario has.
         ValueError: For a bad argument, or when both a problem and a scenario's arguments are given.
     """
 
@@ -77,11 +86,15 @@ class JointNavigationEnv(gymnasium.Env[FloatArray, FloatArray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[FloatArray, dict[str, Any]]:
-        """Begin an episode; ``options`` are accepted and not used.
+        """Begin an episode; there are no ``options``.
 
         Returns:
             Observation ``(K * D,)`` and infos.
+
+        Raises:
+            ValueError: For any option.
         """
+        check_options(options)
         super().reset(seed=seed)
         step = self._simulation.reset(self.np_random)
         if self.render_mode == "human":
@@ -96,7 +109,8 @@ class JointNavigationEnv(gymnasium.Env[FloatArray, FloatArray]):
 
         Raises:
             RuntimeError: Before the first reset, or after the end of an episode.
-            ValueError: If the action has another shape or a value that is not finite.
+            ValueError: If the action has another shape, or a value that is not finite or beyond 1e15. What is merely
+                outside the action space is clipped to the robots' limits.
         """
         simulation = self._simulation
         simulation.require_reset()
@@ -134,14 +148,21 @@ class JointNavigationEnv(gymnasium.Env[FloatArray, FloatArray]):
         self._viewer.close()
 
     def _controls(self, action: FloatArray) -> FloatArray:
-        with np.errstate(over="ignore"):
-            controls = np.array(action, np.float32)
+        try:
+            controls = as_float32(action)
+        except ValueError as error:
+            raise ValueError(
+                f"action must be an array of {self.action_space.shape} numbers, not {action!r}: {error}"
+            ) from None
         if controls.shape != self.action_space.shape:
             raise ValueError(f"action has shape {controls.shape}; expected (K * m,) = {self.action_space.shape}")
         controls = controls.reshape(self.problem.num_robots, self.problem.control_size)
-        if not np.isfinite(controls).all():
-            robot = int(np.argmin(np.isfinite(controls).all(axis=1)))
-            raise ValueError(f"action of robot_{robot} is {controls[robot].tolist()}; every value must be finite")
+        if not usable(controls).all():
+            robot = int(np.argmin(usable(controls).all(axis=1)))
+            raise ValueError(
+                f"action of robot_{robot} is {controls[robot].tolist()}; every value must be finite and at most "
+                f"{MAX_ACTION:g} in magnitude"
+            )
         return controls
 
     def _infos(self, step: TeamStep) -> dict[str, Any]:

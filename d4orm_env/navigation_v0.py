@@ -6,21 +6,24 @@ controls in physical units, so that a plan's controls ``(H, K, m)`` can be stepp
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium.utils import seeding
 from pettingzoo import AECEnv, ParallelEnv
-from pettingzoo.utils import parallel_to_aec
+from pettingzoo.utils import OrderEnforcingWrapper
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
-from d4orm_env.core.arrays import FloatArray, whole_number
+from d4orm_env.core.arrays import FloatArray, as_float32
 from d4orm_env.core.problem import Problem
-from d4orm_env.simulation import agent_infos, make_simulation
+from d4orm_env.simulation import MAX_ACTION, agent_infos, check_options, checked_cycles, make_simulation, usable
 from d4orm_env.viewer import RENDER_MODES, Viewer
 
 __all__ = ["env", "parallel_env", "raw_env"]
+
+_OPTIONS_OF_CONFORMANCE_TESTS = ("options",)  # PettingZoo's API tests send options={"options": 1}
 
 
 class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
@@ -45,6 +48,7 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
         **scenario_kwargs: Arguments of the scenario, such as ``model`` or ``seed``.
 
     Raises:
+        TypeError: For an argument that neither the environment nor the scenario has.
         ValueError: For a bad argument, or when both a problem and a scenario's arguments are given.
     """
 
@@ -117,7 +121,7 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
 
     @max_cycles.setter
     def max_cycles(self, value: int) -> None:
-        self._simulation.max_cycles = whole_number(value, "max_cycles", 1)
+        self._simulation.max_cycles = checked_cycles(value)
         self.state_space = gymnasium.spaces.Box(*self._simulation.state_bounds)
 
     @property
@@ -145,11 +149,15 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
 
         Args:
             seed: Seeds the noise, new goals and new instances; ``None`` goes on with the present generator.
-            options: Accepted for the API; none are used.
+            options: Part of the API; there are none.
 
         Returns:
             Observations and infos of all agents.
+
+        Raises:
+            ValueError: For any option.
         """
+        check_options(options, ignored=_OPTIONS_OF_CONFORMANCE_TESTS)
         if seed is not None:
             self._np_random = seeding.np_random(seed)[0]
         step = self._simulation.reset(self.np_random)
@@ -172,7 +180,8 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
 
         Raises:
             RuntimeError: Before the first reset.
-            ValueError: If an action is missing, has another shape, or is not finite; the message names the agent.
+            ValueError: If an action is missing, has another shape, is not finite, or beyond 1e15; the message names
+                the agent. What is merely outside the action space is clipped to the robot's limits.
         """
         simulation, acting = self._simulation, self.agents
         simulation.require_reset()
@@ -224,38 +233,59 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
     def _collect(self, actions: dict[str, FloatArray]) -> FloatArray:
         """``(agents, m)`` the actions of the agents still acting, checked."""
         try:
-            with np.errstate(over="ignore"):
-                block: FloatArray = np.array([actions[agent] for agent in self.agents], np.float32)
-        except (KeyError, TypeError, ValueError):
+            block = as_float32([actions[agent] for agent in self.agents])
+        except (KeyError, IndexError, TypeError, ValueError):
             raise ValueError(self._complaint(actions)) from None
-        if block.shape != (len(self.agents), self._control_size) or not np.isfinite(block).all():
+        if block.shape != (len(self.agents), self._control_size) or not usable(block).all():
             raise ValueError(self._complaint(actions))
         if len(actions) != len(self.agents) and not actions.keys() <= self._robots.keys():
             unknown = sorted(map(str, actions.keys() - self._robots.keys()))
             raise ValueError(f"actions name unknown agents {', '.join(unknown)}; the agents are env.possible_agents")
         return block
 
-    def _complaint(self, actions: dict[str, FloatArray]) -> str:
-        shape = (self._control_size,)
+    def _complaint(self, actions: Any) -> str:
+        if not isinstance(actions, Mapping):
+            return f"actions must be a dictionary with an action for every agent in env.agents, not {actions!r}"
         for agent in self.agents:
             if agent not in actions:
                 return f"actions lack {agent}; give one for every agent in env.agents"
-            action = actions[agent]
-            try:
-                with np.errstate(over="ignore"):
-                    array = np.asarray(action, np.float32)
-            except (TypeError, ValueError):
-                return f"action of {agent} is {action!r}; it must be {shape[0]} numbers"
-            if array.shape != shape or not np.isfinite(array).all():
-                return f"action of {agent} is {action!r}; it must be {shape[0]} finite numbers, of shape {shape}"
+            complaint = self.complaint(agent, actions[agent])
+            if complaint:
+                return complaint
         raise AssertionError("every action is fine")
+
+    def complaint(self, agent: str, action: Any) -> str:
+        """What is wrong with an action of that agent; the empty string if nothing is."""
+        shape = (self._control_size,)
+        try:
+            array = as_float32(action)
+        except ValueError:
+            return f"action of {agent} is {action!r}; it must be {shape[0]} numbers"
+        if array.shape != shape or not usable(array).all():
+            return (
+                f"action of {agent} is {action!r}; it must be {shape[0]} finite numbers of at most {MAX_ACTION:g} in "
+                f"magnitude, of shape {shape}"
+            )
+        return ""
+
+
+class _TurnByTurn(parallel_to_aec_wrapper):
+    """PettingZoo's conversion, with a bad action refused when it is given, and by the name of who gave it."""
+
+    def step(self, action: FloatArray | None) -> None:
+        agent = self.agent_selection
+        if not (self.terminations.get(agent, True) or self.truncations.get(agent, True)):
+            complaint = self.env.unwrapped.complaint(agent, action)
+            if complaint:
+                raise ValueError(complaint)
+        super().step(action)
 
 
 def raw_env(*args: Any, **kwargs: Any) -> AECEnv[str, FloatArray, FloatArray | None]:
     """The robots act in turn and move together when the last has chosen; arguments of :class:`parallel_env`."""
-    return parallel_to_aec_wrapper(parallel_env(*args, **kwargs))
+    return _TurnByTurn(parallel_env(*args, **kwargs))
 
 
 def env(*args: Any, **kwargs: Any) -> AECEnv[str, FloatArray, FloatArray | None]:
     """:func:`raw_env`, with calls in the wrong order caught; arguments of :class:`parallel_env`."""
-    return parallel_to_aec(parallel_env(*args, **kwargs))
+    return OrderEnforcingWrapper(raw_env(*args, **kwargs))

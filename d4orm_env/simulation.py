@@ -14,13 +14,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, frozen_array, whole_number
+from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, as_float32, frozen_array, whole_number
+from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.core.observation import ObservationLayout
 from d4orm_env.core.problem import Problem, inverse_initial_distance
 from d4orm_env.episode_record import EpisodeRecord
 from d4orm_env.joint_state import JointState, join_state, state_bounds
 from d4orm_env.lifelong import fresh_goal, goal_region, reached_goals
 
+MAX_ACTION = 1e15
+"""Largest magnitude of an action. float32 still holds the square of more, but no control of a robot is near it: an
+action so far outside its space is refused like one that is not finite, and less is clipped to the robot's limits."""
+MAX_CYCLES = 10**9
+MAX_OBSERVED = 10_000
 _OPEN_WORLD_EXTENT = 1000.0
 _TRAIL_LENGTH = 50
 
@@ -74,13 +80,13 @@ class Simulation:
         redraw: Callable[[int], Problem] | None = None,
     ) -> None:
         self.problem = problem
-        self.max_cycles = whole_number(problem.horizon if max_cycles is None else max_cycles, "max_cycles", 1)
+        self.max_cycles = checked_cycles(problem.horizon if max_cycles is None else max_cycles)
         self.noise_std = noise_std(control_noise_std, problem.control_size)
         self.lifelong = lifelong
         self.layout = ObservationLayout.for_problem(
             problem,
-            num_neighbors=whole_number(observed_robots, "observed_robots", 0),
-            num_obstacles=whole_number(observed_obstacles, "observed_obstacles", 0),
+            num_neighbors=whole_number(observed_robots, "observed_robots", 0, MAX_OBSERVED),
+            num_obstacles=whole_number(observed_obstacles, "observed_obstacles", 0, MAX_OBSERVED),
         )
         # Here, because importing the compiler takes longer than importing all the rest of the package.
         from d4orm_env.engine.cpu import CpuEngine
@@ -241,16 +247,45 @@ class Simulation:
         self.arrays = self.problem.arrays._replace(goal=goals, inverse_initial_distance=inverse_initial_distance)
 
 
+def checked_cycles(value: Any) -> int:
+    """``max_cycles`` as an int."""
+    return whole_number(value, "max_cycles", 1, MAX_CYCLES)
+
+
+def usable(actions: FloatArray) -> BoolArray:
+    """Where actions are finite, and at most :data:`MAX_ACTION` in magnitude."""
+    within: BoolArray = np.abs(actions) <= MAX_ACTION
+    return within
+
+
+def check_options(options: Any, known: tuple[str, ...] = (), ignored: tuple[str, ...] = ()) -> None:
+    """Refuse what ``reset`` would otherwise ignore.
+
+    Raises:
+        TypeError: If ``options`` is no dictionary.
+        ValueError: For an option that is neither in ``known`` nor in ``ignored``.
+    """
+    if options is None:
+        return
+    if not isinstance(options, dict):
+        raise TypeError(f"options must be a dictionary or None, not {options!r}")
+    for name in options:
+        if name not in known + ignored:
+            raise ValueError(
+                f"reset takes no option {name!r}; it takes {', '.join(known) or 'none'}, and what is to differ between "
+                "environments goes to their constructors"
+            )
+
+
 def noise_std(value: Any, control_size: int) -> FloatArray | None:
     """``(m,)`` standard deviations from one number or one per component; ``None`` where all are zero.
 
     Raises:
-        ValueError: If it has another shape, or a value is negative or not finite.
+        ValueError: If it has another shape, or a value is negative, not finite or above 1e6.
     """
     try:
-        with np.errstate(over="ignore"):
-            std = np.asarray(value, np.float32)
-    except (TypeError, ValueError):
+        std = as_float32(value)
+    except ValueError:
         raise ValueError(f"control_noise_std must be a number or one per control component, not {value!r}") from None
     if std.shape not in ((), (control_size,)):
         raise ValueError(
@@ -258,6 +293,8 @@ def noise_std(value: Any, control_size: int) -> FloatArray | None:
         )
     if not np.isfinite(std).all() or (std < 0).any():
         raise ValueError(f"control_noise_std is {std.tolist()}; it must be zero or more and finite")
+    if (std > LARGEST).any():
+        raise ValueError(f"control_noise_std is {std.tolist()}; it must be at most {LARGEST:g}")
     return np.broadcast_to(std, (control_size,)).copy() if std.any() else None
 
 
@@ -280,8 +317,18 @@ def make_simulation(
         settings: Passed on to :class:`Simulation`.
 
     Raises:
+        TypeError: For an argument that neither the scenario nor the environment has.
         ValueError: If both a problem and a scenario's arguments are given, or one of them is bad.
     """
+    # Imported here, since scenarios bring much along that a given problem does not need.
+    if scenario_kwargs:
+        from d4orm_env.scenarios.registry import unknown_argument
+
+        name = "circle" if scenario is None else scenario
+        own = (*settings, "scenario", "problem", "render_mode", "randomize_instance")
+        complaint = unknown_argument(None if problem is not None else name, scenario_kwargs, own)
+        if complaint:
+            raise UnknownKeywordError(complaint)
     if num_robots is not None:
         scenario_kwargs = {"num_robots": num_robots, **scenario_kwargs}
     if problem is not None:
@@ -291,8 +338,7 @@ def make_simulation(
             raise ValueError(f"problem= excludes the scenario arguments ({named}); give one or the other")
         return Simulation(problem, **settings)
 
-    # Imported here, since scenario files bring pydantic and YAML along, which a given problem does not need.
-    from d4orm_env.scenarios import make_problem
+    from d4orm_env.scenarios.registry import make_problem
 
     name = "circle" if scenario is None else scenario
     first = make_problem(name, **scenario_kwargs)

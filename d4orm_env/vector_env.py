@@ -12,13 +12,14 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, whole_number
+from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, whole_number
 from d4orm_env.core.observation import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.episode_record import episode_metrics
 from d4orm_env.joint_env import joint_spaces
-from d4orm_env.simulation import make_simulation
+from d4orm_env.simulation import MAX_ACTION, check_options, make_simulation, usable
 
+MAX_WORLDS = 1_000_000
 _NOISE_STEPS = 32
 """Steps of execution noise that a world draws at a time: drawing costs more per call than per number."""
 
@@ -61,6 +62,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         **scenario_kwargs: Arguments of the scenario.
 
     Raises:
+        TypeError: For an argument that neither the environment nor the scenario has.
         ValueError: For a bad argument, or instances that differ in their team or obstacles.
     """
 
@@ -90,7 +92,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             raise ValueError(f"render_mode is {render_mode!r}; a batch of worlds is not drawn, use gymnasium.make")
         if lifelong:
             raise ValueError("lifelong mode needs goals drawn one by one; use gymnasium.make or navigation_v0 for it")
-        self.num_envs = whole_number(num_envs, "num_envs", 1)
+        self.num_envs = whole_number(num_envs, "num_envs", 1, MAX_WORLDS)
         self._mode = _autoreset_mode(autoreset_mode)
         self.metadata = type(self).metadata | {"autoreset_mode": self._mode}
         # It steps no world: it checks the arguments and draws the instances.
@@ -164,7 +166,8 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
 
         Raises:
             TypeError: If the mask is not an array of bool.
-            ValueError: If mask or seeds have another length, or the mask is empty.
+            ValueError: If mask or seeds have another length, a seed is no whole number of zero or more, the mask is
+                empty, or an option is unknown.
             RuntimeError: If the first reset leaves worlds out.
         """
         from d4orm_env.engine.worlds import LOOK, RESET
@@ -192,7 +195,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
 
         Raises:
             RuntimeError: Before the first reset, or, without auto-reset, if an episode is over.
-            ValueError: If the actions have another shape or a value that is not finite.
+            ValueError: If the actions have another shape, or a value that is not finite or beyond 1e15.
         """
         from d4orm_env.engine.worlds import RESET, SKIP, STEP
 
@@ -312,15 +315,22 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
 
     def _controls(self, actions: FloatArray) -> FloatArray:
         """``(B, K, m)`` a checked copy."""
-        with np.errstate(over="ignore"):
-            controls = np.array(actions, np.float32)
+        try:
+            controls = as_float32(actions)
+        except ValueError as error:
+            raise ValueError(
+                f"actions must be an array of {self.action_space.shape} numbers, not {actions!r}: {error}"
+            ) from None
         if controls.shape != self.action_space.shape:
             raise ValueError(f"actions have shape {controls.shape}; expected (B, K * m) = {self.action_space.shape}")
         controls = controls.reshape(self._worlds.control.shape)
-        if not np.isfinite(controls).all():
-            world, robot = (int(i) for i in np.argwhere(~np.isfinite(controls).all(axis=2))[0])
+        if not usable(controls).all():
+            world, robot = (int(i) for i in np.argwhere(~usable(controls).all(axis=2))[0])
             value = controls[world, robot].tolist()
-            raise ValueError(f"action of robot_{robot} in world {world} is {value}; every value must be finite")
+            raise ValueError(
+                f"action of robot_{robot} in world {world} is {value}; every value must be finite and at most "
+                f"{MAX_ACTION:g} in magnitude"
+            )
         return controls
 
     def _infos(self, mask: BoolArray) -> dict[str, Any]:
@@ -348,6 +358,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         return masked
 
     def _reset_mask(self, options: dict[str, Any] | None) -> BoolArray:
+        check_options(options, ("reset_mask",))
         if options is None or "reset_mask" not in options:
             return np.ones(self.num_envs, np.bool_)
         mask = options["reset_mask"]
@@ -365,11 +376,12 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None:
             return [None] * self.num_envs
-        if isinstance(seed, (int, np.integer)):
-            return [int(seed) + world for world in range(self.num_envs)]
+        if not isinstance(seed, (Sequence, np.ndarray)) or isinstance(seed, str):
+            first = whole_number(seed, "seed", 0)
+            return [first + world for world in range(self.num_envs)]
         if len(seed) != self.num_envs:
             raise ValueError(f"seed has {len(seed)} entries for {self.num_envs} worlds; give one per world")
-        return list(seed)
+        return [None if one is None else whole_number(one, f"seed[{world}]", 0) for world, one in enumerate(seed)]
 
 
 def _final(observations: FloatArray, infos: dict[str, Any], ended: BoolArray) -> dict[str, Any]:

@@ -29,6 +29,10 @@ class Viewer:
         self._renderer: Any = None
         self._problem: Problem | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Figures and windows are neither copied nor sent to other processes; a copy opens its own.
+        return self.__dict__ | {"_renderer": None, "_problem": None}
+
     def render(self, simulation: Simulation) -> Any:
         """``(height, width, 3)`` uint8 frame in mode ``"rgb_array"``, else ``None``."""
         if self._mode is None:

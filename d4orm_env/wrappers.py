@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -52,7 +53,7 @@ class GaussianControlNoise(BaseParallelWrapper[str, FloatArray, FloatArray]):
         self, actions: dict[str, FloatArray]
     ) -> tuple[dict[str, FloatArray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """Step the environment with disturbed actions."""
-        if self._std is None:
+        if self._std is None or not isinstance(actions, Mapping):  # what is no dictionary is refused further in
             return super().step(actions)
         # Drawn for all agents whoever is left, so that one agent's noise does not depend on the others' fate.
         noise = self._std * self._random.standard_normal((self.max_num_agents, *self._shape), dtype=np.float32)

@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from d4orm_env.core.arrays import positive_number, shown
+from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_planners.base import Planner
 from d4orm_planners.cem import CEM
 from d4orm_planners.d4orm import D4orm
@@ -20,7 +21,6 @@ from d4orm_planners.mppi import MPPI
 from d4orm_planners.orca import Orca
 from d4orm_planners.policy import DriveToGoal, OpenLoop, Policy, RandomControls
 from d4orm_planners.rl.learned import PPO, SAC
-from d4orm_planners.settings import UnknownSettingError
 
 PLANNERS: Mapping[str, type[Planner]] = MappingProxyType(
     {planner.name: planner for planner in (D4orm, D4ormD, DD4orm, MPPI, CEM, MBD, IterativeMBD, Ipopt)}
@@ -111,7 +111,7 @@ def _policy_config(name: str, config: Mapping[str, Any]) -> Any:
         kind.config_class.check_names(config, f"policy {name!r}")
         return kind.config_class(**config)
     if config:
-        raise UnknownSettingError(f"policy {name!r} takes no settings, but was given {', '.join(config)}")
+        raise UnknownKeywordError(f"policy {name!r} takes no settings, but was given {', '.join(config)}")
     return None
 
 

@@ -15,7 +15,8 @@ from typing import Annotated, Any, get_type_hints
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, create_model
 
-from d4orm_env.core.arrays import LARGEST, LARGEST_WHOLE, shown
+from d4orm_env.core.arrays import LARGEST_NUMBER, LARGEST_WHOLE, shown
+from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.engine.base import ENGINES
 
 
@@ -70,7 +71,7 @@ Count = Annotated[Whole, Field(ge=1)]
 Samples = Annotated[Whole, Field(ge=2, le=10**7)]
 Steps = Annotated[Whole, Field(ge=1, le=10**6)]
 """Of samples and steps there are no more than memory and patience can hold."""
-Number = Annotated[float, BeforeValidator(_number), Field(le=LARGEST)]
+Number = Annotated[float, BeforeValidator(_number), Field(le=LARGEST_NUMBER)]
 Positive = Annotated[Number, Field(gt=0)]
 NotNegative = Annotated[Number, Field(ge=0)]
 Share = Annotated[Number, Field(gt=0, le=1)]
@@ -78,10 +79,6 @@ ShareOrNone = Annotated[Number, Field(ge=0, le=1)]
 Variance = Annotated[Number, AfterValidator(_variance)]
 PathText = Annotated[str, BeforeValidator(_path)]
 EngineName = Annotated[str, one_of(ENGINES)]
-
-
-class UnknownSettingError(TypeError, ValueError):
-    """A setting that does not exist: to Python an unexpected keyword, and bad input like any other."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,12 +108,12 @@ class Settings:
         """Refuse what is no setting.
 
         Raises:
-            UnknownSettingError: One line that names it, whose setting it is not, and those that there are.
+            UnknownKeywordError: One line that names it, whose setting it is not, and those that there are.
         """
         known = cls.setting_names()
         for name in given:
             if name not in known:
-                raise UnknownSettingError(f"{name!r} is no setting of {owner}; it takes {', '.join(known)}")
+                raise UnknownKeywordError(f"{name!r} is no setting of {owner}; it takes {', '.join(known)}")
 
 
 @cache

@@ -112,6 +112,10 @@ def test_spaces_follow_the_robots_own_limits() -> None:
         (np.zeros((2, 2)), "action has shape"),
         (np.array([0, 0, np.nan, 0]), "action of robot_1"),
         (np.array([0, 1e300, 0, 0]), "action of robot_0"),
+        (np.array([0, 0, 2e19, 0]), r"action of robot_1 is .*; every value must be finite and at most 1e\+15"),
+        (None, "action has shape"),
+        (["a", "b", "c", "d"], "action must be an array of"),
+        ([10**400, 0, 0, 0], "action must be an array of .* too large for a float"),
     ],
 )
 def test_bad_actions_are_refused(action: np.ndarray, message: str) -> None:
@@ -119,6 +123,12 @@ def test_bad_actions_are_refused(action: np.ndarray, message: str) -> None:
     env.reset()
     with pytest.raises(ValueError, match=message):
         env.step(action)
+
+
+def test_options_that_would_be_ignored_are_refused() -> None:
+    env = JointNavigationEnv(num_robots=2)
+    with pytest.raises(ValueError, match="reset takes no option 'problem'"):
+        env.reset(options={"problem": env.problem})
 
 
 def test_calls_before_reset_are_refused() -> None:

@@ -22,8 +22,10 @@ from d4orm_env import navigation_v0
 from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.world import World
 from d4orm_env.engine.base import get_engine
+from d4orm_env.joint_env import JointNavigationEnv
 from d4orm_env.joint_state import split_state
 from d4orm_env.scenarios import make_problem
+from d4orm_env.vector_env import NavigationVectorEnv
 
 INFO_TYPES = {"arrived": bool, "collided": bool, "margin_violated": bool, "distance_to_goal": float}
 
@@ -204,6 +206,8 @@ def test_what_is_returned_is_the_callers() -> None:
         ({"robot_1": [0.0, float("nan")]}, "action of robot_1"),
         ({"robot_2": [float("inf"), 0.0]}, "action of robot_2"),
         ({"robot_2": [1e300, 0.0]}, "action of robot_2"),
+        ({"robot_2": [2e19, 0.0]}, r"action of robot_2 is \[2e\+19, 0.0\]; .* at most 1e\+15 in magnitude"),
+        ({"robot_2": [10**400, 0.0]}, "action of robot_2"),
         ({"robot_7": [0.0, 0.0]}, "unknown agents robot_7"),
     ],
 )
@@ -215,6 +219,57 @@ def test_bad_actions_are_refused_by_name(change: dict[str, Any], message: str) -
     with pytest.raises(ValueError, match=message):
         env.step(actions)
     np.testing.assert_array_equal(env.state(), before)
+
+
+@pytest.mark.parametrize("actions", [None, 3, [[0, 0]] * 3])
+def test_actions_that_are_no_dictionary_are_refused(actions: Any) -> None:
+    env = navigation_v0.parallel_env("circle", 3)
+    env.reset()
+    with pytest.raises(ValueError, match="actions must be a dictionary with an action for every agent"):
+        env.step(actions)
+
+
+@pytest.mark.parametrize("make", [navigation_v0.raw_env, navigation_v0.env])
+def test_robots_that_act_in_turn_are_blamed_at_their_own_step(make: Any) -> None:
+    env = make("circle", 3)
+    env.reset()
+    env.step(np.zeros(2, np.float32))
+    for action in ([np.nan, 0], None, [0, 0, 0], [1e20, 0]):
+        with pytest.raises(ValueError, match="action of robot_1 is"):
+            env.step(action)
+    assert env.agent_selection == "robot_1"
+    for _ in range(2):
+        env.step(np.zeros(2, np.float32))
+    assert env.agent_selection == "robot_0"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"colour": "red"}, "scenario 'circle' takes no argument 'colour'; it takes .*control_noise_std, .*diameter"),
+        ({"max_cycle": 5}, "takes no argument 'max_cycle'.*did you mean 'max_cycles'?"),
+        ({"scenario": "swap", "diameter": 5.0}, "scenario 'swap' takes no argument 'diameter'"),
+        (
+            {"problem": line_problem([1.0]), "render": "human"},
+            "takes no argument 'render'.*did you mean 'render_mode'?",
+        ),
+    ],
+)
+def test_unknown_arguments_are_type_errors(arguments: dict[str, Any], message: str) -> None:
+    for make in (navigation_v0.parallel_env, navigation_v0.env, JointNavigationEnv, NavigationVectorEnv):
+        with pytest.raises(TypeError, match=message):
+            make(**arguments)
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_of_an_environment_that_has_drawn_draws_too(duplicate: Any) -> None:
+    env = navigation_v0.parallel_env("circle", 2, render_mode="rgb_array")
+    env.reset(seed=0)
+    frame = env.render()
+    twin = duplicate(env)
+    np.testing.assert_array_equal(twin.render(), frame)
+    env.close()
+    twin.close()
 
 
 def test_a_missing_action_is_refused_by_name() -> None:
@@ -233,11 +288,14 @@ def test_a_missing_action_is_refused_by_name() -> None:
         ({"problem": line_problem([1.0]), "randomize_instance": True}, "randomize_instance"),
         ({"scenario": "circle", "randomize_instance": True}, "same for every seed"),
         ({"scenario": "nowhere"}, "nowhere"),
-        ({"colour": "red"}, "colour"),
         ({"render_mode": "ansi"}, "render_mode is 'ansi'"),
         ({"control_noise_std": -0.1}, "control_noise_std"),
         ({"control_noise_std": float("nan")}, "control_noise_std"),
         ({"control_noise_std": 1e300}, "control_noise_std"),
+        ({"control_noise_std": 1e7}, r"control_noise_std is .*; it must be at most 1e\+06"),
+        ({"control_noise_std": 10**400}, "control_noise_std must be a number"),
+        ({"max_cycles": 10**12}, "max_cycles is 1000000000000; it must be at most 1000000000"),
+        ({"observed_robots": 10**9}, "observed_robots is 1000000000; it must be at most 10000"),
         ({"control_noise_std": "much"}, "control_noise_std must be a number"),
         ({"control_noise_std": [0.1, 0.1, 0.1]}, "control_noise_std has shape"),
         ({"max_cycles": 0}, "max_cycles is 0"),
@@ -278,10 +336,13 @@ def test_reset_without_seed_goes_on_with_the_generator() -> None:
     assert data_equivalence(logs[0], logs[1], exact=True)
 
 
-def test_unknown_options_are_accepted() -> None:
+def test_options_that_would_be_ignored_are_refused() -> None:
     env = navigation_v0.parallel_env("circle", 2)
-    plain, optioned = env.reset(seed=0), env.reset(seed=0, options={"weather": "rain"})
-    assert data_equivalence(plain, optioned, exact=True)
+    with pytest.raises(ValueError, match="reset takes no option 'problem'; it takes none"):
+        env.reset(seed=0, options={"problem": env.problem})
+    with pytest.raises(TypeError, match="options must be a dictionary"):
+        env.reset(options="fast")  # type: ignore[arg-type]
+    assert data_equivalence(env.reset(seed=0), env.reset(seed=0, options={}), exact=True)
 
 
 def test_noise_has_its_standard_deviation_per_component() -> None:

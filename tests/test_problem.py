@@ -13,6 +13,7 @@ import pytest
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
+from d4orm_env.rollout import rollout
 
 NAN, INF = float("nan"), float("inf")
 
@@ -57,6 +58,9 @@ def spatial(**changes: Any) -> Problem:
         ({"max_acceleration": -1}, "max_acceleration of robot_0 is -1; it must be positive"),
         ({"max_turn_rate": [1, -2]}, "max_turn_rate of robot_1 is -2; it must be positive"),
         ({"max_turn_rate": 1e39}, r"max_turn_rate\[0\] is inf; every value must be finite"),
+        ({"max_acceleration": 1e30}, r"max_acceleration of robot_0 is 1e\+30; it must be from 1e-07 to 1e\+06"),
+        ({"max_speed": [1, 1e-30]}, r"max_speed of robot_1 is 1e-30; it must be from 1e-07 to 1e\+06"),
+        ({"radius": 10**400}, "radius must be an array of numbers, .* whole number too large for a float"),
     ],
 )
 def test_bad_teams_are_refused(arguments: dict[str, Any], message: str) -> None:
@@ -73,6 +77,8 @@ def test_bad_teams_are_refused(arguments: dict[str, Any], message: str) -> None:
         ({"circles": [[0, 0, 1], [0, 0, 0]]}, r"radius of circles\[1\] is 0; it must be positive"),
         ({"circles": [[0, NAN, 1]]}, r"circles\[0, 1\] is nan; every value must be finite"),
         ({"circles": [["left", 0, 1]]}, "circles must be an array of numbers"),
+        ({"circles": [[1e30, 0, 1]]}, r"circles\[0, 0\] is 1e\+30; magnitudes must be at most 1e\+06"),
+        ({"lower": [0, 0], "upper": [1, 1e7]}, r"bounds upper\[1\] is 1e\+07; magnitudes must be at most"),
         ({"circles": [[0, 0, 1], [0]]}, "circles must be an array of numbers"),
         ({"spheres": [[0, 0, 0, 1]]}, "spheres need a world of dimension 3, and this one has 2"),
         ({"cylinders": [[0, 0, 1]]}, "cylinders need a world of dimension 3, and this one has 2"),
@@ -114,7 +120,28 @@ def test_bad_worlds_are_refused(arguments: dict[str, Any], message: str) -> None
         ({"dt": -0.1}, "dt is -0.1; it must be positive and finite"),
         ({"dt": NAN}, "dt is nan; it must be positive and finite"),
         ({"dt": "soon"}, "dt must be a number, not 'soon'"),
-        ({"dt": 1e19}, r"dt is 1e\+19; it must be at most 1e\+18"),
+        ({"dt": 1e4}, r"dt is 10000; it must be at most 1000"),
+        ({"dt": 1e-50}, r"dt is 1e-50; it must be at least 1e-06"),
+        ({"dt": 10**400}, r"dt is inf; it must be positive and finite"),
+        ({"horizon": 100_000_000}, "horizon is 100000000; it must be at most 1000000"),
+        ({"horizon": 10**5000}, "horizon is a number of thousands of digits; it must be at most 1000000"),
+        ({"margin": 1e7}, r"margin is 1e\+07; it must be at most 1e\+06"),
+        ({"goal_radius": 1e-9}, "goal_radius is 1e-09; it must be at least 1e-07"),
+        (
+            {"goal_radius": 1e-5, "goal": [[1, 0], [-1, 0]]},
+            r"robot_0 starts or ends at a coordinate of 1 m, where float32 resolves 1.2e-07 m, more than 1/100 of the "
+            r"goal radius of 1e-05 m; move the problem nearer to the origin, or use a larger goal_radius",
+        ),
+        (
+            {"world": None, "goal": [[1, 0], [1e4, 0]]},
+            r"robot_1 .* coordinate of 10000 m, where float32 resolves 0.00098 m",
+        ),
+        ({"world": None, "goal": [[1, 0], [1e7, 0]]}, r"goal\[1, 0\] is 1e\+07; magnitudes must be at most 1e\+06"),
+        (
+            {"dt": 1e-6},
+            "robot_0 .* moves at most 1e-06 m in a step of 1e-06 s; move .* or use a larger dt or max_speed",
+        ),
+        ({"goal": [[1, 0], [10**400, 0]]}, "goal must be an array of numbers, .* whole number too large for a float"),
         ({"horizon": 0}, "horizon is 0; it must be at least 1"),
         ({"horizon": 10.0}, "horizon must be a whole number, not 10.0"),
         ({"horizon": True}, "horizon must be a whole number, not True"),
@@ -122,7 +149,7 @@ def test_bad_worlds_are_refused(arguments: dict[str, Any], message: str) -> None
         ({"margin": INF}, "margin is inf; it must be zero or more and finite"),
         ({"goal_radius": 0}, "goal_radius is 0; it must be positive and finite"),
         ({"goal_speed": -1}, "goal_speed is -1; it must be zero or more and finite"),
-        ({"goal_speed": 1e200}, r"goal_speed is 1e\+200; it must be at most 1e\+18"),
+        ({"goal_speed": 1e200}, r"goal_speed is 1e\+200; it must be at most 1e\+06"),
         ({"world": World(3)}, "the world has dimension 3 and the team 2; match them"),
         (
             {"start": [[-1, 0, 0, 0], [-0.6, 0.25, 0, 0]]},  # 0.4717 m apart, radii 0.2 and 0.3
@@ -167,6 +194,49 @@ def test_touching_counts_as_contact_and_just_beside_does_not() -> None:
         Problem(team, [[0, 0], [0.5, 0]], [[0, 5], [5, 0]])
     beside = np.nextafter(np.float32(0.5), np.float32(1))
     assert Problem(team, [[0, 0], [beside, 0]], [[0, 5], [5, 0]]).num_robots == 2
+
+
+def drive(**changes: Any) -> Problem:
+    """One differential drive at 1 m/s."""
+    limits = {"max_turn_rate": changes.pop("max_turn_rate", np.pi / 2)}
+    return Problem(Team(("differential_drive",), **limits), [[0, 0, changes.pop("heading", 0), 0]], [[1, 0]], **changes)
+
+
+def test_turns_that_one_step_of_rk4_does_not_follow_are_refused() -> None:
+    # Half a turn in a step: Simpson's rule makes of 2/pi m sideways 2/3 m. A bound of its error is 0.034 m.
+    with pytest.raises(
+        ValueError, match=r"robot_0 may turn by 3.14 rad in a step of 1 s, .* be 0.034 m off .* smaller"
+    ):
+        drive(dt=1.0, max_turn_rate=np.pi)
+    with pytest.raises(ValueError, match=r"robot_0 may turn by 6.28 rad in a step of 1 s"):
+        drive(dt=1.0, max_turn_rate=6.28)
+    assert drive(dt=1.0, max_turn_rate=2.3).dt == 1.0
+    assert drive(dt=0.8).dt == 0.8
+    # Other models do not turn.
+    assert Problem(Team(("velocity2d",), max_turn_rate=9), [[0, 0]], [[1, 0]], dt=1.0).dt == 1.0
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0])
+def test_rk4_is_no_farther_off_than_the_bound_says(factor: float) -> None:
+    turn_rate = factor * (0.01 * 2880) ** 0.25  # at 1 m/s and 1 s, the bound is 0.01 m for the whole of it
+    problem = drive(dt=1.0, max_turn_rate=turn_rate * 0.999, horizon=1)
+    problem = problem.replace(start=[[0, 0, 0, 1]])
+    end = rollout(problem, np.array([[[turn_rate * 0.999, 0]]]), engine="cpu").positions[1, 0]
+    angle = turn_rate * 0.999
+    truth = np.array([np.sin(angle), 1 - np.cos(angle)]) / angle
+    error = float(np.linalg.norm(end - truth))
+    assert 0.7 * 0.01 * factor**4 < error <= 0.01 * factor**4
+
+
+def test_headings_of_many_turns_are_refused() -> None:
+    with pytest.raises(ValueError, match="start heading of robot_0 is 2000 rad; it must be at most 1000"):
+        drive(heading=2000)
+
+
+def test_what_is_under_way_is_not_checked() -> None:
+    problem = drive()
+    coarse = problem.moment(problem.start, problem.goal, dt=2.0, horizon=5)
+    assert (coarse.dt, coarse.horizon) == (2.0, 5)
 
 
 def test_the_margin_may_be_violated_at_the_start() -> None:

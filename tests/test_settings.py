@@ -15,7 +15,7 @@ import pytest
 from d4orm_env.core.arrays import positive_number, whole_number
 from d4orm_planners import list_policies, make_planner, make_policy
 from d4orm_planners.registry import PLANNERS, POLICIES, policy_settings
-from d4orm_planners.settings import Settings, UnknownSettingError
+from d4orm_planners.settings import Settings, UnknownKeywordError
 
 KINDS: dict[str, type[Settings]] = {
     name: kind.config_class for name, kind in {**PLANNERS, **POLICIES}.items() if kind.config_class is not None
@@ -107,7 +107,7 @@ def test_an_unknown_setting_is_an_unexpected_keyword(name: str) -> None:
     for make in (make_policy, policy_settings, *([make_planner] if name in PLANNERS else [])):
         with pytest.raises(TypeError, match=r"'?colour'?") as caught:
             make(name, colour=1)
-        assert isinstance(caught.value, UnknownSettingError)
+        assert isinstance(caught.value, UnknownKeywordError)
         assert "\n" not in str(caught.value)
 
 

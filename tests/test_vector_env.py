@@ -259,12 +259,23 @@ def test_bad_calls() -> None:
         env.step(np.zeros((2, 4), np.float32))
     with pytest.raises(RuntimeError, match="without a mask"):
         env.reset(options={"reset_mask": np.array([True, False])})
-    env.reset(seed=0, options={"anything": 1})
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="reset takes no option 'problem'; it takes reset_mask"):
+        env.reset(options={"problem": env.problem})
+    for seed, message in ((1.5, "seed must be a whole number"), (-1, "seed is -1"), ([1, "a"], r"seed\[1\] must be")):
+        with pytest.raises(ValueError, match=message):
+            env.reset(seed=seed)
+    for bad in (None, "left", [10**400] * 2):
+        with pytest.raises(ValueError, match="actions"):
+            env.step(bad)
     with pytest.raises(ValueError, match=r"shape \(4,\)"):
         env.step(np.zeros(4, np.float32))
     actions = np.zeros((2, 4), np.float32)
     actions[1, 2] = np.nan
     with pytest.raises(ValueError, match="robot_1 in world 1"):
+        env.step(actions)
+    actions[1, 2] = 2e19
+    with pytest.raises(ValueError, match=r"robot_1 in world 1 is .*e\+19, 0.0\]; every value .* at most 1e\+15"):
         env.step(actions)
     with pytest.raises(ValueError, match="one per world"):
         env.reset(seed=[1])

@@ -108,6 +108,8 @@ def test_bad_actions_still_name_the_agent() -> None:
         env.step({"robot_0": [0, 0], "robot_1": None})
     with pytest.raises(ValueError, match="action of robot_0"):
         env.step({"robot_0": [0, np.nan], "robot_1": [0, 0]})
+    with pytest.raises(ValueError, match="actions must be a dictionary"):
+        env.step(None)
 
 
 @pytest.mark.parametrize("std", [-0.1, float("nan"), float("inf"), [0.1, 0.1, 0.1]])

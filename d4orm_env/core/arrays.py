@@ -11,24 +11,43 @@ FloatArray = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 
 
-def frozen_array(value: Any, name: str, shape: tuple[int | None, ...]) -> FloatArray:
+SMALLEST, LARGEST = 1e-7, 1e6
+"""Limits, radii, coordinates and times lie between these in SI units: float32 then holds all that is computed of them,
+over a whole horizon."""
+
+
+def as_float32(value: Any) -> FloatArray:
+    """A new float32 array of ``value``; what is too large for float32 becomes infinite.
+
+    Raises:
+        ValueError: If it cannot be read as numbers, or holds a whole number that no float holds.
+    """
+    try:
+        with np.errstate(over="ignore"):
+            return np.array(value, np.float32)
+    except OverflowError:
+        raise ValueError("it holds a whole number too large for a float") from None
+    except (TypeError, ValueError):
+        raise ValueError("it does not hold numbers only, in rows of one length") from None
+
+
+def frozen_array(value: Any, name: str, shape: tuple[int | None, ...], *, largest: float = float("inf")) -> FloatArray:
     """``value`` as a read-only, finite float32 array.
 
     Args:
         value: Anything NumPy can read as numbers.
         name: What to call it in an error.
         shape: Expected shape; ``None`` matches any length.
+        largest: Largest magnitude.
 
     Raises:
-        ValueError: If it cannot be read, has another shape, or holds a value that is not finite.
+        ValueError: If it cannot be read, has another shape, or holds a value that is not finite or too large.
     """
     try:
-        # A value too large for float32 becomes infinite, and is refused as such below.
-        with np.errstate(over="ignore"):
-            # Adding zero makes -0.0 a plain zero, so that equal problems have equal bits.
-            array = np.array(value, dtype=np.float32) + np.float32(0)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be an array of numbers, not {value!r}") from error
+        # Adding zero makes -0.0 a plain zero, so that equal problems have equal bits.
+        array = as_float32(value) + np.float32(0)
+    except ValueError as error:
+        raise ValueError(f"{name} must be an array of numbers, not {shown(value)}; {error}") from error
     if (array.size == 0 and 0 in shape) or (array.size == 0 and None in shape):
         array = array.reshape([size or 0 for size in shape])
     if array.ndim != len(shape) or any(want is not None and want != have for want, have in zip(shape, array.shape)):
@@ -37,6 +56,9 @@ def frozen_array(value: Any, name: str, shape: tuple[int | None, ...]) -> FloatA
     if not np.isfinite(array).all():
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise ValueError(f"{name}{list(where)} is {array[where]}; every value must be finite")
+    if (np.abs(array) > largest).any():
+        where = tuple(int(i) for i in np.argwhere(np.abs(array) > largest)[0])
+        raise ValueError(f"{name}{list(where)} is {array[where]:g}; magnitudes must be at most {largest:g}")
     array.setflags(write=False)
     return array
 
@@ -45,7 +67,8 @@ def frozen_per_robot(value: Any, name: str, num_robots: int) -> FloatArray:
     """``value`` as ``(num_robots,)`` positive numbers; a single number is given to every robot.
 
     Raises:
-        ValueError: As :func:`frozen_array`, or if a value is not positive; the message names the robot.
+        ValueError: As :func:`frozen_array`, or if a value is not positive, or not from :data:`SMALLEST` to
+            :data:`LARGEST`; the message names the robot.
     """
     if np.ndim(value) == 0:
         value = [value] * num_robots
@@ -53,6 +76,10 @@ def frozen_per_robot(value: Any, name: str, num_robots: int) -> FloatArray:
     if (array <= 0).any():
         robot = int(np.argmax(array <= 0))
         raise ValueError(f"{name} of robot_{robot} is {array[robot]:g}; it must be positive")
+    outside = (array < np.float32(SMALLEST)) | (array > LARGEST)
+    if outside.any():
+        robot = int(np.argmax(outside))
+        raise ValueError(f"{name} of robot_{robot} is {array[robot]:g}; it must be from {SMALLEST:g} to {LARGEST:g}")
     return array
 
 
@@ -64,7 +91,7 @@ def restore_frozen(instance: Any, state: dict[str, Any]) -> None:
         object.__setattr__(instance, name, value)
 
 
-LARGEST = 1e18
+LARGEST_NUMBER = 1e18
 """Numbers must stay below it: float32 still holds their squares."""
 
 LARGEST_WHOLE = 2**63 - 1
@@ -82,12 +109,21 @@ def shown(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def positive_number(value: Any, name: str, *, zero_allowed: bool = False) -> float:
+def positive_number(
+    value: Any, name: str, *, zero_allowed: bool = False, least: float = 0.0, most: float = LARGEST_NUMBER
+) -> float:
     """``value`` as a finite positive float.
 
+    Args:
+        value: Anything that is a number.
+        name: What to call it in an error.
+        zero_allowed: Whether it may be zero.
+        least: Least value other than zero.
+        most: Largest value; by default, float32 still holds its square.
+
     Raises:
-        ValueError: If it is not a number, not finite, negative, zero where zero is not allowed, or beyond
-            :data:`LARGEST`.
+        ValueError: If it is not a number, not finite, negative, zero where zero is not allowed, below ``least`` or
+            above ``most``.
     """
     try:
         if isinstance(value, bool | np.bool_):
@@ -101,19 +137,23 @@ def positive_number(value: Any, name: str, *, zero_allowed: bool = False) -> flo
         raise ValueError(
             f"{name} is {number:g}; it must be {'zero or more' if zero_allowed else 'positive'} and finite"
         )
-    if number > LARGEST:
-        raise ValueError(f"{name} is {number:g}; it must be at most {LARGEST:g}")
+    if number > most:
+        raise ValueError(f"{name} is {number:g}; it must be at most {most:g}")
+    if 0 < number < least:
+        raise ValueError(f"{name} is {number:g}; it must be at least {least:g}")
     return number
 
 
-def whole_number(value: Any, name: str, minimum: int) -> int:
-    """``value`` as an int of at least ``minimum``.
+def whole_number(value: Any, name: str, minimum: int, maximum: int | None = None) -> int:
+    """``value`` as an int of at least ``minimum``, and at most ``maximum`` where there is one.
 
     Raises:
-        ValueError: If it is not a whole number or is too small.
+        ValueError: If it is not a whole number, too small or too large.
     """
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
         raise ValueError(f"{name} must be a whole number, not {shown(value)}")
     if value < minimum:
         raise ValueError(f"{name} is {shown(int(value))}; it must be at least {minimum}")
+    if maximum is not None and value > maximum:
+        raise ValueError(f"{name} is {shown(int(value))}; it must be at most {maximum}")
     return int(value)

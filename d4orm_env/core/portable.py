@@ -114,27 +114,32 @@ def _in_float64(function: Callable[..., Any]) -> Callable[..., Any]:
         single = all(array.dtype == np.float32 for array in arrays)
         with np.errstate(all="ignore"):
             result = function(*(array.astype(np.float64, copy=False) for array in arrays))
+            if isinstance(result, tuple):
+                return tuple(np.float32(part) for part in result) if single else result
             return np.float32(result) if single else result
 
     return wrapper
 
 
-@_in_float64
 def sin(x: Any) -> Any:
     """Sine of ``x`` [rad]."""
-    quadrant, high, low = _reduced(x)
-    swapped = (quadrant & 1).astype(bool)
-    size = np.where(swapped, _cosine(high, low), _sine(high, low))
-    return np.where(x == 0, x, np.where(quadrant & 2, -size, size))[()]  # minus zero keeps its sign
+    return sin_cos(x)[0]
+
+
+def cos(x: Any) -> Any:
+    """Cosine of ``x`` [rad]."""
+    return sin_cos(x)[1]
 
 
 @_in_float64
-def cos(x: Any) -> Any:
-    """Cosine of ``x`` [rad]."""
+def sin_cos(x: Any) -> Any:
+    """Sine and cosine of ``x`` [rad], for little more than the price of one."""
     quadrant, high, low = _reduced(x)
+    sine, cosine = _sine(high, low), _cosine(high, low)
     swapped = (quadrant & 1).astype(bool)
-    size = np.where(swapped, _sine(high, low), _cosine(high, low))
-    return np.where((quadrant + 1) & 2, -size, size)[()]
+    first, second = np.where(swapped, cosine, sine), np.where(swapped, sine, cosine)
+    first, second = np.where(quadrant & 2, -first, first), np.where((quadrant + 1) & 2, -second, second)
+    return np.where(x == 0, x, first)[()], second[()]  # minus zero keeps its sign
 
 
 @_in_float64

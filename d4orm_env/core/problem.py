@@ -11,10 +11,31 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import FloatArray, frozen_array, positive_number, restore_frozen, whole_number
+from d4orm_env.core.arrays import (
+    LARGEST,
+    SMALLEST,
+    FloatArray,
+    frozen_array,
+    positive_number,
+    restore_frozen,
+    whole_number,
+)
 from d4orm_env.core.dynamics import MODEL_CODES
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
+
+MAX_HORIZON = 1_000_000
+"""Most steps of a problem: a slip of the finger must not fill the memory."""
+MIN_TIME_STEP, MAX_TIME_STEP = 1e-6, 1e3
+"""Bounds of ``dt`` [s]."""
+MAX_HEADING = 1000.0
+"""Largest heading of a start [rad]; float32 resolves it to 6e-5 rad."""
+RESOLUTION = 100
+"""The goal radius is at least so many times what float32 resolves at the farthest start or goal."""
+STEP_RESOLUTION = 10
+"""A robot at its speed limit moves at least so many times that in one step."""
+INTEGRATION_ERROR = 0.01
+"""Most that one step of RK4 may be off where a differential drive turns at its limits [m]."""
 
 
 class ProblemArrays(NamedTuple):
@@ -59,22 +80,28 @@ class Problem:
 
     Two problems are equal when everything but their names is equal to the bit; they hash accordingly.
 
+    The physics is float32 and takes one RK4 step per ``dt``, so a problem that these do not hold is refused: where
+    float32 resolves a start or goal to more than a hundredth of the goal radius (with the default of 0.075 m, beyond
+    8192 m from the origin) or to more than a tenth of what a robot moves in a step, and where a differential drive at
+    its limits turns too far. At constant turn rate ``w`` and speed ``v`` RK4 is Simpson's rule, which is off by at
+    most ``v dt (w dt)^4 / 2880`` per step; that must not exceed 1 cm.
+
     Attributes:
         team: The robots.
         start: ``(K, n)`` initial states.
         goal: ``(K, d)`` goal positions [m].
         world: Obstacles and bounds; an empty open world of the team's dimension by default.
-        dt: Time step [s].
-        horizon: Number of steps ``H``.
+        dt: Time step [s], from 1e-6 to 1000.
+        horizon: Number of steps ``H``, at most a million.
         margin: Safety margin epsilon [m] that plans keep to everything.
         goal_radius: A robot within it has arrived [m].
         goal_speed: Speed at which a robot may still dock [m/s]; ``None`` is no limit, as in the paper.
         name: Where the problem comes from, for tables and pictures.
 
     Raises:
-        ValueError: If a value is not finite, a shape is wrong, a number is not positive, or a start or goal is out of
-            bounds or in contact with another robot or an obstacle. The message names the robot, the value and the
-            remedy.
+        ValueError: If a value is not finite or out of range, a shape is wrong, a number is not positive, a start or
+            goal is out of bounds or in contact with another robot or an obstacle, or float32 or RK4 does not hold the
+            problem. The message names the robot, the value and the remedy.
     """
 
     team: Team
@@ -96,15 +123,21 @@ class Problem:
             raise ValueError(
                 f"the world has dimension {self.world.dimension} and the team {team.dimension}; match them"
             )
-        object.__setattr__(self, "start", frozen_array(self.start, "start", (team.num_robots, team.state_size)))
-        object.__setattr__(self, "goal", frozen_array(self.goal, "goal", (team.num_robots, team.dimension)))
-        object.__setattr__(self, "dt", positive_number(self.dt, "dt"))
-        object.__setattr__(self, "horizon", whole_number(self.horizon, "horizon", 1))
-        object.__setattr__(self, "margin", positive_number(self.margin, "margin", zero_allowed=True))
-        object.__setattr__(self, "goal_radius", positive_number(self.goal_radius, "goal_radius"))
+        converted = {
+            "start": frozen_array(self.start, "start", (team.num_robots, team.state_size), largest=LARGEST),
+            "goal": frozen_array(self.goal, "goal", (team.num_robots, team.dimension), largest=LARGEST),
+            "dt": positive_number(self.dt, "dt", least=MIN_TIME_STEP, most=MAX_TIME_STEP),
+            "horizon": whole_number(self.horizon, "horizon", 1, MAX_HORIZON),
+            "margin": positive_number(self.margin, "margin", zero_allowed=True, most=LARGEST),
+            "goal_radius": positive_number(self.goal_radius, "goal_radius", least=SMALLEST, most=LARGEST),
+        }
         if self.goal_speed is not None:
-            object.__setattr__(self, "goal_speed", positive_number(self.goal_speed, "goal_speed", zero_allowed=True))
+            converted["goal_speed"] = positive_number(self.goal_speed, "goal_speed", zero_allowed=True, most=LARGEST)
+        for name, value in converted.items():
+            object.__setattr__(self, name, value)
         self._check_start_states()
+        self._check_resolution()
+        self._check_turning()
         self._check_places("start", self.start[:, : team.dimension])
         self._check_places("goal", self.goal)
 
@@ -120,6 +153,46 @@ class Problem:
             limit = float(np.asarray(self.team.max_speed)[robot])
             if speed > limit * (1 + 1e-5):
                 raise ValueError(f"start speed of robot_{robot} is {speed:g} m/s, above its limit of {limit:g} m/s")
+            heading = 0.0 if model.heading_index is None else float(state[model.heading_index])
+            if abs(heading) > MAX_HEADING:
+                raise ValueError(
+                    f"start heading of robot_{robot} is {heading:g} rad; it must be at most {MAX_HEADING:g} in "
+                    f"magnitude, so take whole turns off"
+                )
+
+    def _check_resolution(self) -> None:
+        """float32 tells places apart that the goal radius, and a step of a robot, tell apart."""
+        places = np.concatenate([self.start[:, : self.dimension], self.goal], axis=1)
+        farthest = np.abs(places).max(axis=1)
+        grain = np.spacing(farthest).astype(np.float64)
+        stride = np.asarray(self.team.max_speed, np.float64) * self.dt
+        for robot in range(self.num_robots):
+            where = f"robot_{robot} starts or ends at a coordinate of {farthest[robot]:g} m, where float32 resolves "
+            if RESOLUTION * grain[robot] > self.goal_radius:
+                raise ValueError(
+                    f"{where}{grain[robot]:.2g} m, more than 1/{RESOLUTION} of the goal radius of {self.goal_radius:g} "
+                    f"m; move the problem nearer to the origin, or use a larger goal_radius"
+                )
+            if STEP_RESOLUTION * grain[robot] > stride[robot]:
+                raise ValueError(
+                    f"{where}{grain[robot]:.2g} m, and moves at most {stride[robot]:.2g} m in a step of {self.dt:g} s; "
+                    f"move the problem nearer to the origin, or use a larger dt or max_speed"
+                )
+
+    def _check_turning(self) -> None:
+        """One step of RK4 follows every differential drive that turns as fast as it may."""
+        for robot, model in enumerate(self.team.robot_models):
+            if model.heading_index is None:
+                continue
+            speed, _, turn_rate = (float(limit) for limit in self.team.limits[robot])
+            angle = turn_rate * self.dt
+            error = speed * self.dt * angle**4 / 2880
+            if error > INTEGRATION_ERROR:
+                raise ValueError(
+                    f"robot_{robot} may turn by {angle:.3g} rad in a step of {self.dt:g} s, and at {speed:g} m/s one "
+                    f"step of RK4 may then be {error:.2g} m off (most: {INTEGRATION_ERROR:g} m); use a smaller dt, "
+                    f"max_turn_rate or max_speed"
+                )
 
     def _check_places(self, what: str, places: FloatArray) -> None:
         """Every start, or every goal, lies inside the world and touches nothing."""

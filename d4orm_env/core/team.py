@@ -16,17 +16,19 @@ from d4orm_env.core.dynamics import ACCELERATION, SPEED, TURN_RATE, Model, get_m
 class Team:
     """The robots, in order. Teams may mix models; all must move in the same number of dimensions.
 
-    Single numbers are given to every robot.
+    Single numbers are given to every robot. All lie from 1e-7 to 1e6, where float32 holds what is computed of them.
 
     Attributes:
         models: ``K`` model names.
         radius: ``(K,)`` body radius [m].
         max_speed: ``(K,)`` speed limit [m/s].
         max_acceleration: ``(K,)`` acceleration limit [m/s^2]; no use to a first-order robot.
-        max_turn_rate: ``(K,)`` turn rate limit [rad/s]; of use to differential drives only.
+        max_turn_rate: ``(K,)`` turn rate limit [rad/s]; of use to differential drives only. How far one may turn in
+            a time step is bounded; see :class:`~d4orm_env.core.problem.Problem`.
 
     Raises:
-        ValueError: For an unknown model, an empty or mixed-dimension team, or a limit that is not positive.
+        ValueError: For an unknown model, an empty or mixed-dimension team, or a limit that is not positive or out of
+            range.
     """
 
     models: tuple[str, ...]

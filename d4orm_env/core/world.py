@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, frozen_array, restore_frozen
+from d4orm_env.core.arrays import LARGEST, FloatArray, frozen_array, restore_frozen
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Obstacles and bounds of a planar or spatial world.
+    """Obstacles and bounds of a planar or spatial world; all numbers are at most 1e6 in magnitude.
 
     Attributes:
         dimension: 2 or 3.
@@ -39,7 +39,8 @@ class World:
         if self.dimension not in (2, 3):
             raise ValueError(f"dimension of the world is {self.dimension!r}; it must be 2 or 3")
         for name, width in (("circles", 3), ("spheres", 4), ("cylinders", 3), ("boxes", 2 * self.dimension)):
-            object.__setattr__(self, name, frozen_array(getattr(self, name), name, (None, width)))
+            rows = frozen_array(getattr(self, name), name, (None, width), largest=LARGEST)
+            object.__setattr__(self, name, rows)
         for name, dimension in (("circles", 2), ("spheres", 3), ("cylinders", 3)):
             round_obstacles = getattr(self, name)
             if len(round_obstacles) and self.dimension != dimension:
@@ -54,7 +55,8 @@ class World:
             raise ValueError("bounds need both lower and upper; give both, or neither for an open world")
         if self.lower is not None:
             for name in ("lower", "upper"):
-                object.__setattr__(self, name, frozen_array(getattr(self, name), f"bounds {name}", (self.dimension,)))
+                bound = frozen_array(getattr(self, name), f"bounds {name}", (self.dimension,), largest=LARGEST)
+                object.__setattr__(self, name, bound)
             if (self.lower >= self.upper).any():
                 raise ValueError(f"bounds lower {self.lower.tolist()} must lie below upper {self.upper.tolist()}")
 

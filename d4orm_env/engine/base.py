@@ -197,7 +197,10 @@ def checked_controls(problem: Problem, controls: Any) -> FloatArray:
     Raises:
         ValueError: If the shape is another, or a value is not finite.
     """
-    array = np.ascontiguousarray(controls, dtype=np.float32)
+    try:
+        array = np.ascontiguousarray(controls, dtype=np.float32)
+    except OverflowError as error:
+        raise ValueError("controls hold a whole number too large for a float; keep them within the limits") from error
     expected = (problem.horizon, problem.num_robots, problem.control_size)
     if array.shape != expected:
         raise ValueError(f"controls have shape {array.shape}; expected (H, K, m) = {expected}")

@@ -28,6 +28,8 @@ def load_problem(path: str | os.PathLike[str]) -> Problem:
         ValueError: If the file cannot be read, is not YAML, breaks the schema, or makes no valid problem. One line that
             names the file, the field, and what was expected.
     """
+    if not isinstance(path, (str, os.PathLike)):
+        raise ValueError(f"the path of a scenario file must be text or a path, not {path!r}")
     try:
         return parse(read_yaml(path))
     except ValueError as error:

@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem import MAX_HORIZON, Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.placement import Points, with_random_obstacles
 from d4orm_env.scenarios.settings import Settings
 
 MIN_HORIZON = 100
-MAX_HORIZON = 1_000_000
 HORIZON_SLACK = 1.6
 
 

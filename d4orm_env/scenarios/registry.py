@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import difflib
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
+from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios import generators
 from d4orm_env.scenarios.settings import Settings
@@ -87,6 +89,28 @@ def describe_scenario(name: str) -> str:
     return get_scenario(name).description
 
 
+def unknown_argument(scenario: str | None, names: Iterable[str], others: Iterable[str] = ()) -> str:
+    """What is wrong with the first of ``names`` that is no argument of that scenario; the empty string if none is.
+
+    Args:
+        scenario: Name of the scenario; ``None`` is any of them.
+        names: The arguments given.
+        others: Further arguments that the caller takes.
+
+    Raises:
+        ValueError: If there is no such scenario.
+    """
+    entries = SCENARIOS.values() if scenario is None else [get_scenario(scenario)]
+    known = sorted({*others, *(name for entry in entries for name in entry.arguments)})
+    for name in names:
+        if name not in known:
+            close = difflib.get_close_matches(name, known, 1)
+            hint = f"; did you mean {close[0]!r}?" if close else ""
+            owner = "this" if scenario is None else f"scenario {scenario!r}"
+            return f"{owner} takes no argument {name!r}; it takes {', '.join(known)}{hint}"
+    return ""
+
+
 def make_problem(scenario: str, num_robots: int | None = None, seed: int | None = None, **arguments: Any) -> Problem:
     """A problem of a named scenario. The same arguments give the same problem, to the bit.
 
@@ -101,16 +125,15 @@ def make_problem(scenario: str, num_robots: int | None = None, seed: int | None 
     allow for: see :func:`~d4orm_env.scenarios.layout.default_horizon`.
 
     Raises:
-        ValueError: For an unknown scenario or argument, a value that makes no sense, a model that does not fit, or more
-            robots or obstacles than fit; the message says what would do.
+        TypeError: For an argument that the scenario does not have; the message lists those it has.
+        ValueError: For an unknown scenario, a value that makes no sense, a model that does not fit, or more robots or
+            obstacles than fit; the message says what would do.
     """
+    complaint = unknown_argument(scenario, arguments)
+    if complaint:
+        raise UnknownKeywordError(complaint)
     entry = get_scenario(scenario)
     arguments = {"num_robots": num_robots, "seed": seed, **arguments}
-    for name in arguments:
-        if name not in entry.arguments:
-            raise ValueError(
-                f"scenario {scenario!r} takes no argument {name!r}; it takes {', '.join(sorted(entry.arguments))}"
-            )
     given = {name: value for name, value in arguments.items() if value is not None}
     own = {name: given.pop(name) for name in entry.own_arguments if name in given}
     # A value too large for float32 becomes infinite, and is then refused by name.

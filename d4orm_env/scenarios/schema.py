@@ -14,7 +14,7 @@ from d4orm_env.core.dynamics import Model, get_model
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.registry import make_problem
+from d4orm_env.scenarios.registry import make_problem, unknown_argument
 
 FLOAT32_MAX = float(str(np.finfo(np.float32).max))
 VERSION = 1
@@ -180,7 +180,11 @@ class ScenarioFile(BaseModel):
     name: str | None = None
 
     def build(self) -> Problem:
-        problem = make_problem(self.scenario, **(self.model_extra or {}))
+        arguments = self.model_extra or {}
+        complaint = unknown_argument(self.scenario, arguments)
+        if complaint:
+            raise ValueError(complaint)
+        problem = make_problem(self.scenario, **arguments)
         return problem if self.name is None else problem.replace(name=self.name)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import positive_number, whole_number
 from d4orm_env.core.dynamics import get_model
+from d4orm_env.core.problem import MAX_HORIZON
 from d4orm_env.core.team import Team
 
 MAX_COUNT = 10_000
@@ -68,7 +69,7 @@ class Settings:
             if getattr(self, name) > MAX_COUNT:
                 raise ValueError(f"{name} is {getattr(self, name)}; scenarios make at most {MAX_COUNT}")
         if self.horizon is not None:
-            object.__setattr__(self, "horizon", whole_number(self.horizon, "horizon", 1))
+            object.__setattr__(self, "horizon", whole_number(self.horizon, "horizon", 1, MAX_HORIZON))
         for name in ("dt", "goal_radius", "obstacle_radius"):
             object.__setattr__(self, name, bounded(getattr(self, name), name))
         object.__setattr__(self, "margin", bounded(self.margin, "margin", zero_allowed=True))

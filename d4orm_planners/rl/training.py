@@ -21,6 +21,7 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
 from d4orm_env.scenarios import make_problem
+from d4orm_env.scenarios.registry import unknown_argument
 from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm
 from d4orm_planners.rl.checkpoints import Checkpoints
 from d4orm_planners.rl.curriculum import Lesson, common_batch, make_lessons, team_sizes
@@ -80,6 +81,9 @@ class TrainingSettings(Settings):
         for name, own in (("num_robots", "robots"), ("seed", "seed"), ("model", "model")):
             if name in self.scenario_settings:
                 raise ValueError(f"scenario_settings has {name!r}; give {own!r} (--{own}) itself instead")
+        complaint = unknown_argument(self.scenario, self.scenario_settings)
+        if complaint:
+            raise ValueError(f"scenario_settings: {complaint}")
         make_problem(self.scenario, num_robots=self.robots, model=self.model, **self.scenario_settings)
 
     @property

@@ -1,0 +1,7 @@
+"""Errors that callers may want to tell apart."""
+
+from __future__ import annotations
+
+
+class UnknownKeywordError(TypeError, ValueError):
+    """A keyword or setting that does not exist: a TypeError, as Python raises, and bad input like any other."""

@@ -1,0 +1,181 @@
+"""The independent judge of plans: float64, sub-stepped, continuous in time, in plain NumPy.
+
+It shares no code with the engines: of the problem it reads data only, and the models, the integration, the docking and
+the distances are written again here, so that a mistake in the physics of the engines does not excuse itself. What it
+says is a function of its input: the same on every processor, to the bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.verify.contact import MAX_NUMBERS, Pairs, Stretch, Watch, surroundings
+from d4orm_env.verify.docking import Docking, find_docking
+from d4orm_env.verify.geometry import Floats, norm
+from d4orm_env.verify.motion import MODELS, Motion
+from d4orm_env.verify.report import VerificationReport, Violation
+
+if TYPE_CHECKING:
+    from d4orm_env.core.problem import Problem
+
+__all__ = ["VerificationReport", "Violation", "verify"]
+
+MIN_SUB_STEPS = 10
+MAX_SUB_STEPS = 1000
+"""More in one step are not taken: the robot would leave the straight line by 10 m within the step."""
+CHORD_ERROR = 1e-5
+"""Largest distance between a robot's curve and the chord that stands for it [m]."""
+LIMIT_TOLERANCE = 1e-5
+"""Relative excess over a control limit that float32 rounding may cause."""
+
+
+def verify(problem: Problem, controls: Any) -> VerificationReport:
+    """Judge a plan: do all robots arrive by the horizon, within their limits, touching nothing at any time?
+
+    Contact is judged, not the safety margin: it is a gap of zero or less at any moment, also between steps, known to
+    ``CHORD_ERROR`` for each moving robot. Controls above the limits are reported, and clipped before they are executed,
+    as the robot would.
+
+    Docking is decided at the end of each step; from then on the robot stands where it is and its controls are ignored.
+    The environments decide it in float32. Where a robot ends a step so close to the goal radius, or at a speed so close
+    to the goal speed, that rounding decides (see :mod:`d4orm_env.verify.docking`), both readings are judged, that it
+    docks there and that it drives on, and the plan is fine only if everyone arrives and nobody touches in all of them.
+
+    Controls that are not finite define no motion: they are reported, and nothing else is judged. So are robots that
+    turn or accelerate so hard that ``MAX_SUB_STEPS`` sub-steps do not follow them through one step.
+
+    Args:
+        problem: The problem the plan is for.
+        controls: ``(H, K, m)``, each held constant over ``problem.dt``.
+
+    Returns:
+        The report; ``report.ok`` when there are no violations.
+
+    Raises:
+        ValueError: If the controls are not numbers or their shape is another, or a model is unknown here.
+    """
+    array = _checked_controls(problem, controls)
+    if not np.isfinite(array).all():
+        return _unjudged(problem, _non_finite(array, problem.dt))
+    motion = Motion(problem, array)
+    sub_steps = np.ceil(problem.dt * np.sqrt(motion.bend / (8 * CHORD_ERROR)))
+    if sub_steps.max() > MAX_SUB_STEPS:
+        return _unjudged(problem, list(_too_violent(sub_steps, motion, problem.dt)))
+    course = _Course(motion, max(MIN_SUB_STEPS, int(sub_steps.max())), np.asarray(problem.start, np.float64))
+    docking = find_docking(problem, motion, course.ends)
+    radius = np.asarray(problem.team.radius, np.float64)
+    pairs, obstacles = Pairs(docking.robot, radius), surroundings(problem.world, docking.robot, radius)
+    watches: list[Watch] = [pairs, *obstacles]
+    for stretch in course.stretches(docking, max(len(watch.rows) for watch in watches)):
+        for watch in watches:
+            watch.observe(stretch)
+    contacts = (violation for watch in watches for violation in watch.violations())
+    violations = [
+        *_control_limits(motion, docking.last_steps),
+        *(_with_notes(violation, docking, problem.dt) for violation in contacts),
+        *docking.violations,
+    ]
+    return VerificationReport(
+        pairs.minimum,
+        min((watch.minimum for watch in obstacles), default=np.inf),
+        docking.arrival_times,
+        sorted(violations, key=lambda violation: violation.time),
+    )
+
+
+class _Course:
+    """Where all robots are over the whole horizon, some steps at a time."""
+
+    def __init__(self, motion: Motion, sub_steps: int, start: Floats) -> None:
+        self._motion, self._sub_steps = motion, sub_steps
+        horizon, num_robots = motion.pace.shape
+        self._numbers = (2 * sub_steps + 1) * num_robots * motion.size  # of one step
+        ways = [self._way(steps)[:, -1] for steps in self._parts(horizon, self._numbers)]
+        self.ends: Floats = np.cumsum(np.concatenate([start[None, :, : motion.size], *ways]), axis=0)
+
+    def _way(self, steps: slice) -> Floats:
+        return self._motion.way(steps, self._sub_steps)
+
+    def _parts(self, horizon: int, numbers: int) -> Iterator[slice]:
+        size = max(1, MAX_NUMBERS // numbers)
+        return (slice(first, first + size) for first in range(0, horizon, size))
+
+    def stretches(self, docking: Docking, num_pairs: int) -> Iterator[Stretch]:
+        """All steps, with a body for every reading of every robot, standing from where it docks."""
+        horizon, dt, robot = len(self.ends) - 1, self._motion.dt, docking.robot
+        stop = np.minimum(docking.steps, horizon)
+        docked = self.ends[stop, robot]
+        for steps in self._parts(horizon, max(self._numbers, num_pairs)):
+            way, place = self._way(steps), self.ends[:-1][steps]
+            if len(robot) > way.shape[2]:  # copying is not free, and one reading each is the rule
+                way, place = way[:, :, robot], place[:, robot]
+            stands = np.arange(horizon)[steps, None] >= docking.steps
+            way[np.broadcast_to(stands[:, None], way.shape[:3])] = 0.0
+            place = np.where(stands[..., None], docked, place)
+            yield Stretch(place[:, None] + way, norm(way).max(axis=1), steps.start * dt, dt)
+
+
+def _checked_controls(problem: Problem, controls: Any) -> Floats:
+    for robot, name in enumerate(problem.team.models):
+        if name not in MODELS:
+            raise ValueError(f"verify cannot judge model {name!r} of robot_{robot}; it knows {', '.join(MODELS)}")
+    try:
+        array = np.asarray(controls, np.float64)
+    except OverflowError as error:
+        raise ValueError("controls hold a whole number too large for float64; keep them within the limits") from error
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"controls must be an array of numbers, not {type(controls).__name__}") from error
+    # Every model has as many controls as position dimensions.
+    expected = (problem.horizon, *np.shape(problem.goal))
+    if array.shape != expected:
+        raise ValueError(f"controls have shape {array.shape}; expected (H, K, m) = {expected}")
+    return array
+
+
+def _unjudged(problem: Problem, violations: list[Violation]) -> VerificationReport:
+    return VerificationReport(np.nan, np.nan, np.full(len(problem.team.models), np.inf), violations)
+
+
+def _non_finite(controls: Floats, dt: float) -> list[Violation]:
+    bad: NDArray[np.bool_] = np.any(~np.isfinite(controls), axis=2)
+    violations = []
+    for robot in np.flatnonzero(bad.any(axis=0)):
+        step = int(bad[:, robot].argmax())
+        detail = f"control {controls[step, robot].tolist()} at step {step}; {bad[:, robot].sum()} steps in all"
+        violations.append(Violation("non-finite", (int(robot),), step * dt, detail))
+    return sorted(violations, key=lambda violation: violation.time)
+
+
+def _too_violent(sub_steps: Floats, motion: Motion, dt: float) -> Iterator[Violation]:
+    for robot in np.flatnonzero((sub_steps > MAX_SUB_STEPS).any(axis=0)):
+        step = int(np.argmax(sub_steps[:, robot] > MAX_SUB_STEPS))
+        detail = (
+            f"accelerates with {motion.bend[step, robot]:.4g} m/s^2 at step {step}, which {MAX_SUB_STEPS} sub-steps of "
+            f"a step of {dt:g} s do not follow to {CHORD_ERROR:g} m; use a smaller dt, or lower limits"
+        )
+        yield Violation("not judged", (int(robot),), step * dt, detail)
+
+
+def _control_limits(motion: Motion, docked_after: NDArray[np.intp]) -> Iterator[Violation]:
+    """Controls above a limit before docking, one entry for each robot and limit."""
+    sizes, limits = motion.sizes, motion.limits
+    before_docking = np.arange(len(sizes))[:, None] < docked_after
+    over = (sizes > limits * (1 + LIMIT_TOLERANCE)) & before_docking[..., None]
+    for robot, column in np.argwhere(over.any(axis=0)):
+        steps = np.flatnonzero(over[:, robot, column])
+        values = sizes[steps, robot, column]
+        detail = (
+            f"{motion.limited_quantity(robot, column)} of the control is {values[0]:.7g} at step {steps[0]}, "
+            f"limit {limits[robot, column]:.7g}; {len(steps)} steps over it, at most {values.max():.7g}"
+        )
+        yield Violation("control limit", (int(robot),), float(steps[0] * motion.dt), detail)
+
+
+def _with_notes(violation: Violation, docking: Docking, dt: float) -> Violation:
+    notes = "".join(docking.note(robot, dt) for robot in violation.robots)
+    return replace(violation, detail=violation.detail + notes)

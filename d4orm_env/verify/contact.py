@@ -1,0 +1,240 @@
+"""What bodies come close to, and when: closest approach over continuous time.
+
+The motion is cut into sub-steps so short that each curve departs from its chord by at most ``CHORD_ERROR``, and on the
+chords the closest approach is solved exactly.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.verify.geometry import Floats, box_approach, box_distance, closest_approach, norm
+from d4orm_env.verify.report import Violation
+
+if TYPE_CHECKING:
+    from d4orm_env.core.world import World
+
+MAX_NUMBERS = 2**18
+"""Numbers in the largest arrays that are worked on at once, but for those of a single step."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """Some steps of all bodies.
+
+    Attributes:
+        path: ``(T, S+1, B, d)`` positions at the ends of the sub-steps [m].
+        reach: ``(T, B)`` how far from where it began a body gets in each step [m].
+        start: When it begins [s].
+        dt: Length of a step [s].
+    """
+
+    path: Floats
+    reach: Floats
+    start: float
+    dt: float
+
+    def of(self, steps: Any, bodies: Any) -> Floats:
+        """``(N, S+1, d)`` the path of one body in one step each."""
+        return self.path[steps, :, bodies]
+
+    def times(self, steps: Any, sub_steps: Any, fraction: Any) -> Floats:
+        """When that fraction of that sub-step of that step has passed [s]."""
+        sub_step = self.dt / (self.path.shape[1] - 1)
+        times: Floats = self.start + steps * self.dt + (sub_steps + fraction) * sub_step
+        return times
+
+
+class Watch(ABC):
+    """Closest approach and first contact of every robot with every thing of a kind.
+
+    ``rows`` and ``columns`` ``(P,)`` are the pairs of a body and a thing that are watched; ``minimum`` is the smallest
+    gap between any two [m].
+    """
+
+    def __init__(self, kind: str, robot: NDArray[np.intp], names: Sequence[str], rows: Any, columns: Any) -> None:
+        self.kind, self.names, self.rows, self.columns = kind, names, rows, columns
+        self.minimum = np.inf
+        self._robot = robot
+        size = (int(robot.max()) + 1) * len(names)
+        self._smallest, self._smallest_time, self._first = (np.full(size, np.inf) for _ in range(3))
+
+    @abstractmethod
+    def begin(self, stretch: Stretch) -> tuple[Floats, Floats]:
+        """``(T, P)`` gaps at the beginning of each step, and by how much they may shrink during it."""
+
+    @abstractmethod
+    def approach(self, stretch: Stretch, steps: Any, pairs: Any) -> tuple[Floats, Floats]:
+        """``(N, S)`` smallest gap in every sub-step of that step and pair, and at what fraction of the sub-step."""
+
+    @abstractmethod
+    def thing(self, column: Any) -> Any:
+        """Index into ``names`` of what the column stands for."""
+
+    def observe(self, stretch: Stretch) -> None:
+        """Judge a stretch. Only pairs that may touch, or come closer than any so far, are looked at closely."""
+        gap, shrinkage = self.begin(stretch)
+        self.minimum = min(self.minimum, float(gap.min(initial=np.inf)))
+        least = gap - shrinkage - 1e-9
+        steps, pairs = np.nonzero(least < max(self.minimum, 0.0))
+        least = least[steps, pairs]
+        order = np.argsort(least, kind="stable")
+        size = max(1, MAX_NUMBERS // (stretch.path.shape[1] * stretch.path.shape[3]))
+        for some in (order[first : first + size] for first in range(0, len(order), size)):
+            if least[some[0]] >= max(self.minimum, 0.0):
+                break
+            self._look(stretch, steps[some], pairs[some])
+
+    def _look(self, stretch: Stretch, steps: Any, pairs: Any) -> None:
+        gap, fraction = self.approach(stretch, steps, pairs)
+        self.minimum = min(self.minimum, float(gap.min()))
+        touching = gap <= 0
+        hit = np.flatnonzero(touching.any(axis=1))
+        if len(hit) == 0:
+            return
+        gap, fraction, steps, pairs = gap[hit], fraction[hit], steps[hit], pairs[hit]
+        each, first, lowest = np.arange(len(hit)), touching[hit].argmax(axis=1), gap.argmin(axis=1)
+        key = self._robot[self.rows[pairs]] * len(self.names) + self.thing(self.columns[pairs])
+        np.minimum.at(self._first, key, stretch.times(steps, first, fraction[each, first]))
+        smallest, before = gap[each, lowest], self._smallest[key]
+        np.minimum.at(self._smallest, key, smallest)
+        closest = (smallest == self._smallest[key]) & (smallest < before)
+        self._smallest_time[key[closest]] = stretch.times(steps, lowest, fraction[each, lowest])[closest]
+
+    def violations(self) -> Iterator[Violation]:
+        """One for each robot and thing that touched."""
+        for key in np.flatnonzero(np.isfinite(self._first)):
+            robot, thing = (int(index) for index in divmod(key, len(self.names)))
+            robots = (robot, thing) if self.kind == "robot contact" else (robot,)
+            gap, time = self._smallest[key], self._smallest_time[key]
+            detail = f"touches {self.names[thing]}, smallest gap {gap:.4g} m at {time:.3f} s"
+            yield Violation(self.kind, robots, float(self._first[key]), detail)
+
+
+class Pairs(Watch):
+    """Robots against each other."""
+
+    def __init__(self, robot: NDArray[np.intp], radius: Floats) -> None:
+        rows, columns = np.triu_indices(len(robot), 1)
+        others = robot[rows] != robot[columns]  # two readings of one robot do not meet
+        names = [f"robot_{index}" for index in range(len(radius))]
+        super().__init__("robot contact", robot, names, rows[others], columns[others])
+        self._size = radius[robot[self.rows]] + radius[robot[self.columns]]
+
+    def begin(self, stretch: Stretch) -> tuple[Floats, Floats]:
+        place = stretch.path[:, 0]
+        gap = norm(place[:, self.rows] - place[:, self.columns]) - self._size
+        return gap, stretch.reach[:, self.rows] + stretch.reach[:, self.columns]
+
+    def approach(self, stretch: Stretch, steps: Any, pairs: Any) -> tuple[Floats, Floats]:
+        offset = stretch.of(steps, self.rows[pairs]) - stretch.of(steps, self.columns[pairs])
+        distance, fraction = closest_approach(offset[:, :-1], offset[:, 1:])
+        return distance - self._size[pairs][:, None], fraction
+
+    def thing(self, column: Any) -> Any:
+        return self._robot[column]
+
+
+class Static(Watch):
+    """Robots against things that stand, one column each."""
+
+    def __init__(self, kind: str, robot: NDArray[np.intp], radius: Floats, names: Sequence[str]) -> None:
+        rows, columns = (index.ravel() for index in np.indices((len(robot), len(names))))
+        super().__init__(kind, robot, names, rows, columns)
+        self._radius = radius[robot[rows]]
+
+    def begin(self, stretch: Stretch) -> tuple[Floats, Floats]:
+        gap = self.distance(stretch.path[:, 0][:, self.rows], self.columns) - self._radius
+        return gap, stretch.reach[:, self.rows]
+
+    def approach(self, stretch: Stretch, steps: Any, pairs: Any) -> tuple[Floats, Floats]:
+        path = stretch.of(steps, self.rows[pairs])
+        distance, fraction = self.pass_by(path[:, :-1], path[:, 1:], self.columns[pairs][:, None])
+        return distance - self._radius[pairs][:, None], fraction
+
+    def thing(self, column: Any) -> Any:
+        return column
+
+    @abstractmethod
+    def distance(self, places: Floats, columns: Any) -> Floats:
+        """Signed distance from places to the surface of the things in ``columns`` [m]."""
+
+    @abstractmethod
+    def pass_by(self, start: Floats, end: Floats, columns: Any) -> tuple[Floats, Floats]:
+        """Smallest distance on the chords from ``start`` to ``end``, and at what fraction of them."""
+
+
+class Round(Static):
+    """Robots against circles, spheres or vertical cylinders."""
+
+    def __init__(self, robot: NDArray[np.intp], radius: Floats, obstacles: Floats, shape: str) -> None:
+        super().__init__("obstacle contact", robot, radius, [f"{shape}[{index}]" for index in range(len(obstacles))])
+        self._centres, self._sizes = obstacles[:, :-1], obstacles[:, -1]
+
+    def distance(self, places: Floats, columns: Any) -> Floats:
+        return norm(self._offset(places, columns)) - self._sizes[columns]
+
+    def pass_by(self, start: Floats, end: Floats, columns: Any) -> tuple[Floats, Floats]:
+        distance, fraction = closest_approach(self._offset(start, columns), self._offset(end, columns))
+        return distance - self._sizes[columns], fraction
+
+    def _offset(self, places: Floats, columns: Any) -> Floats:
+        # A cylinder is a circle seen from above.
+        offset: Floats = places[..., : self._centres.shape[1]] - self._centres[columns]
+        return offset
+
+
+class Boxes(Static):
+    """Robots against axis-aligned boxes."""
+
+    def __init__(self, robot: NDArray[np.intp], radius: Floats, boxes: Floats) -> None:
+        super().__init__("obstacle contact", robot, radius, [f"boxes[{index}]" for index in range(len(boxes))])
+        self._boxes = boxes
+
+    def distance(self, places: Floats, columns: Any) -> Floats:
+        return box_distance(places, self._boxes[columns])
+
+    def pass_by(self, start: Floats, end: Floats, columns: Any) -> tuple[Floats, Floats]:
+        return box_approach(start, end, self._boxes[columns])
+
+
+class Bounds(Static):
+    """Robots against the sides of the world."""
+
+    def __init__(self, robot: NDArray[np.intp], radius: Floats, lower: Floats, upper: Floats) -> None:
+        axes = "xyz"[: len(lower)]
+        names = [f"the {side} bound of {axis}" for side in ("lower", "upper") for axis in axes]
+        super().__init__("bounds contact", robot, radius, names)
+        self._axis, self._sign = np.tile(np.arange(len(lower)), 2), np.repeat([1.0, -1.0], len(lower))
+        self._place = np.concatenate([lower, -upper])
+
+    def distance(self, places: Floats, columns: Any) -> Floats:
+        axis = np.broadcast_to(self._axis[columns], places.shape[:-1])
+        value = np.take_along_axis(places, axis[..., None], axis=-1)[..., 0]
+        distance: Floats = self._sign[columns] * value - self._place[columns]
+        return distance
+
+    def pass_by(self, start: Floats, end: Floats, columns: Any) -> tuple[Floats, Floats]:
+        before, after = self.distance(start, columns), self.distance(end, columns)
+        return np.minimum(before, after), (after < before).astype(np.float64)
+
+
+def surroundings(world: World, robot: NDArray[np.intp], radius: Floats) -> list[Watch]:
+    """What watches for each kind of obstacle there is, and for the bounds."""
+    watches: list[Watch] = []
+    for shape in ("circles", "spheres", "cylinders"):
+        obstacles = np.asarray(getattr(world, shape), np.float64)
+        if len(obstacles):
+            watches.append(Round(robot, radius, obstacles, shape))
+    if len(world.boxes):
+        watches.append(Boxes(robot, radius, np.asarray(world.boxes, np.float64)))
+    if world.lower is not None:
+        lower, upper = (np.asarray(bound, np.float64) for bound in (world.lower, world.upper))
+        watches.append(Bounds(robot, radius, lower, upper))
+    return watches

@@ -1,0 +1,101 @@
+"""When robots dock, where rounding decides it in every way that it could.
+
+The engines decide docking in float32. A robot that ends a step so close to its goal radius, or to the goal speed, that
+their rounding could decide either way has several *readings*: it docks there, or drives on, until a step at which it
+docks beyond doubt. A plan must be fine in all of them. Robots do not act on each other's motion, so the readings of a
+team are those of its robots.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.verify.geometry import Floats, norm
+from d4orm_env.verify.motion import Motion
+from d4orm_env.verify.report import Violation
+
+if TYPE_CHECKING:
+    from d4orm_env.core.problem import Problem
+
+DOCKING_TOLERANCE = 1e-5
+"""Least distance to the goal radius [m], or to the goal speed [m/s], that rounding does not bridge."""
+ROUNDING = 32 * 2.0**-23
+"""The same, as a share of the coordinates or of the speed limit; 20 units in float32's last place were measured."""
+MAX_READINGS = 8
+"""More readings of one robot are not followed, but reported."""
+
+
+@dataclass(frozen=True, eq=False)
+class Docking:
+    """All readings of all robots, one body for each.
+
+    Attributes:
+        robot: ``(B,)`` whose body it is.
+        steps: ``(B,)`` steps after which it docks; more than the horizon where it never does.
+        arrival_times: ``(K,)`` of each robot's first reading [s]; infinite where it does not dock in every reading.
+        last_steps: ``(K,)`` steps of each robot's last reading.
+        violations: Robots that do not dock in every reading.
+    """
+
+    robot: NDArray[np.intp]
+    steps: NDArray[np.intp]
+    arrival_times: Floats
+    last_steps: NDArray[np.intp]
+    violations: list[Violation]
+
+    def note(self, robot: int, dt: float) -> str:
+        """What to say of a robot with several readings, for the details of a violation."""
+        steps = self.steps[self.robot == robot]
+        if len(steps) == 1:
+            return ""
+        return f"; rounding decides whether robot_{robot} docks at {steps[0] * dt:.3f} s, and both are judged"
+
+
+def find_docking(problem: Problem, motion: Motion, ends: Floats) -> Docking:
+    """The readings of every robot's docking; ``ends`` are its ``(H+1, K, d)`` positions if it drives on [m]."""
+    distance = norm(ends[1:] - np.asarray(problem.goal, np.float64))
+    possible, certain = _docks(problem, motion, ends, distance)
+    never = len(distance) + 1
+    robots, steps, times, last, violations = [], [], [], [], []
+    for robot in range(distance.shape[1]):
+        sure = np.flatnonzero(certain[:, robot])[:1] + 1
+        unsure = np.flatnonzero(possible[:, robot]) + 1
+        unsure = unsure[unsure < (sure[0] if len(sure) else never)]
+        readings = [*unsure.tolist(), *(sure.tolist() or [never])][:MAX_READINGS]
+        arrives = readings[-1] < never and len(unsure) < MAX_READINGS
+        robots += [robot] * len(readings)
+        steps += readings
+        last.append(readings[-1])
+        times.append(readings[0] * problem.dt if arrives else np.inf)
+        if not arrives:
+            detail = "".join(_failure(problem, distance[:, robot], motion.pace[:, robot], unsure.tolist()))
+            violations.append(Violation("not arrived", (robot,), problem.dt * problem.horizon, detail))
+    return Docking(np.array(robots), np.array(steps), np.array(times), np.array(last), violations)
+
+
+def _docks(problem: Problem, motion: Motion, ends: Floats, distance: Floats) -> tuple[NDArray[np.bool_], ...]:
+    """``(H, K)`` where a robot may dock, as rounding has it, and where it does beyond doubt."""
+    extent = np.maximum.accumulate(np.abs(ends).max(axis=2), axis=0)[1:]
+    doubt = np.maximum(DOCKING_TOLERANCE, ROUNDING * extent) + motion.integration_error
+    doubt = np.minimum(doubt, problem.goal_radius / 4)
+    speed_doubt = np.maximum(DOCKING_TOLERANCE, ROUNDING * motion.max_speed)
+    goal_speed = np.inf if problem.goal_speed is None else problem.goal_speed
+    slow = (motion.pace <= goal_speed - speed_doubt) | (motion.pace == 0)
+    possible = (distance <= problem.goal_radius + doubt) & (motion.pace <= goal_speed + speed_doubt)
+    return possible, (distance <= problem.goal_radius - doubt) & slow
+
+
+def _failure(problem: Problem, distance: Floats, pace: Floats, unsure: list[int]) -> Iterator[str]:
+    yield f"{distance[-1]:.4g} m from its goal (goal radius {problem.goal_radius:g} m) at the horizon"
+    if problem.goal_speed is not None:
+        yield f", at {pace[-1]:.4g} m/s (goal speed {problem.goal_speed:g} m/s)"
+    if unsure:
+        yield (
+            f", unless it docks at {unsure[0] * problem.dt:.3f} s, {distance[unsure[0] - 1]:.8g} m from its goal at "
+            f"{pace[unsure[0] - 1]:.8g} m/s, which rounding decides; drive further in"
+        )

@@ -1,0 +1,125 @@
+"""How robots move under a plan, written again in float64: clipping, the models in continuous time, the speed limit.
+
+Within a control step holonomic robots move on parabolas, integrated in closed form; the heading and speed of a
+differential drive are linear in time and its position is their Simpson quadrature. Robots do not act on each other, so
+each is moved over the whole horizon at once, as if it never docked. Models and limits: paper, sections III and IV-B.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from d4orm_env.core import portable
+from d4orm_env.verify.geometry import Floats, norm
+
+if TYPE_CHECKING:
+    from d4orm_env.core.problem import Problem
+
+MODELS = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive")
+"""The models that have equations here."""
+
+
+class Motion:
+    """All robots under a plan's controls, over the whole horizon.
+
+    Attributes:
+        limits: ``(K, d)`` limits of the controls.
+        sizes: ``(H, K, d)`` the quantities that they limit, before clipping: one norm, or turn rate and acceleration.
+        pace: ``(H, K)`` speed after each step [m/s].
+        bend: ``(H, K)`` bound on the acceleration within each step, curvature included [m/s^2].
+        integration_error: ``(H, K)`` bound on what RK4, one step at a time, may differ from this by [m].
+    """
+
+    def __init__(self, problem: Problem, controls: Floats) -> None:
+        team, start = problem.team, np.asarray(problem.start, np.float64)
+        self.dt, self.size = problem.dt, np.shape(problem.goal)[1]
+        self.wheeled = np.array([name == "differential_drive" for name in team.models])
+        self.first_order = np.array([name == "velocity2d" for name in team.models])
+        self.max_speed, self.max_acceleration, self.max_turn_rate = (
+            np.asarray(values, np.float64) for values in (team.max_speed, team.max_acceleration, team.max_turn_rate)
+        )
+        self.limits = self._limits()
+        commands, self.sizes = self._clip(controls)
+        self._turn_rate, self._thrust = (np.where(self.wheeled, commands[..., column], 0.0) for column in (0, 1))
+        self._acceleration = np.where((self.wheeled | self.first_order)[:, None], 0.0, commands)
+        self._set_velocities(start, commands)
+        thrust, turn_rate = np.abs(self._thrust), np.abs(self._turn_rate)
+        fastest = np.abs(self._speed) + thrust * self.dt
+        sideways = fastest * turn_rate
+        self.bend = norm(self._acceleration) + np.sqrt(thrust * thrust + sideways * sideways)
+        # With constant controls RK4 is Simpson's rule, whose error is dt^5/2880 of the fourth derivative.
+        angle = turn_rate * self.dt
+        error = angle * angle * angle * (fastest * angle + 4 * thrust * self.dt) * self.dt / 2880
+        self.integration_error = np.cumsum(error, axis=0)
+
+    def _limits(self) -> Floats:
+        limits = np.ones((len(self.wheeled), self.size))  # a column that limits nothing meets sizes of zero
+        limits[:, 0] = np.where(self.first_order, self.max_speed, self.max_acceleration)
+        for robot in np.flatnonzero(self.wheeled):
+            limits[robot] = self.max_turn_rate[robot], self.max_acceleration[robot]
+        return limits
+
+    def limited_quantity(self, robot: int, column: int) -> str:
+        """What a column of :attr:`limits` limits, with its unit."""
+        if self.wheeled[robot]:
+            return ("turn rate [rad/s]", "acceleration [m/s^2]")[column]
+        return "speed [m/s]" if self.first_order[robot] else "acceleration [m/s^2]"
+
+    def _clip(self, controls: Floats) -> tuple[Floats, Floats]:
+        """``(H, K, d)`` controls within the limits, and the size of each limited quantity before."""
+        sizes = np.abs(controls)
+        # Scaled by the largest component, so that the square of a huge control does not overflow.
+        largest = np.maximum(sizes.max(axis=2), np.finfo(float).tiny)
+        norms = largest * norm(controls / largest[..., None])
+        sizes[:, ~self.wheeled] = 0.0
+        sizes[..., 0] = np.where(self.wheeled, sizes[..., 0], norms)
+        scale = self.limits / np.maximum(sizes, self.limits)
+        return controls * np.where(self.wheeled[:, None], scale, scale[..., :1]), sizes
+
+    def _set_velocities(self, start: Floats, commands: Floats) -> None:
+        """Velocity, heading and speed at the beginning of every step; the speed limit acts between steps."""
+        dt, state = self.dt, np.zeros((len(start), max(4, 2 * self.size)))
+        state[:, : start.shape[1]] = start
+        heading, speed = np.where(self.wheeled, state[:, 2], 0.0), np.where(self.wheeled, state[:, 3], 0.0)
+        has_velocity = ~(self.wheeled | self.first_order)[:, None]
+        velocity = np.where(has_velocity, state[:, self.size : 2 * self.size], 0.0)
+        velocities, speeds, paces = [], [], []
+        for command, acceleration, thrust in zip(commands, self._acceleration, self._thrust):
+            velocity = np.where(self.first_order[:, None], command, velocity)
+            velocities.append(velocity)
+            speeds.append(speed)
+            velocity = velocity + acceleration * dt
+            pace = norm(velocity)
+            velocity = velocity * (self.max_speed / np.maximum(pace, self.max_speed))[:, None]
+            speed = np.clip(speed + thrust * dt, -self.max_speed, self.max_speed)
+            paces.append(np.where(self.wheeled, np.abs(speed), np.minimum(pace, self.max_speed)))
+        self._velocity, self._speed, self.pace = np.array(velocities), np.array(speeds), np.array(paces)
+        self._heading = np.cumsum(np.concatenate([heading[None], self._turn_rate * dt]), axis=0)
+
+    def way(self, steps: slice, sub_steps: int) -> Floats:
+        """``(T, S+1, K, d)`` where the robots are at the ends of sub-steps, from where each step began [m]."""
+        time = np.linspace(0.0, self.dt, sub_steps + 1)[:, None, None]
+        way: Floats = self._velocity[steps, None] * time + self._acceleration[steps, None] * (time * time / 2)
+        if self.wheeled.any():
+            way[:, 1:, self.wheeled] = self._wheeled_way(steps, sub_steps)
+        return way
+
+    def _wheeled_way(self, steps: slice, sub_steps: int) -> Floats:
+        """``(T, S, ., 2)`` the differential drives' part of :meth:`way`, but for its beginning."""
+        turn_rate, thrust, speed, heading = (
+            values[steps, self.wheeled] for values in (self._turn_rate, self._thrust, self._speed, self._heading[:-1])
+        )
+        half = self.dt / (2 * sub_steps)  # Simpson's rule asks for the middles of the sub-steps too
+        sine, cosine = portable.sin_cos(heading)
+        turn_sine, turn_cosine = portable.sin_cos(turn_rate * half)
+        rates = []
+        for node in range(2 * sub_steps + 1):
+            pace = speed + thrust * (node * half)
+            rates.append(np.stack([pace * cosine, pace * sine], axis=-1))
+            cosine, sine = cosine * turn_cosine - sine * turn_sine, sine * turn_cosine + cosine * turn_sine
+        rate = np.stack(rates, axis=1)
+        six_means = rate[:, :-1:2] + 4 * rate[:, 1::2] + rate[:, 2::2]
+        way: Floats = np.cumsum(six_means, axis=1) * (half / 3)
+        return way

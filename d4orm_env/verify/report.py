@@ -1,0 +1,55 @@
+"""What :func:`d4orm_env.verify.verify` reports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from d4orm_env.verify.geometry import Floats
+
+
+@dataclass(frozen=True)
+class Violation:
+    """One thing wrong with a plan.
+
+    Attributes:
+        kind: ``"robot contact"``, ``"obstacle contact"``, ``"bounds contact"``, ``"control limit"``, ``"not arrived"``,
+            ``"non-finite"`` or ``"not judged"``.
+        robots: Indices of the robots concerned.
+        time: When it first happens, contacts to within a sub-step [s].
+        detail: What happened, with values and units.
+    """
+
+    kind: str
+    robots: tuple[int, ...]
+    time: float
+    detail: str
+
+    def __str__(self) -> str:
+        names = " and ".join(f"robot_{robot}" for robot in self.robots)
+        return f"{self.kind} at {self.time:.3f} s, {names}: {self.detail}"
+
+
+@dataclass(frozen=True, eq=False)
+class VerificationReport:
+    """What :func:`~d4orm_env.verify.verify` found.
+
+    Attributes:
+        min_separation: Smallest gap between the surfaces of two robots over continuous time, negative where they
+            overlap [m]; infinite for one robot, NaN for a plan whose motion is not judged.
+        min_clearance: Smallest gap from a robot's surface to an obstacle or the bounds, negative inside [m]; infinite
+            in an empty open world, NaN for a plan whose motion is not judged.
+        arrival_times: ``(K,)`` when each robot docked, in the first reading of its docking [s]; infinite for one that
+            does not dock in every reading.
+        violations: Everything wrong, by time; one entry for each pair, robot and obstacle, robot and side of the
+            bounds, or robot and limit.
+    """
+
+    min_separation: float
+    min_clearance: float
+    arrival_times: Floats
+    violations: list[Violation]
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.violations
