@@ -127,7 +127,7 @@ def test_every_loop_is_recorded() -> None:
     # Without disturbances what was predicted to be kept apart stays apart.
     assert min(loop.predicted_margin for loop in policy.loops) >= problem.margin - 1e-4
     assert policy.missed == 0
-    assert 0 < policy.coarse_time < 60
+    assert policy.coarse_time > 0
 
 
 def test_a_lone_robot_has_nobody_to_keep_a_margin_to() -> None:
