@@ -65,6 +65,14 @@ def in_space() -> SamplingTask:
     return SamplingTask(problem, 0.5 * toward_goals(problem))
 
 
+def arriving() -> SamplingTask:
+    """With little noise everybody docks early, and stands from then on: robot 0 within the margin of a circle."""
+    world = World(2, circles=[[0.35, -0.33, 0.15]])
+    start, goal = [[0, 0, 0, 0], [0, 1, 0, 0]], [[0.5, 0], [0.5, 1]]
+    problem = Problem(Team(("holonomic2d",) * 2), start, goal, world, goal_radius=0.2, **PLANNED)
+    return SamplingTask(problem, 0.5 * toward_goals(problem))
+
+
 def mixed_team() -> SamplingTask:
     problem = mixed_problem().replace(**PLANNED)
     return SamplingTask(problem, np.zeros((25, 3, 2), np.float32))
@@ -214,6 +222,13 @@ ENGINES = {"cpu": CPU, "jax": JAX}
 )
 def test_every_step_is_that_of_the_reference(name: str, credit: str, engine: str) -> None:
     step_by_step(ENGINES[engine], replace(TASKS[name](), credit=credit))
+
+
+@pytest.mark.parametrize("engine", ENGINE_NAMES)
+def test_so_it_is_for_robots_that_stand_in_all_samples(engine: str) -> None:
+    task = replace(arriving(), credit="robot")
+    assert CPU.rollout(task.problem, task.base).arrived[10].all()
+    step_by_step(ENGINES[engine], task, sigma=(0.1, 0.05))
 
 
 @pytest.mark.parametrize("engine", ENGINE_NAMES)

@@ -5,59 +5,48 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 from fuzzing import NUMBER_LIKE, SCALAR, WORD, few
 from hypothesis import given
 from hypothesis import strategies as st
+from planner_support import CHEAP
 
 from d4orm_planners import cli
-from d4orm_planners.registry import list_planners, list_policies
+from d4orm_planners.registry import PLANNERS, list_planners, list_policies
 
 SCENARIO = "version: 1\nrobots:\n  - {model: velocity2d, start: [0, 0], goal: [0.3, 0]}\n"
 TEXT = st.one_of(NUMBER_LIKE, WORD, SCALAR.map(str)).filter(lambda text: "\0" not in text and text.isprintable())
 FILE = st.sampled_from(["small.yaml", "taken", "taken/x.npz", "absent.yaml", "absent/x.npz", ".", "", "/proc/x.npz"])
 TARGET = st.sampled_from(["taken", "absent/x.npz", "x.txt", ".", "", "new.npz", "new.png"])
-NAME = st.one_of(st.sampled_from(["circle", "small.yaml", "nope", "", "circle,small.yaml"]), TEXT)
-SETTING = st.one_of(
-    TEXT,
-    st.builds("{}={}".format, st.sampled_from(["num_samples", "beta_start", "engine", "temperature", "x", ""]), TEXT),
-)
-OPTIONS: dict[str, Any] = {
+NAME = st.one_of(st.sampled_from(["small.yaml", "nope", "", "circle,small.yaml"]), TEXT)
+SETTING_NAMES = sorted({field.name for kind in PLANNERS.values() for field in fields(kind.config_class)} - {"nodes"})
+# Not the number of nodes: a crew of 10^30 of them is made node by node.
+SETTING = st.one_of(st.builds("{}={}".format, st.sampled_from(SETTING_NAMES), st.one_of(NUMBER_LIKE, TEXT)), TEXT)
+ACTOR = st.sampled_from([name for name in list_policies() if name not in ("ppo", "sac", "ipopt")])
+TOLD = st.builds("{}:{}={}".format, ACTOR, st.sampled_from(["extra_margin", "deadline", "temperature", "x"]), TEXT)
+VALUES: dict[str, Any] = {
     "--scenario": NAME,
-    "--robots": TEXT,
     "--model": st.one_of(st.sampled_from(["velocity2d", "holonomic3d"]), TEXT),
-    "--obstacles": TEXT,
-    "--seed": TEXT,
-    "--seeds": TEXT,
-    "--planner": st.one_of(st.sampled_from(list_planners()), TEXT),
-    "--policy": st.one_of(st.sampled_from([name for name in list_policies() if name not in ("ppo", "sac")]), TEXT),
+    "--planner": st.one_of(st.sampled_from([name for name in list_planners() if name != "ipopt"]), TEXT),
+    "--policy": st.one_of(ACTOR, TOLD, TEXT),
     "--preset": st.one_of(st.just("paper"), TEXT),
     "--set": SETTING,
     "--engine": st.one_of(st.just("cpu"), TEXT),
-    "--noise": TEXT,
-    "--time-limit": TEXT,
-    "--max-iterations": TEXT,
-    "--trial-timeout": TEXT,
-    "--workers": TEXT,
-    "--deadlines": TEXT,
-    "--num-envs": TEXT,
-    "--steps": TEXT,
-    "--lessons": TEXT,
-    "--models": TEXT,
-    "--engines": TEXT,
     "--config": FILE,
     "--picture": TARGET,
+    "--animation": TARGET,
     "--out": TARGET,
-    "--quiet": None,
-    "--nonsense": TEXT,
 }
-# Whatever else they are told: nothing that takes long.
+"""Of options that take more than a number; all others get text of any kind."""
+
 SMALL: dict[str, list[str]] = {
-    "plan": ["--quiet", "--scenario", "small.yaml", "--max-iterations=1", "--set=num_samples=8", "--set=num_steps=1"],
-    "run": ["--quiet", "--scenario", "small.yaml", "--policy", "goal"],
+    "plan": ["--quiet", "--robots=2", "--max-iterations=1", "--set=num_samples=8", "--set=num_steps=1"],
+    "run": ["--quiet", "--robots=2", "--policy=goal"],
     "scenarios": [],
     "planners": [],
     "leaderboard": [],
@@ -69,19 +58,27 @@ SMALL: dict[str, list[str]] = {
     "bench": ["--out", "taken"],
     "train": ["ppo", "--out", "taken"],
 }
+"""What keeps a call from taking long, whatever else it is told."""
+
 FOLDER = ("demo", "evaluate", "robustness", "bench", "train")
+
+
+def options_of(command: str) -> list[Any]:
+    """The options that a command has, however many there are one day."""
+    parameters = typer.main.get_command(cli.app).commands[command].params  # type: ignore[attr-defined]
+    options = [parameter for parameter in parameters if parameter.opts[0].startswith("--")]
+    return [option for option in options if option.name != "out" or command not in FOLDER]
 
 
 @st.composite
 def calls(draw: st.DrawFn) -> list[str]:
     command = draw(st.one_of(st.sampled_from(list(SMALL)), st.just("plan"), st.just("run")))
     arguments = [command, *SMALL[command]]
-    for option in draw(st.lists(st.sampled_from(list(OPTIONS)), min_size=1, max_size=3, unique=True)):
-        if option == "--out" and command in FOLDER:
-            continue
-        value = OPTIONS[option]
-        arguments.append(option if value is None else f"{option}={draw(value)}")
-    if draw(st.integers(0, 5)) == 0:
+    known = options_of(command)
+    for option in draw(st.lists(st.sampled_from(known), max_size=3, unique=True)) if known else []:
+        name = draw(st.sampled_from([*option.opts, *option.secondary_opts]))
+        arguments += [name] if option.is_flag else [name, draw(VALUES.get(option.opts[0], TEXT))]
+    for _ in range(draw(st.sampled_from([0, 0, 0, 1]))):
         arguments.insert(draw(st.integers(1, len(arguments))), draw(st.one_of(FILE, TEXT)))
     return arguments
 
@@ -101,9 +98,7 @@ def call(arguments: list[str]) -> tuple[int, str, str]:
     return int(exited.value.code or 0), out.getvalue(), err.getvalue()
 
 
-@few(100)
-@given(arguments=calls())
-def test_every_call_works_or_says_in_one_line_what_is_wrong(folder: Path, arguments: list[str]) -> None:
+def call_and_check(folder: Path, arguments: list[str]) -> None:
     before = sorted(folder.rglob("*"))
     status, out, err = call(arguments)
     assert status in (0, 1, 2), (status, err)
@@ -118,3 +113,18 @@ def test_every_call_works_or_says_in_one_line_what_is_wrong(folder: Path, argume
     assert (folder / "small.yaml").read_text() == SCENARIO
     for path in set(folder.rglob("*")) - set(before):
         path.unlink()
+
+
+@few(120)
+@given(arguments=calls())
+def test_every_call_works_or_says_in_one_line_what_is_wrong(folder: Path, arguments: list[str]) -> None:
+    call_and_check(folder, arguments)
+
+
+@few(60)
+@given(planner=st.sampled_from(list_planners()), data=st.data())
+def test_every_setting_of_every_planner_works_or_is_refused(folder: Path, planner: str, data: st.DataObject) -> None:
+    known = [field.name for field in fields(PLANNERS[planner].config_class) if field.name != "nodes"]
+    small = [f"--set={name}={value}" for name, value in CHEAP.items() if name in known]
+    setting = f"--set={data.draw(st.sampled_from(known))}={data.draw(NUMBER_LIKE)}"
+    call_and_check(folder, ["plan", "--quiet", "--scenario=small.yaml", f"--planner={planner}", *small, setting])
