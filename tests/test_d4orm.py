@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from planner_support import walled_in_problem
+from planner_support import hop_problem, walled_in_problem
 
 from d4orm_env.engine.base import SamplingTask, get_engine
 from d4orm_env.scenarios import make_problem
@@ -142,10 +142,12 @@ def test_robot_credit_learns_faster_than_team_credit() -> None:
 
 
 def test_both_engines_plan_the_same() -> None:
-    problem = make_problem("circle", num_robots=4)
+    # Half a second, in which nobody comes near its goal or another: no reward jumps, so that rounding stays rounding.
+    problem = hop_problem(2, horizon=5)
     settings = {"num_samples": 128, "num_steps": 5, "max_iterations": 1}
     on_cpu = make_planner("d4orm", engine="cpu", **settings).solve(problem, seed=3)
     on_jax = make_planner("d4orm", engine="jax", **settings).solve(problem, seed=3)
+    assert np.abs(on_cpu.controls).max() > 0.1
     np.testing.assert_allclose(on_jax.controls, on_cpu.controls, atol=2e-3)
     assert on_jax.history[0].reward == pytest.approx(on_cpu.history[0].reward, abs=1e-4)
 
