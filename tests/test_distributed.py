@@ -89,6 +89,14 @@ def test_k_means_finds_the_groups() -> None:
         np.testing.assert_array_equal(labels, k_means(points, 3, generator(seed)))
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_k_means_puts_every_point_to_the_nearest_mean(seed: int) -> None:
+    points = np.random.default_rng(seed).gamma(1, size=(40, 2))
+    labels = k_means(points, 4, generator(seed))
+    means = np.stack([points[labels == cluster].mean(axis=0) for cluster in range(4)])
+    np.testing.assert_array_equal(labels, np.linalg.norm(points[:, None] - means, axis=2).argmin(axis=1))
+
+
 def test_k_means_of_points_that_are_fewer_or_all_the_same() -> None:
     assert set(k_means([[1.0], [2.0]], 4, generator())) == {0, 1}
     assert set(k_means([[1.0], [1.0], [1.0]], 2, generator())) == {0}
