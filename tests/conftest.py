@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 
+import pytest
 from hypothesis import settings
 
 # A rank mismatch that JAX would broadcast silently is a bug here, so it is an error in the suite.
@@ -14,3 +15,19 @@ os.environ["MPLBACKEND"] = "Agg"
 settings.register_profile("local", deadline=None)
 settings.register_profile("ci", deadline=None, derandomize=True, print_blob=True)
 settings.load_profile("ci" if os.environ.get("CI") else "local")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--fuzz-examples",
+        type=int,
+        metavar="N",
+        help="examples of every test in tests/fuzz, drawn anew; without it a few, the same in every run",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    examples = config.getoption("--fuzz-examples")
+    if examples is not None:
+        # Read where the tests are imported, and by the processes of pytest-xdist.
+        os.environ["FUZZ_EXAMPLES"] = str(examples)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import numpy as np
 
 from d4orm_env.core.dynamics import Ops
@@ -123,23 +124,50 @@ class SameWeights:
         return xp.asarray(self.rows, dtype=np.float32)
 
 
-class RecordedWeights:
-    """Rules for the CPU engine that keep the rewards they are called with."""
+class RecordedRules:
+    """A method's rules that keep what an engine calls them with and what they answer, step by step.
 
-    def __init__(self, weights: Callable[[Any, Any], Any]) -> None:
+    Attributes:
+        rules: To hand to the engine.
+        rewards: ``(1, M)`` or ``(K, M)`` of each step.
+        weights: Of the same shapes.
+        log_ratios: Likewise, where the rules ask for them.
+        deviations: ``(H, K, m)`` of each step, where the rules adapt the noise.
+    """
+
+    def __init__(self, rules: SamplingRules) -> None:
         self.rewards: list[np.ndarray] = []
-        self._weights = weights
+        self.weights: list[np.ndarray] = []
+        self.log_ratios: list[np.ndarray] = []
+        self.deviations: list[np.ndarray] = []
+        self._inner = rules
+        self.rules = rules._replace(weights=self._weights, adapt=None if rules.adapt is None else self._adapt)
 
-    def __call__(self, rewards: Any, xp: Any) -> Any:
-        self.rewards.append(rewards.copy())
-        return self._weights(rewards, xp)
+    def _weights(self, rewards: Any, xp: Any, *log_ratio: Any) -> Any:
+        weights = self._inner.weights(rewards, xp, *log_ratio)
+        for kept, value in zip((self.rewards, self.weights, self.log_ratios), (rewards, weights, *log_ratio)):
+            _keep(kept, value, xp)
+        return weights
+
+    def _adapt(self, deviation2: Any, xp: Any) -> Any:
+        assert self._inner.adapt is not None
+        _keep(self.deviations, deviation2, xp)
+        return self._inner.adapt(deviation2, xp)
+
+
+def _keep(kept: list[np.ndarray], value: Any, xp: Any) -> None:
+    """Append a copy; out of a compiled run it comes by a callback."""
+    if xp is np:
+        kept.append(np.array(value))
+    else:
+        jax.debug.callback(lambda array: kept.append(np.array(array)), value, ordered=True)
 
 
 def cpu_rewards(engine: Engine, task: SamplingTask, sigma: float, num_samples: int, seed: int) -> np.ndarray:
     """``(1, M)`` or ``(K, M)`` rewards of the samples of one step around zero."""
-    recorded = RecordedWeights(lambda rewards, xp: xp.full_like(rewards, 1 / rewards.shape[-1]))
+    recorded = RecordedRules(SamplingRules(lambda rewards, xp: xp.full_like(rewards, 1 / rewards.shape[-1])))
     mean = np.zeros_like(task.base)
-    engine.denoise(task, SamplingRules(recorded), mean, np.array([sigma], np.float32), num_samples, seed)
+    engine.denoise(task, recorded.rules, mean, np.array([sigma], np.float32), num_samples, seed)
     return recorded.rewards[0]
 
 

@@ -24,12 +24,3 @@ def score(problem: Problem, controls: Any) -> np.ndarray:
     """``(M, K)`` mean rewards of ``controls`` ``(M, H, K, m)``."""
     model, team = plain.plain_team(problem)
     return np.asarray(plain.score(model, team, np.asarray(controls, np.float32)))
-
-
-def denoise(task: SamplingTask, mean: Any, noise_scale: Any, num_samples: int, seed: int) -> np.ndarray:
-    """``(H, K, m)`` mean after a run with team weights, on the engines' own noise."""
-    for step, sigma in enumerate(noise_scale):
-        samples = sample_controls(task, mean, sigma, num_samples, seed, step)
-        rewards = score(task.problem, task.base[None] + samples).mean(axis=1)
-        mean = np.asarray(plain.softmax_mean(rewards, samples, TEMPERATURE))
-    return mean

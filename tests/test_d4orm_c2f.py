@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from d4orm_env import navigation_v0
+from d4orm_env.core.dynamics import ACCELERATION
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
+from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Episode, make_policy, run_episode
@@ -125,7 +127,7 @@ def test_every_loop_is_recorded() -> None:
     # Without disturbances what was predicted to be kept apart stays apart.
     assert min(loop.predicted_margin for loop in policy.loops) >= problem.margin - 1e-4
     assert policy.missed == 0
-    assert 0 < policy.coarse_time < 60
+    assert policy.coarse_time > 0
 
 
 def test_a_lone_robot_has_nobody_to_keep_a_margin_to() -> None:
@@ -141,6 +143,38 @@ def test_a_plan_may_be_executed_for_some_steps(execute: int) -> None:
     executed = episode(policy, problem)
     assert_verified(problem, executed)
     assert [loop.step for loop in policy.loops] == list(range(0, len(executed.trajectory.controls), execute))
+
+
+@pytest.mark.parametrize("execute", [1, 3])
+def test_a_loop_deforms_what_is_left_of_the_last_plan(monkeypatch: pytest.MonkeyPatch, execute: int) -> None:
+    """A lone robot in the open: nothing stops it from doing as it has planned."""
+    problem, ahead, samples = circle(1, horizon=20), 12, 72
+    bases, plans = [], []
+    sample = CpuEngine.denoise
+
+    def denoise(
+        self: CpuEngine, task: Any, rules: Any, mean: Any, scale: Any, num_samples: int, *more: Any, **options: Any
+    ) -> Any:
+        result = sample(self, task, rules, mean, scale, num_samples, *more, **options)
+        if num_samples == samples:  # a control loop, and not the coarse plan
+            limit = task.problem.team.control_limits
+            bases.append(task.base)
+            plans.append(np.clip(task.base + result.mean, -limit, limit))
+        return result
+
+    policy = controller(predict_horizon=ahead, execute_horizon=execute, num_samples=samples)
+    monkeypatch.setattr(CpuEngine, "denoise", denoise)
+    executed = episode(policy, problem).trajectory.controls
+    bases, plans = bases[-len(policy.loops) :], plans[-len(policy.loops) :]
+    assert len(bases) == len(policy.loops) >= 6
+    for last, base in zip(plans, bases[1:]):
+        assert np.abs(base[: ahead - execute]).max() > 0.1
+        np.testing.assert_allclose(base[: ahead - execute], last[execute:], atol=1e-6)
+    # And the plan is what is executed, but for the circle that limits a control, where clipping takes a square.
+    limit = problem.team.limits[0, ACCELERATION]
+    for loop, plan in enumerate(plans):
+        push = plan[0, 0] * min(1, limit / np.linalg.norm(plan[0, 0]))
+        np.testing.assert_allclose(executed[loop * execute, 0], push, atol=1e-5)
 
 
 def test_loops_that_miss_their_deadline_are_counted_and_the_last_plan_goes_on() -> None:

@@ -9,6 +9,10 @@ import pytest
 from planner_support import walled_in_problem
 
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
+from d4orm_env.engine.base import SamplingResult
+from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import make_planner
@@ -114,6 +118,31 @@ def test_an_independent_repair_leaves_whoever_does_not_fail_alone() -> None:
         assert same[~before.failed].all()
     assert repairs >= 1
     assert search.best.solved
+
+
+class Astray(CpuEngine):
+    """Sampling that goes wrong: it sends everybody to the right at full throttle."""
+
+    def denoise(self, task: Any, rules: Any, mean: Any, noise_scale: Any, *more: Any, **options: Any) -> Any:
+        away = np.zeros_like(task.base)
+        away[..., 0] = task.problem.team.control_limits[:, 0]
+        return SamplingResult(away - task.base, np.zeros(len(noise_scale), np.float32), 0)
+
+
+def test_a_repair_that_makes_things_worse_is_not_taken_over() -> None:
+    """Robot 0 cannot reach its goal, and on every way there it meets robot 1, which has docked in between."""
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    ring = np.column_stack([4 + 0.8 * np.cos(angle), 0.8 * np.sin(angle), np.full(12, 0.25)])
+    start = [[0, 0, 0, 0], [1.5, -0.5, 0, 0]]
+    problem = Problem(Team(("holonomic2d",) * 2), start, [[4, 0], [1.5, 0]], World(circles=ring), horizon=60)
+    controls = np.zeros((60, 2, 2), np.float32)
+    controls[:, 1, 1] = 0.5
+    search = Search(make_planner("d4orm-d", engine="cpu"), problem, 0, controls, Astray())
+    before = search.current
+    assert before.failed.tolist() == [True, False]
+    search.advance()
+    assert search.denoising_steps > 0, "a repair was tried"
+    np.testing.assert_array_equal(search.current.trajectory.states, before.trajectory.states)
 
 
 @pytest.mark.parametrize(("scenario", "straight"), [("circle", False), ("random", True)])

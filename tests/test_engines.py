@@ -82,7 +82,8 @@ def assert_same_motion(first: Trajectory, second: Trajectory) -> None:
 @pytest.mark.parametrize("case", [pytest.param(case, id=case_name(case)) for case in scenario_cases(4)])
 def test_engines_roll_out_alike(case: dict[str, Any]) -> None:
     problem = make_problem(**case, horizon=HORIZON, dt=0.3)
-    for controls in (random_controls(problem, 5), toward_goals(problem)):
+    # Not at full throttle, under which some stand at exactly the margin of each other.
+    for controls in (random_controls(problem, 5), 0.97 * toward_goals(problem)):
         first, second = CPU.rollout(problem, controls), JAX.rollout(problem, controls)
         assert_same_motion(first, second)
     # Six seconds toward the goals: everyone has moved.

@@ -206,3 +206,21 @@ def test_the_replay_buffer_likewise() -> None:
     values = set(buffer.sample(200).observations[:, 0].tolist())
     assert values == {0, 1, 2, 3, 4, 10, 11, 12, 13, 14}
     env.close()
+
+
+def test_the_replay_buffer_takes_running_out_of_time_for_no_end() -> None:
+    """A robot that ran out of steps could have gone on, so what its last state is worth is learned from; an arrival
+    is an end.
+    """
+    env = RobotVecEnv(3, 1, "random", randomize_instance=True)
+    buffer = MaskedReplayBuffer(30, env.observation_space, env.action_space, n_envs=3)
+    buffer.source, buffer.random = Source(), np.random.default_rng(0)  # type: ignore[assignment]
+    cases = [(False, False, 0), (True, False, 1), (True, True, 0)]
+    for step, (done, out_of_time, _) in enumerate(cases):
+        marks = np.full((3, env.features.size), step, np.float32)
+        infos = [{"TimeLimit.truncated": out_of_time}] * 3
+        buffer.add(marks, marks, np.zeros((3, 2)), np.zeros(3), np.full(3, done), infos)
+    batch = buffer.sample(200)
+    ends = {(int(mark), int(end)) for mark, end in zip(batch.observations[:, 0], batch.dones[:, 0], strict=True)}
+    assert ends == {(step, end) for step, (*_, end) in enumerate(cases)}
+    env.close()

@@ -88,6 +88,15 @@ def test_success_rate_sums_up() -> None:
     assert (row.lower, row.upper) == wilson_interval(2, 4)
 
 
+def test_only_what_was_judged_counts_as_verified() -> None:
+    assert success_rate([trial(0, verified=True), trial(1, verified=False), trial(2, verified=None)]).verified == 1
+
+
+def test_a_trial_that_was_over_at_once_has_no_time_of_motion() -> None:
+    row = success_rate([trial(0, steps=0, wall_time=1.0), trial(1, steps=50, wall_time=1.0)])
+    assert row.compute == pytest.approx(1.0 / 5.0)
+
+
 # The store.
 
 
