@@ -26,7 +26,7 @@ from d4orm_env.engine.base import (
     get_engine,
 )
 from d4orm_env.verify import verify
-from d4orm_planners.plan import IterationRecord, Plan
+from d4orm_planners.plan import IterationRecord, Plan, failed_robots
 
 Callback = Callable[[IterationRecord], Any]
 
@@ -126,8 +126,7 @@ def evaluate_controls(engine: Engine, problem: Problem, controls: FloatArray) ->
     bounded = np.clip(controls, -reach, reach)
     trajectory = engine.rollout(problem, bounded)
     planned = np.where(trajectory.arrived[:-1, :, None], np.float32(0), bounded)
-    # The start itself cannot be planned away, so it does not count.
-    failed = ~trajectory.arrived[-1] | trajectory.margin_violated[1:].any(axis=0)
+    failed = failed_robots(trajectory)
     solved = not failed.any() and verify(problem, trajectory.controls).ok
     return Candidate(planned, trajectory.controls, trajectory, solved, failed)
 
