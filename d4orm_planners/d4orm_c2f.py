@@ -519,9 +519,11 @@ class _Background:
     def run(self, work: Callable[[], Any], timeout: float) -> Any:
         """What the work gives within the time [s], or ``None``. What is late goes on, and is thrown away."""
         end = time.perf_counter() + timeout
+        if timeout <= 0:
+            return None
         try:
             if self._job is not None:
-                self._job.result(max(timeout, 0))
+                self._job.result(timeout)
             self.start(work)
             assert self._job is not None
             return self._job.result(max(end - time.perf_counter(), 0))
