@@ -554,7 +554,6 @@ def test_without_ray_the_error_says_what_to_install(d4orm, monkeypatch: pytest.M
 
 @pytest.mark.slow
 def test_a_cluster_gives_the_same_rows(tmp_path: Path) -> None:
-    pytest.importorskip("ray")
     body = EVALUATE.format(policies='["goal", "orca"]', arguments='ray="local"')
     result = program(tmp_path, body)
     assert result.stdout == "(6, 0) (6, 0) (6, 0) (6, 0)\n", result.stderr
@@ -578,7 +577,6 @@ def test_a_cluster_gives_the_same_rows(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
 def test_a_worker_lost_on_a_cluster_is_a_row(tmp_path: Path) -> None:
-    pytest.importorskip("ray")
     # Workers import the module by name, and with it the trouble.
     (tmp_path / "trouble.py").write_text(TROUBLE + "def hook(): pass\n")
     options = "num_cpus=2, log_to_driver=False, runtime_env={'worker_process_setup_hook': 'trouble.hook'}"
@@ -602,7 +600,6 @@ def test_a_worker_lost_on_a_cluster_is_a_row(tmp_path: Path) -> None:
     ],
 )
 def test_an_unreachable_cluster_is_one_line(d4orm, address: str, message: str) -> None:
-    pytest.importorskip("ray")
     status, _, err = d4orm("evaluate", "-p", "goal", "-k", "2", "-n", "1", "--ray", address)
     assert (status, err.count("\n")) == (2, 1)
     assert message in err

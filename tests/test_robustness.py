@@ -123,8 +123,8 @@ def test_a_seed_that_the_store_has_no_room_for_is_refused(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("column", "value"),
     [
-        ("reward", "much"), ("robots", "many"), ("success", "yes"), ("seed", "first"), ("noise", "some"), ("label", b"x"),
-        ("history", "[[1"), ("history", "[1, 2]"), ("config", "none"), ("travel_time", "soon"),
+        ("reward", "much"), ("robots", "many"), ("success", "yes"), ("seed", "first"), ("noise", "some"),
+        ("label", b"x"), ("history", "[[1"), ("history", "[1, 2]"), ("config", "none"), ("travel_time", "soon"),
     ],
 )  # fmt: skip
 def test_what_does_not_belong_in_a_column_is_one_clear_error(tmp_path: Path, column: str, value: Any) -> None:

@@ -51,7 +51,8 @@ class Node:
         engine: What rolls out and samples.
         transport: Its access to the others.
         selection: How it chooses what to go on from.
-        told: What it begins to number its messages after; more than it had told before, if it did.
+        told: What it begins to number its messages after; more than it had told before, if it did, and on a network the
+            time at which it began, by which two nodes of one number tell who was first.
         observer: Called with every :class:`~d4orm_planners.distributed.events.Event`, in the node's own thread.
 
     Attributes:
@@ -87,7 +88,7 @@ class Node:
         self.inbox = Inbox(problem, engine, self.transport, num_nodes, number, judge)
         self.excluded = 0
         self._selection = selection
-        self._told = told
+        self._told = self._began = told
         self._observer = observer
         self._others = set(range(num_nodes)) - {number}
         self._awaited = self._others
@@ -123,6 +124,16 @@ class Node:
             return False
         self._choose()
         return True
+
+    def check_number(self) -> None:
+        """Raise ``ValueError`` if another node has this one's number, and had it first."""
+        namesake = self.inbox.namesake
+        if namesake is not None and namesake <= self._began:
+            last = len(self._others)
+            raise ValueError(
+                f"node is {self.number}, and another process on the network is node {self.number} already; give each "
+                f"a number of its own, from 0 to {last}"
+            )
 
     def settle(self, seconds: float) -> bool:
         """Tell the best candidate again and again, until all others have one as good or the seconds are over.

@@ -194,7 +194,7 @@ class _Run:
             model = self._model
             model.set_env(env, force_reset=True)
         if self._checkpoint is not None:
-            self._checkpoint.restore(env, model if fresh else None)
+            self._checkpoint.restore(env, model, fresh)
         return model
 
     def _training_seed(self, number: int) -> int:
