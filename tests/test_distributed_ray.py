@@ -33,7 +33,7 @@ if __name__ == "__main__":
     shared = connection.ray.is_initialized()
     connection.close()
     solve(**{settings})
-    print(json.dumps([
+    print("RESULT", json.dumps([
         {{clip: [[record.reward for record in plan.history] for plan in pair] for clip, pair in plans.items()}},
         plans[True][0].metrics["messages"], shared, connection.ray.is_initialized(),
     ]))
@@ -72,7 +72,7 @@ def kill(restarts, mode):
 
 if __name__ == "__main__":
     connection = RayConnection("local", "this test")
-    print(json.dumps([kill({restarts}, mode) for mode in ("sync", "async")]))
+    print("RESULT", json.dumps([kill({restarts}, mode) for mode in ("sync", "async")]))
     connection.close()
 """
 
@@ -96,7 +96,8 @@ if __name__ == "__main__":
         os.kill(planner.process, signal.SIGSTOP)
     ray_planner.RayPlanner.start = frozen
     overdue = solve(0.1)
-    print(json.dumps([[plan.status, plan.history[-1].note, plan.denoising_steps] for plan in (in_time, overdue)]))
+    plans = [[plan.status, plan.history[-1].note, plan.denoising_steps] for plan in (in_time, overdue)]
+    print("RESULT", json.dumps(plans))
     connection.close()
 """
 
@@ -136,14 +137,16 @@ if __name__ == "__main__":
     planner = make_planner("d-d4orm", transport="ray", engine="cpu", num_samples=64, num_steps=5)
     problem = make_problem("circle", num_robots=2)
     planner.solve(problem, max_iterations=1, callback=lambda record: heard.extend(listening()))
-    print(json.dumps(heard))
+    print("RESULT", json.dumps(heard))
 """
 
 
 def result_of(tmp_path: Path, body: str) -> Any:
     result = program(tmp_path, body)
     assert result.returncode == 0, result.stderr
-    return json.loads(result.stdout.splitlines()[-1])
+    # Ray may have something to say before and after.
+    (line,) = [line for line in result.stdout.splitlines() if line.startswith("RESULT ")]
+    return json.loads(line.removeprefix("RESULT "))
 
 
 @pytest.mark.slow
