@@ -10,9 +10,8 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils.wrappers import BaseParallelWrapper
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.simulation import noise_std
-
-_STREAM = 0x6E6F697365
 
 
 class GaussianControlNoise(BaseParallelWrapper[str, FloatArray, FloatArray]):
@@ -45,8 +44,7 @@ class GaussianControlNoise(BaseParallelWrapper[str, FloatArray, FloatArray]):
     ) -> tuple[dict[str, FloatArray], dict[str, dict[str, Any]]]:
         """Reset the environment, and with a seed the noise too; without one the noise goes on."""
         if seed is not None:
-            # The environment is given the same seed: keep the two streams apart.
-            self._random = np.random.default_rng([seed, _STREAM])
+            self._random = generator(seed, Stream.CONTROL_NOISE)
         return super().reset(seed=seed, options=options)
 
     def step(

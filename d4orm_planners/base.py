@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
@@ -14,10 +15,18 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, positive_number, whole_number
 from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.engine.base import Engine, checked_controls, get_engine
+from d4orm_env.engine.base import (
+    Engine,
+    SamplingResult,
+    SamplingRules,
+    SamplingTask,
+    checked_controls,
+    get_engine,
+)
 from d4orm_env.verify import verify
-from d4orm_planners.plan import IterationRecord, Plan
+from d4orm_planners.plan import IterationRecord, Plan, failed_robots
 from d4orm_planners.settings import Count, EngineName, Settings
 
 Callback = Callable[[IterationRecord], Any]
@@ -107,8 +116,7 @@ def evaluate_controls(engine: Engine, problem: Problem, controls: FloatArray) ->
     bounded = np.clip(controls, -reach, reach)
     trajectory = engine.rollout(problem, bounded)
     planned = np.where(trajectory.arrived[:-1, :, None], np.float32(0), bounded)
-    # The start itself cannot be planned away, so it does not count.
-    failed = ~trajectory.arrived[-1] | trajectory.margin_violated[1:].any(axis=0)
+    failed = failed_robots(trajectory)
     solved = not failed.any() and verify(problem, trajectory.controls).ok
     return Candidate(planned, trajectory.controls, trajectory, solved, failed)
 
@@ -168,7 +176,9 @@ class Planner(ABC):
         Args:
             problem: What to solve.
             seed: Non-negative seed; the same seed gives the same plan.
-            time_limit: Seconds, compilation not counted; checked before every iteration, and by IPOPT within.
+            time_limit: Seconds, compilation not counted; looked at before every iteration, and within one between its
+                denoising steps, repairs or IPOPT's iterations. An iteration that it cuts short ends with what it has
+                by then, a candidate like any other. A limit that is not reached changes nothing.
             max_iterations: Iterations; the configured number by default.
             callback: Called with an :class:`IterationRecord` after every iteration; returning ``True`` stops.
             initial_controls: ``(H, K, m)`` to start from, zeros by default.
@@ -225,6 +235,7 @@ class Search:
         memory: What a planner keeps between its own iterations.
         metrics: Numbers of the method's own that the plan's metrics will have.
         time_limit: Seconds that the solve may take, or ``None``.
+        cancelled: Once set, by whatever thread, the iteration under way is left as if its time were over.
     """
 
     def __init__(
@@ -253,16 +264,34 @@ class Search:
         self.memory: dict[str, Any] = {}
         self.metrics: dict[str, float] = {}
         self.time_limit: float | None = None
+        self.cancelled = threading.Event()
 
     @property
     def time_left(self) -> float | None:
         """Seconds left, zero when they are used up; ``None`` without a limit."""
         return None if self.time_limit is None else max(self.time_limit - self.watch.elapsed, 0.0)
 
-    def iteration_seed(self, stream: int = 0) -> int:
-        """A seed for one denoising run of the present iteration."""
-        words = np.random.SeedSequence([self.seed, self.iteration, stream]).generate_state(1, np.uint64)
-        return int(words[0])
+    def should_stop(self) -> bool:
+        """Whether an iteration must come to its end as it is."""
+        return self.time_left == 0 or self.cancelled.is_set()
+
+    def denoise(
+        self,
+        task: SamplingTask,
+        rules: SamplingRules,
+        mean: FloatArray,
+        noise_scale: FloatArray,
+        num_samples: int,
+        seed: int,
+    ) -> SamplingResult:
+        """See :meth:`d4orm_env.engine.base.Engine.denoise`; compiling is not counted, and time may end it."""
+        with self.watch.paused():
+            self.engine.prepare(task, rules, noise_scale, num_samples)
+        return self.engine.denoise(task, rules, mean, noise_scale, num_samples, seed, self.should_stop)
+
+    def iteration_seed(self, stream: Stream = Stream.SAMPLES, number: int = 0) -> int:
+        """A seed for the present iteration's use of a stream with this number."""
+        return derived_seed(self.seed, stream, self.iteration, number)
 
     def advance(self) -> IterationRecord:
         """Run one iteration, judge it and remember the best."""

@@ -8,7 +8,7 @@ Programming, 2006.
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import chain
 from threading import Event, current_thread, main_thread
@@ -82,7 +82,7 @@ class TeamProgram:
         ]
 
     def solve(
-        self, guess: Motion, contacts: Contacts, docks: Any, options: dict[str, Any], time_limit: float | None
+        self, guess: Motion, contacts: Contacts, docks: Any, options: dict[str, Any], should_stop: Callable[[], bool]
     ) -> tuple[Motion, str]:
         """Solve from a guess.
 
@@ -91,7 +91,7 @@ class TeamProgram:
             contacts: What is kept clear of what, and when.
             docks: ``(K,)`` steps by which the robots are at their goals, and from which on they stand there.
             options: IPOPT's.
-            time_limit: Seconds after which IPOPT stops, or ``None``.
+            should_stop: Asked after each of IPOPT's iterations whether it is to be the last one.
 
         Returns:
             The motion that IPOPT ended with, feasible or not, and its word for how it ended.
@@ -108,11 +108,13 @@ class TeamProgram:
             "g": ca.vertcat(*(ca.vec(row) for row, _, _ in rows)),
         }
         options = {"print_level": 0, "sb": "yes", "constr_viol_tol": FEASIBILITY, **options}
-        if time_limit is not None:
-            options["max_wall_time"] = max(time_limit, 1e-3)
         lowest, highest = self._variable_bounds()
         with _ctrl_c_kept() as ctrl_c:
-            stopper = _stopper(ca, {name: part.numel() for name, part in program.items()}, ctrl_c)
+
+            def ends() -> bool:
+                return ctrl_c.is_set() or should_stop()
+
+            stopper = _stopper(ca, {name: part.numel() for name, part in program.items()}, ends)
             settings = {"print_time": False, "show_eval_warnings": False, "iteration_callback": stopper}
             solver = ca.nlpsol("team", "ipopt", program, {"ipopt": options, **settings})
             solution = solver(
@@ -302,8 +304,8 @@ def _ctrl_c_kept() -> Iterator[Event]:
         former(signal.SIGINT, None)
 
 
-def _stopper(casadi: Any, sizes: dict[str, int], stop: Event) -> Any:
-    """What IPOPT calls after every iteration of a program of these sizes, and what ends it once ``stop`` is set."""
+def _stopper(casadi: Any, sizes: dict[str, int], ends: Callable[[], bool]) -> Any:
+    """What IPOPT calls after every iteration of a program of these sizes, and what ends it once ``ends()`` is true."""
 
     class Stopper(casadi.Callback):
         def __init__(self) -> None:
@@ -319,7 +321,7 @@ def _stopper(casadi: Any, sizes: dict[str, int], stop: Event) -> Any:
 
         def eval(self, arguments: Any) -> list[int]:
             del arguments
-            return [int(stop.is_set())]
+            return [int(ends())]
 
     return Stopper()
 

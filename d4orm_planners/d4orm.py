@@ -68,9 +68,12 @@ class D4orm(SamplingPlanner):
         base = self.base(search)
         return base, self.start(search, base)
 
-    def start(self, search: Search, base: FloatArray) -> FloatArray:
-        """``U_N`` of a deformation of ``base``, as a mean to draw samples around, in the shape of ``base``."""
+    def start(self, search: Search, base: FloatArray, number: int = 0) -> FloatArray:
+        """``U_N`` of a deformation of ``base``, as a mean to draw samples around, in the shape of ``base``.
+
+        ``number`` tells the deformations of one iteration apart.
+        """
         if not self.config.random_start:
             return np.zeros_like(base)
         final = alpha_bar(self.config.num_steps, self.config.beta_start, self.config.beta_end)[-1]
-        return standard_normal(search, base.shape, stream=1) / np.float32(np.sqrt(final))
+        return standard_normal(search, base.shape, number) / np.float32(np.sqrt(final))

@@ -15,6 +15,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.seeds import Stream, derived_seed, generator
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.base import SamplingRules, SamplingTask, get_engine
 from d4orm_env.joint_state import JointState, split_state
@@ -199,7 +200,7 @@ class D4ormC2F(Policy):
 
     def _begin(self, env: Any, seed: int) -> None:
         self._seed = seed
-        self._random = np.random.default_rng([seed, 1])
+        self._random = generator(seed, Stream.CONTROLLER_NOISE)
         self._refinement.forget()
         self._control.forget()
         self.loops: list[LoopRecord] = []
@@ -239,7 +240,7 @@ class D4ormC2F(Policy):
         """Plan for the whole team from where it is, until a plan passes the checks (Algorithm 4, lines 1 to 3)."""
         present = self.problem.moment(joint.states, joint.goals)
         coarse = coarse_problem(present, self.config.coarse_factor)
-        search = Search(self._planner, coarse, self._seed + joint.steps, initial)
+        search = Search(self._planner, coarse, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps), initial)
         chosen = search.current
         for _ in range(iterations):
             if passes_checks(chosen.trajectory, self.config.check_interval):
@@ -274,7 +275,7 @@ class D4ormC2F(Policy):
         index = self._index + self.config.subgoal_offset
         if self.config.refine == "off" or index >= len(self.guidance.path) - 1:
             return False
-        guidance, seed = self.guidance, self._seed + 1_000_003 * (step + 1)
+        guidance, seed = self.guidance, derived_seed(self._seed, Stream.REFINEMENT, step)
         due = len(self.loops) % self.config.refine_every == 0
         if self.config.refine == "sync":
             if due:
@@ -311,7 +312,7 @@ class D4ormC2F(Policy):
         targets = self._targets(joint, docked)
         subgoals = self.guidance.path[targets, np.arange(len(targets))]
         base = self._base()
-        seed = self._seed + 7919 * (joint.steps + 1)
+        seed = derived_seed(self._seed, Stream.CONTROL_LOOP, joint.steps)
 
         def predict() -> tuple[FloatArray, float]:
             return self._predict(joint, docked, subgoals, base, seed)
@@ -503,9 +504,11 @@ class _Background:
     def run(self, work: Callable[[], Any], timeout: float) -> Any:
         """What the work gives within the time [s], or ``None``. What is late goes on, and is thrown away."""
         end = time.perf_counter() + timeout
+        if timeout <= 0:
+            return None
         try:
             if self._job is not None:
-                self._job.result(max(timeout, 0))
+                self._job.result(timeout)
             self.start(work)
             assert self._job is not None
             return self._job.result(max(end - time.perf_counter(), 0))

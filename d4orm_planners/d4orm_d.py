@@ -11,6 +11,7 @@ import numpy as np
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.seeds import Stream
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.base import MovingObstacles, SamplingTask
 from d4orm_planners.base import Iteration, Search
@@ -162,7 +163,7 @@ class _Repair:
         self.graph = self.conflicts(self.positions)
         self.denoising_steps = 0
         self.excluded = 0
-        self.stream = 0
+        self.runs = self.detours = 0
 
     def conflicts(self, positions: Any) -> Any:
         """``(K, K)`` who comes within the margin of whom after the start."""
@@ -186,12 +187,10 @@ class _Repair:
         base = np.ascontiguousarray(self.controls[:horizon, robots, : part.control_size])
         task = SamplingTask(part.moment(part.start, part.goal, horizon=horizon), base, moving=moving, **scoring)
         rules = planner.rules()
-        with search.watch.paused():
-            search.engine.prepare(task, rules, noise_scale, num_samples)
-        self.stream += 1
-        seed = search.iteration_seed(self.stream)
-        result = search.engine.denoise(task, rules, planner.start(search, base), noise_scale, num_samples, seed)
-        self.denoising_steps += len(noise_scale)
+        self.runs += 1
+        start, seed = planner.start(search, base, self.runs), search.iteration_seed(Stream.REPAIR, self.runs)
+        result = search.denoise(task, rules, start, noise_scale, num_samples, seed)
+        self.denoising_steps += len(result.rewards)
         self.excluded += result.excluded
         controls = np.zeros((problem.horizon, len(robots), part.control_size), np.float32)
         controls[:horizon] = base + result.mean
@@ -204,6 +203,8 @@ class _Repair:
         joined = reconnected(self.graph, memory.get("graph"))
         memory["graph"] = self.graph
         for group in failure_groups(self.failed, joined):
+            if self.search.should_stop():
+                break
             robots, scale = list(group), self.planner.noise_scale()
             part, controls, trajectory = self.denoise(
                 robots, self.problem.horizon, self.config.num_samples, scale, credit="team"
@@ -237,6 +238,8 @@ class _Repair:
     def shorten(self) -> None:
         """Let everybody turn home as soon as that is no worse."""
         for _ in range(SHORTENINGS):
+            if self.search.should_stop():
+                break
             trajectory = self.search.engine.rollout(self.problem, self.controls)
             self.take_over(range(self.problem.num_robots), self.problem, trajectory)
 
@@ -249,7 +252,7 @@ class _Repair:
         search = self.search
         vain = search.memory["vain"]
         tired = search.memory.setdefault("tired", np.zeros(self.problem.num_robots))
-        random = np.random.default_rng(search.iteration_seed(0)).random(len(tired))
+        random = np.random.default_rng(search.iteration_seed(Stream.REPAIR_ORDER)).random(len(tired))
         order = np.argsort(tired + random - 0.2 * self.graph.sum(axis=1), kind="stable")
         if search.iteration % JOINTLY == 0:
             stuck = [
@@ -312,6 +315,8 @@ class _Repair:
         paths[:, robots] = trajectory.positions
         controls, positions = trajectory.controls.copy(), trajectory.positions.copy()
         for i in np.argsort(-nearest, kind="stable"):
+            if self.search.should_stop():
+                break
             robot = robots[int(i)]
             own = ways.of(int(i))
             cost = self.costs(robot, own, paths)
@@ -327,8 +332,8 @@ class _Repair:
     def with_detours(self, alone: Problem, ways: Drives) -> Drives:
         """One robot's ways and some more, each by a random point."""
         start, goal = alone.start[0, : alone.dimension], alone.goal[0]
-        random = np.random.default_rng(self.search.iteration_seed(1000 + self.stream))
-        self.stream += 1
+        random = np.random.default_rng(self.search.iteration_seed(Stream.DETOURS, self.detours))
+        self.detours += 1
         spread = 0.5 * np.linalg.norm((goal - start)[None], axis=1) + 1
         vias = (
             start

@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
+from d4orm_env.core.seeds import Stream
 from d4orm_planners.base import Candidate, Iteration, Planner, PlannerConfig, Search, evaluate_controls
 from d4orm_planners.collocation import Contacts, Motion, TeamProgram, load_casadi
 from d4orm_planners.settings import Count, NotNegative, Positive
@@ -15,6 +16,9 @@ from d4orm_planners.steering import prepare_drives, straight_drives
 
 FOUND = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 """IPOPT's words for a solution of the program."""
+
+OUT_OF_TIME = "No_Time_After_Warm_Start"
+"""Our own word for an iteration that ends with the warm start."""
 
 NEARLY_SOLVED = 1e-2
 """IPOPT's first barrier parameter in a round that begins where the last one ended."""
@@ -79,14 +83,17 @@ class Ipopt(Planner):
             search.memory["program"] = TeamProgram(problem, config.clearance)
             search.memory["warm_start"] = self._warm_start(search)
         program: TeamProgram = search.memory["program"]
+        if search.should_stop():
+            warm_start: Motion = search.memory["warm_start"]
+            return Iteration(warm_start.controls.astype(np.float32), 0, note=OUT_OF_TIME)
         motion = self._perturbed(search)
         contacts = program.contacts(motion, config.lookout)
         docks = np.full(problem.num_robots, problem.horizon)
         best, note, options = None, "", self._options()
         for _ in range(config.rounds):
-            if best is not None and search.time_left == 0:
+            if best is not None and search.should_stop():
                 break
-            motion, note = program.solve(motion, contacts, docks, options, search.time_left)
+            motion, note = program.solve(motion, contacts, docks, options, search.should_stop)
             candidate = evaluate_controls(search.engine, problem, motion.controls.astype(np.float32))
             if best is None or candidate.rank > best.rank:
                 best = candidate
@@ -113,10 +120,10 @@ class Ipopt(Planner):
         straight = evaluate_controls(search.engine, problem, straight_drives(problem).controls[:, :, 0])
         docks = np.full(problem.num_robots, problem.horizon)
         program: TeamProgram = search.memory["program"]
-        return program.solve(_motion(straight), {}, docks, self._options(), search.time_left)[0]
+        return program.solve(_motion(straight), {}, docks, self._options(), search.should_stop)[0]
 
     def _perturbed(self, search: Search) -> Motion:
-        random = np.random.default_rng(search.iteration_seed())
+        random = np.random.default_rng(search.iteration_seed(Stream.PERTURBATION))
         warm_start: Motion = search.memory["warm_start"]
         return Motion(*(part + self.config.perturbation * random.standard_normal(part.shape) for part in warm_start))
 

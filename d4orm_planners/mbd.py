@@ -30,7 +30,7 @@ class _DirectDenoising(SamplingPlanner):
 
     def noisy_controls(self, search: Search) -> FloatArray:
         """``U_N`` of this iteration, ``(H, K, m)``."""
-        return standard_normal(search, search.current.controls.shape, stream=1)
+        return standard_normal(search, search.current.controls.shape)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,6 +15,7 @@ from pydantic import Field
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.joint_state import JointState
 from d4orm_planners.policy import Policy
 from d4orm_planners.settings import NotNegative, Positive, Settings, Whole
@@ -75,7 +76,7 @@ class Orca(Policy):
                 f"policy 'orca' works in the plane, and this problem has {problem.dimension} dimensions; choose "
                 "another policy or a planar model"
             )
-        angle = np.random.default_rng(seed).normal(0, self.config.deviation, problem.num_robots)
+        angle = generator(seed, Stream.PREFERRED_DIRECTION).normal(0, self.config.deviation, problem.num_robots)
         self._turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]], np.float32)
         self._walls = list(_walls(problem))
 

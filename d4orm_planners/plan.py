@@ -4,20 +4,32 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.archives import ArrayArchive
+from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.rollout import rollout
 from d4orm_env.scenarios.schema import describe, parse
+from d4orm_env.verify import verify
 from d4orm_planners.grouping import conflicts
 
 FORMAT = "d4orm-plan-1"
+
+HEADER_BYTES = 64 * 2**20
+"""Of a plan file's header, which has the problem and the history, at most."""
+
+TOLERANCE = 1e-3
+"""What a file's trajectory may differ from what its controls lead to, in SI units: processors round differently."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +77,7 @@ class Plan:
         controls: ``(H, K, m)`` inside the limits, zero once docked.
         solved: Whether everyone arrives, the margin is kept at every step, and :func:`d4orm_env.verify` found no fault.
         status: ``"solved"``, ``"iteration_limit"``, ``"time_limit"``, ``"stopped"`` (by the callback) or
-            ``"interrupted"``.
+            ``"interrupted"``; ``"refuted"`` for one from a file that says ``"solved"`` and is not.
         iterations: Iterations done.
         denoising_steps: Sample-score-update steps done.
         wall_time: Seconds, first-call compilation excluded.
@@ -88,6 +100,11 @@ class Plan:
     history: tuple[IterationRecord, ...]
     trajectory: Trajectory
     metrics: dict[str, float]
+
+    @cached_property
+    def verified(self) -> bool:
+        """Whether :func:`d4orm_env.verify` finds no fault with the controls; judged when it is first asked for."""
+        return verify(self.problem, self.controls).ok
 
     @property
     def failures(self) -> dict[str, str]:
@@ -130,7 +147,10 @@ class Plan:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:
-        """Read a plan that :meth:`save` wrote. Nothing is unpickled.
+        """Read a plan that :meth:`save` wrote. Nothing is unpickled, nor unpacked beyond what the problem has room for.
+
+        What the file says of its controls is judged anew: ``solved`` and the metrics of the trajectory are what is
+        found here, and so is the trajectory itself, unless the file's is the same but for rounding.
 
         Raises:
             FileNotFoundError: If there is no such file.
@@ -138,22 +158,14 @@ class Plan:
         """
         source = _npz_path(path)
         try:
-            # Opened here, because np.load leaves a file that is no archive open.
-            with source.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-                content = {name: file[name] for name in file.files}
-            header = json.loads(str(content.pop("header")))
-            if header.pop("format") != FORMAT:
-                raise ValueError("written by another version")
-            problem = parse(header.pop("problem"))
+            with source.open("rb") as stream, ArrayArchive(stream, ("header", *_ARRAYS)) as archive:
+                header = json.loads(str(archive.array("header", HEADER_BYTES)))
+                if header.pop("format") != FORMAT:
+                    raise ValueError("written by another version")
+                problem = parse(header.pop("problem"))
+                claimed = _checked_trajectory(problem, archive)
             history = tuple(IterationRecord(**record) for record in header.pop("history"))
-            trajectory = _checked_trajectory(problem, content)
-            return cls(
-                problem=problem,
-                history=history,
-                trajectory=trajectory,
-                controls=trajectory.controls,
-                **_checked(header),
-            )
+            return cls._judged(problem, history, claimed, _checked(header))
         except FileNotFoundError:
             raise FileNotFoundError(f"there is no plan at {source}") from None
         except Exception as error:  # a damaged archive makes zipfile, zlib and NumPy raise errors of a dozen kinds
@@ -161,7 +173,31 @@ class Plan:
                 f"{source} is not a readable plan ({_first_line(error)}); write it anew with Plan.save"
             ) from error
 
+    @classmethod
+    def _judged(
+        cls, problem: Problem, history: tuple[IterationRecord, ...], claimed: Trajectory, scalars: dict[str, Any]
+    ) -> Plan:
+        """The plan of a file, with what is true of its controls."""
+        actual = rollout(problem, claimed.controls, engine="cpu")
+        trajectory = claimed if _agree(claimed, actual) else actual
+        scalars["metrics"] |= trajectory_metrics(problem, trajectory)
+        plan = cls(problem=problem, history=history, trajectory=trajectory, controls=trajectory.controls, **scalars)
+        solved = not failed_robots(trajectory).any() and plan.verified
+        refuted = plan.status == "solved" and not solved
+        return replace(plan, solved=solved, status="refuted" if refuted else plan.status)
 
+
+def failed_robots(trajectory: Trajectory) -> BoolArray:
+    """``(K,)`` who does not arrive, or violates the margin at some step.
+
+    The start itself cannot be planned away, so it does not count.
+    """
+    failed: BoolArray = ~trajectory.arrived[-1] | trajectory.margin_violated[1:].any(axis=0)
+    return failed
+
+
+_ARRAYS = tuple(field.name for field in fields(Trajectory))
+_NUMBERS = ("states", "positions", "controls", "rewards")
 _SCALARS = ("planner", "seed", "solved", "status", "iterations", "denoising_steps", "wall_time", "metrics")
 
 
@@ -177,10 +213,12 @@ def _checked(header: dict[str, Any]) -> dict[str, Any]:
     for name, kind in {**kinds, "wall_time": (int, float), "metrics": dict}.items():
         if not isinstance(header[name], kind):  # type: ignore[arg-type]
             raise ValueError(f"{name} is {header[name]!r}")
+    if not all(isinstance(value, (int, float)) for value in header["metrics"].values()):
+        raise ValueError(f"metrics are {header['metrics']!r}, not all numbers")
     return {name: header[name] for name in _SCALARS}
 
 
-def _checked_trajectory(problem: Problem, content: dict[str, Any]) -> Trajectory:
+def _checked_trajectory(problem: Problem, archive: ArrayArchive) -> Trajectory:
     steps, robots = problem.horizon, problem.num_robots
     shapes = {
         "states": (steps + 1, robots, problem.state_size),
@@ -191,11 +229,24 @@ def _checked_trajectory(problem: Problem, content: dict[str, Any]) -> Trajectory
         "collided": (steps + 1, robots),
         "margin_violated": (steps + 1, robots),
     }
+    content = {}
     for name, shape in shapes.items():
-        kind = np.float32 if name in ("states", "positions", "controls", "rewards") else np.bool_
-        if content[name].shape != shape or content[name].dtype != kind or not np.isfinite(content[name]).all():
+        kind: np.dtype[Any] = np.dtype(np.float32 if name in _NUMBERS else np.bool_)
+        array = archive.array(name, prod(shape) * kind.itemsize)
+        if array.shape != shape or array.dtype != kind or not np.isfinite(array).all():
             raise ValueError(f"{name} does not fit the problem")
-    return Trajectory(**{name: content[name] for name in shapes})
+        content[name] = array
+    return Trajectory(**content)
+
+
+def _agree(claimed: Trajectory, actual: Trajectory) -> bool:
+    """Whether two trajectories are the same but for rounding."""
+    return all(
+        np.allclose(getattr(claimed, name), getattr(actual, name), rtol=TOLERANCE, atol=TOLERANCE)
+        if name in _NUMBERS
+        else np.array_equal(getattr(claimed, name), getattr(actual, name))
+        for name in _ARRAYS
+    )
 
 
 def _first_line(error: BaseException) -> str:

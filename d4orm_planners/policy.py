@@ -9,6 +9,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_planners.base import Planner
 from d4orm_planners.plan import Plan
@@ -105,7 +106,7 @@ class RandomControls(Policy):
     name = "random"
 
     def _begin(self, env: Any, seed: int) -> None:
-        self._generator = np.random.default_rng(seed)
+        self._generator = generator(seed, Stream.RANDOM_CONTROLS)
 
     def _controls(self, joint: JointState) -> FloatArray:
         limit = self.problem.team.control_limits

@@ -34,7 +34,7 @@ from d4orm_planners.distributed import messages, node
 from d4orm_planners.distributed.events import KINDS as KINDS_OF_EVENTS
 from d4orm_planners.distributed.events import Event
 from d4orm_planners.distributed.inbox import Inbox
-from d4orm_planners.distributed.judge import Judge, StoppableEngine, Stopped
+from d4orm_planners.distributed.judge import Judge, Stopped
 from d4orm_planners.distributed.messages import KINDS, MAGIC, Message, MessageError, decode, encode
 from d4orm_planners.distributed.node import Node, Selection, node_seed
 from d4orm_planners.distributed.selection import choose, diverse, k_means, merge, shares, top_k
@@ -341,9 +341,11 @@ def test_the_word_to_stop_ends_judging_and_denoising() -> None:
     judge.stop.set()
     with pytest.raises(Stopped):
         judge.own(message().controls)
-    planner = cheap_planner("d4orm")
+    end, engine = LocalNetwork().join(), get_engine("cpu")
+    node = Node(0, 1, cheap_planner("d4orm"), PROBLEM, 0, None, engine, end, Selection("max", 1), judge)
     with pytest.raises(Stopped):
-        Search(planner, PROBLEM, 0, None, StoppableEngine(get_engine("cpu"), judge.stop)).advance()
+        node.refine()
+    assert node.search.planner.inner.iterate(node.search).denoising_steps == 0
 
 
 # The planner.

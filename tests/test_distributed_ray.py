@@ -21,14 +21,21 @@ SOLVE = """
 import json
 from d4orm_env import make_problem
 from d4orm_planners import make_planner
+from d4orm_planners.distributed.ray_connection import RayConnection
 
 if __name__ == "__main__":
-    planner = make_planner("d-d4orm", transport="ray", {settings})
-    plans = [planner.solve(make_problem("circle", num_robots=4), seed=3, max_iterations=3) for _ in range(2)]
-    import ray
-    print(json.dumps([
-        [[record.reward for record in plan.history] for plan in plans],
-        plans[0].metrics["messages"], ray.is_initialized(),
+    def solve(**settings):
+        planner = make_planner("d-d4orm", transport="ray", **settings)
+        return planner.solve(make_problem("circle", num_robots=4), seed=3, max_iterations=3)
+
+    connection = RayConnection("local", "this test")
+    plans = {{clip: [solve(clip_between_iterations=clip, **{settings}) for _ in range(2)] for clip in (True, False)}}
+    shared = connection.ray.is_initialized()
+    connection.close()
+    solve(**{settings})
+    print("RESULT", json.dumps([
+        {{clip: [[record.reward for record in plan.history] for plan in pair] for clip, pair in plans.items()}},
+        plans[True][0].metrics["messages"], shared, connection.ray.is_initialized(),
     ]))
 """
 
@@ -38,11 +45,12 @@ from d4orm_env import make_problem
 from d4orm_planners import make_planner
 from d4orm_planners.base import Search
 from d4orm_planners.distributed import ray_planner
+from d4orm_planners.distributed.ray_connection import RayConnection
 
-if __name__ == "__main__":
-    ray_planner.RESTARTS = {restarts}
+def kill(restarts, mode):
+    ray_planner.RESTARTS = restarts
     planner = make_planner(
-        "d-d4orm", engine="cpu", transport="ray", mode="{mode}", improve=True, patience=60, num_steps=400
+        "d-d4orm", engine="cpu", transport="ray", mode=mode, improve=True, patience=60, num_steps=400
     )
     search = Search(planner, make_problem("circle", num_robots=8), 0, None)
     notes = []
@@ -60,18 +68,37 @@ if __name__ == "__main__":
     finally:
         planner.finish(search)
     plan = search.plan("stopped")
-    print(json.dumps([before, after, [note for note in notes if note], plan.solved]))
+    return [before, after, [note for note in notes if note], plan.solved]
+
+if __name__ == "__main__":
+    connection = RayConnection("local", "this test")
+    print("RESULT", json.dumps([kill({restarts}, mode) for mode in ("sync", "async")]))
+    connection.close()
 """
 
 OVERDUE = """
-import json
+import json, os, signal
 from d4orm_env import make_problem
 from d4orm_planners import make_planner
+from d4orm_planners.distributed import ray_planner
+from d4orm_planners.distributed.ray_connection import RayConnection
+
+def solve(patience):
+    planner = make_planner("d-d4orm", engine="cpu", transport="ray", improve=True, patience=patience, num_steps=200000)
+    return planner.solve(make_problem("circle", num_robots=8), time_limit=1)
 
 if __name__ == "__main__":
-    planner = make_planner("d-d4orm", engine="cpu", transport="ray", improve=True, patience=0.1, num_steps=20000)
-    plan = planner.solve(make_problem("circle", num_robots=8), time_limit=0.5)
-    print(json.dumps([plan.status, plan.history[-1].note]))
+    connection = RayConnection("local", "this test")
+    in_time = solve(60)
+    start = ray_planner.RayPlanner.start
+    def frozen(planner):
+        start(planner)
+        os.kill(planner.process, signal.SIGSTOP)
+    ray_planner.RayPlanner.start = frozen
+    overdue = solve(0.1)
+    plans = [[plan.status, plan.history[-1].note, plan.denoising_steps] for plan in (in_time, overdue)]
+    print("RESULT", json.dumps(plans))
+    connection.close()
 """
 
 SOCKETS = """
@@ -110,58 +137,59 @@ if __name__ == "__main__":
     planner = make_planner("d-d4orm", transport="ray", engine="cpu", num_samples=64, num_steps=5)
     problem = make_problem("circle", num_robots=2)
     planner.solve(problem, max_iterations=1, callback=lambda record: heard.extend(listening()))
-    print(json.dumps(heard))
+    print("RESULT", json.dumps(heard))
 """
 
 
 def result_of(tmp_path: Path, body: str) -> Any:
-    pytest.importorskip("ray")
     result = program(tmp_path, body)
     assert result.returncode == 0, result.stderr
-    return json.loads(result.stdout.splitlines()[-1])
+    # Ray may have something to say before and after.
+    (line,) = [line for line in result.stdout.splitlines() if line.startswith("RESULT ")]
+    return json.loads(line.removeprefix("RESULT "))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("clip", [True, False])
-def test_rounds_in_actors_are_those_of_threads(tmp_path: Path, clip: bool) -> None:
-    config = SETTINGS | {"clip_between_iterations": clip}
-    settings = ", ".join(f"{name}={value!r}" for name, value in config.items())
-    (first, second), messages, still_there = result_of(tmp_path, SOLVE.format(settings=settings))
-    assert first == second
+def test_rounds_in_actors_are_those_of_threads(tmp_path: Path) -> None:
+    rewards, messages, shared, still_there = result_of(tmp_path, SOLVE.format(settings=SETTINGS))
     assert messages == 6
+    assert shared, "an instance that was there stays"
     assert not still_there, "an instance of its own ends with the solve"
-    here = make_planner("d-d4orm", **config).solve(make_problem("circle", num_robots=4), seed=3, max_iterations=3)
-    np.testing.assert_allclose(first, [record.reward for record in here.history], atol=1e-6)
+    for clip in (True, False):
+        first, second = rewards[json.dumps(clip)]
+        assert first == second
+        planner = make_planner("d-d4orm", **SETTINGS, clip_between_iterations=clip)
+        here = planner.solve(make_problem("circle", num_robots=4), seed=3, max_iterations=3)
+        np.testing.assert_allclose(first, [record.reward for record in here.history], atol=1e-6)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
-@pytest.mark.parametrize("mode", ["sync", "async"])
-def test_an_actor_that_is_killed_is_restarted(tmp_path: Path, mode: str) -> None:
-    before, after, notes, solved = result_of(tmp_path, KILL.format(restarts=3, mode=mode))
-    assert len(before) == len(after) == 2
-    assert before[0] == after[0]
-    assert before[1] != after[1]
-    assert notes == ["the actor of node 1 was lost and restarted"]
-    assert solved
+def test_an_actor_that_is_killed_is_restarted(tmp_path: Path) -> None:
+    for before, after, notes, solved in result_of(tmp_path, KILL.format(restarts=3)):
+        assert len(before) == len(after) == 2
+        assert before[0] == after[0]
+        assert before[1] != after[1]
+        assert notes == ["the actor of node 1 was lost and restarted"]
+        assert solved
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
-@pytest.mark.parametrize("mode", ["sync", "async"])
-def test_an_actor_that_is_killed_too_often_is_done_without(tmp_path: Path, mode: str) -> None:
-    before, after, (note,), solved = result_of(tmp_path, KILL.format(restarts=0, mode=mode))
-    assert before[:1] == after
-    assert note.startswith("node 1 failed (ChildProcessError: its actor was lost for good (")
-    assert solved
+def test_an_actor_that_is_killed_too_often_is_done_without(tmp_path: Path) -> None:
+    for before, after, (note,), solved in result_of(tmp_path, KILL.format(restarts=0)):
+        assert before[:1] == after
+        assert note.startswith("node 1 failed (ChildProcessError: its actor was lost for good (")
+        assert solved
 
 
 @pytest.mark.slow
-def test_actors_that_do_not_finish_in_time_are_given_up(tmp_path: Path) -> None:
-    assert result_of(tmp_path, OVERDUE) == [
-        "time_limit",
-        "node 0 did not finish in time; node 1 did not finish in time",
-    ]
+@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="needs kill -STOP")
+def test_actors_keep_the_time_limit_and_those_that_do_not_are_given_up(tmp_path: Path) -> None:
+    in_time, overdue = result_of(tmp_path, OVERDUE)
+    assert in_time[:2] == ["time_limit", ""]
+    assert 0 < in_time[2] < 200000
+    assert overdue == ["time_limit", "node 0 did not finish in time; node 1 did not finish in time", 0]
 
 
 @pytest.mark.slow
@@ -199,7 +227,6 @@ def test_a_bad_address_is_refused(settings: dict[str, Any], text: str) -> None:
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1"])
 def test_a_cluster_that_is_not_there_is_one_clear_error(address: str) -> None:
-    pytest.importorskip("ray")
     planner = make_planner("d-d4orm", transport="ray", address=address)
     with pytest.raises(ConnectionError, match=rf"Ray cluster '{address}' cannot be reached \(ConnectionRefused"):
         planner.solve(make_problem("circle", num_robots=2))

@@ -218,7 +218,7 @@ if __name__ == "__main__":
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
 def test_what_crashes_dies_or_hangs_is_a_row_and_the_rest_goes_on(tmp_path: Path) -> None:
-    result = program(tmp_path, TROUBLE + EVALUATE.format(policies='"goal"', arguments="workers=2, trial_timeout=3"))
+    result = program(tmp_path, TROUBLE + EVALUATE.format(policies='"goal"', arguments="workers=2, trial_timeout=8"))
     assert result.stdout == "(6, 3) (6, 3)\n", result.stderr
     stored = TrialStore(tmp_path / "out" / STORE).trials()
     errors = {(row.seed, row.noise): row.error for row in stored}
@@ -228,7 +228,7 @@ def test_what_crashes_dies_or_hangs_is_a_row_and_the_rest_goes_on(tmp_path: Path
     for noise in (0.0, 0.1):
         assert errors[1, noise] == "RuntimeError: out of luck"
         assert errors[2, noise] == "ChildProcessError: the worker process died (SIGKILL, perhaps for lack of memory)"
-        assert errors[3, noise] == "TimeoutError: took longer than 3 s"
+        assert errors[3, noise] == "TimeoutError: took longer than 8 s"
     assert {row.verified for row in stored if row.error} == {None}
     # Without the trouble the same call runs again what failed, and nothing else.
     before = {row.key: row for row in stored if not row.error}
@@ -564,6 +564,7 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
         ({"seeds": []}, "seeds is empty"),
         ({"seeds": 5}, r"seeds is 5; give the seeds themselves, as range\(50\)"),
         ({"seeds": [0.5]}, "seed must be a whole number, not 0.5"),
+        ({"seeds": [2**63]}, "seed is 9223372036854775808; a store of trials has room for seeds up to"),
         ({"control_noise_std": []}, "noise is empty"),
     ],
 )
@@ -585,10 +586,9 @@ def test_without_ray_the_error_says_what_to_install(d4orm, monkeypatch: pytest.M
 
 @pytest.mark.slow
 def test_a_cluster_gives_the_same_rows(tmp_path: Path) -> None:
-    pytest.importorskip("ray")
     body = EVALUATE.format(policies='["goal", "orca"]', arguments='ray="local"')
     result = program(tmp_path, body)
-    assert result.stdout == "(6, 0) (6, 0) (6, 0) (6, 0)\n", result.stderr
+    assert "(6, 0) (6, 0) (6, 0) (6, 0)" in result.stdout.splitlines(), result.stderr
     measure(
         ["goal", "orca"],
         "circle",
@@ -609,19 +609,18 @@ def test_a_cluster_gives_the_same_rows(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
 def test_a_worker_lost_on_a_cluster_is_a_row(tmp_path: Path) -> None:
-    pytest.importorskip("ray")
     # Workers import the module by name, and with it the trouble.
     (tmp_path / "trouble.py").write_text(TROUBLE + "def hook(): pass\n")
     options = "num_cpus=2, log_to_driver=False, runtime_env={'worker_process_setup_hook': 'trouble.hook'}"
     start = f"import ray\nray.init(address='local', {options})\n"
-    body = start + EVALUATE.format(policies='"goal"', arguments='ray="auto", trial_timeout=5')
+    body = start + EVALUATE.format(policies='"goal"', arguments='ray="auto", trial_timeout=8')
     result = program(tmp_path, body)
     # Ray may have something to say before and after.
     assert "(6, 3) (6, 3)" in result.stdout.splitlines(), result.stderr
     errors = {row.seed: row.error for row in TrialStore(tmp_path / "out" / STORE).trials() if row.error}
     assert errors[1] == "RuntimeError: out of luck"
     assert errors[2].startswith("ChildProcessError: the worker was lost (WorkerCrashedError: ")
-    assert errors[3] == "TimeoutError: took longer than 5 s"
+    assert errors[3] == "TimeoutError: took longer than 8 s"
 
 
 @pytest.mark.parametrize(
@@ -633,7 +632,6 @@ def test_a_worker_lost_on_a_cluster_is_a_row(tmp_path: Path) -> None:
     ],
 )
 def test_an_unreachable_cluster_is_one_line(d4orm, address: str, message: str) -> None:
-    pytest.importorskip("ray")
     status, _, err = d4orm("evaluate", "-p", "goal", "-k", "2", "-n", "1", "--ray", address)
     assert (status, err.count("\n")) == (2, 1)
     assert message in err

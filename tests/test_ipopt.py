@@ -113,7 +113,7 @@ def test_the_motion_is_what_the_engine_rolls_out(model: str) -> None:
     problem = swap_problem((model, model))
     program = TeamProgram(problem, clearance=2e-3)
     still = Motion(np.repeat(problem.start[None].astype(float), 46, axis=0), np.zeros((45, 2, problem.control_size)))
-    motion, note = program.solve(still, {}, np.array([45, 45]), {"tol": 1e-3}, None)
+    motion, note = program.solve(still, {}, np.array([45, 45]), {"tol": 1e-3}, lambda: False)
     assert note == "Solve_Succeeded"
     rolled_out = get_engine("cpu").rollout(problem, motion.controls)
     moving = ~rolled_out.arrived
@@ -143,14 +143,6 @@ def test_the_same_seed_gives_the_same_plan() -> None:
     np.testing.assert_array_equal(first.controls, again.controls)
     other = assert_solves(swap_problem(), seed=4)
     assert not np.allclose(first.controls, other.controls, atol=1e-3)
-
-
-def test_the_time_limit_holds_within_an_iteration() -> None:
-    problem = make_problem("circle", num_robots=8)
-    plan = make_planner("ipopt", engine="cpu").solve(problem, time_limit=0.5)
-    assert plan.status == "time_limit"
-    assert plan.iterations == 1
-    assert plan.history[0].note == "Maximum_WallTime_Exceeded"
 
 
 def test_an_infeasible_problem_ends_cleanly() -> None:

@@ -204,6 +204,20 @@ def hold(monkeypatch: pytest.MonkeyPatch, node: int) -> threading.Event:
     return go
 
 
+def test_of_two_nodes_with_one_number_the_second_is_refused() -> None:
+    endpoint, problem, enough = free_endpoint(), walled_in_problem(), threading.Event()
+    zenoh = {"listen": [endpoint]}
+    first = Solve(problem, node=0, nodes=2, zenoh=zenoh, callback=lambda record: enough.is_set(), **WEAK)
+    wait_until(lambda: first.iterations > 0)
+    second = Solve(problem, node=0, nodes=2, zenoh={"connect": [endpoint]}, **WEAK)
+    with pytest.raises(ValueError, match=r"another process on the network is node 0 already; .* from 0 to 1"):
+        second.plan  # noqa: B018 - raises what the solve raised
+    before = first.iterations
+    wait_until(lambda: first.iterations > before, "the first one goes on")
+    enough.set()
+    assert first.plan.status == "stopped"
+
+
 @pytest.mark.parametrize("stalls", [True, False])
 def test_a_partition_that_heals(
     stalls: bool, tmp_path: Path, ends: list[ZenohTransport], monkeypatch: pytest.MonkeyPatch

@@ -144,13 +144,27 @@ def test_a_file_in_place_of_the_folder_is_reported_and_left_alone(plan: Plan, tm
     assert (tmp_path / "file").read_text() == "mine"
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write anywhere")
-def test_an_unwritable_folder_is_left_alone(plan: Plan, tmp_path: Path) -> None:
-    folder = tmp_path / "locked"
-    folder.mkdir(mode=0o500)
-    with pytest.raises(PermissionError):
-        plan.save(folder / "plan.npz")
-    assert not list(folder.iterdir())
+def test_an_unwritable_folder_is_left_alone(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def forbidden(path: Path, **_: Any) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    # Root, who may run this, can write anywhere.
+    monkeypatch.setattr(Path, "touch", forbidden)
+    with pytest.raises(PermissionError, match=f"cannot write to folder {tmp_path}: Permission denied"):
+        plan.save(tmp_path / "plan.npz")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_is_reported_with_the_name_of_the_file(
+    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    with pytest.raises(OSError, match=r"No space left on device: '.*plan\.npz'") as caught:
+        plan.save(tmp_path / "plan.npz")
+    assert caught.value.filename == str(tmp_path / "plan.npz")
 
 
 @pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()], ids=["full", "ctrl-c"])
@@ -234,7 +248,7 @@ def rewrite(path: Path, header: Any, arrays: dict[str, Any]) -> None:
     np.savez_compressed(path, header=np.array(json.dumps(header)), **arrays)
 
 
-@pytest.mark.parametrize("name", ["header", "controls", "extra"])
+@pytest.mark.parametrize("name", ["header", "controls"])
 def test_an_array_of_objects_is_refused_and_not_unpickled(saved: Path, name: str) -> None:
     header, arrays = contents(saved)
     witness = saved.with_name("witness")
@@ -242,6 +256,88 @@ def test_an_array_of_objects_is_refused_and_not_unpickled(saved: Path, name: str
     np.savez_compressed(saved, **members)
     refuse(saved, "allow_pickle=False")
     assert not witness.exists()
+
+
+def test_what_does_not_belong_there_is_not_unpacked(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    header, arrays = contents(saved)
+    unpacked: list[str] = []
+    open_member = zipfile.ZipFile.open
+
+    def recorded(archive: zipfile.ZipFile, member: Any, *rest: Any, **options: Any) -> Any:
+        unpacked.append(getattr(member, "filename", member))
+        return open_member(archive, member, *rest, **options)
+
+    monkeypatch.setattr("d4orm_planners.plan.HEADER_BYTES", 10**6)
+    large = {"extra": np.zeros(10**7), "controls": np.zeros(10**7), "header": np.array("0" * 10**6)}
+    for name, content in large.items():
+        np.savez_compressed(saved, **({"header": np.array(json.dumps(header)), **arrays} | {name: content}))
+        unpacked.clear()
+        with monkeypatch.context() as patch:
+            patch.setattr(zipfile.ZipFile, "open", recorded)
+            text = refuse(saved)
+        assert f"{name}.npy" not in unpacked
+        assert ("it holds" if name == "extra" else f"{name} does not fit") in text
+
+
+def test_what_is_there_twice_is_refused(saved: Path) -> None:
+    with zipfile.ZipFile(saved, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
+        archive.writestr("controls.npy", archive.read("controls.npy"))
+    refuse(saved, "it holds")
+
+
+# What a file claims.
+
+
+@pytest.fixture
+def solved(tmp_path: Path) -> tuple[Plan, Path]:
+    problem = hop_problem()
+    given = np.zeros((problem.horizon, 3, 2))
+    given[..., 0] = 1
+    plan = cheap_planner("d4orm").solve(problem, initial_controls=given)
+    assert plan.solved
+    assert plan.verified
+    path = tmp_path / "solved.npz"
+    plan.save(path)
+    return plan, path
+
+
+def test_a_solution_is_still_one_when_loaded(solved: tuple[Plan, Path]) -> None:
+    plan, path = solved
+    loaded = Plan.load(path)
+    assert_equal(plan, loaded)
+    assert loaded.verified
+
+
+@pytest.mark.parametrize("forged", ["beyond limits", "none", "one robot fewer"])
+def test_what_a_file_claims_of_its_controls_is_judged_anew(solved: tuple[Plan, Path], forged: str) -> None:
+    plan, path = solved
+    header, arrays = contents(path)
+    if forged == "beyond limits":
+        arrays["controls"][:] = -1e6
+    elif forged == "none":
+        arrays["controls"][:] = 0
+    else:
+        arrays["controls"][:, 1] = 0
+    rewrite(path, header, arrays)
+    loaded = Plan.load(path)
+    assert (loaded.solved, loaded.status) == (False, "refuted")
+    assert not loaded.verified
+    assert np.abs(loaded.controls).max() <= plan.problem.team.control_limits.max()
+    assert loaded.metrics["success"] == 0
+    assert len(loaded.failures) == (1 if forged == "one robot fewer" else 3)
+
+
+def test_a_trajectory_that_is_none_of_the_controls_does_not_count(solved: tuple[Plan, Path]) -> None:
+    plan, path = solved
+    header, arrays = contents(path)
+    arrays["arrived"][:] = False
+    arrays["states"][:] += 1
+    rewrite(path, header | {"metrics": header["metrics"] | {"travel_time": 0.1}}, arrays)
+    loaded = Plan.load(path)
+    assert loaded.solved
+    np.testing.assert_array_equal(loaded.trajectory.arrived, plan.trajectory.arrived)
+    np.testing.assert_allclose(loaded.trajectory.states, plan.trajectory.states, atol=1e-4)
+    assert loaded.metrics["travel_time"] == pytest.approx(plan.metrics["travel_time"])
 
 
 def test_a_plain_array_is_no_plan(tmp_path: Path) -> None:
@@ -278,6 +374,7 @@ def test_another_version_is_refused(saved: Path) -> None:
         lambda header: header.update(seed="0"),
         lambda header: header.update(solved="yes"),
         lambda header: header.update(metrics=[1, 2]),
+        lambda header: header["metrics"].update(reward="much"),
         lambda header: header.update(history=[{"iteration": 1}]),
         lambda header: header.update(history=4),
         lambda header: header["history"][0].update(surprise=1),
@@ -305,7 +402,7 @@ def test_an_array_that_does_not_fit_the_problem_is_refused(saved: Path, name: st
     header, arrays = contents(saved)
     for wrong in (arrays[name][:-1], arrays[name][:, :-1], arrays[name][None], arrays[name].astype(np.int32)):
         rewrite(saved, header, arrays | {name: wrong})
-        refuse(saved, f"{name} does not fit the problem")
+        refuse(saved, f"{name} does not fit")
     rewrite(saved, header, {key: value for key, value in arrays.items() if key != name})
     refuse(saved, name)
 

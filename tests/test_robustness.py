@@ -5,12 +5,15 @@ from __future__ import annotations
 import csv
 import multiprocessing
 import os
+import re
 import signal
 import sqlite3
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -116,6 +119,73 @@ def test_a_finished_trial_stays_and_a_failed_one_is_replaced(tmp_path: Path) -> 
     assert store.add(trial(1, error="boom"))
     assert store.add(trial(1))
     assert store.trials() == [trial(), trial(1)]
+
+
+def test_a_seed_that_the_store_has_no_room_for_is_refused(tmp_path: Path) -> None:
+    store = TrialStore(tmp_path / "trials.sqlite")
+    with pytest.raises(ValueError, match=f"seed is {2**63}; a store has room for seeds up to {2**63 - 1}"):
+        store.add(trial(0), trial(2**63))
+    assert store.trials() == []
+    assert store.add(trial(2**63 - 1))
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [
+        ("reward", "much"), ("robots", "many"), ("success", "yes"), ("seed", "first"), ("noise", "some"),
+        ("label", b"x"), ("history", "[[1"), ("history", "[1, 2]"), ("config", "none"), ("travel_time", "soon"),
+    ],
+)  # fmt: skip
+def test_what_does_not_belong_in_a_column_is_one_clear_error(tmp_path: Path, column: str, value: Any) -> None:
+    path = tmp_path / "trials.sqlite"
+    TrialStore(path).add(trial())
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute(f"UPDATE trials SET {column} = ?", (value,))
+    message = rf"trial store .*trials\.sqlite is damaged \(trial 0 has {re.escape(repr(value))} as {column}\)"
+    with pytest.raises(ValueError, match=message):
+        TrialStore.existing(path).trials()
+
+
+def test_a_damaged_file_is_called_damaged(tmp_path: Path) -> None:
+    path = tmp_path / "trials.sqlite"
+    TrialStore(path).add(*(trial(seed) for seed in range(200)))
+    content = bytearray(path.read_bytes())
+    content[4096:] = bytes(len(content) - 4096)
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"trial store .* is damaged \(database disk image is malformed\); put a copy"):
+        TrialStore.existing(path).trials()
+
+
+READ = """
+import os, sys
+from d4orm_planners.evaluation.store import TrialStore
+if os.geteuid() == 0:
+    os.setresuid(65534, 65534, 65534)
+try:
+    print(len(TrialStore.existing(sys.argv[1]).trials()))
+except OSError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="file modes of POSIX")
+@pytest.mark.parametrize("left_behind", [False, True])
+def test_a_store_that_cannot_be_written_to_can_be_read(left_behind: bool) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "trials.sqlite"
+        store = TrialStore(path)
+        store.add(trial(0), trial(1))
+        if left_behind:
+            Path(f"{path}-wal").write_bytes(b"not a log that could be read without writing")
+        os.chmod(folder, 0o555)
+        command = [sys.executable, "-c", READ, str(path)]
+        told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        os.chmod(folder, 0o755)
+    if left_behind:
+        assert "cannot be read: " in told
+        assert "; copy it with all files beside it to a folder that can be written to" in told
+    else:
+        assert told == "2\n"
 
 
 def fill(path: Path, first: int, last: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -123,6 +124,28 @@ def test_a_training_that_is_killed_goes_on(tmp_path: Path) -> None:
     assert [int(row["steps"]) for row in curve(tmp_path)] == [512 * (i + 1) for i in range(10)]
     assert (tmp_path / "curve.png").stat().st_size > 0
     assert list((tmp_path / "tensorboard").glob("events*"))
+
+
+@pytest.mark.parametrize("damage", ["extra", "large", "cut", "state"])
+def test_a_damaged_checkpoint_is_one_clear_error(
+    trained: tuple[TrainingSettings, Path], tmp_path: Path, damage: str
+) -> None:
+    settings, straight = trained
+    shutil.copytree(straight, tmp_path / "out")
+    first, last = sorted((tmp_path / "out" / "checkpoints").iterdir())
+    shutil.rmtree(last)
+    with np.load(first / "state.npz", allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    if damage in ("extra", "large"):
+        name = "extra" if damage == "extra" else "observation_mean"
+        np.savez(first / "state.npz", **(arrays | {name: np.zeros(10**5)}))
+    elif damage == "cut":
+        (first / "state.npz").write_bytes((first / "state.npz").read_bytes()[:200])
+    else:
+        (first / "state.json").write_text("{}")
+    text = {"extra": "it holds", "large": "observation_mean does not fit", "cut": "zip file", "state": "evaluations"}
+    with pytest.raises(ValueError, match=rf"checkpoint .*{first.name} cannot be read \(.*{text[damage]}.*; remove it"):
+        train(settings, tmp_path / "out", command="d4orm train ...")
 
 
 def test_a_trained_policy_acts_as_its_model_does(trained: tuple[TrainingSettings, Path]) -> None:

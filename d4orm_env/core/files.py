@@ -19,7 +19,8 @@ def replaced_when_done(path: Path, suffixes: tuple[str, ...] = ()) -> Iterator[P
 
     Raises:
         ValueError: If ``path`` does not end in one of the suffixes.
-        OSError: If the folder does not exist or cannot be written to, or ``path`` is a folder.
+        OSError: If the folder does not exist or cannot be written to, or ``path`` is a folder. An error while writing
+            names ``path``.
     """
     if suffixes and path.suffix.lower() not in suffixes:
         raise ValueError(f"{path} ends in {path.suffix!r}; choose one of {', '.join(suffixes)}")
@@ -35,5 +36,10 @@ def replaced_when_done(path: Path, suffixes: tuple[str, ...] = ()) -> Iterator[P
             raise type(error)(f"cannot write to folder {path.parent}: {error.strerror}") from error
         yield temporary
         temporary.replace(path)
+    except OSError as error:
+        # A full disk names no file, and others the temporary one.
+        if error.errno is not None and error.filename in (None, str(temporary), temporary):
+            error.filename = str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)

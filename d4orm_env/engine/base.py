@@ -111,7 +111,7 @@ class SamplingResult(NamedTuple):
 
     Attributes:
         mean: ``(H, K, m)`` the last weighted mean of the deformations.
-        rewards: ``(N,)`` mean reward of the samples at each step.
+        rewards: ``(N,)`` mean reward of the samples at each step done: fewer than asked for where the run was stopped.
         excluded: Samples left out because their reward was not finite.
     """
 
@@ -148,12 +148,14 @@ class Engine(Protocol):
         noise_scale: FloatArray,
         num_samples: int,
         seed: int,
+        should_stop: Callable[[], bool] | None = None,
     ) -> SamplingResult:
         """Run ``len(noise_scale)`` sample-score-update steps (paper, Algorithm 1, lines 2 to 7).
 
         Each step draws ``num_samples`` deformations around ``mean`` ``(H, K, m)`` with the step's standard deviation,
         rolls them out on top of ``task.base``, and replaces the mean by the weighted mean of the deformations.
-        The noise is a function of ``seed`` and the step alone.
+        The noise is a function of ``seed`` and the step alone. Between steps ``should_stop`` is asked whether to leave
+        the rest out; the result is then that of the steps done.
         """
         ...
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -156,13 +157,17 @@ class CpuEngine:
         noise_scale: FloatArray,
         num_samples: int,
         seed: int,
+        should_stop: Callable[[], bool] | None = None,
     ) -> SamplingResult:
         """See :meth:`d4orm_env.engine.base.Engine.denoise`."""
         run = _Sampling(task, rules, num_samples, seed, self._threads)
         factor = np.ones_like(task.base)
         mean_rewards = np.empty(len(noise_scale), np.float32)
-        excluded = 0
+        done = excluded = 0
         for step, sigma in enumerate(noise_scale):
+            if should_stop is not None and should_stop():
+                break
+            done = step + 1
             scale = factor * sigma
             rewards = run.score(step, mean, scale)
             mean_rewards[step] = rewards.mean()
@@ -178,7 +183,7 @@ class CpuEngine:
             if rules.adapt is not None:
                 # The square deviation of the samples from their new mean.
                 factor = rules.adapt(scale**2 * (second - first**2), np).astype(np.float32)
-        return SamplingResult(mean, mean_rewards, excluded)
+        return SamplingResult(mean, mean_rewards[:done], excluded)
 
 
 class _Sampling:

@@ -1,11 +1,13 @@
 """The JAX engine: the same physics as pure array functions, for GPUs and TPUs, and for those who jit, vmap and grad.
 
 Arrays keep the samples on the last axis, ``(K, component, S)``, as on the CPU engine. A whole denoising run is one
-compiled scan; nothing returns to the host before it ends.
+compiled loop; nothing returns to the host before it ends, or before the next look at whether it is to be stopped.
 """
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -27,6 +29,9 @@ from d4orm_env.engine.base import (
     StepResult,
     checked_controls,
 )
+
+LOOK = 0.03
+"""Seconds between looks at whether a run is to be stopped, if that is more than a step; at most twice as many."""
 
 OPS = Ops(jnp.cos, jnp.sin, jnp.sqrt, jnp.minimum, jnp.maximum, jnp.arctan2, jnp.where)
 BIT_OPS = noise.BitOps(
@@ -229,11 +234,21 @@ def _score(static: _Static, inputs: _Inputs, step: Any, mean: Any, scale: Any) -
     return total / len(mean), deformations
 
 
-def _denoise(static: _Static, inputs: _Inputs, mean: Any, noise_scale: Any) -> Any:
-    def update(carry: Any, xs: Any) -> Any:
-        mean, factor = carry
-        step, sigma = xs
-        rewards, deformations = _score(static, inputs, step, mean, factor * sigma)
+class _Run(NamedTuple):
+    """A denoising run on its way: means, factors on the schedule, rewards ``(N,)`` so far, samples left out."""
+
+    mean: Any
+    factor: Any
+    rewards: Any
+    excluded: Any
+
+
+def _denoise(static: _Static, inputs: _Inputs, noise_scale: Any, run: _Run, begin: Any, end: Any) -> _Run:
+    """The steps from ``begin`` to before ``end``; both are arguments, so that one compilation serves all parts."""
+
+    def update(step: Any, run: _Run) -> _Run:
+        mean, factor, sigma = run.mean, run.factor, noise_scale[step]
+        rewards, deformations = _score(static, inputs, step.astype(jnp.uint32), mean, factor * sigma)
         if static.credit == "team":
             rewards = rewards.mean(axis=0, keepdims=True)
         finite = jnp.isfinite(rewards)
@@ -254,11 +269,9 @@ def _denoise(static: _Static, inputs: _Inputs, mean: Any, noise_scale: Any) -> A
             deviation2 = jnp.einsum("tkms,ks->tkm", (usable - new_mean[..., None]) ** 2, weights)
             factor = static.rules.adapt(deviation2, jnp)
         average = jnp.where(finite, rewards, 0).sum() / jnp.maximum(finite.sum(), 1)
-        return (new_mean, factor), (average, (~finite).sum())
+        return _Run(new_mean, factor, run.rewards.at[step].set(average), run.excluded + (~finite).sum())
 
-    steps = jnp.arange(len(noise_scale), dtype=jnp.uint32)
-    (mean, _), (rewards, excluded) = jax.lax.scan(update, (mean, jnp.ones_like(mean)), (steps, noise_scale))
-    return mean, rewards, excluded.sum()
+    return jax.lax.fori_loop(begin, end, update, run)
 
 
 @lru_cache(maxsize=256)
@@ -323,7 +336,9 @@ class JaxEngine:
         docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
         inputs = _Inputs(task.arrays, task.base, docked, task.moving, np.float32(task.penalty), noise.seed_words(seed))
         static = _Static(problem.team.models, rules, num_samples, task.collisions, task.credit)
-        arguments = jax.tree.map(jnp.asarray, (inputs, mean, np.asarray(noise_scale, np.float32)))
+        scale = np.asarray(noise_scale, np.float32)
+        run = _Run(mean, np.ones_like(mean), np.zeros_like(scale), np.int32(0))
+        arguments = jax.tree.map(jnp.asarray, (inputs, scale, run, np.int32(0), np.int32(len(scale))))
         leaves, treedef = jax.tree.flatten(arguments)
         return _compiled_denoise(static, treedef, tuple((leaf.shape, leaf.dtype) for leaf in leaves)), arguments
 
@@ -339,8 +354,16 @@ class JaxEngine:
         noise_scale: FloatArray,
         num_samples: int,
         seed: int,
+        should_stop: Callable[[], bool] | None = None,
     ) -> SamplingResult:
         """See :meth:`d4orm_env.engine.base.Engine.denoise`."""
-        compiled, arguments = self._lower(task, rules, mean, noise_scale, num_samples, seed)
-        mean, rewards, excluded = compiled(*arguments)
-        return SamplingResult(np.asarray(mean), np.asarray(rewards), int(excluded))
+        compiled, (inputs, scale, run, *_) = self._lower(task, rules, mean, noise_scale, num_samples, seed)
+        done, total = 0, len(noise_scale)
+        part = total if should_stop is None else 1
+        while done < total and not (should_stop is not None and should_stop()):
+            start, first = time.perf_counter(), done
+            done = min(done + part, total)
+            run = jax.block_until_ready(compiled(inputs, scale, run, jnp.int32(first), jnp.int32(done)))
+            if time.perf_counter() - start < LOOK:
+                part *= 2
+        return SamplingResult(np.asarray(run.mean), np.asarray(run.rewards)[:done], int(run.excluded))

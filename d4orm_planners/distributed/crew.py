@@ -104,6 +104,9 @@ class Crew(ABC):
                 return None
             return search.time_limit - search.watch.elapsed + compiling()
 
+        left = time_left()
+        for node in self.alive:
+            node.search.time_limit = None if left is None else node.search.watch.elapsed + left
         candidates = self._round(time_left, search.planner.config.improve)
         search.watch.leave_out(compiling())
         if not candidates and not self.alive:
@@ -197,8 +200,10 @@ class SyncCrew(Crew):
         """See :meth:`Crew._round`."""
         self._all(Node.refine, time_left)
         candidates = [node.candidate for node in self.alive]
-        # Judging what others claim to be solutions takes its time, and after the first one nobody goes on from it.
-        if improve or not any(candidate.solved for candidate in candidates):
+        # Judging what others claim to be solutions takes its time, and after the last round nobody goes on from it.
+        left = time_left()
+        in_time = left is None or left > 0
+        if in_time and (improve or not any(candidate.solved for candidate in candidates)):
             self._all(Node.exchange, time_left)
         return candidates
 

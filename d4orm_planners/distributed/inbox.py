@@ -44,6 +44,7 @@ class Inbox:
         newest: The newest report of every node heard from, by node.
         dropped: How many messages were dropped, by :data:`~d4orm_planners.distributed.messages.KINDS`.
         false_claims: Candidates that were not what their sender claimed. They count for what they are.
+        namesake: The number of the last candidate that another node told under this one's own number, or ``None``.
     """
 
     def __init__(
@@ -64,6 +65,7 @@ class Inbox:
         # All kinds from the beginning: other threads look at it, which a growing dictionary does not bear.
         self.dropped: Counter[str] = Counter(dict.fromkeys(KINDS, 0))
         self.false_claims = 0
+        self.namesake: int | None = None
 
     def receive(self, timeout: float = 0.0) -> list[Report]:
         """The new reports among what has arrived, by node; waits up to ``timeout`` [s] if nothing has."""
@@ -85,6 +87,7 @@ class Inbox:
     def _decoded(self, data: bytes) -> Message:
         message = decode(data, self._problem, self._num_nodes)
         if message.node == self._own:
+            self.namesake = message.sequence
             raise MessageError("node", f"claims to be from node {message.node}, which has received it")
         return message
 

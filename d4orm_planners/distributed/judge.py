@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import threading
 from dataclasses import replace
-from typing import Any
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.base import Engine, SamplingResult, SamplingRules, SamplingTask
+from d4orm_env.engine.base import Engine
 from d4orm_planners.base import Candidate, Iteration, Planner, Search, evaluate_controls
 
 
@@ -57,34 +56,6 @@ class Judge:
     def received(self, controls: FloatArray) -> Candidate:
         """Judge what has arrived; the very controls that a node of this process has made are known already."""
         return self._known.get(controls.tobytes()) or evaluate_controls(self._engine, self._problem, controls)
-
-
-class StoppableEngine:
-    """An engine that leaves a denoising run when told to; one that compiles the whole run does so after it."""
-
-    def __init__(self, engine: Engine, stop: threading.Event) -> None:
-        self._engine, self._stop = engine, stop
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._engine, name)
-
-    def denoise(self, task: SamplingTask, rules: SamplingRules, *rest: Any) -> SamplingResult:
-        """See :meth:`d4orm_env.engine.base.Engine.denoise`.
-
-        Raises:
-            Stopped: If told to stop.
-        """
-        if self._engine.name == "cpu":
-            rules = rules._replace(weights=self._checked(rules.weights))
-        return self._engine.denoise(task, rules, *rest)
-
-    def _checked(self, weights: Any) -> Any:
-        def checked(*arguments: Any) -> Any:
-            if self._stop.is_set():
-                raise Stopped
-            return weights(*arguments)
-
-        return checked
 
 
 class JudgedPlanner(Planner):

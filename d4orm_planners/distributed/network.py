@@ -51,6 +51,7 @@ class NetworkCrew(SyncCrew):
         left = time_left()
         patience = self.patience if left is None else min(self.patience, max(left, 0.0))
         self._all(lambda node: node.step(self._judge.stop, patience, improve), time_left)
+        self._node.check_number()
         if not self.alive:
             # What others have sent is not lost with the planner here.
             self._node.settle(0.0)

@@ -5,24 +5,21 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.engine.base import Engine
 from d4orm_planners.base import Candidate, Planner, Search
 from d4orm_planners.distributed.events import Event, Observer
 from d4orm_planners.distributed.inbox import TOLERANCE, Inbox
-from d4orm_planners.distributed.judge import Judge, JudgedPlanner, StoppableEngine
+from d4orm_planners.distributed.judge import Judge, JudgedPlanner
 from d4orm_planners.distributed.messages import Message, encode
 from d4orm_planners.distributed.meter import Meter
 from d4orm_planners.distributed.selection import choose
 from d4orm_planners.distributed.transport import Transport
-
-CHOICE = 10**6
-"""The stream of random numbers that a node chooses with; planners use lower ones."""
 
 RETELL = 0.2
 """Seconds after which a candidate is told again, as messages may get lost."""
@@ -38,9 +35,7 @@ class Selection:
 
 def node_seed(seed: int, node: int) -> int:
     """The seed of a node; the first one's is the solve's own, so that a single node is the planner that it runs."""
-    if node == 0:
-        return seed
-    return int(np.random.SeedSequence([seed, node]).generate_state(1, np.uint64)[0])
+    return seed if node == 0 else derived_seed(seed, Stream.NODE, node)
 
 
 class Node:
@@ -56,7 +51,8 @@ class Node:
         engine: What rolls out and samples.
         transport: Its access to the others.
         selection: How it chooses what to go on from.
-        told: What it begins to number its messages after; more than it had told before, if it did.
+        told: What it begins to number its messages after; more than it had told before, if it did, and on a network the
+            time at which it began, by which two nodes of one number tell who was first.
         observer: Called with every :class:`~d4orm_planners.distributed.events.Event`, in the node's own thread.
 
     Attributes:
@@ -85,14 +81,14 @@ class Node:
     ) -> None:
         self.number = number
         judge = judge or Judge(engine, problem)
-        stoppable: Any = StoppableEngine(engine, judge.stop)
-        self.search = Search(JudgedPlanner(planner, judge), problem, node_seed(seed, number), controls, stoppable)
+        self.search = Search(JudgedPlanner(planner, judge), problem, node_seed(seed, number), controls, engine)
+        self.search.cancelled = judge.stop
         self.candidate = self.search.current
         self.transport = Meter(transport)
         self.inbox = Inbox(problem, engine, self.transport, num_nodes, number, judge)
         self.excluded = 0
         self._selection = selection
-        self._told = told
+        self._told = self._began = told
         self._observer = observer
         self._others = set(range(num_nodes)) - {number}
         self._awaited = self._others
@@ -121,13 +117,23 @@ class Node:
     def step(self, stop: threading.Event, patience: float, improve: bool) -> bool:
         """One round of :meth:`run`; whether there is to be another one."""
         self.refine()
-        if stop.is_set() or (self.search.best.solved and not improve):
+        if stop.is_set() or self.search.time_left == 0 or (self.search.best.solved and not improve):
             return False
         self._await_others(stop, patience)
         if self.search.best.solved and not improve:
             return False
         self._choose()
         return True
+
+    def check_number(self) -> None:
+        """Raise ``ValueError`` if another node has this one's number, and had it first."""
+        namesake = self.inbox.namesake
+        if namesake is not None and namesake <= self._began:
+            last = len(self._others)
+            raise ValueError(
+                f"node is {self.number}, and another process on the network is node {self.number} already; give each "
+                f"a number of its own, from 0 to {last}"
+            )
 
     def settle(self, seconds: float) -> bool:
         """Tell the best candidate again and again, until all others have one as good or the seconds are over.
@@ -207,7 +213,7 @@ class Node:
             [candidate.trajectory.rewards.mean() for candidate in candidates],
             np.stack([candidate.controls for candidate in candidates]),
             self._selection.k,
-            np.random.default_rng(self.search.iteration_seed(CHOICE)),
+            np.random.default_rng(self.search.iteration_seed(Stream.CHOICE)),
         )
         self.search.current = candidates[chosen]
         self._note("selected", nodes[chosen], *received[nodes[chosen]])

@@ -68,15 +68,17 @@ class Worker:
         Search(type(planner)(replace(config, **short)), self._search.problem, 0, None, self._engine).advance()
         return os.getpid()
 
-    def advance(self, iteration: int, data: bytes) -> Outcome:
+    def advance(self, iteration: int, data: bytes, time_left: float | None) -> Outcome:
         """One iteration.
 
         Args:
             iteration: Those done so far. It is all that a worker must know of the past, so that a new one can take the
                 place of one that was lost.
             data: The candidate to go on from, a message.
+            time_left: Seconds that it may take, compilation not counted, or ``None``.
         """
         search = self._search
+        search.time_limit = None if time_left is None else search.watch.elapsed + time_left
         controls = decode(data, search.problem, self._num_nodes).controls
         search.iteration = iteration
         search.current = evaluate_controls(self._engine, search.problem, controls)
@@ -124,7 +126,7 @@ class RayPlanner(Planner):
     def iterate(self, search: Search) -> Iteration:
         """See :meth:`Planner.iterate`."""
         with self._calling:
-            outcome = self._outcome(search.iteration, _message(self._node, search))
+            outcome = self._outcome(search.iteration, _message(self._node, search), search.time_left)
         search.watch.leave_out(outcome.compiling)
         note = "" if outcome.process == self.process else f"the actor of node {self._node} was lost and restarted"
         self.process = outcome.process
@@ -140,11 +142,11 @@ class RayPlanner(Planner):
         with self._calling:
             pass
 
-    def _outcome(self, iteration: int, data: bytes) -> Outcome:
+    def _outcome(self, iteration: int, data: bytes, time_left: float | None) -> Outcome:
         if self._closed.is_set():
             raise ChildProcessError("its actor has been ended")
         try:
-            call = self._actor.advance.remote(iteration, data)
+            call = self._actor.advance.remote(iteration, data, time_left)
             # An actor whose machine cannot be reached may not be seen to end for long.
             while not self._ray.wait([call], timeout=GLANCE)[0]:
                 if self._closed.is_set():

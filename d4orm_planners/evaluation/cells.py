@@ -10,6 +10,7 @@ from typing import Any
 from d4orm_env.core.arrays import positive_number, shown, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios import load_problem, make_problem
+from d4orm_planners.evaluation.store import LARGEST_NUMBER
 from d4orm_planners.evaluation.trials import Configuration
 from d4orm_planners.registry import PLANNERS, list_policies, make_policy
 
@@ -112,14 +113,21 @@ def checked_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
     """Seeds, each once.
 
     Raises:
-        ValueError: If there are none, or they are no whole numbers from 0 up.
+        ValueError: If there are none, or they are no whole numbers from 0 to what a store has room for.
     """
     if not isinstance(seeds, Iterable):
         raise ValueError(f"seeds is {seeds!r}; give the seeds themselves, as range(50)")
-    checked = tuple(dict.fromkeys(whole_number(seed, "seed", 0) for seed in seeds))
+    checked = tuple(dict.fromkeys(_checked_seed(seed) for seed in seeds))
     if not checked:
         raise ValueError("seeds is empty; give at least one")
     return checked
+
+
+def _checked_seed(value: Any) -> int:
+    seed = whole_number(value, "seed", 0)
+    if seed > LARGEST_NUMBER:
+        raise ValueError(f"seed is {seed}; a store of trials has room for seeds up to {LARGEST_NUMBER}")
+    return seed
 
 
 def several(values: Any) -> tuple[Any, ...]:

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sqlite3
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import astuple, dataclass, fields
+from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 APPLICATION_ID = 0x64346F72
 """Marks the file as one of ours, in its header ("d4or")."""
 VERSION = 4
 STORE = "trials.sqlite"
 """Name of the file in a folder of results."""
+LARGEST_NUMBER = 2**63 - 1
+"""That a whole number in it can be, seeds among them."""
 PATIENCE = 60.0
 """Seconds to wait for another writer."""
 
@@ -122,6 +126,18 @@ class Trial:
 _NAMES = tuple(field.name for field in fields(Trial))
 _KEY = ", ".join(TrialKey._fields)
 _TRUTHS = ("success", "verified")
+_JSON = {"config": dict, "versions": dict, "machine": dict, "history": list}
+_PYTHON: Mapping[str, tuple[type, ...]] = {
+    "str": (str,),
+    "int": (int,),
+    "float": (float, int),
+    "bool": (int,),
+    "None": (type(None),),
+}
+_KINDS = {
+    field.name: tuple(chain(*(_PYTHON[kind] for kind in str(field.type).split(" | ")))) for field in fields(Trial)
+}
+"""What may be in a row, by column."""
 _CREATE = f"""
 CREATE TABLE trials (
     policy TEXT NOT NULL, config TEXT NOT NULL, problem TEXT NOT NULL, noise REAL NOT NULL, seed INTEGER NOT NULL,
@@ -150,21 +166,26 @@ class TrialStore:
 
     Args:
         path: The file.
+        read_only: Leave it as it is, which must be there then; its folder need not be writable.
 
     Raises:
         ValueError: If the file is something else, or of another version.
         OSError: If it cannot be opened or written to.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], *, read_only: bool = False) -> None:
         self.path = Path(path)
+        self._read_only = read_only
         with self._connection() as connection:
+            if not read_only:
+                self._make(connection)
             self._check(connection)
-            _use_wal(connection)
+            if not read_only:
+                _use_wal(connection)
 
     @classmethod
     def existing(cls, path: str | os.PathLike[str]) -> TrialStore:
-        """The store in a file, or in a folder under its usual name, which must be there.
+        """The store in a file, or in a folder under its usual name, which must be there; to read only.
 
         Raises:
             FileNotFoundError: If there is none.
@@ -173,17 +194,25 @@ class TrialStore:
         file = Path(path) / STORE if Path(path).is_dir() else Path(path)
         if not file.is_file():
             raise FileNotFoundError(f"there is no store of trials at {file}; `d4orm evaluate` makes one")
-        return cls(file)
+        return cls(file, read_only=True)
 
     def add(self, *trials: Trial) -> int:
         """Store trials, durably and at once: all of them or, after an error, none.
 
         Returns:
             How many were new, or took the place of one that had failed; a finished trial is never overwritten.
+
+        Raises:
+            ValueError: If a number is too large for the store.
+            OSError: If it cannot be written to.
         """
         with self._connection() as connection:
             connection.execute("BEGIN IMMEDIATE")
-            added = connection.executemany(_ADD, [astuple(trial) for trial in trials]).rowcount
+            try:
+                added = connection.executemany(_ADD, [astuple(trial) for trial in trials]).rowcount
+            except OverflowError as error:
+                largest = max(trial.seed for trial in trials)
+                raise ValueError(f"seed is {largest}; a store has room for seeds up to {LARGEST_NUMBER}") from error
             connection.execute("COMMIT")
         return int(added)
 
@@ -191,13 +220,16 @@ class TrialStore:
         """All trials, in order of key."""
         with self._connection() as connection:
             rows = connection.execute(f"SELECT {', '.join(_NAMES)} FROM trials ORDER BY {_KEY}").fetchall()
-        trials = []
-        for row in rows:
-            values = dict(zip(_NAMES, row))
-            for name in _TRUTHS:  # SQLite keeps truth values as numbers
-                values[name] = None if values[name] is None else bool(values[name])
-            trials.append(Trial(**values))
-        return trials
+        return [self._trial(number, dict(zip(_NAMES, row))) for number, row in enumerate(rows)]
+
+    def _trial(self, number: int, values: dict[str, Any]) -> Trial:
+        """A row as a trial. SQLite keeps truth values as numbers, and whatever it is given in any column."""
+        for name, kinds in _KINDS.items():
+            if not isinstance(values[name], kinds) or (name in _JSON and not _is_json(values[name], _JSON[name])):
+                raise self._damaged(f"trial {number} has {values[name]!r} as {name}")
+        for name in _TRUTHS:
+            values[name] = None if values[name] is None else bool(values[name])
+        return Trial(**values)
 
     def finished(self) -> set[TrialKey]:
         """Keys of all trials that ran to their end."""
@@ -207,17 +239,30 @@ class TrialStore:
     @contextmanager
     def _connection(self) -> Iterator[sqlite3.Connection]:
         try:
-            with closing(sqlite3.connect(self.path, timeout=PATIENCE, isolation_level=None)) as connection:
+            with closing(self._opened()) as connection:
                 yield connection
         except sqlite3.OperationalError as error:
-            raise OSError(
-                f"trial store {self.path} cannot be used: {error}; free some space or choose another folder"
-            ) from error
+            action, remedy = (
+                ("read", "copy it with all files beside it to a folder that can be written to")
+                if self._read_only
+                else ("used", "free some space or choose another folder")
+            )
+            raise OSError(f"trial store {self.path} cannot be {action}: {error}; {remedy}") from error
         except sqlite3.DatabaseError as error:
-            raise self._foreign(str(error)) from error
+            if error.sqlite_errorcode == sqlite3.SQLITE_NOTADB:
+                raise self._foreign(str(error)) from error
+            raise self._damaged(str(error)) from error
 
-    def _check(self, connection: sqlite3.Connection) -> None:
-        """Make the table in a new file; refuse a file of another kind or version, which stays untouched."""
+    def _opened(self) -> sqlite3.Connection:
+        name = self.path.absolute().as_uri()
+        log = self.path.with_name(f"{self.path.name}-wal")
+        if self._read_only and not os.access(self.path.parent, os.W_OK) and not (log.exists() and log.stat().st_size):
+            # SQLite cannot make the files that it keeps beside the store, and no writer has left anything in them.
+            name += "?mode=ro&immutable=1"
+        return sqlite3.connect(name, uri=True, timeout=PATIENCE, isolation_level=None)
+
+    def _make(self, connection: sqlite3.Connection) -> None:
+        """Make the table in a new file."""
         if _pragma(connection, "application_id") != APPLICATION_ID:
             # One transaction, so that of two processes that find no file one makes the table.
             connection.execute("BEGIN IMMEDIATE")
@@ -226,6 +271,9 @@ class TrialStore:
                 connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
                 connection.execute(f"PRAGMA user_version = {VERSION}")
             connection.execute("COMMIT")
+
+    def _check(self, connection: sqlite3.Connection) -> None:
+        """Refuse a file of another kind or version, which stays untouched."""
         if _pragma(connection, "application_id") != APPLICATION_ID:
             raise self._foreign("it is another program's database")
         if (version := _pragma(connection, "user_version")) != VERSION:
@@ -233,6 +281,11 @@ class TrialStore:
 
     def _foreign(self, reason: str) -> ValueError:
         return ValueError(f"{self.path} is no store of trials ({reason}); choose another folder or remove it")
+
+    def _damaged(self, reason: str) -> ValueError:
+        return ValueError(
+            f"trial store {self.path} is damaged ({reason}); put a copy in its place, or move it away to begin anew"
+        )
 
 
 def _use_wal(connection: sqlite3.Connection) -> None:
@@ -247,6 +300,17 @@ def _use_wal(connection: sqlite3.Connection) -> None:
             if error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY or time.monotonic() > deadline:
                 raise
             time.sleep(0.01)
+
+
+def _is_json(text: str, kind: type) -> bool:
+    """Whether a text is JSON of this kind; a list must be one of lists of three, as a history is."""
+    try:
+        content = json.loads(text)
+    except ValueError:
+        return False
+    if kind is list and isinstance(content, list):
+        return all(isinstance(entry, list) and len(entry) == 3 for entry in content)
+    return isinstance(content, kind)
 
 
 def _pragma(connection: sqlite3.Connection, name: str) -> int:

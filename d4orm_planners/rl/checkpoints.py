@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 from stable_baselines3.common.save_util import load_from_zip_file, recursive_setattr
 from stable_baselines3.common.vec_env import VecNormalize
 
+from d4orm_env.core.archives import ArrayArchive
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.rl.curve import Evaluation
 from d4orm_planners.rl.network import SUFFIX, Network, load_network
@@ -101,26 +103,54 @@ class Checkpoint:
 
     @classmethod
     def read(cls, folder: Path) -> Checkpoint:
-        """Read what is small."""
-        state = json.loads((folder / "state.json").read_text())
-        return cls(folder, [Evaluation(**evaluation) for evaluation in state["evaluations"]])
+        """Read what is small.
 
-    def restore(self, env: VecNormalize, model: Any | None) -> None:
-        """Put a new environment, and a new model if one is given, into the checkpoint's state."""
-        with np.load(self.folder / "state.npz", allow_pickle=False) as numbers:
-            for name, running in _running(env).items():
-                running.mean, running.var = numbers[f"{name}_mean"], numbers[f"{name}_var"]
-                running.count = float(numbers[f"{name}_count"])
-            if model is None:
-                return
-            for name in _COUNTERS:
-                setattr(model, name, int(numbers[name]))
-            buffer = getattr(model, "replay_buffer", None)
-            if buffer is not None:
-                for name in _REPLAY:
-                    filled = numbers[f"replay_{name}"]
-                    getattr(buffer, name)[: len(filled)] = filled
-                buffer.pos, buffer.full = int(numbers["replay_pos"]), bool(numbers["replay_full"])
+        Raises:
+            ValueError: If it cannot be read.
+        """
+        with _readable(folder):
+            state = json.loads((folder / "state.json").read_text())
+            return cls(folder, [Evaluation(**evaluation) for evaluation in state["evaluations"]])
+
+    def restore(self, env: VecNormalize, model: Any, fresh: bool) -> None:
+        """Put a new environment, and the model if it is fresh, into the checkpoint's state.
+
+        Raises:
+            ValueError: If it cannot be read, or has numbers of other shapes.
+        """
+        with _readable(self.folder):
+            numbers = self._numbers(model, env, fresh)
+        for name, running in _running(env).items():
+            running.mean, running.var = numbers[f"{name}_mean"], numbers[f"{name}_var"]
+            running.count = float(numbers[f"{name}_count"])
+        if not fresh:
+            return
+        for name in _COUNTERS:
+            setattr(model, name, int(numbers[name]))
+        buffer = getattr(model, "replay_buffer", None)
+        if buffer is not None:
+            for name in _REPLAY:
+                filled = numbers[f"replay_{name}"]
+                getattr(buffer, name)[: len(filled)] = filled
+            buffer.pos, buffer.full = int(numbers["replay_pos"]), bool(numbers["replay_full"])
+        with _readable(self.folder):
+            self._set_parameters(model)
+
+    def _numbers(self, model: Any, env: VecNormalize, fresh: bool) -> dict[str, Any]:
+        """The arrays of ``state.npz`` that are wanted, none larger than the model and the environment have room for."""
+        room = _room(model, env)
+        numbers = {}
+        with (self.folder / "state.npz").open("rb") as stream, ArrayArchive(stream, room) as archive:
+            for name, place in room.items():
+                if not (fresh or name.startswith(tuple(f"{running}_" for running in _running(env)))):
+                    continue
+                numbers[name] = array = archive.array(name, place.nbytes)
+                same = array.shape[1:] == place.shape[1:] and array.ndim == place.ndim and array.dtype == place.dtype
+                if not same or (not name.startswith("replay_") and array.shape != place.shape):
+                    raise ValueError(f"{name} is {array.dtype} {array.shape}, not {place.dtype} {place.shape}")
+        return numbers
+
+    def _set_parameters(self, model: Any) -> None:
         _, parameters, variables = load_from_zip_file(self.folder / "model.zip", device="cpu", load_data=False)
         model.set_parameters(parameters, device="cpu")
         for name, value in (variables or {}).items():
@@ -130,6 +160,25 @@ class Checkpoint:
 def _running(env: VecNormalize) -> dict[str, Any]:
     """The running statistics by name."""
     return {"observation": env.obs_rms, "reward": env.ret_rms}
+
+
+@contextmanager
+def _readable(folder: Path) -> Iterator[None]:
+    """Say of whatever goes wrong with a checkpoint what it is and what to do."""
+    try:
+        yield
+    except Exception as error:  # a damaged archive makes zipfile, NumPy and torch raise errors of a dozen kinds
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        raise ValueError(
+            f"checkpoint {folder} cannot be read ({reason}); remove it to go on from the one before"
+        ) from error
+
+
+def _room(model: Any, env: VecNormalize) -> dict[str, Any]:
+    """Arrays like those of :func:`_numbers`, those of the replay buffer as when it is full."""
+    room = _numbers(model, env)
+    buffer = getattr(model, "replay_buffer", None)
+    return room if buffer is None else room | {f"replay_{name}": getattr(buffer, name) for name in _REPLAY}
 
 
 def _numbers(model: Any, env: VecNormalize) -> dict[str, Any]:

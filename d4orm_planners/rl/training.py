@@ -20,6 +20,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
+from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.scenarios import make_problem
 from d4orm_env.scenarios.registry import unknown_argument
 from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm
@@ -32,15 +33,13 @@ from d4orm_planners.settings import Count, Settings, Whole, one_of
 
 Progress = Callable[[str, int, int], Any]
 _VALIDATION_SEED = 0
+"""Worlds are seeded one by one from here in validation, and in training from numbers of 64 random bits."""
 _INSTANCES = 256
 """Drawn for each lesson, at most."""
-_TRAINING_SEED = 1_000_000
-"""Worlds are seeded one by one from these; a million apart, no instance is seen in training and in validation."""
 
 Many = Annotated[Count, Field(le=100_000)]
 """Robots or worlds that act at once: beyond, their observations would fill the memory."""
-Seed = Annotated[Whole, Field(ge=0, le=4000)]
-"""A million worlds further on each, it must stay below 2**32, where NumPy's seeds end."""
+Seed = Annotated[Whole, Field(ge=0)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,11 +157,10 @@ class _Run:
         begin, lesson = time.perf_counter(), self.lessons[index]
         done = sum(earlier.steps for earlier in self.lessons[:index])
         self._progress(_describe(lesson, self.evaluations), done, self._total)
-        seed = _TRAINING_SEED * (self.settings.seed + 1) + index * self.settings.batch
-        robots = self._worlds(lesson, seed)
+        robots = self._worlds(lesson, derived_seed(self.settings.seed, Stream.TRAINING_WORLDS, index))
         normalized = VecNormalize(robots, clip_obs=CLIP, gamma=self._algorithm.gamma, epsilon=EPSILON)
         self._model = self._restored(normalized)
-        self._algorithm.prepare(self._model, robots, seed)
+        self._algorithm.prepare(self._model, robots, self._training_seed(index + 1))
         self._algorithm.set_learning_rate(self._model, 1 - done / self._total)
         watch = _Watch(lambda steps: self._progress(_describe(lesson, self.evaluations), done + steps, self._total))
         self._model.learn(lesson.steps, callback=watch, reset_num_timesteps=False)
@@ -195,15 +193,19 @@ class _Run:
         """The model with the state of the last checkpoint, in a new environment."""
         fresh = self._model is None
         if fresh:
-            set_random_seed(self.settings.seed)
+            set_random_seed(self._training_seed(0))
             model = self._algorithm.make(env)
             model.set_logger(configure(str(self._out / "tensorboard"), ["tensorboard"]))
         else:
             model = self._model
             model.set_env(env, force_reset=True)
         if self._checkpoint is not None:
-            self._checkpoint.restore(env, model if fresh else None)
+            self._checkpoint.restore(env, model, fresh)
         return model
+
+    def _training_seed(self, number: int) -> int:
+        """A seed for the libraries' own random states, which take 32 bits."""
+        return derived_seed(self.settings.seed, Stream.TRAINING, number) % 2**32
 
     def _header(self, index: int) -> dict[str, Any]:
         features, problem = self._validation.features, self._validation.problem

@@ -17,6 +17,7 @@ from pydantic import Field
 
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.seeds import Stream
 from d4orm_env.engine.base import SamplingRules, SamplingTask
 from d4orm_planners.base import Iteration, Planner, PlannerConfig, Search
 from d4orm_planners.sampling.weights import SoftmaxWeights
@@ -63,10 +64,6 @@ PAPER = {"num_samples": 1024, "num_steps": 100, "weight_cutoff": 0.0, "clip_betw
 """What the paper's experiments share (section IV-B)."""
 
 
-STAGE_STREAM = 1 << 16
-"""Stages of an iteration draw their noise from every so many-th stream, so that it differs from all other noise."""
-
-
 class SamplingPlanner(Planner):
     """A planner whose iteration is one run of the sampling loop over the whole team."""
 
@@ -111,15 +108,13 @@ class SamplingPlanner(Planner):
         task, rules = self.task(search, base), self.rules()
         num_steps = excluded = 0
         for stage, (noise_scale, num_samples) in enumerate(self.stages(search)):
-            with search.watch.paused():
-                search.engine.prepare(task, rules, noise_scale, num_samples)
-            seed = search.iteration_seed(stage * STAGE_STREAM)
-            result = search.engine.denoise(task, rules, mean, noise_scale, num_samples, seed)
-            mean, num_steps, excluded = result.mean, num_steps + len(noise_scale), excluded + result.excluded
+            seed = search.iteration_seed(Stream.SAMPLES, stage)
+            result = search.denoise(task, rules, mean, noise_scale, num_samples, seed)
+            mean, num_steps, excluded = result.mean, num_steps + len(result.rewards), excluded + result.excluded
         return Iteration(base + mean, num_steps, excluded)
 
 
-def standard_normal(search: Search, shape: tuple[int, ...], stream: int) -> FloatArray:
-    """Standard normal numbers of this iteration in this shape."""
-    generator = np.random.default_rng(search.iteration_seed(stream))
+def standard_normal(search: Search, shape: tuple[int, ...], number: int = 0) -> FloatArray:
+    """Standard normal numbers in this shape for the start of a run of this iteration."""
+    generator = np.random.default_rng(search.iteration_seed(Stream.DEFORMATION_START, number))
     return portable.standard_normal(generator, shape)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from d4orm_env import Problem
+from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.engine.base import Engine
 from d4orm_planners.base import Candidate
 from d4orm_planners.d4orm import D4orm, D4ormConfig
@@ -69,6 +70,7 @@ class Round:
         planning = mission.planning()
         planner = D4orm(D4ormConfig(**planning.node_settings(nodes)[own]))
         choice = Selection(planning.selection, planning.k)
+        seed = derived_seed(mission.seed, Stream.TAKEOVER, takeover)
 
         def observe(event: Event) -> None:
             plan = digest(engine, problem, event.candidate)
@@ -80,7 +82,7 @@ class Round:
         def work() -> None:
             try:
                 self._node = Node(
-                    own, nodes, planner, problem, mission.seed + takeover, guess, engine, team, choice,
+                    own, nodes, planner, problem, seed, guess, engine, team, choice,
                     told=TOLD * number, observer=observe,
                 )  # fmt: skip
                 self._think(self._node)

@@ -1,0 +1,56 @@
+"""Independent streams of random numbers from one seed: every purpose has its own, for every seed."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+
+class Stream(IntEnum):
+    """What random numbers are drawn for. The numbers are part of what a seed means, so append.
+
+    Scenarios draw their instances from ``default_rng([seed, purpose])``, and environments seed themselves as Gymnasium
+    has it; neither coincides with any of these.
+    """
+
+    SAMPLES = 0  # of an iteration's denoising run, by stage
+    DEFORMATION_START = 1  # U_N, by run of the iteration
+    REPAIR = 2  # samples of D4orm-D's repairs, by repair of the iteration
+    REPAIR_ORDER = 3
+    DETOURS = 4  # by detour of the iteration
+    CHOICE = 5  # what a node goes on from
+    NODE = 6  # the seed of a node of D-D4orm
+    PERTURBATION = 7  # of IPOPT's warm start
+    COARSE_PLAN = 8  # the seeds of D4orm-C2F's searches and loops, by step of the episode
+    REFINEMENT = 9
+    CONTROL_LOOP = 10
+    CONTROLLER_NOISE = 11
+    RANDOM_CONTROLS = 12
+    PREFERRED_DIRECTION = 13  # of ORCA
+    CONTROL_NOISE = 14  # of the environment wrapper
+    TRAINING_WORLDS = 15  # by lesson
+    TRAINING = 16  # first weights (0), then exploration and minibatches by lesson (from 1)
+    TAKEOVER = 17  # the seeds of the plans that a team makes on the way, by takeover
+
+
+def derived_seed(seed: int, stream: Stream, *key: int) -> int:
+    """A 64-bit seed for one purpose, another one for every other seed, stream and key.
+
+    Args:
+        seed: Non-negative.
+        stream: The purpose.
+        key: Non-negative numbers that tell its uses apart, such as the iteration; as many in every use of a stream.
+    """
+    return int(_sequence(seed, stream, key).generate_state(1, np.uint64)[0])
+
+
+def generator(seed: int, stream: Stream, *key: int) -> np.random.Generator:
+    """Random numbers for one purpose; arguments as for :func:`derived_seed`."""
+    return np.random.default_rng(_sequence(seed, stream, key))
+
+
+def _sequence(seed: int, stream: Stream, key: tuple[int, ...]) -> np.random.SeedSequence:
+    # A spawn key is hashed after the seed, filled up to full length: the two cannot be mistaken for each other as the
+    # words of a list can, where [5] is [5, 0].
+    return np.random.SeedSequence(seed, spawn_key=(int(stream), *key))
