@@ -16,7 +16,7 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import OrderEnforcingWrapper
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
-from d4orm_env.core.arrays import FloatArray, as_float32
+from d4orm_env.core.arrays import FloatArray, as_float32, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.simulation import MAX_ACTION, agent_infos, check_options, checked_cycles, make_simulation, usable
 from d4orm_env.viewer import RENDER_MODES, Viewer
@@ -159,7 +159,7 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
         """
         check_options(options, ignored=_OPTIONS_OF_CONFORMANCE_TESTS)
         if seed is not None:
-            self._np_random = seeding.np_random(seed)[0]
+            self._np_random = seeding.np_random(whole_number(seed, "seed", 0))[0]
         step = self._simulation.reset(self.np_random)
         self.agents = self.possible_agents[:]
         if self.render_mode == "human":

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, positive_number, whole_number
+from d4orm_env.core.arrays import LARGEST, LARGEST_NUMBER, FloatArray, positive_number, whole_number
 from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
@@ -31,7 +31,7 @@ from d4orm_planners.settings import Count, EngineName, Settings
 
 Callback = Callable[[IterationRecord], Any]
 
-PLAN_REACH = 1e15
+PLAN_REACH = LARGEST_NUMBER / LARGEST
 """Times its limit that a planned control may be, so that no square of it overflows: some methods scale theirs up."""
 
 

@@ -442,15 +442,15 @@ def test_jax_excludes_and_counts_samples_with_infinite_controls(credit: str) -> 
 
 @pytest.mark.parametrize("credit", CREDITS)
 def test_samples_that_blow_up_are_excluded_and_counted_and_change_no_other(credit: str) -> None:
-    """A quarter of the samples in each tile gets a control whose square is infinite: its robot is nowhere."""
+    """One in six samples gets an infinite control: its robot is nowhere."""
     task = replace(TASKS["obstacles"](), credit=credit)
-    burst = Burst(task.base.shape, (6, 0, 1), 1.6e19)
+    burst = Burst(task.base.shape, (6, 0, 1), 2.5e38)
     recorded = RecordedRules(SamplingRules(SOFTMAX.weights, burst))
     sigma = np.ones(2, np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
         result = CPU.denoise(task, recorded.rules, 0 * task.base, sigma, NUM_SAMPLES, seed=4)
         controls = bursting_controls(task, burst)
-        blown = ~np.isfinite(np.square(controls, dtype=np.float32)).all(axis=(1, 2, 3))
+        blown = ~np.isfinite(controls).all(axis=(1, 2, 3))
     assert 20 < blown.sum() < 80
     rewards = recorded.rewards[1]
     if credit == "team":

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import LARGEST_NUMBER, BoolArray, FloatArray, as_float32
 from d4orm_env.core.problem import Problem, ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
 
@@ -197,16 +197,21 @@ def checked_controls(problem: Problem, controls: Any) -> FloatArray:
     """``controls`` as a contiguous ``(H, K, m)`` float32 array.
 
     Raises:
-        ValueError: If the shape is another, or a value is not finite.
+        ValueError: If the shape is another, or a value is not finite or so large that its square would not be.
     """
     try:
-        array = np.ascontiguousarray(controls, dtype=np.float32)
-    except OverflowError as error:
-        raise ValueError("controls hold a whole number too large for a float; keep them within the limits") from error
+        array = as_float32(controls)
+    except ValueError as error:
+        raise ValueError(f"controls must be an array of numbers; {error}") from None
     expected = (problem.horizon, problem.num_robots, problem.control_size)
     if array.shape != expected:
         raise ValueError(f"controls have shape {array.shape}; expected (H, K, m) = {expected}")
     if not np.isfinite(array).all():
         step, robot, component = (int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise ValueError(f"controls[{step}, {robot}, {component}] is not finite; every control must be")
+    if (np.abs(array) > LARGEST_NUMBER).any():
+        where = [int(i) for i in np.argwhere(np.abs(array) > LARGEST_NUMBER)[0]]
+        raise ValueError(
+            f"controls{where} is {array[tuple(where)]:g}; it must be at most {LARGEST_NUMBER:g} in magnitude"
+        )
     return array

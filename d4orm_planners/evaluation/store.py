@@ -252,6 +252,8 @@ class TrialStore:
             if error.sqlite_errorcode == sqlite3.SQLITE_NOTADB:
                 raise self._foreign(str(error)) from error
             raise self._damaged(str(error)) from error
+        except UnicodeDecodeError as error:
+            raise self._damaged(str(error)) from error
 
     def _opened(self) -> sqlite3.Connection:
         name = self.path.absolute().as_uri()
