@@ -89,14 +89,14 @@ class Model:
         return len(self.control_names)
 
 
-def norm_scale_2(a: Any, b: Any, limit: Any, ops: Ops) -> Any:
-    """Factor that brings the vector ``(a, b)`` to at most ``limit``; the maximum keeps the gradient finite at zero."""
-    return limit / ops.sqrt(ops.maximum(a * a + b * b, limit * limit))
+def norm_scale(square: Any, limit: Any, ops: Ops) -> Any:
+    """Factor that brings a vector of this squared length to at most ``limit``; exactly one for a shorter vector."""
+    return limit / ops.sqrt(ops.maximum(square, limit * limit))
 
 
-def norm_scale_3(a: Any, b: Any, c: Any, limit: Any, ops: Ops) -> Any:
-    """As :func:`norm_scale_2`, for a vector of three."""
-    return limit / ops.sqrt(ops.maximum(a * a + b * b + c * c, limit * limit))
+def control_scale(square: Any, limit: Any, ops: Ops) -> Any:
+    """As :func:`norm_scale`; NaN where the square has overflowed, lest the control pass for none at all."""
+    return norm_scale(square, limit, ops) + (square - square)
 
 
 def clip(value: Any, limit: Any, ops: Ops) -> Any:
@@ -136,12 +136,12 @@ def holonomic2d_integrate(x: Any, u: Any, h: Any, ops: Ops) -> Any:
 
 
 def holonomic2d_limit_control(u: Any, limits: Any, ops: Ops) -> Any:
-    scale = norm_scale_2(u[0], u[1], limits[ACCELERATION], ops)
+    scale = control_scale(u[0] * u[0] + u[1] * u[1], limits[ACCELERATION], ops)
     return (u[0] * scale, u[1] * scale)
 
 
 def holonomic2d_limit_state(x: Any, limits: Any, ops: Ops) -> Any:
-    scale = norm_scale_2(x[2], x[3], limits[SPEED], ops)
+    scale = norm_scale(x[2] * x[2] + x[3] * x[3], limits[SPEED], ops)
     return (x[0], x[1], x[2] * scale, x[3] * scale)
 
 
@@ -183,12 +183,12 @@ def holonomic3d_integrate(x: Any, u: Any, h: Any, ops: Ops) -> Any:
 
 
 def holonomic3d_limit_control(u: Any, limits: Any, ops: Ops) -> Any:
-    scale = norm_scale_3(u[0], u[1], u[2], limits[ACCELERATION], ops)
+    scale = control_scale(u[0] * u[0] + u[1] * u[1] + u[2] * u[2], limits[ACCELERATION], ops)
     return (u[0] * scale, u[1] * scale, u[2] * scale)
 
 
 def holonomic3d_limit_state(x: Any, limits: Any, ops: Ops) -> Any:
-    scale = norm_scale_3(x[3], x[4], x[5], limits[SPEED], ops)
+    scale = norm_scale(x[3] * x[3] + x[4] * x[4] + x[5] * x[5], limits[SPEED], ops)
     return (x[0], x[1], x[2], x[3] * scale, x[4] * scale, x[5] * scale)
 
 
@@ -223,7 +223,7 @@ def velocity2d_integrate(x: Any, u: Any, h: Any, ops: Ops) -> Any:
 
 
 def velocity2d_limit_control(u: Any, limits: Any, ops: Ops) -> Any:
-    scale = norm_scale_2(u[0], u[1], limits[SPEED], ops)
+    scale = control_scale(u[0] * u[0] + u[1] * u[1], limits[SPEED], ops)
     return (u[0] * scale, u[1] * scale)
 
 

@@ -210,7 +210,7 @@ def checked_controls(problem: Problem, controls: Any) -> FloatArray:
         step, robot, component = (int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise ValueError(f"controls[{step}, {robot}, {component}] is not finite; every control must be")
     if (np.abs(array) > LARGEST_NUMBER).any():
-        where = [int(i) for i in np.argwhere(np.abs(array) > LARGEST_NUMBER)[0]]
+        where = tuple(int(i) for i in np.argwhere(np.abs(array) > LARGEST_NUMBER)[0])
         raise ValueError(
             f"controls{where} is {array[tuple(where)]:g}; it must be at most {LARGEST_NUMBER:g} in magnitude"
         )

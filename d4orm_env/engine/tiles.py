@@ -52,8 +52,8 @@ keep the kernels on disk. And for those that take a problem's arrays, which are 
 inlined = numba.njit(nogil=True, **INLINED)
 
 for _function in (
-    dynamics.norm_scale_2,
-    dynamics.norm_scale_3,
+    dynamics.norm_scale,
+    dynamics.control_scale,
     dynamics.clip,
     dynamics.stopping_speed,
     dynamics.share,
