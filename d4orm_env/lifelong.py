@@ -42,7 +42,7 @@ def reached_goals(problem: Problem, goals: FloatArray, states: FloatArray, contr
             squared_speed[robot] = sum(component * component for component in velocity)
     arrays = problem.arrays
     reached: BoolArray = arrives(
-        np.einsum("kd,kd->k", offsets, offsets), squared_speed, arrays.squared_goal_radius, arrays.squared_goal_speed
+        (offsets * offsets).sum(axis=1), squared_speed, arrays.squared_goal_radius, arrays.squared_goal_speed
     )
     return reached
 

@@ -227,7 +227,7 @@ class Simulation:
             self.arrays, self.layout, self.states, self.controls, self.arrived, time_left
         )
         offsets = self.arrays.goal - self.states[:, : self._dimension]
-        distances = np.sqrt(np.einsum("kd,kd->k", offsets, offsets))
+        distances = np.sqrt((offsets * offsets).sum(axis=1))
         return TeamStep(observations, rewards, arrived, self.collided, margin_violated, distances)
 
     def _assign_goals(self, robots: Any) -> None:

@@ -124,7 +124,7 @@ def test_bad_worlds_are_refused(arguments: dict[str, Any], message: str) -> None
         ({"dt": 1e-50}, r"dt is 1e-50; it must be at least 1e-06"),
         ({"dt": 10**400}, r"dt is inf; it must be positive and finite"),
         ({"horizon": 100_000_000}, "horizon is 100000000; it must be at most 1000000"),
-        ({"horizon": 10**5000}, "horizon is a number of thousands of digits; it must be at most 1000000"),
+        ({"horizon": 10**5000}, "horizon is about 1e5000; it must be at most 1000000"),
         ({"margin": 1e7}, r"margin is 1e\+07; it must be at most 1e\+06"),
         ({"goal_radius": 1e-9}, "goal_radius is 1e-09; it must be at least 1e-07"),
         (

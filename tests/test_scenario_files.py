@@ -362,14 +362,18 @@ def test_any_value_in_an_otherwise_good_file(field: str, value: Any, where: str)
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (MINIMAL + "horizon: 100000000", "horizon is 100000000 steps for 1 robots; a file may ask for at most"),
+        (MINIMAL + "horizon: 100000000", "horizon is 100000000; it must be at most 1000000"),
+        (
+            "version: 1\nscenario: random\nnum_robots: 51\nhorizon: 1000000",
+            "horizon is 1000000 steps for 51 robots; it must be at most 980392",
+        ),
         (MINIMAL + "horizon: 999999999999", "horizon is 999999999999"),
         ("version: 1\nscenario: circle\nhorizon: 100000000", "horizon is 100000000"),
         ("version: 1\nrobots: [" + "1," * 4_400_000 + "1]", "has a list of more than 10000 entries in line 2"),
         ("version: 1\nrobots: [" + "[1,1,1]," * 900_000 + "1]", "has a list of more than 10000 entries in line 2"),
         ("a: [" + ("[" + "1," * 9_999 + "1],") * 60 + "1]", "holds more than 500000 values"),
     ],
-    ids=["horizon", "endless", "short form", "flat", "nested", "many lists"],
+    ids=["horizon", "robots and steps", "endless", "short form", "flat", "nested", "many lists"],
 )
 def test_more_than_memory_holds_is_refused_before_it_is_read(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "huge.yaml"

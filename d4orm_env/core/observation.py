@@ -58,7 +58,7 @@ class ObservationLayout:
         # Nobody gets further than the widest distance between places, plus a full-speed drive from either end. Within a
         # step a robot may exceed the speed limit, which is applied at its end.
         drive = (speed + acceleration * problem.dt / 2) * problem.duration
-        reach = float(np.linalg.norm(np.ptp(places, axis=0))) + 2 * drive + 2 * radius
+        reach = float(np.sqrt(np.square(np.ptp(places, axis=0)).sum())) + 2 * drive + 2 * radius
         own = [speed] * d + [1.0, 1.0, speed] + [reach] * d
         own += [1.0, 1.0, radius, speed, acceleration]
         neighbor = [1.0] + [reach] * d + [2 * speed] * d + [radius]

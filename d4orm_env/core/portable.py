@@ -180,6 +180,11 @@ def log(x: Any) -> Any:
     return np.where(np.isposinf(x), x, result)[()]
 
 
+def root(value: float, degree: int) -> float:
+    """The square root, or one of another degree, of a positive number."""
+    return float(np.sqrt(value) if degree == 2 else exp(log(value) / degree))
+
+
 def standard_normal(generator: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float32]:
     """Standard normal numbers of this shape, by the transform of Box and Muller from the generator's uniform ones."""
     uniform = generator.random((2, *shape))

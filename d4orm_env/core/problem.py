@@ -24,8 +24,8 @@ from d4orm_env.core.dynamics import MODEL_CODES
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 
-MAX_HORIZON = 1_000_000
-"""Most steps of a problem: a slip of the finger must not fill the memory."""
+MAX_HORIZON, MAX_ROBOT_STEPS = 1_000_000, 50_000_000
+"""Most steps of a problem, and most robots times steps: a slip of the finger must not fill the memory."""
 MIN_TIME_STEP, MAX_TIME_STEP = 1e-6, 1e3
 """Bounds of ``dt`` [s]."""
 MAX_HEADING = 1000.0
@@ -135,6 +135,11 @@ class Problem:
             converted["goal_speed"] = positive_number(self.goal_speed, "goal_speed", zero_allowed=True, most=LARGEST)
         for name, value in converted.items():
             object.__setattr__(self, name, value)
+        if self.horizon * team.num_robots > MAX_ROBOT_STEPS:
+            most = MAX_ROBOT_STEPS // team.num_robots
+            raise ValueError(
+                f"horizon is {self.horizon} steps for {team.num_robots} robots; it must be at most {most} for so many"
+            )
         self._check_start_states()
         self._check_resolution()
         self._check_turning()
@@ -257,8 +262,8 @@ class Problem:
             bounds=self.world.bounds,
             time_step=np.array([self.dt, self.dt / 2, self.dt / 3, self.dt / 6], np.float32),
             margin=np.float32(self.margin),
-            squared_goal_radius=np.float32(self.goal_radius**2),
-            squared_goal_speed=np.float32(goal_speed**2),
+            squared_goal_radius=np.float32(self.goal_radius * self.goal_radius),
+            squared_goal_speed=np.float32(goal_speed * goal_speed),
         )
         for array in arrays:
             if isinstance(array, np.ndarray):

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from d4orm_env.core.portable import cos, root, sin
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.layout import Layout, build, in_space
@@ -65,7 +66,7 @@ def random(settings: Settings, *, size: float | None = None) -> Problem:
     """
     dimension = settings.team.dimension
     if size is None:
-        size = max(5.0, 1.25 * settings.num_robots ** (1 / dimension))
+        size = max(5.0, 1.25 * root(settings.num_robots, dimension))
     size = bounded(size, "size")
     starts, goals = scatter(settings, size)
     half_extent = np.full(dimension, size / 2)
@@ -192,16 +193,16 @@ def fibonacci_sphere(count: int) -> Points:
     index = np.arange(count)
     z = 1 - (2 * index + 1) / count
     across = np.sqrt(1 - z**2)
-    return np.column_stack([across * np.cos(index * GOLDEN_ANGLE), across * np.sin(index * GOLDEN_ANGLE), z])
+    return np.column_stack([across * cos(index * GOLDEN_ANGLE), across * sin(index * GOLDEN_ANGLE), z])
 
 
 def _antipodal_circle(settings: Settings, diameter: float) -> Layout:
     count, dimension = settings.num_robots, settings.team.dimension
-    needed = settings.spacing / math.sin(math.pi / count) if count > 1 else 0.0
+    needed = settings.spacing / float(sin(math.pi / count)) if count > 1 else 0.0
     if needed >= diameter:
         raise _too_small(settings, "diameter", diameter, needed)
     angle = 2 * math.pi * np.arange(count) / count
-    points = diameter / 2 * np.column_stack([np.cos(angle), np.sin(angle)])
+    points = diameter / 2 * np.column_stack([cos(angle), sin(angle)])
     starts, goals = _antipodal(in_space(points, dimension))
     half_extent = in_space([diameter / 2, diameter / 2], dimension)[0]
     return Layout(starts, goals, World(dimension=dimension), diameter, half_extent, is_round=True)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from d4orm_env.core.portable import arctan2
 from d4orm_env.core.problem import MAX_HORIZON, Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
@@ -100,7 +101,7 @@ def start_states(team: Team, starts: Points, goals: Points) -> Points:
     way = goals - starts
     for robot, model in enumerate(team.robot_models):
         if model.heading_index is not None:
-            states[robot, model.heading_index] = math.atan2(way[robot, 1], way[robot, 0])
+            states[robot, model.heading_index] = arctan2(way[robot, 1], way[robot, 0])
     return states
 
 

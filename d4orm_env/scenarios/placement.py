@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from d4orm_env.core.portable import root
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.settings import OBSTACLES, STARTS_AND_GOALS, Settings
 
@@ -55,8 +56,8 @@ def scatter(settings: Settings, size: float) -> tuple[Points, Points]:
 
 def size_for(count: int, spacing: float, dimension: int) -> float:
     """Side of the square (cube) that takes ``count`` random points ``spacing`` apart without fail [m]."""
-    ball = math.pi / 4 * spacing**2 if dimension == 2 else math.pi / 6 * spacing**3
-    return float((count * ball / DENSITY[dimension]) ** (1 / dimension)) if count > 1 else 0.0
+    ball = math.pi / 4 * spacing * spacing if dimension == 2 else math.pi / 6 * spacing * spacing * spacing
+    return root(count * ball / DENSITY[dimension], dimension) if count > 1 else 0.0
 
 
 def with_random_obstacles(
