@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from d4orm_env.core.arrays import LARGEST, LARGEST_NUMBER, FloatArray, positive_number, whole_number
+from d4orm_env.core.arrays import LARGEST, LARGEST_NUMBER, FloatArray, duration, whole_number
 from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
@@ -190,7 +190,7 @@ class Planner(ABC):
             ValueError: If an argument makes no sense; the message names it.
         """
         if time_limit is not None:
-            time_limit = positive_number(time_limit, "time_limit")
+            time_limit = duration(time_limit, "time_limit")
         limit = (
             self.config.max_iterations if max_iterations is None else whole_number(max_iterations, "max_iterations", 1)
         )

@@ -24,7 +24,7 @@ from d4orm_planners.distributed.ray_planner import ray_planners
 from d4orm_planners.distributed.selection import SELECTIONS, shares
 from d4orm_planners.distributed.transport import TRANSPORTS, LocalNetwork
 from d4orm_planners.distributed.zenoh_transport import ZenohSettings, ZenohTransport
-from d4orm_planners.settings import Count, NotNegative, Whole, one_of
+from d4orm_planners.settings import Count, Seconds, Whole, one_of
 
 INNER = MappingProxyType({kind.name: kind for kind in (D4orm, D4ormD)})
 """The planners that a node can run."""
@@ -62,7 +62,7 @@ class DD4ormConfig(D4ormDConfig):
     selection: Annotated[str, one_of(SELECTIONS)] = "top-k"
     k: Count = 4
     mode: Annotated[str, one_of(MODES)] = "sync"
-    patience: NotNegative = 1.0
+    patience: Seconds = 1.0
     transport: Annotated[str, one_of(TRANSPORTS)] = "local"
     node: Annotated[Whole, Field(ge=0)] | None = None
     zenoh: Annotated[ZenohSettings | None, SkipValidation] = None  # checked once it is known to be of use

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from types import MappingProxyType
 from typing import Any
 
-from d4orm_env.core.arrays import positive_number, shown
+from d4orm_env.core.arrays import duration, shown
 from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_planners.base import Planner
 from d4orm_planners.cem import CEM
@@ -118,7 +118,7 @@ def _policy_config(name: str, config: Mapping[str, Any]) -> Any:
 def _time_limit(config: dict[str, Any]) -> float | None:
     """Take the budget of the solve out of a planner's settings."""
     limit = config.pop("time_limit", None)
-    return None if limit is None else positive_number(limit, "time_limit")
+    return None if limit is None else duration(limit, "time_limit")
 
 
 def _find(name: Any, table: Mapping[str, Any], what: str, owner: str = "") -> Any:

@@ -15,7 +15,7 @@ from typing import Annotated, Any, get_type_hints
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, create_model
 
-from d4orm_env.core.arrays import LARGEST_NUMBER, LARGEST_WHOLE, shown
+from d4orm_env.core.arrays import LARGEST, LARGEST_NUMBER, LARGEST_WHOLE, shown
 from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.engine.base import ENGINES
 
@@ -73,6 +73,8 @@ Steps = Annotated[Whole, Field(ge=1, le=10**6)]
 """Of samples and steps there are no more than memory and patience can hold."""
 Number = Annotated[float, BeforeValidator(_number), Field(le=LARGEST_NUMBER)]
 Positive = Annotated[Number, Field(gt=0)]
+Seconds = Annotated[Number, Field(ge=0, le=LARGEST)]
+"""No clock waits longer."""
 NotNegative = Annotated[Number, Field(ge=0)]
 Share = Annotated[Number, Field(gt=0, le=1)]
 ShareOrNone = Annotated[Number, Field(ge=0, le=1)]

@@ -528,6 +528,8 @@ BAD = [
     (("--time-limit", "0"), "time_limit is 0"),
     (("--time-limit", "1", "-p", "goal"), "none of the policies is one"),
     (("--trial-timeout", "-1"), "trial_timeout is -1"),
+    (("--trial-timeout", "1e17"), "trial_timeout is 1e+17; it must be at most 1e+06"),
+    (("--time-limit", "1e17"), "time_limit is 1e+17; it must be at most 1e+06"),
     (("-o", "file"), "'file' cannot be made"),
     (("-o", "/proc/evaluation"), "choose another"),
 ]

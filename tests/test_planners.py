@@ -437,6 +437,7 @@ def test_an_unknown_planner_is_refused(name: Any) -> None:
         ({"seed": -1}, "seed is -1"),
         ({"seed": 0.5}, "seed must be a whole number"),
         ({"time_limit": 0}, "time_limit is 0"),
+        ({"time_limit": 1e17}, "time_limit is 1e+17; it must be at most 1e+06"),
         ({"time_limit": float("nan")}, "time_limit is nan"),
         ({"max_iterations": 0}, "max_iterations is 0"),
         ({"max_iterations": 2.5}, "max_iterations must be a whole number"),

@@ -144,6 +144,15 @@ def positive_number(
     return number
 
 
+def duration(value: Any, name: str, *, zero_allowed: bool = False) -> float:
+    """``value`` as a positive number of seconds that every clock can wait: at most :data:`LARGEST`, eleven days.
+
+    Raises:
+        ValueError: As :func:`positive_number`.
+    """
+    return positive_number(value, name, zero_allowed=zero_allowed, most=LARGEST)
+
+
 def whole_number(value: Any, name: str, minimum: int, maximum: int | None = None) -> int:
     """``value`` as an int of at least ``minimum``, and at most ``maximum`` where there is one.
 

@@ -56,7 +56,7 @@ def load_node(path: str | os.PathLike[str]) -> NodeTask:
 
 
 def _task(content: Any, folder: Path) -> NodeTask:
-    from d4orm_env.core.arrays import positive_number, whole_number
+    from d4orm_env.core.arrays import duration, whole_number
     from d4orm_planners.registry import make_planner
 
     fields = _mapping("the file", content)
@@ -88,7 +88,7 @@ def _task(content: Any, folder: Path) -> NodeTask:
         planner=planner,
         problem=_problem(fields["problem"], folder),
         seed=whole_number(fields.get("seed", 0), "seed", 0),
-        time_limit=positive_number(fields["time_limit"], "time_limit"),
+        time_limit=duration(fields["time_limit"], "time_limit"),
         out=folder / fields["out"],
     )
 

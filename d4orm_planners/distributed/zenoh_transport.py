@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields
 from types import ModuleType
 from typing import Any
 
-from d4orm_env.core.arrays import positive_number
+from d4orm_env.core.arrays import duration
 from d4orm_planners.distributed.messages import MAX_BYTES
 from d4orm_planners.distributed.transport import WAITING, Mailbox
 
@@ -87,7 +87,7 @@ class ZenohSettings:
             raise ValueError(f"multicast must be true or false, not {self.multicast!r}")
         if self.config_file is not None:
             object.__setattr__(self, "config_file", str(self.config_file))
-        object.__setattr__(self, "linger", positive_number(self.linger, "linger", zero_allowed=True))
+        object.__setattr__(self, "linger", duration(self.linger, "linger", zero_allowed=True))
 
     @classmethod
     def of(cls, settings: Any) -> ZenohSettings:

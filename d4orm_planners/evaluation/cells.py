@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from d4orm_env.core.arrays import positive_number, shown, whole_number
+from d4orm_env.core.arrays import duration, shown, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_planners.evaluation.store import LARGEST_NUMBER
@@ -37,7 +37,7 @@ def configurations(policies: Policies, time_limit: float | None = None) -> list[
         settings = dict(given)
         policy = settings.pop("policy", label)
         if time_limit is not None and policy in PLANNERS:
-            settings.setdefault("time_limit", positive_number(time_limit, "time_limit"))
+            settings.setdefault("time_limit", duration(time_limit, "time_limit"))
         make_policy(policy, **settings)
         chosen.append(Configuration(label, policy, settings))
     if not chosen:

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from d4orm_env.core.arrays import positive_number, whole_number
+from d4orm_env.core.arrays import duration, positive_number, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.threads import available_cores
 from d4orm_planners.evaluation.cells import Policies, checked_seeds, configurations, problems, several
@@ -149,7 +149,7 @@ def gather(
     if not levels:
         raise ValueError("noise is empty; give at least one level")
     if trial_timeout is not None:
-        trial_timeout = positive_number(trial_timeout, "trial_timeout")
+        trial_timeout = duration(trial_timeout, "trial_timeout")
     if workers is not None:
         whole_number(workers, "workers", 1)
     chosen, numbers = configurations(policies, time_limit), checked_seeds(seeds)
