@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 
 import pytest
 from hypothesis import settings
@@ -27,6 +28,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        # A shell starts jobs in the background so; the tests press Ctrl-C, and what they start inherits it.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     examples = config.getoption("--fuzz-examples")
     if examples is not None:
         # Read where the tests are imported, and by the processes of pytest-xdist.
