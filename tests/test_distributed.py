@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from network_support import PATIENCE
+from network_support import PATIENCE, wait_until
 from planner_support import cheap_planner, hop_problem, walled_in_problem
 
 from d4orm_env.core.problem import Problem
@@ -521,6 +521,11 @@ def press_ctrl_c() -> None:
     signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
 
 
+def node_threads() -> list[threading.Thread]:
+    """Threads in which nodes plan."""
+    return [one for one in threading.enumerate() if one.name.startswith("d-d4orm-") and one.is_alive()]
+
+
 POSIX = pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs signals to threads")
 
 
@@ -529,11 +534,17 @@ POSIX = pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs si
 def test_ctrl_c_ends_an_iteration_under_way(mode: str) -> None:
     # Which would take minutes, and patience as long.
     planner = distributed(mode=mode, num_steps=10**6, patience=600)
-    threading.Timer(1, press_ctrl_c).start()
+
+    def interrupt() -> None:
+        wait_until(lambda: len(node_threads()) == planner.config.nodes, "nodes that plan")
+        time.sleep(0.2)
+        press_ctrl_c()
+
+    threading.Thread(target=interrupt, daemon=True).start()
     plan = planner.solve(walled_in_problem())
     assert plan.status == "interrupted"
     # Python may still list a thread whose end was being waited for.
-    assert not [one for one in threading.enumerate() if one.name.startswith("d-d4orm-") and one.is_alive()]
+    assert not node_threads()
 
 
 @POSIX
