@@ -65,9 +65,19 @@ def test_everyone_arrives_and_keeps_the_margin(case: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("refine", ["sync", "background"])
-def test_refined_guidance_leads_home_too(refine: str) -> None:
+def test_refined_guidance_leads_home_too(refine: str, monkeypatch: pytest.MonkeyPatch) -> None:
     problem = circle(8)
     policy = controller(refine=refine, refine_every=2)
+    act = policy.act
+
+    def act_and_let_the_background_work(*arguments: Any) -> Any:
+        actions = act(*arguments)
+        if policy._refinement._job is not None:
+            policy._refinement._job.exception()
+        return actions
+
+    # On a busy machine it might not come to an end before the episode does.
+    monkeypatch.setattr(policy, "act", act_and_let_the_background_work)
     executed = episode(policy, problem)
     assert_verified(problem, executed)
     assert any(loop.refined for loop in policy.loops)
