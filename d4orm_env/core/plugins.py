@@ -31,7 +31,9 @@ def import_object(path: str, what: str) -> Any:
         return reduce(getattr, name.split("."), import_module(module))
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
-        raise ValueError(f"{what} {shown(path)} cannot be imported ({reason}); check the module and the name") from error
+        raise ValueError(
+            f"{what} {shown(path)} cannot be imported ({reason}); check the module and the name"
+        ) from error
 
 
 def entry_point_names(group: str) -> tuple[str, ...]:
