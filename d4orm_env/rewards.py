@@ -125,7 +125,7 @@ def find_reward(reward: Any) -> RewardFunction | None:
         return reward
     if not isinstance(reward, str) or reward not in REWARDS:
         raise ValueError(
-            f"reward {shown(reward)} is unknown; choose one of {', '.join(REWARDS)}, or give a function (see RewardInput)"
+            f"reward {shown(reward)} is unknown; choose one of {', '.join(REWARDS)}, or a function of a RewardInput"
         )
     return REWARDS[reward]
 

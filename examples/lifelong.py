@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from outputs import argument_parser, count, save_gif, save_table
 
-from d4orm_env import Problem, navigation_v0
+from d4orm_env import Problem, make_problem, navigation_v0
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_env.lifelong import goal_region
 from d4orm_env.render import FrameRenderer
