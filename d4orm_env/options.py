@@ -98,7 +98,8 @@ class EnvOptions:
         if self.randomize_instance is False:
             return first, None
         draw = partial(_draw, self._scenario, settings)
-        if draw(0) != draw(1):
+        zeroth = draw(0) if self.scenario_settings.get("seed") else first
+        if draw(1) != zeroth:
             return first, draw
         if self.randomize_instance:
             raise ValueError(

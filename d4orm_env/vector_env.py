@@ -207,10 +207,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             controls += self._noise_std * self._next_noise(~ended)
         if some_ended:
             self._begin(np.flatnonzero(ended))
-        worlds = self._worlds
-        before = None
-        if self._template.reward is not None:
-            before = worlds._replace(**{name: getattr(worlds, name).copy() for name in _READ_BEFORE})
+        before, worlds = self._before(), self._worlds
         np.copyto(worlds.control, controls)
         observations = self._advance(np.where(ended, RESET, STEP))
         self._reward(before, ~ended)
@@ -300,6 +297,13 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
                 part = type(self._worlds)(*(values[one] for values in self._worlds))
                 advance(arrays, layout, cycles, orders[one], part, out[one])
         return out.reshape(self.num_envs, -1)
+
+    def _before(self) -> WorldBatch | None:
+        """The worlds before a step, as far as a reward is computed from them; ``None`` for the paper's."""
+        if self._template.reward is None:
+            return None
+        worlds = self._worlds
+        return worlds._replace(**{name: getattr(worlds, name).copy() for name in _READ_BEFORE})
 
     def _reward(self, before: WorldBatch | None, moved: BoolArray) -> None:
         """Give the robots of the worlds that have ``moved`` from ``before`` their rewards."""

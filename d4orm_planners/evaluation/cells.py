@@ -69,7 +69,7 @@ def _check_distinct(chosen: Sequence[Configuration]) -> None:
 
 
 def problems(
-    scenarios: str | os.PathLike[str] | Iterable[str | os.PathLike[str] | Problem],
+    scenarios: Any,
     sizes: Sequence[int | None],
     seeds: Sequence[int],
     model: str | None,
