@@ -9,13 +9,13 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, as_float32
 from d4orm_env.core.problem import Problem
+from d4orm_env.options import EnvOptions
 from d4orm_env.simulation import (
     MAX_ACTION,
     Simulation,
     TeamStep,
     agent_infos,
     check_options,
-    make_simulation,
     usable,
 )
 from d4orm_env.viewer import RENDER_MODES, Viewer
@@ -31,7 +31,10 @@ class JointNavigationEnv(gymnasium.Env[FloatArray, FloatArray]):
     robot has arrived, and truncates after ``max_cycles`` steps. Infos hold ``agents`` (one dictionary per robot, as in
     :mod:`d4orm_env.navigation_v0`), ``metrics`` of the episode so far, and ``is_success``.
 
-    The arguments are those of :class:`d4orm_env.navigation_v0.parallel_env`.
+    Args:
+        scenario: As in :class:`~d4orm_env.options.EnvOptions`, like all others.
+        num_robots: Size of the team.
+        **options: Further attributes of :class:`~d4orm_env.options.EnvOptions`, and arguments of the scenario.
 
     Raises:
         TypeError: For an argument that neither the environment nor the scenario has.
@@ -40,42 +43,18 @@ class JointNavigationEnv(gymnasium.Env[FloatArray, FloatArray]):
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012
 
-    def __init__(
-        self,
-        scenario: str | None = None,
-        num_robots: int | None = None,
-        *,
-        problem: Problem | None = None,
-        render_mode: str | None = None,
-        control_noise_std: Any = 0.0,
-        lifelong: bool = False,
-        max_cycles: int | None = None,
-        randomize_instance: bool = False,
-        observed_robots: int = 4,
-        observed_obstacles: int = 4,
-        **scenario_kwargs: Any,
-    ) -> None:
-        self._viewer = Viewer(render_mode)
-        self.render_mode = render_mode
-        self._simulation = make_simulation(
-            scenario,
-            num_robots,
-            problem,
-            randomize_instance,
-            scenario_kwargs,
-            max_cycles=max_cycles,
-            control_noise_std=control_noise_std,
-            lifelong=lifelong,
-            observed_robots=observed_robots,
-            observed_obstacles=observed_obstacles,
-        )
+    def __init__(self, scenario: Any = None, num_robots: int | None = None, **options: Any) -> None:
+        chosen = EnvOptions.of(scenario=scenario, num_robots=num_robots, **options)
+        self.render_mode = chosen.render_mode
+        self._viewer = Viewer(chosen.render_mode)
+        self._simulation = Simulation(chosen)
         self.metadata = type(self).metadata | {"render_fps": max(1, round(1 / self.problem.dt))}
         self._agents = [f"robot_{robot}" for robot in range(self.problem.num_robots)]
         self.observation_space, self.action_space = joint_spaces(self._simulation)
 
     @property
     def problem(self) -> Problem:
-        """The problem being run; with ``randomize_instance`` that of the present episode."""
+        """The problem being run; where every reset draws a new instance, that of the present episode."""
         return self._simulation.problem
 
     @property
@@ -122,6 +101,22 @@ class JointNavigationEnv(gymnasium.Env[FloatArray, FloatArray]):
         if self.render_mode == "human":
             self.render()
         return step.observations.ravel(), float(step.rewards.mean()), terminated, truncated, self._infos(step)
+
+    def set_state(self, states: Any) -> tuple[FloatArray, dict[str, Any]]:
+        """Put the robots elsewhere; see :meth:`d4orm_env.navigation_v0.parallel_env.set_state`.
+
+        Args:
+            states: ``(K, n)`` of all robots.
+
+        Returns:
+            Observation ``(K * D,)`` and infos, as at a reset.
+
+        Raises:
+            RuntimeError: Before the first reset.
+            ValueError: If a state is none that the robot may be in; the message names it.
+        """
+        step = self._simulation.set_state(states)
+        return step.observations.ravel(), self._infos(step)
 
     def state(self) -> FloatArray:
         """The joint state; see :mod:`d4orm_env.joint_state`.

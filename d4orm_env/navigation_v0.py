@@ -18,7 +18,8 @@ from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
 from d4orm_env.core.arrays import FloatArray, as_float32, whole_number
 from d4orm_env.core.problem import Problem
-from d4orm_env.simulation import MAX_ACTION, agent_infos, check_options, checked_cycles, make_simulation, usable
+from d4orm_env.options import EnvOptions
+from d4orm_env.simulation import MAX_ACTION, Simulation, TeamStep, agent_infos, check_options, checked_cycles, usable
 from d4orm_env.viewer import RENDER_MODES, Viewer
 
 __all__ = ["env", "parallel_env", "raw_env"]
@@ -33,19 +34,10 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
     in the world at its goal. When ``max_cycles`` steps have been taken the others are truncated.
 
     Args:
-        scenario: Name of a scenario; ``"circle"`` unless a problem is given.
-        num_robots: Size of the team; the scenario's default (8 for most) unless given.
-        problem: The problem to run instead of a scenario.
-        render_mode: ``"rgb_array"``, ``"human"`` or ``None``.
-        control_noise_std: Standard deviation of Gaussian execution noise, in the controls' units, for all components
-            or one per component. It is added before the control is clipped.
-        lifelong: A robot that arrives gets a fresh random goal, keeps moving and is not terminated; its info says
-            ``arrived`` at that step, and ``distance_to_goal`` is to the new goal.
-        max_cycles: Steps until truncation; the problem's horizon unless given. May be assigned later.
-        randomize_instance: Draw a new instance of the scenario at every reset.
-        observed_robots: Nearest robots in an observation; missing ones are marked absent.
-        observed_obstacles: Nearest obstacles in an observation; likewise.
-        **scenario_kwargs: Arguments of the scenario, such as ``model`` or ``seed``.
+        scenario: As in :class:`~d4orm_env.options.EnvOptions`, like all others.
+        num_robots: Size of the team.
+        **options: Further attributes of :class:`~d4orm_env.options.EnvOptions`, and arguments of the scenario, such as
+            ``model`` or ``seed``. ``max_cycles`` may be assigned later too.
 
     Raises:
         TypeError: For an argument that neither the environment nor the scenario has.
@@ -59,35 +51,11 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
         "is_parallelizable": True,
     }
 
-    def __init__(
-        self,
-        scenario: str | None = None,
-        num_robots: int | None = None,
-        *,
-        problem: Problem | None = None,
-        render_mode: str | None = None,
-        control_noise_std: Any = 0.0,
-        lifelong: bool = False,
-        max_cycles: int | None = None,
-        randomize_instance: bool = False,
-        observed_robots: int = 4,
-        observed_obstacles: int = 4,
-        **scenario_kwargs: Any,
-    ) -> None:
-        self._viewer = Viewer(render_mode)
-        self.render_mode = render_mode
-        self._simulation = make_simulation(
-            scenario,
-            num_robots,
-            problem,
-            randomize_instance,
-            scenario_kwargs,
-            max_cycles=max_cycles,
-            control_noise_std=control_noise_std,
-            lifelong=lifelong,
-            observed_robots=observed_robots,
-            observed_obstacles=observed_obstacles,
-        )
+    def __init__(self, scenario: Any = None, num_robots: int | None = None, **options: Any) -> None:
+        chosen = EnvOptions.of(scenario=scenario, num_robots=num_robots, **options)
+        self.render_mode = chosen.render_mode
+        self._viewer = Viewer(chosen.render_mode)
+        self._simulation = Simulation(chosen)
         self.metadata = type(self).metadata | {"render_fps": max(1, round(1 / self.problem.dt))}
         self.possible_agents = [f"robot_{robot}" for robot in range(self.problem.num_robots)]
         self.agents: list[str] = []
@@ -95,6 +63,7 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
         self._control_size = self.problem.control_size
         self._make_spaces()
         self._np_random: np.random.Generator | None = None
+        self.turn_taker: _TurnByTurn | None = None
 
     def _make_spaces(self) -> None:
         layout = self._simulation.layout
@@ -106,7 +75,7 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
 
     @property
     def problem(self) -> Problem:
-        """The problem being run; with ``randomize_instance`` that of the present episode."""
+        """The problem being run; where every reset draws a new instance, that of the present episode."""
         return self._simulation.problem
 
     @property
@@ -206,6 +175,41 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
             agent_infos(acting, robots, step),
         )
 
+    def set_state(self, states: Any) -> tuple[dict[str, FloatArray], dict[str, dict[str, Any]]]:
+        """Put the robots elsewhere in the middle of an episode, to push one or to replay a log.
+
+        Goals, clock, the controls executed last and the metrics so far are kept. A robot that has arrived stays so
+        where it is put, and must be at rest; one that is put at its goal arrives with the next step, if it is still
+        there.
+
+        Args:
+            states: ``(K, n)`` of all robots, padding zero; contact is allowed.
+
+        Returns:
+            Observations and infos of the agents in ``agents``, as at a reset.
+
+        Raises:
+            RuntimeError: Before the first reset.
+            ValueError: If a state is none that the robot may be in; the message names it.
+        """
+        step = self._simulation.set_state(states)
+        robots = [self._robots[agent] for agent in self.agents]
+        observations = {agent: step.observations[robot] for agent, robot in zip(self.agents, robots)}
+        infos = agent_infos(self.agents, robots, step)
+        if self.turn_taker is not None:
+            self.turn_taker.tell(observations, infos)
+        return observations, infos
+
+    @property
+    def last_step(self) -> TeamStep:
+        """What the last step, reset or :meth:`set_state` did to the whole team, robots that have left included.
+
+        Raises:
+            RuntimeError: Before the first reset.
+        """
+        self._simulation.require_reset()
+        return self._simulation.last
+
     def state(self) -> FloatArray:
         """The joint state, all a planner needs to go on from here; see :mod:`d4orm_env.joint_state`.
 
@@ -271,6 +275,17 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
 
 class _TurnByTurn(parallel_to_aec_wrapper):
     """PettingZoo's conversion, with a bad action refused when it is given, and by the name of who gave it."""
+
+    def __init__(self, environment: parallel_env) -> None:
+        super().__init__(environment)
+        self._observations: dict[str, FloatArray] = {}
+        self.infos: dict[str, dict[str, Any]] = {}
+        environment.turn_taker = self
+
+    def tell(self, observations: dict[str, FloatArray], infos: dict[str, dict[str, Any]]) -> None:
+        """Show agents the world as it is now, before all have chosen."""
+        self._observations = {**self._observations, **observations}
+        self.infos = {**self.infos, **infos}
 
     def step(self, action: FloatArray | None) -> None:
         agent = self.agent_selection

@@ -7,20 +7,20 @@ execution noise, and calls an engine for the physics and the observations.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, as_float32, frozen_array, whole_number
-from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.core.observation import ObservationLayout
 from d4orm_env.core.problem import Problem, inverse_initial_distance
+from d4orm_env.engine.base import StepResult
 from d4orm_env.episode_record import EpisodeRecord
 from d4orm_env.joint_state import JointState, join_state, state_bounds
 from d4orm_env.lifelong import fresh_goal, goal_region, reached_goals
+from d4orm_env.options import EnvOptions
+from d4orm_env.rewards import RewardFunction, RewardInput, compute_rewards, find_reward
 
 MAX_ACTION = 1e15
 """Largest magnitude of an action. float32 still holds the square of more, but no control of a robot is near it: an
@@ -55,52 +55,31 @@ class Simulation:
     """A team in its world, stepped with the whole team's controls.
 
     Args:
-        problem: What is simulated.
-        max_cycles: Steps in an episode; ``None`` is the problem's horizon.
-        control_noise_std: Standard deviation of the Gaussian noise added to the controls before they are clipped, in
-            the controls' own units: one number, or one per control component.
-        lifelong: Give a robot that arrives a fresh random goal and leave it moving, instead of docking it.
-        observed_robots: Robots in an observation.
-        observed_obstacles: Obstacles in an observation.
-        redraw: ``seed -> Problem`` draws a new instance at every reset; ``None`` keeps ``problem``.
+        options: What is simulated, and how.
 
     Raises:
-        ValueError: For an argument out of range, or a ``redraw`` whose instances do not differ.
+        ValueError: For an argument out of range.
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        *,
-        max_cycles: int | None = None,
-        control_noise_std: Any = 0.0,
-        lifelong: bool = False,
-        observed_robots: int = 4,
-        observed_obstacles: int = 4,
-        redraw: Callable[[int], Problem] | None = None,
-    ) -> None:
+    def __init__(self, options: EnvOptions) -> None:
+        problem, self._redraw = options.instances()
         self.problem = problem
-        self.max_cycles = checked_cycles(problem.horizon if max_cycles is None else max_cycles)
-        self.noise_std = noise_std(control_noise_std, problem.control_size)
-        self.lifelong = lifelong
+        self.max_cycles = checked_cycles(problem.horizon if options.max_cycles is None else options.max_cycles)
+        self.noise_std = noise_std(options.control_noise_std, problem.control_size)
+        self.lifelong = options.lifelong
+        self.reward = find_reward(options.reward)
         self.layout = ObservationLayout.for_problem(
             problem,
-            num_neighbors=whole_number(observed_robots, "observed_robots", 0, MAX_OBSERVED),
-            num_obstacles=whole_number(observed_obstacles, "observed_obstacles", 0, MAX_OBSERVED),
+            num_neighbors=whole_number(options.observed_robots, "observed_robots", 0, MAX_OBSERVED),
+            num_obstacles=whole_number(options.observed_obstacles, "observed_obstacles", 0, MAX_OBSERVED),
         )
         # Here, because importing the compiler takes longer than importing all the rest of the package.
         from d4orm_env.engine.cpu import CpuEngine
 
         self._engine = CpuEngine()
         self._dimension = problem.dimension
-        self._redraw = redraw
-        if redraw is not None and redraw(0) == redraw(1):
-            raise ValueError(
-                f"scenario {problem.name!r} is the same for every seed, so randomize_instance has nothing to draw; "
-                "use a scenario with random starts and goals, or leave randomize_instance off"
-            )
         self._places = goal_region(problem)
-        if redraw is not None and problem.world.lower is None:
+        if self.redraws and problem.world.lower is None:
             # Nothing but the scenario bounds its instances in an open world, so leave ample room.
             extent = max(_OPEN_WORLD_EXTENT, 10 * float(np.abs(self._places).max()))
             self._places = np.array([[-extent], [extent]], np.float32).repeat(problem.dimension, axis=1)
@@ -199,17 +178,40 @@ class Simulation:
             # A goal radius that nothing is within: a robot under way to its next goal neither docks nor stops.
             arrays = arrays._replace(squared_goal_radius=np.float32(-1))
         result = self._engine.step(arrays, self.states, self.arrived, controls)
+        if self.lifelong:
+            arrived = reached_goals(self.problem, self.arrays.goal, result.states, result.controls)
+        else:
+            arrived = result.arrived.copy()
+        rewards = result.rewards if self.reward is None else self._rewards(self.reward, result, arrived)
         self.states, self.controls, self.collided = result.states, result.controls, result.collided
+        self.arrived = result.arrived
         self.steps += 1
         self._trail.append(self.states[:, : self._dimension])
         if self.lifelong:
-            arrived = reached_goals(self.problem, self.arrays.goal, self.states, self.controls)
             self._assign_goals(np.flatnonzero(arrived))
-        else:
-            self.arrived = result.arrived
-            arrived = result.arrived.copy()
-        self.record.add(result.rewards, arrived, result.collided, result.margin_violated)
-        return self._report(result.rewards, arrived, result.margin_violated)
+        self.record.add(rewards, arrived, result.collided, result.margin_violated)
+        return self._report(rewards, arrived, result.margin_violated)
+
+    def set_state(self, states: Any) -> TeamStep:
+        """Put the robots elsewhere in the middle of an episode; all else stays as it is.
+
+        Goals, clock, the controls executed last and the metrics so far are kept. A robot that has docked stays docked
+        where it is put; one that is put at its goal docks at the end of the next step, if it is still there.
+
+        Args:
+            states: ``(K, n)``.
+
+        Raises:
+            RuntimeError: Before the first reset.
+            ValueError: If the states have another shape, are not finite, faster than the robots may be, outside the
+                state space, have padding that is not zero, or move a docked robot. Contact is allowed.
+        """
+        self.require_reset()
+        shape = self.problem.start.shape
+        self.states = checked_states(self.problem, states, self.arrived, self.state_bounds, shape)
+        self.collided, margin_violated = self._engine.contacts(self.arrays, self.states)
+        self._trail.append(self.states[:, : self._dimension])
+        return self._report(np.zeros(len(self.states), np.float32), self.arrived.copy(), margin_violated)
 
     def state(self) -> FloatArray:
         """The joint state vector; see :mod:`d4orm_env.joint_state`."""
@@ -221,14 +223,40 @@ class Simulation:
         self.require_reset()
         return self.record.metrics()
 
+    def _rewards(self, reward: RewardFunction, result: StepResult, arrived: BoolArray) -> FloatArray:
+        """``(K,)`` of the step from the present states to ``result``."""
+        step = RewardInput(
+            previous_states=self.states,
+            states=result.states,
+            controls=result.controls,
+            goals=self.arrays.goal,
+            previous_distances=self._distances(self.states),
+            distances=self._distances(result.states),
+            initial_distances=1 / self.arrays.inverse_initial_distance,
+            previously_arrived=self.arrived,
+            arrived=arrived,
+            collided=result.collided,
+            margin_violated=result.margin_violated,
+            paper=result.rewards,
+            team=self.problem.team,
+            dt=self.problem.dt,
+        )
+        return compute_rewards(reward, step)
+
+    def _distances(self, states: FloatArray) -> FloatArray:
+        """``(K,)`` to the present goals [m]."""
+        offsets = self.arrays.goal - states[:, : self._dimension]
+        distances: FloatArray = np.sqrt((offsets * offsets).sum(axis=1))
+        return distances
+
     def _report(self, rewards: FloatArray, arrived: BoolArray, margin_violated: BoolArray) -> TeamStep:
         time_left = max(0.0, 1.0 - self.steps / self.max_cycles)
         observations = self._engine.observe(
             self.arrays, self.layout, self.states, self.controls, self.arrived, time_left
         )
-        offsets = self.arrays.goal - self.states[:, : self._dimension]
-        distances = np.sqrt((offsets * offsets).sum(axis=1))
-        return TeamStep(observations, rewards, arrived, self.collided, margin_violated, distances)
+        distances = self._distances(self.states)
+        self.last = TeamStep(observations, rewards, arrived, self.collided, margin_violated, distances)
+        return self.last
 
     def _assign_goals(self, robots: Any) -> None:
         if not len(robots):
@@ -250,6 +278,37 @@ class Simulation:
 def checked_cycles(value: Any) -> int:
     """``max_cycles`` as an int."""
     return whole_number(value, "max_cycles", 1, MAX_CYCLES)
+
+
+def checked_states(
+    problem: Problem, states: Any, docked: BoolArray, bounds: tuple[FloatArray, FloatArray], shape: tuple[int, ...]
+) -> FloatArray:
+    """``states`` as an array of that shape, ``(..., K, n)``, as robots may be put into.
+
+    Args:
+        problem: The problem.
+        states: What was given.
+        docked: ``(..., K)`` bool.
+        bounds: Lowest and highest joint state; see :func:`d4orm_env.joint_state.state_bounds`.
+        shape: The shape expected.
+
+    Raises:
+        ValueError: If a state is none that a robot may be in; the message names the robot.
+    """
+    array = frozen_array(states, "states", shape, largest=LARGEST)
+    low, high = (bound[: problem.start.size].reshape(problem.start.shape) for bound in bounds)
+    for team, parked in zip(array.reshape(-1, *problem.start.shape), docked.reshape(-1, problem.num_robots)):
+        problem.check_states(team, "state")
+        outside = ((team < low) | (team > high)).any(axis=1)
+        if outside.any():
+            robot = int(np.argmax(outside))
+            raise ValueError(
+                f"state of robot_{robot} is {team[robot].tolist()}, outside the state space; move it inside"
+            )
+        for robot in np.flatnonzero(parked).tolist():
+            if team[robot, list(problem.team.robot_models[robot].speed_indices)].any():
+                raise ValueError(f"state of robot_{robot} is moving, but the robot has docked; set its speed to zero")
+    return array
 
 
 def usable(actions: FloatArray) -> BoolArray:
@@ -296,59 +355,6 @@ def noise_std(value: Any, control_size: int) -> FloatArray | None:
     if (std > LARGEST).any():
         raise ValueError(f"control_noise_std is {std.tolist()}; it must be at most {LARGEST:g}")
     return np.broadcast_to(std, (control_size,)).copy() if std.any() else None
-
-
-def make_simulation(
-    scenario: str | None,
-    num_robots: int | None,
-    problem: Problem | None,
-    randomize_instance: bool,
-    scenario_kwargs: dict[str, Any],
-    **settings: Any,
-) -> Simulation:
-    """The simulation that an environment's arguments ask for: of a scenario, or of a given problem.
-
-    Args:
-        scenario: Name of a scenario; ``None`` is ``"circle"``.
-        num_robots: ``None`` is the scenario's default.
-        problem: Simulate this problem instead; excludes the scenario's arguments.
-        randomize_instance: Draw a new instance of the scenario at every reset.
-        scenario_kwargs: Further arguments of the scenario.
-        settings: Passed on to :class:`Simulation`.
-
-    Raises:
-        TypeError: For an argument that neither the scenario nor the environment has.
-        ValueError: If both a problem and a scenario's arguments are given, or one of them is bad.
-    """
-    # Imported here, since scenarios bring much along that a given problem does not need.
-    if scenario_kwargs:
-        from d4orm_env.scenarios.registry import unknown_argument
-
-        name = "circle" if scenario is None else scenario
-        own = (*settings, "scenario", "problem", "render_mode", "randomize_instance")
-        complaint = unknown_argument(None if problem is not None else name, scenario_kwargs, own)
-        if complaint:
-            raise UnknownKeywordError(complaint)
-    if num_robots is not None:
-        scenario_kwargs = {"num_robots": num_robots, **scenario_kwargs}
-    if problem is not None:
-        given = [*([] if scenario is None else ["scenario"]), *scenario_kwargs]
-        if given or randomize_instance:
-            named = ", ".join(given + ["randomize_instance"] * randomize_instance)
-            raise ValueError(f"problem= excludes the scenario arguments ({named}); give one or the other")
-        return Simulation(problem, **settings)
-
-    from d4orm_env.scenarios.registry import make_problem
-
-    name = "circle" if scenario is None else scenario
-    first = make_problem(name, **scenario_kwargs)
-
-    redraw = partial(_draw, make_problem, name, scenario_kwargs) if randomize_instance else None
-    return Simulation(first, redraw=redraw, **settings)
-
-
-def _draw(make_problem: Callable[..., Problem], name: str, arguments: dict[str, Any], seed: int) -> Problem:
-    return make_problem(name, **(arguments | {"seed": seed}))
 
 
 def agent_infos(names: Any, robots: Any, step: TeamStep) -> dict[str, dict[str, Any]]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -14,17 +14,26 @@ from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, whole_number
 from d4orm_env.core.observation import ObservationLayout
-from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem import Problem, ProblemArrays
 from d4orm_env.episode_record import episode_metrics
 from d4orm_env.joint_env import joint_spaces
-from d4orm_env.simulation import MAX_ACTION, check_options, make_simulation, usable
+from d4orm_env.options import EnvOptions
+from d4orm_env.rewards import RewardInput, compute_rewards
+from d4orm_env.simulation import MAX_ACTION, Simulation, check_options, checked_states, usable
+
+if TYPE_CHECKING:
+    from d4orm_env.engine.worlds import WorldBatch
 
 MAX_WORLDS = 1_000_000
 _NOISE_STEPS = 32
 """Steps of execution noise that a world draws at a time: drawing costs more per call than per number."""
 
 _OWN_ARRAYS = ("start", "goal", "inverse_initial_distance")
-"""What may differ from world to world; all the rest of a problem is shared."""
+"""What differs from world to world in one kernel call."""
+_WORLD_ARRAYS = ("balls", "cylinders", "boxes", "bounds")
+"""What may differ too, at the price of a call for each world; all the rest of a problem is shared."""
+_READ_BEFORE = ("state", "distance", "docked", "total_reward")
+"""What rewards are computed from that a step overwrites."""
 
 
 class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
@@ -37,33 +46,31 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
     Infos hold, for every world, ``arrived``, ``collided``, ``margin_violated`` and ``distance_to_goal`` ``(B, K)`` and
     ``is_success`` ``(B,)``. ``metrics`` are those of episodes that have just ended, as the mask ``_metrics`` says.
 
+    Worlds whose obstacles differ are stepped one by one, which takes longer than stepping them together.
+
     Args:
         num_envs: Number of worlds ``B``.
-        scenario: As for :class:`d4orm_env.navigation_v0.parallel_env`, like all arguments not named here.
+        scenario: As in :class:`~d4orm_env.options.EnvOptions`, like all arguments not named here.
         num_robots: Size of the team.
-        problem: The problem to run instead of a scenario.
-        render_mode: Must be ``None``.
-        control_noise_std: Standard deviation of Gaussian execution noise; each world has its own.
-        lifelong: Must be ``False``.
-        max_cycles: Steps until truncation; the problem's horizon unless given.
-        randomize_instance: Each world draws a new instance of the scenario at every reset. Team and obstacles must be
-            the same in all instances.
-        num_instances: With ``randomize_instance``, draw this many instances at the first reset and choose among them at
-            every reset, instead of drawing a new one each time, which takes longer than many steps. Another seed draws
-            others.
-        observed_robots: Nearest robots in an observation.
-        observed_obstacles: Nearest obstacles in an observation.
+        num_instances: Of a scenario that draws at random, draw this many instances at the first reset and choose among
+            them at every reset, instead of drawing a new one each time, which takes longer than many steps. Another
+            seed draws others.
         autoreset_mode: When a world whose episode has ended is reset, an :class:`gymnasium.vector.AutoresetMode` or
             its value. ``"NextStep"``: by the next step, which ignores its action. ``"SameStep"``: at once, with the
             last observation and infos kept in ``infos["final_obs"]`` and ``infos["final_info"]``. ``"Disabled"``: by
             ``reset(options={"reset_mask": ...})`` only.
         copy: Return a new observation array each time. ``False`` returns the same one, overwritten by the next call.
         num_threads: Threads to spread the worlds over; all available cores unless given.
-        **scenario_kwargs: Arguments of the scenario.
+        **options: Further attributes of :class:`~d4orm_env.options.EnvOptions`, but for ``render_mode`` and
+            ``lifelong``, and arguments of the scenario.
+
+    Attributes:
+        robot_rewards: ``(B, K)`` rewards of the robots in the last step, of which the team's is the mean; zero where a
+            world was reset instead.
 
     Raises:
         TypeError: For an argument that neither the environment nor the scenario has.
-        ValueError: For a bad argument, or instances that differ in their team or obstacles.
+        ValueError: For a bad argument, or instances that differ in their team.
     """
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
@@ -71,50 +78,36 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
     def __init__(
         self,
         num_envs: int = 1,
-        scenario: str | None = None,
+        scenario: Any = None,
         num_robots: int | None = None,
         *,
-        problem: Problem | None = None,
-        render_mode: str | None = None,
-        control_noise_std: Any = 0.0,
-        lifelong: bool = False,
-        max_cycles: int | None = None,
-        randomize_instance: bool = False,
         num_instances: int | None = None,
-        observed_robots: int = 4,
-        observed_obstacles: int = 4,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         copy: bool = True,
         num_threads: int | None = None,
-        **scenario_kwargs: Any,
+        **options: Any,
     ) -> None:
-        if render_mode is not None:
-            raise ValueError(f"render_mode is {render_mode!r}; a batch of worlds is not drawn, use gymnasium.make")
-        if lifelong:
+        chosen = EnvOptions.of(scenario=scenario, num_robots=num_robots, **options)
+        if chosen.render_mode is not None:
+            raise ValueError(
+                f"render_mode is {chosen.render_mode!r}; a batch of worlds is not drawn, use gymnasium.make"
+            )
+        if chosen.lifelong:
             raise ValueError("lifelong mode needs goals drawn one by one; use gymnasium.make or navigation_v0 for it")
         self.num_envs = whole_number(num_envs, "num_envs", 1, MAX_WORLDS)
         self._mode = _autoreset_mode(autoreset_mode)
         self.metadata = type(self).metadata | {"autoreset_mode": self._mode}
         # It steps no world: it checks the arguments and draws the instances.
-        self._template = make_simulation(
-            scenario,
-            num_robots,
-            problem,
-            randomize_instance,
-            scenario_kwargs,
-            max_cycles=max_cycles,
-            control_noise_std=control_noise_std,
-            observed_robots=observed_robots,
-            observed_obstacles=observed_obstacles,
-        )
+        self._template = Simulation(chosen)
         self.problem = self._template.problem
         self.single_observation_space, self.single_action_space = joint_spaces(self._template)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._copy = copy
-        if num_instances is not None and not randomize_instance:
+        if num_instances is not None and not self._template.redraws:
             raise ValueError(
-                f"num_instances is {num_instances!r} without randomize_instance=True; give both or neither"
+                f"num_instances is {num_instances!r} without randomize_instance, or for a scenario that draws nothing "
+                "at random; leave it out"
             )
         self._num_instances = None if num_instances is None else whole_number(num_instances, "num_instances", 1)
         self._pool: list[Problem] = []
@@ -130,6 +123,9 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         self._engine = CpuEngine(threads)
         start, goal, inverse = (np.repeat(getattr(problem.arrays, name)[None], count, axis=0) for name in _OWN_ARRAYS)
         self._worlds = WorldBatch.of(start, goal, inverse, problem.control_size)
+        self._arrays: list[ProblemArrays] = [problem.arrays] * count
+        self._apart = False
+        self.robot_rewards = np.zeros((count, problem.num_robots), np.float32)
         shape = (count, problem.num_robots, self._template.layout.size)
         self._observations = np.empty(shape, np.float32)
         self._running = np.zeros(count, np.bool_)
@@ -211,9 +207,11 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             controls += self._noise_std * self._next_noise(~ended)
         if some_ended:
             self._begin(np.flatnonzero(ended))
-        np.copyto(self._worlds.control, controls)
+        before, worlds = self._before(), self._worlds
+        np.copyto(worlds.control, controls)
         observations = self._advance(np.where(ended, RESET, STEP))
-        worlds, ended = self._worlds, self._ended
+        self._reward(before, ~ended)
+        ended = self._ended
         rewards, terminated, truncated = worlds.reward.copy(), worlds.terminated.copy(), worlds.truncated.copy()
         infos = self._infos(np.ones(self.num_envs, np.bool_))
         if ended.any():
@@ -224,6 +222,29 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
                 self._advance(np.where(ended, RESET, SKIP), observations)
                 infos = self._infos(np.ones(self.num_envs, np.bool_)) | final
         return observations, rewards, terminated, truncated, infos
+
+    def set_state(self, states: Any) -> tuple[FloatArray, dict[str, Any]]:
+        """Put the robots elsewhere; see :meth:`d4orm_env.navigation_v0.parallel_env.set_state`.
+
+        Args:
+            states: ``(B, K, n)`` of all robots. Where an episode has ended they do not matter: the next step resets it.
+
+        Returns:
+            Observations ``(B, K * D)`` and infos, as at a reset.
+
+        Raises:
+            RuntimeError: Before the first reset.
+            ValueError: If a state is none that the robot may be in; the message names it.
+        """
+        from d4orm_env.engine.worlds import LOOK
+
+        self._require_reset()
+        worlds = self._worlds
+        shape = worlds.state.shape
+        bounds = self._template.state_bounds
+        np.copyto(worlds.state, checked_states(self.problem, states, worlds.docked, bounds, shape))
+        observations = self._advance(np.full(self.num_envs, LOOK))
+        return observations, self._infos(np.ones(self.num_envs, np.bool_))
 
     def state(self) -> FloatArray:
         """``(B, S)`` joint states of the worlds; see :mod:`d4orm_env.joint_state`.
@@ -267,8 +288,49 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         if observations is None:
             observations = np.empty_like(self._observations) if self._copy else self._observations
         out = observations.reshape(self._observations.shape)
-        self._engine.advance(self.problem.arrays, template.layout, self.max_cycles, orders, self._worlds, out)
+        advance, layout, cycles = self._engine.advance, template.layout, self.max_cycles
+        if not self._apart:
+            advance(self.problem.arrays, layout, cycles, orders, self._worlds, out)
+        else:
+            for world, arrays in enumerate(self._arrays):
+                one = slice(world, world + 1)
+                part = type(self._worlds)(*(values[one] for values in self._worlds))
+                advance(arrays, layout, cycles, orders[one], part, out[one])
         return out.reshape(self.num_envs, -1)
+
+    def _before(self) -> WorldBatch | None:
+        """The worlds before a step, as far as a reward is computed from them; ``None`` for the paper's."""
+        if self._template.reward is None:
+            return None
+        worlds = self._worlds
+        return worlds._replace(**{name: getattr(worlds, name).copy() for name in _READ_BEFORE})
+
+    def _reward(self, before: WorldBatch | None, moved: BoolArray) -> None:
+        """Give the robots of the worlds that have ``moved`` from ``before`` their rewards."""
+        worlds, reward = self._worlds, self._template.reward
+        self.robot_rewards = np.where(moved[:, None], worlds.rewards, np.float32(0))
+        if reward is None or before is None:
+            return
+        step = RewardInput(
+            previous_states=np.where(moved[:, None, None], before.state, worlds.state),
+            states=worlds.state,
+            controls=worlds.control,
+            goals=worlds.goal,
+            previous_distances=np.where(moved[:, None], before.distance, worlds.distance),
+            distances=worlds.distance,
+            initial_distances=1 / worlds.inverse,
+            previously_arrived=before.docked & moved[:, None],
+            arrived=worlds.docked,
+            collided=worlds.collided,
+            margin_violated=worlds.violated,
+            paper=self.robot_rewards,
+            team=self.problem.team,
+            dt=self.problem.dt,
+        )
+        self.robot_rewards = np.where(moved[:, None], compute_rewards(reward, step), np.float32(0))
+        worlds.reward[:] = self.robot_rewards.mean(axis=1)
+        # Where a world was reset both are zero.
+        worlds.total_reward[moved] = before.total_reward[moved] + self.robot_rewards[moved].sum(axis=1)
 
     def _begin(self, indices: NDArray[np.intp]) -> None:
         """Draw what is random in the next episode of these worlds, as a single environment does."""
@@ -283,6 +345,8 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
                 problem = self._next_instance(episode)
                 self._worlds.start[world], self._worlds.goal[world] = problem.start, problem.goal
                 self._worlds.inverse[world] = problem.arrays.inverse_initial_distance
+                self._arrays[world] = problem.arrays
+                self._apart |= bool(_differing(problem, self.problem, _WORLD_ARRAYS))
 
     def _next_instance(self, random: np.random.Generator) -> Problem:
         """A new instance, or one of the pool."""
@@ -293,14 +357,15 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         return self._pool[int(random.integers(self._num_instances))]
 
     def _drawn(self, random: np.random.Generator) -> Problem:
-        """A new instance that differs from the first in starts and goals only."""
+        """A new instance that differs from the first in places and obstacles only."""
         drawn = self._template.draw_instance(random)
-        for name, own, shared in zip(drawn.arrays._fields, drawn.arrays, self.problem.arrays):
-            if name not in _OWN_ARRAYS and not np.array_equal(own, shared):
-                raise ValueError(
-                    f"instances of scenario {drawn.name!r} differ in their {name}, and worlds of a batch share all but "
-                    "starts and goals; use num_obstacles=0, or vectorization_mode='sync'"
-                )
+        shared = set(drawn.arrays._fields) - {*_OWN_ARRAYS, *_WORLD_ARRAYS}
+        differing = _differing(drawn, self.problem, shared)
+        if differing:
+            raise ValueError(
+                f"instances of scenario {drawn.name!r} differ in their {', '.join(differing)}, and worlds of a batch "
+                "share all but starts, goals and obstacles; use vectorization_mode='sync'"
+            )
         return drawn
 
     def _next_noise(self, moving: BoolArray) -> FloatArray:
@@ -382,6 +447,11 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         if len(seed) != self.num_envs:
             raise ValueError(f"seed has {len(seed)} entries for {self.num_envs} worlds; give one per world")
         return [None if one is None else whole_number(one, f"seed[{world}]", 0) for world, one in enumerate(seed)]
+
+
+def _differing(one: Problem, other: Problem, names: Iterable[str]) -> list[str]:
+    """Those of the arrays in which two problems differ."""
+    return [name for name in names if not np.array_equal(getattr(one.arrays, name), getattr(other.arrays, name))]
 
 
 def _final(observations: FloatArray, infos: dict[str, Any], ended: BoolArray) -> dict[str, Any]:

@@ -66,7 +66,10 @@ def options(
 
 
 Scenario = Annotated[
-    str, typer.Option("--scenario", "-s", help="Scenario name (see `d4orm scenarios`) or a YAML file.")
+    str,
+    typer.Option(
+        "--scenario", "-s", help="Scenario name (see `d4orm scenarios`), a YAML file or package.module:function."
+    ),
 ]
 Robots = Annotated[int | None, typer.Option("--robots", "-k", help="Number of robots; the scenario's own by default.")]
 Model = Annotated[str | None, typer.Option("--model", "-m", help="Robot model; the scenario's own by default.")]
@@ -252,7 +255,13 @@ def scenarios() -> None:
     """List the scenarios."""
     from d4orm_env.scenarios import describe_scenario, list_scenarios
 
-    _print_table("Scenarios", [(name, describe_scenario(name)) for name in list_scenarios()])
+    def described(name: str) -> str:
+        try:
+            return describe_scenario(name)
+        except ValueError as error:  # an installed package offers it and cannot be imported
+            return str(error)
+
+    _print_table("Scenarios", [(name, described(name)) for name in list_scenarios()])
 
 
 @app.command()
@@ -266,8 +275,9 @@ def planners() -> None:
 
 def _problem(scenario: str, robots: int | None, model: str | None, obstacles: int | None, seed: int) -> Problem:
     from d4orm_env.scenarios import load_problem, make_problem
+    from d4orm_env.scenarios.registry import is_scenario_file
 
-    if Path(scenario).suffix in (".yaml", ".yml"):
+    if is_scenario_file(scenario):
         given = {"--robots": robots, "--model": model, "--obstacles": obstacles}
         for option, value in given.items():
             if value is not None:

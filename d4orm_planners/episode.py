@@ -11,7 +11,6 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, whole_number
 from d4orm_env.core.metrics import mean_squared_jerk
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.engine.base import Engine, get_engine
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_planners.policy import Policy
 
@@ -52,17 +51,16 @@ def run_episode(env: Any, policy: Policy, seed: int = 0) -> Episode:
     observations, infos = env.reset(seed=seed)
     problem = env.unwrapped.problem
     policy.reset(env, seed=seed)
-    engine = get_engine("cpu")
     joints = [split_state(problem, env.state())]
     all_observations, all_infos = [observations], [infos]
-    outcomes = [_outcome(engine, problem, joints[0], joints[0], dict.fromkeys(infos, 0.0), infos)]
+    outcomes = [_outcome(env, {})]
     while env.agents:
         acting = {agent: observations[agent] for agent in env.agents}
         observations, rewards, _, _, infos = env.step(policy.act(acting, env.state()))
         joints.append(split_state(problem, env.state()))
         all_observations.append(observations)
         all_infos.append(infos)
-        outcomes.append(_outcome(engine, problem, joints[-2], joints[-1], rewards, infos))
+        outcomes.append(_outcome(env, rewards))
     trajectory = _trajectory(problem, joints, outcomes)
     jerk = mean_squared_jerk(trajectory.controls, trajectory.arrived, problem.dt)
     metrics = {**env.unwrapped.metrics(), "mean_squared_jerk": jerk}
@@ -77,29 +75,12 @@ class _Outcome(NamedTuple):
     margin_violated: BoolArray
 
 
-def _outcome(
-    engine: Engine,
-    problem: Problem,
-    before: JointState,
-    after: JointState,
-    rewards: dict[str, float],
-    infos: dict[str, dict[str, Any]],
-) -> _Outcome:
-    """What the environment reports on its agents after a step or a reset, and the same for robots that have left.
-
-    Those stand at their goals and may be run into. The environment reports on them no more, so for them the step is
-    taken again with the controls that were executed.
-    """
-    size = problem.num_robots
-    outcome = _Outcome(np.zeros(size, np.float32), np.zeros(size, bool), np.zeros(size, bool))
-    if len(rewards) < size:
-        again = engine.step(problem.arrays, before.states, before.arrived, after.controls)
-        outcome = _Outcome(again.rewards, again.collided, again.margin_violated)
-    for agent, reward in rewards.items():
-        robot = int(agent.rsplit("_", 1)[1])
-        outcome.rewards[robot] = reward
-        outcome.collided[robot] = infos[agent]["collided"]
-        outcome.margin_violated[robot] = infos[agent]["margin_violated"]
+def _outcome(env: Any, rewards: dict[str, float]) -> _Outcome:
+    """What the last step did to all robots, those that have left and may be run into included."""
+    step = env.unwrapped.last_step
+    outcome = _Outcome(step.rewards.copy(), step.collided, step.margin_violated)
+    for agent, reward in rewards.items():  # as wrappers have made them
+        outcome.rewards[int(agent.rsplit("_", 1)[1])] = reward
     return outcome
 
 

@@ -91,7 +91,10 @@ class OpenLoop(Policy):
         if self.planner is not None:
             self.plan = self.planner.solve(self.problem, seed=seed, time_limit=self.time_limit)
         elif self.plan is not None and self.plan.problem != self.problem:
-            raise ValueError("the plan was made for another problem than the environment's; plan for this one")
+            raise ValueError(
+                "the plan was made for another problem than the environment's; plan for this one, or keep one with "
+                "randomize_instance=False"
+            )
 
     def _controls(self, joint: JointState) -> FloatArray:
         assert self.plan is not None

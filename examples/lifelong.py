@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from outputs import argument_parser, count, save_gif, save_table
 
-from d4orm_env import Problem, navigation_v0
+from d4orm_env import Problem, make_problem, navigation_v0
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_env.lifelong import goal_region
 from d4orm_env.render import FrameRenderer
@@ -47,8 +47,8 @@ def main() -> None:
     if arguments.quick:
         num_robots, minutes, film = 4, 0.1, 2.0
 
-    env = navigation_v0.parallel_env(scenario="random", num_robots=num_robots, seed=arguments.seed, lifelong=True)
-    problem = env.problem
+    problem = make_problem("random", num_robots=num_robots, seed=arguments.seed)
+    env = navigation_v0.parallel_env(problem=problem, lifelong=True)
     env.max_cycles = max(round(60 * minutes / problem.dt), 1)
     observations, _ = env.reset(seed=arguments.seed)
     policy: Any = make_policy("d4orm-c2f")

@@ -184,10 +184,9 @@ def test_a_trained_policy_runs_in_the_environment(trained: tuple[TrainingSetting
     np.testing.assert_array_equal(episode.trajectory.controls, again.trajectory.controls)
 
 
-@pytest.mark.parametrize("change", [{"scenario": "heterogeneous"}, {"scenario_settings": {"num_obstacles": 2}}])
-def test_what_cannot_be_learned_is_refused_and_nothing_is_written(change: dict, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"mixes|differ in their balls"):
-        train(replace(TINY, **change), tmp_path)
+def test_what_cannot_be_learned_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="mixes"):
+        train(replace(TINY, scenario="heterogeneous"), tmp_path)
     assert not list(tmp_path.iterdir())
 
 

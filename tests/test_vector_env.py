@@ -242,7 +242,7 @@ def test_state_is_that_of_the_joint_env() -> None:
         ({"render_mode": "rgb_array"}, "render_mode"),
         ({"autoreset_mode": "Sometimes"}, "autoreset_mode 'Sometimes' is unknown"),
         ({"num_threads": 0}, "num_threads is 0"),
-        ({"scenario": "random", "num_obstacles": 3, "randomize_instance": True}, "num_obstacles=0"),
+        ({"scenario": "random", "randomize_instance": 1}, "randomize_instance is 1"),
         ({"scenario": "circle", "randomize_instance": True}, "same for every seed"),
         ({"scenario": "nowhere"}, "unknown"),
     ],
@@ -302,6 +302,8 @@ def test_a_pool_of_instances_is_drawn_by_the_seed_and_chosen_from() -> None:
     assert len(set(first)) > 1
     assert set(starts(5)).isdisjoint(first)
     with pytest.raises(ValueError, match="without randomize_instance"):
-        NavigationVectorEnv(8, "random", 2, num_instances=3)
+        NavigationVectorEnv(8, "random", 2, num_instances=3, randomize_instance=False)
+    with pytest.raises(ValueError, match="draws nothing at random"):
+        NavigationVectorEnv(8, "circle", 2, num_instances=3)
     with pytest.raises(ValueError, match="num_instances"):
         NavigationVectorEnv(8, num_instances=0, **arguments)

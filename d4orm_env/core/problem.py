@@ -140,28 +140,37 @@ class Problem:
             raise ValueError(
                 f"horizon is {self.horizon} steps for {team.num_robots} robots; it must be at most {most} for so many"
             )
-        self._check_start_states()
+        self.check_states(self.start)
         self._check_resolution()
         self._check_turning()
         self._check_places("start", self.start[:, : team.dimension])
         self._check_places("goal", self.goal)
 
-    def _check_start_states(self) -> None:
+    def check_states(self, states: FloatArray, what: str = "start") -> None:
+        """Whether robots may be in these states, wherever that is.
+
+        Args:
+            states: ``(K, n)``.
+            what: What to call them in an error.
+
+        Raises:
+            ValueError: If padding is not zero, or a speed or heading too large; the message names the robot.
+        """
         for robot, model in enumerate(self.team.robot_models):
-            state = self.start[robot]
+            state = states[robot]
             if state[model.state_size :].any():
                 raise ValueError(
-                    f"start of robot_{robot} is {state.tolist()}; a {model.name} has {model.state_size} components, "
+                    f"{what} of robot_{robot} is {state.tolist()}; a {model.name} has {model.state_size} components, "
                     f"so set the padding after them to zero"
                 )
             speed = float(np.linalg.norm(state[list(model.speed_indices)])) if model.speed_indices else 0.0
             limit = float(np.asarray(self.team.max_speed)[robot])
             if speed > limit * (1 + 1e-5):
-                raise ValueError(f"start speed of robot_{robot} is {speed:g} m/s, above its limit of {limit:g} m/s")
+                raise ValueError(f"{what} speed of robot_{robot} is {speed:g} m/s, above its limit of {limit:g} m/s")
             heading = 0.0 if model.heading_index is None else float(state[model.heading_index])
             if abs(heading) > MAX_HEADING:
                 raise ValueError(
-                    f"start heading of robot_{robot} is {heading:g} rad; it must be at most {MAX_HEADING:g} in "
+                    f"{what} heading of robot_{robot} is {heading:g} rad; it must be at most {MAX_HEADING:g} in "
                     f"magnitude, so take whole turns off"
                 )
 

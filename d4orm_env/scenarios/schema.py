@@ -15,7 +15,7 @@ from d4orm_env.core.portable import arctan2
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.registry import make_problem, unknown_argument
+from d4orm_env.scenarios.registry import get_scenario, make_problem, unknown_argument
 
 FLOAT32_MAX = float(str(np.finfo(np.float32).max))
 VERSION = 1
@@ -179,10 +179,12 @@ class ScenarioFile(BaseModel):
 
     def build(self) -> Problem:
         arguments = self.model_extra or {}
-        complaint = unknown_argument(self.scenario, arguments)
+        # A name only: a file neither imports code nor reads other files.
+        scenario = get_scenario(self.scenario)
+        complaint = unknown_argument(scenario, arguments)
         if complaint:
             raise ValueError(complaint)
-        problem = make_problem(self.scenario, **arguments)
+        problem = make_problem(scenario, **arguments)
         return problem if self.name is None else problem.replace(name=self.name)
 
 

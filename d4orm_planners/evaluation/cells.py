@@ -10,6 +10,7 @@ from typing import Any
 from d4orm_env.core.arrays import duration, shown, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios import load_problem, make_problem
+from d4orm_env.scenarios.registry import is_scenario_file
 from d4orm_planners.evaluation.store import LARGEST_NUMBER
 from d4orm_planners.evaluation.trials import Configuration
 from d4orm_planners.registry import PLANNERS, list_policies, make_policy
@@ -68,7 +69,7 @@ def _check_distinct(chosen: Sequence[Configuration]) -> None:
 
 
 def problems(
-    scenarios: str | os.PathLike[str] | Iterable[str | os.PathLike[str] | Problem],
+    scenarios: Any,
     sizes: Sequence[int | None],
     seeds: Sequence[int],
     model: str | None,
@@ -76,8 +77,8 @@ def problems(
     """One list per scenario and team size, with a problem for every seed.
 
     Args:
-        scenarios: Scenario names, YAML files (``.yaml``, ``.yml``) or problems; the latter two have a team of their own
-            and are the same for all seeds.
+        scenarios: Scenario names, callables or ``"package.module:function"``, YAML files (``.yaml``, ``.yml``) or
+            problems; the latter two have a team of their own and are the same for all seeds.
         sizes: Team sizes for the names; ``None`` is the scenario's own.
         seeds: Seeds of the scenarios.
         model: Robot model for the names; ``None`` is the scenario's own.
@@ -90,12 +91,12 @@ def problems(
     for scenario in dict.fromkeys(several(scenarios)):
         if isinstance(scenario, Problem):
             cells.append([scenario] * len(seeds))
-        elif Path(scenario).suffix in (".yaml", ".yml"):
+        elif is_scenario_file(scenario):
             cells.append([_load(Path(scenario))] * len(seeds))
         else:
             named = True
             for size in sizes:
-                cells.append([make_problem(str(scenario), num_robots=size, seed=seed, model=model) for seed in seeds])
+                cells.append([make_problem(scenario, num_robots=size, seed=seed, model=model) for seed in seeds])
     if not cells:
         raise ValueError("scenarios or num_robots is empty; give at least one of each")
     if not named and (model is not None or any(size is not None for size in sizes)):

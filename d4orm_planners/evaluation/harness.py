@@ -24,7 +24,8 @@ from d4orm_planners.evaluation.trials import Job
 from d4orm_planners.evaluation.workers import LocalCrew, run_here
 
 Progress = Callable[[str, int, int], Any]
-Scenarios = str | os.PathLike[str] | Iterable[str | os.PathLike[str] | Problem]
+Scenario = str | os.PathLike[str] | Problem | Callable[..., Problem]
+Scenarios = Scenario | Iterable[Scenario]
 
 
 def evaluate(
@@ -53,7 +54,7 @@ def evaluate(
         policies: A policy name or several (:func:`d4orm_planners.list_policies`), or settings by label:
             ``{"d4orm": {}, "d4orm, few": {"policy": "d4orm", "num_samples": 128}}``. Without ``"policy"`` the label is
             the name.
-        scenarios: Scenario names, YAML scenario files, or problems.
+        scenarios: Scenarios as for :func:`d4orm_env.make_problem`, or problems.
         out: Folder to write to; made if it does not exist.
         seeds: Each seeds the scenario, the policy and the noise of a trial.
         control_noise_std: Standard deviations of the Gaussian noise added to the controls, in their units.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,31 +11,9 @@ from gymnasium.spaces import Box
 from stable_baselines3.common.vec_env import VecEnv
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.rewards import RewardFunction
 from d4orm_env.vector_env import NavigationVectorEnv
 from d4orm_planners.rl.features import Features
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainingReward:
-    """The reward to learn from, per robot and step.
-
-    The environment's own reward pays a robot for every step that it spends close to its goal, and ends with the
-    arrival: who learns from it does not arrive. This one pays the way made, which is a potential (A. Y. Ng, D. Harada
-    and S. Russell, ICML 1999), and the arrival.
-
-    Attributes:
-        progress: For every step's way at full speed towards the goal.
-        arrival: Once, on arriving.
-        margin: Taken off in every step within the margin of anything.
-        contact: Taken off in every step in contact with anything.
-        time: Taken off in every step.
-    """
-
-    progress: float = 0.3
-    arrival: float = 5.0
-    margin: float = 1.0
-    contact: float = 3.0
-    time: float = 0.05
 
 
 class RobotVecEnv(VecEnv):
@@ -56,7 +33,7 @@ class RobotVecEnv(VecEnv):
         num_robots: ``K``.
         scenario: As for :class:`d4orm_env.navigation_v0.parallel_env`, like ``**kwargs``. One model for all robots.
         seed: Of the first world.
-        reward: The reward to learn from.
+        reward: The reward to learn from, as in :class:`~d4orm_env.options.EnvOptions`.
         **kwargs: Further arguments of :class:`d4orm_env.vector_env.NavigationVectorEnv`.
 
     Attributes:
@@ -77,10 +54,11 @@ class RobotVecEnv(VecEnv):
         scenario: str = "random",
         *,
         seed: int = 0,
-        reward: TrainingReward | None = None,
+        reward: str | RewardFunction = "training",
         **kwargs: Any,
     ) -> None:
-        self._env = NavigationVectorEnv(num_worlds, scenario, num_robots, autoreset_mode="SameStep", **kwargs)
+        kwargs |= {"reward": reward, "autoreset_mode": "SameStep"}
+        self._env = NavigationVectorEnv(num_worlds, scenario, num_robots, **kwargs)
         problem = self.problem = self._env.problem
         if len(set(problem.team.models)) > 1:
             raise ValueError(
@@ -92,8 +70,6 @@ class RobotVecEnv(VecEnv):
         self._shape = (num_worlds, problem.num_robots)
         count = num_worlds * problem.num_robots
         self._limits = np.tile(problem.team.control_limits, (num_worlds, 1))
-        self._max_step = np.asarray(problem.team.max_speed * problem.dt)[None]
-        self._reward = reward or TrainingReward()
         self._seed: int | None = seed
         self.acted = np.ones(count, np.bool_)
         self.finished: list[tuple[int, bool, float]] = []
@@ -107,7 +83,6 @@ class RobotVecEnv(VecEnv):
         observations, infos = self._env.reset(seed=self._seed)
         self._seed = None
         self._acting = ~infos["arrived"]
-        self._distance = infos["distance_to_goal"]
         self._touched = infos["collided"].copy()
         self._return = np.zeros(self._shape)
         self._length = np.zeros(self._shape, np.int64)
@@ -121,11 +96,11 @@ class RobotVecEnv(VecEnv):
         controls = self.features.decode(self._actions, self._frames, self._limits)
         observations, _, terminated, truncated, infos = self._env.step(controls.reshape(self._shape[0], -1))
         ended, acting = terminated | truncated, self._acting
-        now = {name: infos[name] for name in ("arrived", "collided", "margin_violated", "distance_to_goal")}
+        now = {name: infos[name] for name in ("arrived", "collided")}
         if ended.any():
             final = infos["final_info"]
             now = {name: np.where(ended[:, None], final[name], value) for name, value in now.items()}
-        rewards = self._rewards(now) * acting
+        rewards = self._env.robot_rewards * acting
         self.acted = acting.ravel()
         self._touched |= now["collided"] & acting
         self._return += rewards
@@ -134,7 +109,6 @@ class RobotVecEnv(VecEnv):
         # The slot of an arrived robot ends with its world, so that the next episode begins afresh.
         dones = np.where(acting, now["arrived"], False) | ended[:, None]
         self._acting = (acting & ~now["arrived"]) | ended[:, None]
-        self._distance = infos["distance_to_goal"]
         finishing = np.argwhere(dones & acting)
         last = [
             (infos["final_obs"][b] if ended[b] else observations[b]).reshape(self._shape[1], -1)[k]
@@ -146,18 +120,6 @@ class RobotVecEnv(VecEnv):
             values[dones] = 0
         self.seconds += time.perf_counter() - begin
         return features, rewards.ravel().astype(np.float32), dones.ravel(), robot_infos
-
-    def _rewards(self, now: dict[str, Any]) -> FloatArray:
-        """``(B, K)``."""
-        scale = self._reward
-        rewards: FloatArray = (
-            scale.progress * (self._distance - now["distance_to_goal"]) / self._max_step
-            + scale.arrival * now["arrived"]
-            - scale.margin * now["margin_violated"]
-            - scale.contact * now["collided"]
-            - scale.time
-        )
-        return rewards
 
     def _encode(self, observations: FloatArray, last: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
         """Features of what the robots see now, and of what those whose episodes have ended saw last."""

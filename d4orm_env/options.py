@@ -1,0 +1,113 @@
+"""The arguments that all environments share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from functools import partial
+from typing import Any
+
+from d4orm_env.core.arrays import shown
+from d4orm_env.core.errors import UnknownKeywordError
+from d4orm_env.core.problem import Problem
+from d4orm_env.rewards import RewardFunction
+from d4orm_env.scenarios.registry import make_problem, unknown_argument
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EnvOptions:
+    """What an environment is made of; every environment takes these as keyword arguments.
+
+    Attributes:
+        scenario: ``"circle"`` unless a problem is given. The name of a scenario, the path of a YAML file, a callable
+            ``(seed, num_robots, **settings) -> Problem``, or where to import one, ``"package.module:function"``.
+        num_robots: Size of the team; the scenario's default (8 for most) unless given.
+        problem: The problem to run instead of a scenario.
+        render_mode: ``"rgb_array"``, ``"human"`` or ``None``.
+        control_noise_std: Standard deviation of Gaussian execution noise, in the controls' units, for all components
+            or one per component. It is added before the control is clipped.
+        lifelong: A robot that arrives gets a fresh random goal, keeps moving and is not terminated; its info says
+            ``arrived`` at that step, and ``distance_to_goal`` is to the new goal.
+        max_cycles: Steps until truncation; the problem's horizon unless given.
+        randomize_instance: Draw a new instance of the scenario at every reset. By default wherever the scenario draws
+            at random, that is, where seeds 0 and 1 give different problems; ``False`` keeps the one of ``seed=``.
+        reward: ``"paper"``, ``"training"`` (:class:`~d4orm_env.rewards.TrainingReward`), or a function from a
+            :class:`~d4orm_env.rewards.RewardInput` to the rewards ``(..., K)`` of all robots.
+        observed_robots: Nearest robots in an observation; missing ones are marked absent.
+        observed_obstacles: Nearest obstacles in an observation; likewise.
+        scenario_settings: Arguments of the scenario, such as ``model`` or ``seed``: all other keyword arguments.
+    """
+
+    scenario: Any = None
+    num_robots: int | None = None
+    problem: Problem | None = None
+    render_mode: str | None = None
+    control_noise_std: Any = 0.0
+    lifelong: bool = False
+    max_cycles: int | None = None
+    randomize_instance: bool | None = None
+    reward: str | RewardFunction = "paper"
+    observed_robots: int = 4
+    observed_obstacles: int = 4
+    scenario_settings: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, **arguments: Any) -> EnvOptions:
+        """From the keyword arguments of an environment.
+
+        Raises:
+            TypeError: For one that neither the environments nor the scenario have; the message lists those they have.
+            ValueError: If both a problem and a scenario or its arguments are given, or the scenario is unknown.
+        """
+        own = [attribute.name for attribute in fields(cls) if attribute.name != "scenario_settings"]
+        given = {name: arguments.pop(name) for name in own if name in arguments}
+        options = cls(**given, scenario_settings=arguments)
+        if arguments:
+            complaint = unknown_argument(None if options.problem is not None else options._scenario, arguments, own)
+            if complaint:
+                raise UnknownKeywordError(complaint)
+        options._check()
+        return options
+
+    def _check(self) -> None:
+        if not isinstance(self.randomize_instance, bool | None):
+            raise ValueError(f"randomize_instance is {shown(self.randomize_instance)}; it must be True, False or None")
+        if self.problem is None:
+            return
+        beside = {"scenario": self.scenario, "num_robots": self.num_robots}
+        named = [name for name, value in beside.items() if value is not None]
+        named += [*self.scenario_settings, *["randomize_instance"] * bool(self.randomize_instance)]
+        if named:
+            raise ValueError(f"problem= excludes the scenario arguments ({', '.join(named)}); give one or the other")
+
+    @property
+    def _scenario(self) -> Any:
+        return "circle" if self.scenario is None else self.scenario
+
+    def instances(self) -> tuple[Problem, Callable[[int], Problem] | None]:
+        """The problem to begin with, and ``seed -> Problem`` for drawing others; ``None`` where there is only one.
+
+        Raises:
+            ValueError: If the scenario's arguments are bad, or there is nothing to draw although
+                ``randomize_instance`` asks for it.
+        """
+        if self.problem is not None:
+            return self.problem, None
+        settings = {"num_robots": self.num_robots, **self.scenario_settings}
+        first = make_problem(self._scenario, **settings)
+        if self.randomize_instance is False:
+            return first, None
+        draw = partial(_draw, self._scenario, settings)
+        zeroth = draw(0) if self.scenario_settings.get("seed") else first
+        if draw(1) != zeroth:
+            return first, draw
+        if self.randomize_instance:
+            raise ValueError(
+                f"scenario {first.name!r} is the same for every seed, so randomize_instance has nothing to draw; "
+                "use a scenario with random starts and goals, or leave randomize_instance off"
+            )
+        return first, None
+
+
+def _draw(scenario: Any, settings: Mapping[str, Any], seed: int) -> Problem:
+    return make_problem(scenario, **(dict(settings) | {"seed": seed}))

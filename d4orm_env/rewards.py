@@ -1,0 +1,151 @@
+"""What a step is worth: the paper's reward, one to learn from, and those that users bring."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, shown
+from d4orm_env.core.team import Team
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RewardInput:
+    """One step of a team, or in the batched environment of ``B`` teams: what a reward is computed from.
+
+    Every array is a read-only copy with the leading axes ``...``: none in the PettingZoo and the joint environment, so
+    that ``(..., K)`` is ``(K,)``, and ``(B,)`` in the batched one, so that it is ``(B, K)``. All robots are there,
+    docked ones too.
+
+    Attributes:
+        previous_states: ``(..., K, n)`` before the step.
+        states: ``(..., K, n)`` after it.
+        controls: ``(..., K, m)`` as executed.
+        goals: ``(..., K, d)`` the goals during the step [m].
+        previous_distances: ``(..., K)`` to the goals before the step [m].
+        distances: ``(..., K)`` after it [m].
+        initial_distances: ``(..., K)`` where the way to the goal began, at least the goal radius [m].
+        previously_arrived: ``(..., K)`` bool: docked before the step.
+        arrived: ``(..., K)`` bool: docked after it; in lifelong mode, reached a goal in this step.
+        collided: ``(..., K)`` bool, hard contact.
+        margin_violated: ``(..., K)`` bool, within the margin of anything.
+        paper: ``(..., K)`` the paper's reward, to build upon.
+        team: The robots.
+        dt: Time step [s].
+    """
+
+    previous_states: FloatArray
+    states: FloatArray
+    controls: FloatArray
+    goals: FloatArray
+    previous_distances: FloatArray
+    distances: FloatArray
+    initial_distances: FloatArray
+    previously_arrived: BoolArray
+    arrived: BoolArray
+    collided: BoolArray
+    margin_violated: BoolArray
+    paper: FloatArray
+    team: Team
+    dt: float
+
+    def __post_init__(self) -> None:
+        for attribute in fields(self):
+            value = getattr(self, attribute.name)
+            if isinstance(value, np.ndarray):
+                copy = value.copy()
+                copy.setflags(write=False)
+                object.__setattr__(self, attribute.name, copy)
+
+    @property
+    def previous_positions(self) -> FloatArray:
+        """``(..., K, d)`` before the step [m]."""
+        return self.previous_states[..., : self.goals.shape[-1]]
+
+    @property
+    def positions(self) -> FloatArray:
+        """``(..., K, d)`` after the step [m]."""
+        return self.states[..., : self.goals.shape[-1]]
+
+
+RewardFunction = Callable[[RewardInput], Any]
+"""``(step) -> (..., K)`` rewards of all robots."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingReward:
+    """A reward to learn from, per robot and step; zero once a robot has docked.
+
+    The paper's reward pays a robot for every step that it spends close to its goal, and an episode ends with the
+    arrival: who learns from it does not arrive. This one pays the way made, which is a potential (A. Y. Ng, D. Harada
+    and S. Russell, ICML 1999), and the arrival.
+
+    Attributes:
+        progress: For every step's way at full speed towards the goal.
+        arrival: Once, on arriving.
+        margin: Taken off in every step within the margin of anything.
+        contact: Taken off in every step in contact with anything.
+        time: Taken off in every step.
+    """
+
+    progress: float = 0.3
+    arrival: float = 5.0
+    margin: float = 1.0
+    contact: float = 3.0
+    time: float = 0.05
+
+    def __call__(self, step: RewardInput) -> FloatArray:
+        """``(..., K)``."""
+        longest = np.asarray(step.team.max_speed) * step.dt
+        rewards: FloatArray = (
+            self.progress * (step.previous_distances - step.distances) / longest
+            + self.arrival * step.arrived
+            - self.margin * step.margin_violated
+            - self.contact * step.collided
+            - self.time
+        ) * ~step.previously_arrived
+        return rewards
+
+
+REWARDS: Mapping[str, RewardFunction | None] = MappingProxyType({"paper": None, "training": TrainingReward()})
+"""Rewards by name; ``None`` is what the engines compute themselves."""
+
+
+def find_reward(reward: Any) -> RewardFunction | None:
+    """The function behind ``reward=``; ``None`` for the paper's.
+
+    Raises:
+        ValueError: If it is neither a name that exists nor a callable.
+    """
+    if callable(reward):
+        return reward
+    if not isinstance(reward, str) or reward not in REWARDS:
+        raise ValueError(
+            f"reward {shown(reward)} is unknown; choose one of {', '.join(REWARDS)}, or a function of a RewardInput"
+        )
+    return REWARDS[reward]
+
+
+def compute_rewards(function: RewardFunction, step: RewardInput) -> FloatArray:
+    """``(..., K)`` float32 rewards of a step, checked.
+
+    Raises:
+        ValueError: If the function returns another shape, or a value that is not finite.
+    """
+    name = getattr(function, "__name__", type(function).__name__)
+    try:
+        rewards = as_float32(function(step))
+    except ValueError as error:
+        raise ValueError(f"reward {name!r}: {error}") from error
+    expected = step.distances.shape
+    if rewards.shape != expected:
+        axes = "(K,)" if len(expected) == 1 else "(B, K)"
+        raise ValueError(f"reward {name!r} returned shape {rewards.shape}; expected {axes} = {expected}")
+    if not np.isfinite(rewards).all():
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(rewards))[0])
+        raise ValueError(f"reward {name!r} returned {rewards[where]} for robot_{where[-1]}; rewards must be finite")
+    return rewards
