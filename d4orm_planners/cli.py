@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +19,7 @@ from d4orm_planners.commands.evaluate import evaluate, leaderboard
 from d4orm_planners.commands.inputs import (
     MOST_SEEDS,
     check_target,
+    find_here,
     make_folder,
     names,
     numbers,
@@ -156,7 +158,9 @@ def run(
     model: Model = None,
     obstacles: Obstacles = None,
     seed: Seed = 0,
-    policy: Annotated[str, typer.Option("--policy", "-p", help="Planner or policy to run.")] = "d4orm",
+    policy: Annotated[
+        str, typer.Option("--policy", "-p", help="Planner, policy or package.module:Name to run.")
+    ] = "d4orm",
     noise: Annotated[float, typer.Option("--noise", help="Standard deviation of the execution noise.")] = 0.0,
     picture: Annotated[Path | None, typer.Option("--picture", help="Picture to write: .png, .svg or .pdf.")] = None,
     animation: Annotated[Path | None, typer.Option("--animation", help="Animation to write: .gif or .mp4.")] = None,
@@ -181,6 +185,7 @@ def run(
         problem: Problem = plan.problem
         actor: Policy = OpenLoop(plan=plan)
     else:
+        find_here([policy])
         problem, actor = _problem(scenario, robots, model, obstacles, seed), make_policy(policy)
     env = navigation_v0.parallel_env(problem=problem, control_noise_std=noise)
     episode = run_episode(env, actor, seed=seed)
@@ -258,10 +263,19 @@ def scenarios() -> None:
 @app.command()
 def planners() -> None:
     """List the planners and policies."""
-    from d4orm_planners.registry import POLICIES, describe_planner, describe_policy, list_planners
+    from d4orm_planners.names import PLANNERS, POLICIES
+    from d4orm_planners.registry import describe_planner, describe_policy
 
-    _print_table("Planners", [(name, describe_planner(name)) for name in list_planners()])
-    _print_table("Policies", [(name, describe_policy(name)) for name in POLICIES])
+    for title, table, describe in (("Planners", PLANNERS, describe_planner), ("Policies", POLICIES, describe_policy)):
+        _print_table(title, [(name, _or_error(describe, name)) for name in table])
+
+
+def _or_error(describe: Callable[[str], str], name: str) -> str:
+    """A description, or why there is none: what another package brings may be broken."""
+    try:
+        return describe(name)
+    except ValueError as error:
+        return f"unusable: {error}"
 
 
 def _problem(scenario: str, robots: int | None, model: str | None, obstacles: int | None, seed: int) -> Problem:
