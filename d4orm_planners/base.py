@@ -134,7 +134,7 @@ class Iteration:
     """
 
     controls: FloatArray
-    denoising_steps: int
+    denoising_steps: int = 0
     excluded: int = 0
     note: str = ""
     judged: Candidate | None = None

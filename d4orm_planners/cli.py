@@ -74,7 +74,9 @@ Robots = Annotated[int | None, typer.Option("--robots", "-k", help="Number of ro
 Model = Annotated[str | None, typer.Option("--model", "-m", help="Robot model; the scenario's own by default.")]
 Obstacles = Annotated[int | None, typer.Option("--obstacles", help="Random obstacles to add.")]
 Seed = Annotated[int, typer.Option("--seed", help="Seed of the scenario and of the planner.")]
-PlannerName = Annotated[str, typer.Option("--planner", "-p", help="Planner (see `d4orm planners`).")]
+PlannerName = Annotated[
+    str, typer.Option("--planner", "-p", help="Planner (see `d4orm planners`), or package.module:Name.")
+]
 Preset = Annotated[str | None, typer.Option("--preset", help="`paper` for the paper's parameters.")]
 Settings = Annotated[list[str] | None, typer.Option("--set", help="A planner setting, as num_samples=512; repeatable.")]
 Engine = Annotated[str, typer.Option("--engine", help="auto, cpu or jax.")]
@@ -136,6 +138,7 @@ def plan_command(
     for name in {"engine", "preset", "max_iterations"}.intersection(chosen):
         refuse_options(context, (name,), f"and --set {name} say the same; give one of them")
     chosen = {"engine": engine, "preset": preset, **chosen}
+    find_here([planner])
     problem = _problem(scenario, robots, model, obstacles, seed)
     plan = _solve(problem, planner, chosen, seed, time_limit, max_iterations, quiet)
     if not quiet:

@@ -182,6 +182,8 @@ def _planner_class(name: Any) -> type[Planner]:
         if kind is not name:
             raise ValueError(f"planner {name!r} is {shown(kind)}; it must be a subclass of d4orm_planners.Planner")
         raise ValueError(f"planner {shown(name)} is unknown; choose one of {', '.join(PLANNERS)}")
+    if inspect.isabstract(kind):
+        raise ValueError(f"planner {_called(name)!r} lacks iterate; define it in the class")
     return kind
 
 
@@ -224,14 +226,22 @@ def _required(function: Any) -> int | None:
 
 def _check_keywords(kind: Any, config: Mapping[str, Any], owner: str) -> None:
     """Refuse what a function or class that makes a policy does not take, and what it lacks."""
-    parameters = inspect.signature(kind).parameters
+    if inspect.isabstract(kind):
+        raise ValueError(f"{owner} lacks {', '.join(sorted(kind.__abstractmethods__))}; define it in the class")
+    try:
+        signature = inspect.signature(kind)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"{owner} is {shown(kind)}, which does not say what it takes; give a Policy of yours"
+        ) from None
+    parameters = signature.parameters
     if not parameters:
         _refuse_settings(config, owner)
     for name in config:
         if name not in parameters and not any(known.kind is known.VAR_KEYWORD for known in parameters.values()):
             raise UnknownKeywordError(f"{name!r} is no setting of {owner}; it takes {', '.join(parameters)}")
     try:
-        inspect.signature(kind).bind(**config)
+        signature.bind(**config)
     except TypeError as error:
         raise ValueError(f"{owner} cannot be made: {error}; give it as a setting") from None
 
