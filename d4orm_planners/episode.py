@@ -13,7 +13,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.base import Engine, get_engine
 from d4orm_env.joint_state import JointState, split_state
-from d4orm_planners.registry import make_policy
+from d4orm_planners.registry import PolicyLike, make_policy
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Episode:
     infos: tuple[dict[str, dict[str, Any]], ...]
 
 
-def run_episode(env: Any, policy: Any, seed: int = 0) -> Episode:
+def run_episode(env: Any, policy: PolicyLike, seed: int = 0) -> Episode:
     """Reset ``env``, reset ``policy``, and step until no agent is left.
 
     Args:

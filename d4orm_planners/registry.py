@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
-from typing import Any
+from typing import Any, TypeAlias
 
 from d4orm_env.core.arrays import positive_number, shown
 from d4orm_env.core.errors import UnknownKeywordError
@@ -13,6 +13,9 @@ from d4orm_planners.base import Planner
 from d4orm_planners.names import PLANNERS, POLICIES, is_planner_class
 from d4orm_planners.policy import OpenLoop, Policy, RobotFunction, TeamFunction, plain_attributes
 from d4orm_planners.references import load_reference, source_digest, written
+
+PolicyLike: TypeAlias = str | Policy | Planner | type[Any] | Callable[..., Any]
+"""What :func:`make_policy` takes; other objects with ``reset`` and ``act`` as well."""
 
 
 def list_planners() -> tuple[str, ...]:
@@ -56,7 +59,7 @@ def make_planner(name: str | type[Planner], *, preset: str | None = None, **conf
     return kind(kind.config_class(**{**settings, **config}))
 
 
-def make_policy(name: Any, **config: Any) -> Policy:
+def make_policy(name: PolicyLike, **config: Any) -> Policy:
     """A policy: by name, a planner's for executing its plan open loop; or from what a user brings.
 
     Args:

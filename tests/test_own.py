@@ -197,9 +197,9 @@ def test_taken_names_and_bad_ones_are_refused() -> None:
         with pytest.raises(ValueError, match=f"{name!r} .*register yours under another"):
             register(name, Ahead)
     for name in ("a:b", "a,b", "", " ", "a=b", 3):
-        with pytest.raises(ValueError, match="name .* is none; give one of letters"):
+        with pytest.raises(ValueError, match=r"name .* is none; give one of letters"):
             register_policy(name, Push)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="planner 'x' is .*give a subclass of"):
+    with pytest.raises(ValueError, match=r"planner 'x' is .*give a subclass of"):
         register_planner("x", Push)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="policy 'x' is 3; give a Policy"):
         register_policy("x", 3)
@@ -224,7 +224,7 @@ def test_entry_points_are_found_and_loaded_when_asked_for(
     np.testing.assert_array_equal(controls("theirs"), controls("theirs-planner"))
     with pytest.raises(ValueError, match="policy 'broken': 'theirs_module:nothing' names nothing"):
         make_policy("broken")
-    with pytest.raises(ValueError, match="policy name 'goal' is claimed by .*DriveToGoal and theirs_module:Theirs"):
+    with pytest.raises(ValueError, match=r"policy name 'goal' is claimed by .*DriveToGoal and theirs_module:Theirs"):
         make_policy("goal")
     with pytest.raises(SystemExit, match="0"):
         cli.main(["planners"])
@@ -351,7 +351,7 @@ def test_other_processes_get_the_same_policies(tmp_path: Path, arguments: str) -
 
 def test_what_workers_cannot_import_is_refused_before_anything_runs(tmp_path: Path) -> None:
     local = {"f": lambda observations, state: push(observations, state)}
-    with pytest.raises(ValueError, match="policy 'f' cannot be handed to worker processes .* or run with workers=1"):
+    with pytest.raises(ValueError, match=r"policy 'f' cannot be handed to worker processes .* or run with workers=1"):
         compare(local, tmp_path, workers=2)
     assert rows_of(tmp_path) == []
     assert [row.errors for row in compare(local, tmp_path)] == [0]

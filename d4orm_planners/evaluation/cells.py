@@ -5,16 +5,16 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from d4orm_env.core.arrays import positive_number, shown, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_planners.evaluation.store import LARGEST_NUMBER
 from d4orm_planners.evaluation.trials import Configuration
-from d4orm_planners.registry import is_brought, list_policies, make_policy, origin
+from d4orm_planners.registry import PolicyLike, is_brought, list_policies, make_policy, origin
 
-Policies = Any
+Policies: TypeAlias = PolicyLike | Iterable[PolicyLike] | Mapping[str, PolicyLike | Mapping[str, Any]]
 """A policy, several, or by label a policy or a mapping of settings; see :func:`configurations`."""
 
 
