@@ -6,33 +6,39 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from d4orm_planners.base import Planner, PlannerConfig
+    from d4orm_planners.base import Iteration, Planner, PlannerConfig, Search
     from d4orm_planners.episode import Episode, run_episode
     from d4orm_planners.evaluation.harness import evaluate
+    from d4orm_planners.names import register_planner, register_policy
     from d4orm_planners.plan import IterationRecord, Plan
     from d4orm_planners.policy import OpenLoop, Policy
     from d4orm_planners.registry import list_planners, list_policies, make_planner, make_policy
 
 __all__ = [
     "Episode",
+    "Iteration",
     "IterationRecord",
     "OpenLoop",
     "Plan",
     "Planner",
     "PlannerConfig",
     "Policy",
+    "Search",
     "evaluate",
     "list_planners",
     "list_policies",
     "make_planner",
     "make_policy",
+    "register_planner",
+    "register_policy",
     "run_episode",
 ]
 
 _HOMES = {
-    "base": ("Planner", "PlannerConfig"),
+    "base": ("Iteration", "Planner", "PlannerConfig", "Search"),
     "episode": ("Episode", "run_episode"),
     "evaluation.harness": ("evaluate",),
+    "names": ("register_planner", "register_policy"),
     "plan": ("IterationRecord", "Plan"),
     "policy": ("OpenLoop", "Policy"),
     "registry": ("list_planners", "list_policies", "make_planner", "make_policy"),

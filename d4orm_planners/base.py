@@ -134,7 +134,7 @@ class Iteration:
     """
 
     controls: FloatArray
-    denoising_steps: int
+    denoising_steps: int = 0
     excluded: int = 0
     note: str = ""
     judged: Candidate | None = None
@@ -144,13 +144,16 @@ class Planner(ABC):
     """A method that turns a problem into a plan. Instances hold settings only; everything else lives in a solve.
 
     Attributes:
-        name: Registry name.
+        name: What its plans say they are by; that of the class unless it gives another.
         config: The settings.
     """
 
     name: ClassVar[str]
     config_class: ClassVar[type[PlannerConfig]] = PlannerConfig
     presets: ClassVar[dict[str, dict[str, Any]]] = {}
+
+    def __init_subclass__(cls) -> None:
+        cls.name = cls.__dict__.get("name", cls.__name__)
 
     def __init__(self, config: PlannerConfig) -> None:
         self.config = config

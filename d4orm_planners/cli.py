@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +19,7 @@ from d4orm_planners.commands.evaluate import evaluate, leaderboard
 from d4orm_planners.commands.inputs import (
     MOST_SEEDS,
     check_target,
+    find_here,
     make_folder,
     names,
     numbers,
@@ -75,7 +77,9 @@ Robots = Annotated[int | None, typer.Option("--robots", "-k", help="Number of ro
 Model = Annotated[str | None, typer.Option("--model", "-m", help="Robot model; the scenario's own by default.")]
 Obstacles = Annotated[int | None, typer.Option("--obstacles", help="Random obstacles to add.")]
 Seed = Annotated[int, typer.Option("--seed", help="Seed of the scenario and of the planner.")]
-PlannerName = Annotated[str, typer.Option("--planner", "-p", help="Planner (see `d4orm planners`).")]
+PlannerName = Annotated[
+    str, typer.Option("--planner", "-p", help="Planner (see `d4orm planners`), or package.module:Name.")
+]
 Preset = Annotated[str | None, typer.Option("--preset", help="`paper` for the paper's parameters.")]
 Settings = Annotated[list[str] | None, typer.Option("--set", help="A planner setting, as num_samples=512; repeatable.")]
 Engine = Annotated[str, typer.Option("--engine", help="auto, cpu or jax.")]
@@ -137,6 +141,7 @@ def plan_command(
     for name in {"engine", "preset", "max_iterations"}.intersection(chosen):
         refuse_options(context, (name,), f"and --set {name} say the same; give one of them")
     chosen = {"engine": engine, "preset": preset, **chosen}
+    find_here([planner])
     problem = _problem(scenario, robots, model, obstacles, seed)
     plan = _solve(problem, planner, chosen, seed, time_limit, max_iterations, quiet)
     if not quiet:
@@ -159,7 +164,9 @@ def run(
     model: Model = None,
     obstacles: Obstacles = None,
     seed: Seed = 0,
-    policy: Annotated[str, typer.Option("--policy", "-p", help="Planner or policy to run.")] = "d4orm",
+    policy: Annotated[
+        str, typer.Option("--policy", "-p", help="Planner, policy or package.module:Name to run.")
+    ] = "d4orm",
     noise: Annotated[float, typer.Option("--noise", help="Standard deviation of the execution noise.")] = 0.0,
     picture: Annotated[Path | None, typer.Option("--picture", help="Picture to write: .png, .svg or .pdf.")] = None,
     animation: Annotated[Path | None, typer.Option("--animation", help="Animation to write: .gif or .mp4.")] = None,
@@ -184,6 +191,7 @@ def run(
         problem: Problem = plan.problem
         actor: Policy = OpenLoop(plan=plan)
     else:
+        find_here([policy])
         problem, actor = _problem(scenario, robots, model, obstacles, seed), make_policy(policy)
     env = navigation_v0.parallel_env(problem=problem, control_noise_std=noise)
     episode = run_episode(env, actor, seed=seed)
@@ -267,10 +275,19 @@ def scenarios() -> None:
 @app.command()
 def planners() -> None:
     """List the planners and policies."""
-    from d4orm_planners.registry import POLICIES, describe_planner, describe_policy, list_planners
+    from d4orm_planners.names import PLANNERS, POLICIES
+    from d4orm_planners.registry import describe_planner, describe_policy
 
-    _print_table("Planners", [(name, describe_planner(name)) for name in list_planners()])
-    _print_table("Policies", [(name, describe_policy(name)) for name in POLICIES])
+    for title, table, describe in (("Planners", PLANNERS, describe_planner), ("Policies", POLICIES, describe_policy)):
+        _print_table(title, [(name, _or_error(describe, name)) for name in table])
+
+
+def _or_error(describe: Callable[[str], str], name: str) -> str:
+    """A description, or why there is none: what another package brings may be broken."""
+    try:
+        return describe(name)
+    except ValueError as error:
+        return f"unusable: {error}"
 
 
 def _problem(scenario: str, robots: int | None, model: str | None, obstacles: int | None, seed: int) -> Problem:

@@ -30,7 +30,7 @@ from d4orm_planners.guidance import (
     rest_of,
     subgoal_indices,
 )
-from d4orm_planners.policy import Policy
+from d4orm_planners.policy import StatePolicy
 from d4orm_planners.sampling.schedule import annealed
 from d4orm_planners.sampling.weights import SoftmaxWeights
 from d4orm_planners.settings import (
@@ -160,7 +160,7 @@ class LoopRecord:
     refined: bool
 
 
-class D4ormC2F(Policy):
+class D4ormC2F(StatePolicy):
     """Follows a coarse plan of the whole team by short fine plans from wherever the robots are, loop by loop.
 
     Attributes:

@@ -12,7 +12,7 @@ from d4orm_env.core.metrics import mean_squared_jerk
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.joint_state import JointState, split_state
-from d4orm_planners.policy import Policy
+from d4orm_planners.registry import PolicyLike, make_policy
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,30 +33,31 @@ class Episode:
     infos: tuple[dict[str, dict[str, Any]], ...]
 
 
-def run_episode(env: Any, policy: Policy, seed: int = 0) -> Episode:
+def run_episode(env: Any, policy: PolicyLike, seed: int = 0) -> Episode:
     """Reset ``env``, reset ``policy``, and step until no agent is left.
 
     Args:
         env: A :mod:`d4orm_env.navigation_v0` parallel environment, wrapped or not.
-        policy: What acts.
+        policy: What acts: a policy, or anything else that :func:`~d4orm_planners.make_policy` takes.
         seed: Seeds both.
 
     Returns:
         The executed trajectory and its metrics.
 
     Raises:
-        ValueError: If the seed is negative.
+        ValueError: If the seed is negative, or there is no such policy.
     """
     whole_number(seed, "seed", 0)
+    actor = make_policy(policy)
     observations, infos = env.reset(seed=seed)
     problem = env.unwrapped.problem
-    policy.reset(env, seed=seed)
+    actor.reset(env, seed=seed)
     joints = [split_state(problem, env.state())]
     all_observations, all_infos = [observations], [infos]
     outcomes = [_outcome(env, {})]
     while env.agents:
         acting = {agent: observations[agent] for agent in env.agents}
-        observations, rewards, _, _, infos = env.step(policy.act(acting, env.state()))
+        observations, rewards, _, _, infos = env.step(actor.act(acting, env.state()))
         joints.append(split_state(problem, env.state()))
         all_observations.append(observations)
         all_infos.append(infos)

@@ -17,7 +17,7 @@ from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.joint_state import JointState
-from d4orm_planners.policy import Policy
+from d4orm_planners.policy import StatePolicy
 from d4orm_planners.settings import NotNegative, Positive, Settings, Whole
 from d4orm_planners.steering import preferred_velocities, track_velocities
 
@@ -54,7 +54,7 @@ class OrcaConfig(Settings):
     deviation: NotNegative = 0.1
 
 
-class Orca(Policy):
+class Orca(StatePolicy):
     """ORCA: every robot drives to its goal at the velocity nearest to the one it prefers that avoids all others.
 
     All robots give way to each other by halves; docked robots, obstacles and bounds do not give way. ORCA speaks of

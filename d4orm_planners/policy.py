@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,14 +26,16 @@ Actions = dict[str, FloatArray]
 class Policy(ABC):
     """Something that chooses every robot's control at every step.
 
+    A subclass has :meth:`act`, and a :meth:`reset` if it draws, plans or remembers anything.
+
     Attributes:
-        name: Registry name.
-        config_class: :class:`~d4orm_planners.settings.Settings` of the policy, of which the constructor takes an
-            instance; ``None`` for a policy without settings, whose constructor takes nothing.
+        problem: Problem of the present episode, from the reset on.
+        config_class: :class:`~d4orm_planners.settings.Settings` of the policy, of which the constructor then takes an
+            instance. Without one, settings are keyword arguments of the constructor.
     """
 
-    name: ClassVar[str]
     config_class: ClassVar[type[Settings] | None] = None
+    problem: Problem
 
     def reset(self, env: Any, seed: int = 0) -> None:
         """Get ready for an episode that ``env.reset()`` has begun.
@@ -38,29 +44,56 @@ class Policy(ABC):
             env: A :mod:`d4orm_env.navigation_v0` parallel environment, wrapped or not.
             seed: Seeds whatever the policy draws.
         """
-        self.problem: Problem = env.unwrapped.problem
-        self._begin(env, seed)
+        self.problem = env.unwrapped.problem
 
+    @abstractmethod
     def act(self, observations: dict[str, Any], state: Any) -> Actions:
         """Controls for the agents in ``observations``.
 
         Args:
             observations: The environment's observations; their keys are the agents that act.
-            state: ``env.state()``.
+            state: ``env.state()``; :func:`d4orm_env.joint_state.split_state` takes it apart.
 
         Returns:
             ``{agent: (m,) float32 control}``.
 
         Raises:
-            RuntimeError: Before the first reset.
+            RuntimeError: Before the first reset, if the policy needs one.
         """
-        if not hasattr(self, "problem"):
-            raise RuntimeError("the policy has seen no environment yet; call reset(env) before act()")
-        joint = split_state(self.problem, state)
-        controls = self._controls(joint)
-        return {agent: controls[int(agent.rsplit("_", 1)[1])] for agent in observations}
 
-    def _begin(self, env: Any, seed: int) -> None:  # noqa: B027 - a hook that most policies need not fill
+    def identity(self) -> dict[str, Any]:
+        """What a store of trials tells this instance from others of its class by, as JSON has it.
+
+        By default the settings in ``config``, if it has any, else its attributes that are numbers or text.
+        """
+        config = getattr(self, "config", None)
+        return asdict(config) if isinstance(config, Settings) else plain_attributes(self)
+
+
+def plain_attributes(thing: Any) -> dict[str, Any]:
+    """Attributes of an object that are numbers, truth values or text."""
+    if isinstance(thing, partial):
+        return {str(name): value for name, value in (*enumerate(thing.args), *thing.keywords.items()) if _plain(value)}
+    return {name: value for name, value in getattr(thing, "__dict__", {}).items() if _plain(value)}
+
+
+def _plain(value: Any) -> bool:
+    return isinstance(value, bool | int | float | str)
+
+
+class StatePolicy(Policy):
+    """A policy that goes by the joint state: a subclass says what the whole team does, by :meth:`_controls`."""
+
+    def reset(self, env: Any, seed: int = 0) -> None:
+        super().reset(env, seed)
+        self._begin(env, seed)
+
+    def act(self, observations: dict[str, Any], state: Any) -> Actions:
+        require_reset(self)
+        controls = self._controls(split_state(self.problem, state))
+        return {agent: controls[robot] for agent, robot in zip(observations, robot_indices(observations))}
+
+    def _begin(self, env: Any, seed: int) -> None:
         """What the policy does at a reset beyond looking at the problem."""
 
     @abstractmethod
@@ -68,7 +101,42 @@ class Policy(ABC):
         """``(K, m)`` controls of the whole team."""
 
 
-class OpenLoop(Policy):
+def require_reset(policy: Policy) -> None:
+    """Refuse to act before the first reset.
+
+    Raises:
+        RuntimeError: If there was none.
+    """
+    if not hasattr(policy, "problem"):
+        raise RuntimeError("the policy has seen no environment yet; call reset(env) before act()")
+
+
+def robot_indices(agents: Iterable[str]) -> list[int]:
+    """Which robots the agents ``"robot_0"``, ... are."""
+    return [int(agent.rsplit("_", 1)[1]) for agent in agents]
+
+
+class TeamFunction(Policy):
+    """A function ``(observations, state) -> actions`` as a policy."""
+
+    def __init__(self, function: Callable[[dict[str, Any], Any], Actions]) -> None:
+        self.function = function
+
+    def act(self, observations: dict[str, Any], state: Any) -> Actions:
+        return self.function(observations, state)
+
+
+class RobotFunction(Policy):
+    """A function ``observation -> action`` as a policy: every robot asks it by itself."""
+
+    def __init__(self, function: Callable[[Any], Any]) -> None:
+        self.function = function
+
+    def act(self, observations: dict[str, Any], state: Any) -> Actions:
+        return {agent: self.function(observation) for agent, observation in observations.items()}
+
+
+class OpenLoop(StatePolicy):
     """Plans once at the reset and executes the plan, whatever happens.
 
     Attributes:
@@ -96,6 +164,13 @@ class OpenLoop(Policy):
                 "randomize_instance=False"
             )
 
+    def identity(self) -> dict[str, Any]:
+        if self.planner is not None:
+            config = asdict(self.planner.config)
+            return {"planner": self.planner.name, **config, "time_limit": self.time_limit}
+        assert self.plan is not None
+        return {"controls": hashlib.sha256(self.plan.controls.tobytes()).hexdigest()}
+
     def _controls(self, joint: JointState) -> FloatArray:
         assert self.plan is not None
         if joint.steps >= len(self.plan.controls):
@@ -103,7 +178,7 @@ class OpenLoop(Policy):
         return self.plan.controls[joint.steps]
 
 
-class RandomControls(Policy):
+class RandomControls(StatePolicy):
     """Controls drawn uniformly from the box of each robot's limits."""
 
     name = "random"
@@ -116,7 +191,7 @@ class RandomControls(Policy):
         return self._generator.uniform(-limit, limit).astype(np.float32)
 
 
-class DriveToGoal(Policy):
+class DriveToGoal(StatePolicy):
     """Drives straight to the goal and brakes for it, as if nobody else were there."""
 
     name = "goal"

@@ -1,36 +1,21 @@
-"""Planners and policies by name."""
+"""Planners and policies: by name, those that come with the package and those that users bring, or given themselves."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import inspect
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
-from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeAlias
 
 from d4orm_env.core.arrays import duration, shown
 from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_planners.base import Planner
-from d4orm_planners.cem import CEM
-from d4orm_planners.d4orm import D4orm
-from d4orm_planners.d4orm_c2f import D4ormC2F
-from d4orm_planners.d4orm_d import D4ormD
-from d4orm_planners.d_d4orm import DD4orm
-from d4orm_planners.ipopt import Ipopt
-from d4orm_planners.mbd import MBD, IterativeMBD
-from d4orm_planners.mppi import MPPI
-from d4orm_planners.orca import Orca
-from d4orm_planners.policy import DriveToGoal, OpenLoop, Policy, RandomControls
-from d4orm_planners.rl.learned import PPO, SAC
+from d4orm_planners.names import PLANNERS, POLICIES, is_planner_class
+from d4orm_planners.policy import OpenLoop, Policy, RobotFunction, TeamFunction, plain_attributes
+from d4orm_planners.references import load_reference, source_digest, written
 
-PLANNERS: Mapping[str, type[Planner]] = MappingProxyType(
-    {planner.name: planner for planner in (D4orm, D4ormD, DD4orm, MPPI, CEM, MBD, IterativeMBD, Ipopt)}
-)
-"""Every planner class by its name."""
-
-POLICIES: Mapping[str, type[Policy]] = MappingProxyType(
-    {policy.name: policy for policy in (D4ormC2F, DriveToGoal, RandomControls, Orca, PPO, SAC)}
-)
-"""The policies that are no planners; every planner is an open-loop policy too."""
+PolicyLike: TypeAlias = str | Policy | Planner | type[Any] | Callable[..., Any]
+"""What :func:`make_policy` takes; other objects with ``reset`` and ``act`` as well."""
 
 
 def list_planners() -> tuple[str, ...]:
@@ -44,20 +29,21 @@ def list_policies() -> tuple[str, ...]:
 
 
 def describe_planner(name: str) -> str:
-    """The first sentence of a planner's documentation."""
-    return _summary(_find(name, PLANNERS, "planner"))
+    """The first line of a planner's documentation."""
+    return _summary(_planner_class(name))
 
 
 def describe_policy(name: str) -> str:
-    """The first sentence of a policy's documentation."""
-    return _summary(_find(name, {**PLANNERS, **POLICIES}, "policy"))
+    """The first line of a policy's documentation."""
+    return _summary(find_policy(name))
 
 
-def make_planner(name: str, *, preset: str | None = None, **config: Any) -> Planner:
+def make_planner(name: str | type[Planner], *, preset: str | None = None, **config: Any) -> Planner:
     """A planner by name.
 
     Args:
-        name: One of :func:`list_planners`.
+        name: One of :func:`list_planners`, ``"package.module:Name"`` (or ``"folder/file.py:Name"``) of a planner class,
+            or the class.
         preset: ``"paper"`` for the paper's algorithm and parameters; ``None`` for this project's defaults.
         **config: Settings that differ from the preset; see the planner's configuration class.
 
@@ -65,54 +51,207 @@ def make_planner(name: str, *, preset: str | None = None, **config: Any) -> Plan
         ValueError: For an unknown planner or preset, or a setting that makes no sense.
         TypeError: For an unknown setting.
     """
-    kind = _find(name, PLANNERS, "planner")
-    settings = {} if preset is None else _find(preset, kind.presets, "preset", f" of planner {name!r}")
-    kind.config_class.check_names(config, f"planner {name!r}")
+    kind, owner = _planner_class(name), f"planner {_called(name)!r}"
+    if preset is not None and not (isinstance(preset, str) and preset in kind.presets):
+        raise ValueError(f"preset {shown(preset)} of {owner} is unknown; choose one of {', '.join(kind.presets)}")
+    settings = {} if preset is None else kind.presets[preset]
+    kind.config_class.check_names(config, owner)
     return kind(kind.config_class(**{**settings, **config}))
 
 
-def make_policy(name: str, **config: Any) -> Policy:
-    """A policy by name: a planner's name for executing its plan open loop, or one of the policies.
+def make_policy(name: PolicyLike, **config: Any) -> Policy:
+    """A policy: by name, a planner's for executing its plan open loop; or from what a user brings.
 
     Args:
-        name: One of :func:`list_policies`.
+        name: One of :func:`list_policies`; ``"package.module:Name"`` or ``"folder/file.py:Name"`` of any of the
+            following; a :class:`Policy` or another object with ``reset`` and ``act``; a planner, executed open loop; a
+            class of these; a function ``(observations, state) -> actions`` of the team, ``observation -> action`` of
+            every robot by itself, or without required positional parameters, which makes a policy.
         **config: For a planner, its settings and ``preset``, and the budget of the solve (``time_limit``,
-            ``max_iterations``); for a policy, its own settings.
+            ``max_iterations``); for a policy class, its own settings; for a function that makes one, its keywords.
 
     Raises:
-        ValueError: For an unknown name, or a setting that makes no sense.
+        ValueError: For an unknown name, an import path that leads nowhere, something that does not act, or a setting
+            that makes no sense.
         TypeError: For an unknown setting.
     """
-    if isinstance(name, str) and name in PLANNERS:
+    kind, owner = find_policy(name), f"policy {_called(name)!r}"
+    if is_planner_class(kind):
         time_limit = _time_limit(config)
-        return OpenLoop(make_planner(name, **config), time_limit=time_limit)
-    config_instance = _policy_config(name, config)
-    kind: Any = POLICIES[name]
-    return kind() if config_instance is None else kind(config_instance)
+        return OpenLoop(make_planner(name if isinstance(name, str) else kind, **config), time_limit=time_limit)
+    if not makes_policy(kind):
+        _refuse_settings(config, owner)
+        return _as_policy(kind, owner)
+    if (config_class := getattr(kind, "config_class", None)) is not None:
+        config_class.check_names(config, owner)
+        return _as_policy(kind(config_class(**config)), owner)
+    _check_keywords(kind, config, owner)
+    return _as_policy(kind(**config), owner)
 
 
-def policy_settings(name: str, **config: Any) -> dict[str, Any]:
-    """All settings of ``make_policy(name, **config)``, defaults filled in; a preset has become its settings.
+def find_policy(policy: Any) -> Any:
+    """What stands behind a policy's name or import path; anything but text is returned as it is.
 
     Raises:
-        ValueError, TypeError: As :func:`make_policy`.
+        ValueError: If there is no such policy.
     """
-    if isinstance(name, str) and name in PLANNERS:
+    if is_brought(policy):
+        return policy
+    if isinstance(policy, str):
+        if policy in PLANNERS and policy in POLICIES:
+            raise ValueError(f"{policy!r} names a planner and a policy of two packages; uninstall one of them")
+        for table in (PLANNERS, POLICIES):
+            if policy in table:
+                return table[policy]
+        if ":" in policy:
+            return load_reference(policy)
+    raise ValueError(
+        f"policy {shown(policy)} is unknown; choose one of {', '.join(list_policies())}, or give a Policy, a function, "
+        "or package.module:Name of one"
+    )
+
+
+def is_brought(policy: Any) -> bool:
+    """Whether a policy is given itself, rather than by name or import path."""
+    return callable(policy) or isinstance(policy, Planner) or _acts(policy)
+
+
+def origin(policy: Any) -> Any:
+    """What :func:`make_policy` takes for a policy in any process, whatever was registered there."""
+    for table in (PLANNERS, POLICIES):
+        if isinstance(policy, str) and policy in table:
+            return table.origin(policy)
+    return policy
+
+
+def is_planned(policy: Any) -> bool:
+    """Whether a policy is a planner, whose plan is executed open loop."""
+    kind = find_policy(policy)
+    return is_planner_class(kind) or isinstance(kind, Planner)
+
+
+def makes_policy(kind: Any) -> bool:
+    """Whether something that :func:`find_policy` found takes settings and makes a policy, rather than acts itself."""
+    return isinstance(kind, type) or (not _acts(kind) and callable(kind) and _required(kind) == 0)
+
+
+def setting_names(policy: Any) -> tuple[str, ...]:
+    """Settings that :func:`make_policy` takes for a policy."""
+    kind = find_policy(policy)
+    if is_planner_class(kind):
+        return (*kind.config_class.setting_names(), "preset", "time_limit")
+    if not makes_policy(kind):
+        return ()
+    if (config_class := getattr(kind, "config_class", None)) is not None:
+        return tuple(config_class.setting_names())
+    return tuple(inspect.signature(kind).parameters)
+
+
+def policy_settings(name: Any, **config: Any) -> dict[str, Any]:
+    """All that tells ``make_policy(name, **config)`` from other policies of that name.
+
+    These are its settings, defaults filled in where a configuration class has them; a preset has become its settings.
+    A policy that does not come with this package has the digest of its source as well.
+
+    Raises:
+        ValueError, TypeError: As :func:`make_policy`; also if there is no source to be read.
+    """
+    kind, owner = find_policy(name), f"policy {_called(name)!r}"
+    settings: dict[str, Any]
+    if is_planner_class(kind):
         time_limit = _time_limit(config)
-        return {**asdict(make_planner(name, **config).config), "time_limit": time_limit}
-    config_instance = _policy_config(name, config)
-    return {} if config_instance is None else asdict(config_instance)
+        planner = make_planner(name if isinstance(name, str) else kind, **config)
+        settings = {**asdict(planner.config), "time_limit": time_limit}
+    elif not makes_policy(kind):
+        _refuse_settings(config, owner)
+        policy = _as_policy(kind, owner)
+        settings = policy.identity() if isinstance(kind, Policy | Planner) else plain_attributes(kind)
+    elif (config_class := getattr(kind, "config_class", None)) is not None:
+        config_class.check_names(config, owner)
+        settings = asdict(config_class(**config))
+    else:
+        _check_keywords(kind, config, owner)
+        settings = dict(config)
+    code = written(kind.planner if isinstance(kind, OpenLoop) and kind.planner is not None else kind)
+    foreign = code.__module__.partition(".")[0] != __name__.partition(".")[0]
+    return {**settings, "source": source_digest(code)} if foreign else settings
 
 
-def _policy_config(name: str, config: Mapping[str, Any]) -> Any:
-    """The configuration of a policy that is no planner; ``None`` for one without settings."""
-    kind = _find(name, {**PLANNERS, **POLICIES}, "policy")
-    if kind.config_class is not None:
-        kind.config_class.check_names(config, f"policy {name!r}")
-        return kind.config_class(**config)
+def _planner_class(name: Any) -> type[Planner]:
+    kind = name
+    if isinstance(name, str) and (name in PLANNERS or ":" in name):
+        kind = PLANNERS[name] if name in PLANNERS else load_reference(name)
+    if not is_planner_class(kind):
+        if kind is not name:
+            raise ValueError(f"planner {name!r} is {shown(kind)}; it must be a subclass of d4orm_planners.Planner")
+        raise ValueError(f"planner {shown(name)} is unknown; choose one of {', '.join(PLANNERS)}")
+    if inspect.isabstract(kind):
+        raise ValueError(f"planner {_called(name)!r} lacks iterate; define it in the class")
+    return kind
+
+
+def _acts(thing: Any) -> bool:
+    return callable(getattr(thing, "reset", None)) and callable(getattr(thing, "act", None))
+
+
+def _as_policy(thing: Any, owner: str) -> Policy:
+    """What acts itself, as a policy.
+
+    Raises:
+        ValueError: If it does not.
+    """
+    if isinstance(thing, Planner):
+        return OpenLoop(thing)
+    if _acts(thing) and not isinstance(thing, type):
+        return thing
+    count = _required(thing) if callable(thing) and not isinstance(thing, type) else 0
+    if count not in (1, 2):
+        raise ValueError(
+            f"{owner} is {shown(thing)}, which does not act; it must have reset and act, or be a function of "
+            "(observations, state) or of one robot's observation, told apart by their required positional parameters"
+        )
+    return TeamFunction(thing) if count == 2 else RobotFunction(thing)
+
+
+def _required(function: Any) -> int | None:
+    """How many positional parameters a function requires; ``None`` if that says nothing about it."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):
+        return None
+    count = sum(
+        parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
+        and parameter.default is parameter.empty
+        for parameter in parameters
+    )
+    return None if not count and any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters) else count
+
+
+def _check_keywords(kind: Any, config: Mapping[str, Any], owner: str) -> None:
+    """Refuse what a function or class that makes a policy does not take, and what it lacks."""
+    if inspect.isabstract(kind):
+        raise ValueError(f"{owner} lacks {', '.join(sorted(kind.__abstractmethods__))}; define it in the class")
+    try:
+        signature = inspect.signature(kind)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"{owner} is {shown(kind)}, which does not say what it takes; give a Policy of yours"
+        ) from None
+    parameters = signature.parameters
+    if not parameters:
+        _refuse_settings(config, owner)
+    for name in config:
+        if name not in parameters and not any(known.kind is known.VAR_KEYWORD for known in parameters.values()):
+            raise UnknownKeywordError(f"{name!r} is no setting of {owner}; it takes {', '.join(parameters)}")
+    try:
+        signature.bind(**config)
+    except TypeError as error:
+        raise ValueError(f"{owner} cannot be made: {error}; give it as a setting") from None
+
+
+def _refuse_settings(config: Mapping[str, Any], owner: str) -> None:
     if config:
-        raise UnknownKeywordError(f"policy {name!r} takes no settings, but was given {', '.join(config)}")
-    return None
+        raise UnknownKeywordError(f"{owner} takes no settings, but was given {', '.join(config)}")
 
 
 def _time_limit(config: dict[str, Any]) -> float | None:
@@ -121,11 +260,10 @@ def _time_limit(config: dict[str, Any]) -> float | None:
     return None if limit is None else duration(limit, "time_limit")
 
 
-def _find(name: Any, table: Mapping[str, Any], what: str, owner: str = "") -> Any:
-    if not isinstance(name, str) or name not in table:
-        raise ValueError(f"{what} {shown(name)}{owner} is unknown; choose one of {', '.join(table)}")
-    return table[name]
+def _called(thing: Any) -> str:
+    """What to call a policy in messages."""
+    return thing if isinstance(thing, str) else getattr(thing, "__name__", type(thing).__name__)
 
 
-def _summary(kind: type) -> str:
-    return (kind.__doc__ or "").strip().splitlines()[0]
+def _summary(kind: Any) -> str:
+    return (kind.__doc__ or "").strip().partition("\n")[0]

@@ -16,13 +16,12 @@ from d4orm_env.core.team import Team
 from d4orm_env.engine.base import get_engine
 from d4orm_env.joint_state import JointState
 from d4orm_env.scenarios import make_problem
-from d4orm_planners import Episode, OpenLoop, Policy, make_policy, run_episode
+from d4orm_planners import Episode, OpenLoop, make_policy, run_episode
+from d4orm_planners.policy import StatePolicy
 
 
-class Script(Policy):
+class Script(StatePolicy):
     """Executes ``(H, K, m)`` controls, whatever the problem."""
-
-    name = "script"
 
     def __init__(self, controls: Any) -> None:
         self._script = np.asarray(controls, np.float32)

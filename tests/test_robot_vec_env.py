@@ -140,16 +140,11 @@ def test_evaluate_policy_and_run_episode_agree_on_the_same_instances(model: str)
         return np.stack([np.clip(features[:, 6] * -2 + 1.6 - slow, -1, 1), 0.4 * features[:, 12]], axis=1)
 
     class StraightPolicy(Policy):
-        name = "straight"
-
         def act(self, observations: dict, state: np.ndarray) -> dict:
             encoder = Features.of(ObservationLayout.for_problem(self.problem), model)
             features, frames = encoder.encode(np.stack(list(observations.values())))
             controls = encoder.decode(drive_by(features), frames, limit[: len(features)])
             return dict(zip(observations, controls))
-
-        def _controls(self, joint: object) -> np.ndarray:
-            raise NotImplementedError
 
     env = RobotVecEnv(worlds, robots, "random", seed=20, randomize_instance=True, model=model)
     seen: dict[int, bool] = {}

@@ -10,6 +10,7 @@ import typer
 from d4orm_planners.commands.inputs import (
     MOST_SEEDS,
     decimals,
+    find_here,
     make_folder,
     names,
     numbers,
@@ -25,7 +26,7 @@ def evaluate(
             "--policy",
             "--policies",
             "-p",
-            help="Names separated by commas, or one with settings, as d4orm:num_samples=512,engine=cpu; repeatable.",
+            help="Names or package.module:Name with commas, or one with settings, d4orm:num_samples=512; repeatable.",
         ),
     ] = None,
     scenario: Annotated[
@@ -110,15 +111,19 @@ def leaderboard(
 
 def _policies(texts: list[str]) -> dict[str, dict[str, Any]]:
     """Settings by label: a name stands for itself, and a configuration is called what was typed."""
+    from d4orm_planners.registry import list_policies
+
     chosen: dict[str, dict[str, Any]] = {}
     for text in texts:
-        if ":" not in text:
+        # The name ends where the first setting begins, for an import path has a colon too.
+        policy, colon, _ = text.partition("=")[0].rpartition(":")
+        if not colon or ("=" not in text and policy not in list_policies()):
             chosen.update((name, {}) for name in names(text) or ())
             continue
-        policy, _, settings = text.partition(":")
-        if "policy" in (values := parse_settings(settings.split(","), "--policy")):
+        if "policy" in (values := parse_settings(text.removeprefix(policy + colon).split(","), "--policy")):
             raise ValueError(f"--policy {text!r}: 'policy' is no setting; the name stands before the colon")
         chosen[text] = {"policy": policy, **values}
+    find_here(settings.get("policy", label) for label, settings in chosen.items())
     return chosen
 
 

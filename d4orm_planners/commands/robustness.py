@@ -11,6 +11,7 @@ import typer
 from d4orm_planners.commands.inputs import (
     MOST_SEEDS,
     decimals,
+    find_here,
     make_folder,
     names,
     numbers,
@@ -20,9 +21,12 @@ from d4orm_planners.commands.inputs import (
 
 
 def robustness(
-    policies: Annotated[str, typer.Option("--policies", "-p", help="Planners and policies, separated by commas.")] = (
-        "d4orm,goal"
-    ),
+    policies: Annotated[
+        str,
+        typer.Option(
+            "--policies", "--policy", "-p", help="Planners, policies and package.module:Name, separated by commas."
+        ),
+    ] = "d4orm,goal",
     scenario: Annotated[str, typer.Option("--scenario", "-s", help="Scenarios, separated by commas.")] = "circle",
     robots: Annotated[
         str | None, typer.Option("--robots", "-k", help="Team sizes, as 4,8; the scenario's own by default.")
@@ -80,9 +84,10 @@ def robustness(
 
 def _settings_by_policy(policies: Sequence[str], settings: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """What ``--set`` says, for each policy: ``orca.time_horizon`` for one, ``num_samples`` for all that have it."""
-    from d4orm_planners.registry import PLANNERS, policy_settings
+    from d4orm_planners.registry import setting_names
 
-    known = {policy: {*policy_settings(policy), *(("preset",) if policy in PLANNERS else ())} for policy in policies}
+    find_here(policies)
+    known = {policy: setting_names(policy) for policy in policies}
     chosen: dict[str, dict[str, Any]] = {policy: {} for policy in policies}
     # A setting of one policy counts more than one of all, whichever was given first.
     for name, value in sorted(settings.items(), key=lambda setting: "." in setting[0]):

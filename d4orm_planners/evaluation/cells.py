@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from d4orm_env.core.arrays import duration, shown, whole_number
 from d4orm_env.core.problem import Problem
@@ -13,51 +13,74 @@ from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_env.scenarios.registry import is_scenario_file
 from d4orm_planners.evaluation.store import LARGEST_NUMBER
 from d4orm_planners.evaluation.trials import Configuration
-from d4orm_planners.registry import PLANNERS, list_policies, make_policy
+from d4orm_planners.registry import PolicyLike, is_brought, list_policies, make_policy, origin
 
-Policies = str | Iterable[str] | Mapping[str, Mapping[str, Any]]
+Policies: TypeAlias = PolicyLike | Iterable[PolicyLike] | Mapping[str, PolicyLike | Mapping[str, Any]]
+"""A policy, several, or by label a policy or a mapping of settings; see :func:`configurations`."""
 
 
 def configurations(policies: Policies, time_limit: float | None = None) -> list[Configuration]:
     """Policies with their settings, checked.
 
     Args:
-        policies: A name, names, or settings by label. A label is the policy's name, unless the settings name another as
-            ``policy``.
+        policies: A policy, several, or policies or settings by label. A policy is a name, an import path or whatever
+            else :func:`~d4orm_planners.make_policy` takes; what has no label is called by its name. A label with
+            settings is the policy's name, unless the settings have another policy as ``policy``.
         time_limit: Seconds for planning, for every planner that has no ``time_limit`` among its settings.
 
     Raises:
         ValueError: For an unknown name or setting, no policy, or a time limit that concerns none of them.
         ImportError: If a policy needs a library that is not installed.
     """
-    named: Iterable[tuple[Any, Any]] = (
-        policies.items() if isinstance(policies, Mapping) else ((name, {}) for name in several(policies))
-    )
     chosen = []
-    for label, given in dict(_checked(label, given) for label, given in named).items():
-        settings = dict(given)
-        policy = settings.pop("policy", label)
-        if time_limit is not None and policy in PLANNERS:
+    for label, (policy, settings) in _labelled(policies).items():
+        named = isinstance(policy, str)
+        choice = Configuration(label, policy if named else label, settings, origin(policy))
+        if time_limit is not None and choice.planned:
             settings.setdefault("time_limit", duration(time_limit, "time_limit"))
         make_policy(policy, **settings)
-        chosen.append(Configuration(label, policy, settings))
+        if not named and label in list_policies():
+            raise ValueError(f"policies[{label!r}] has the name of another policy; give it another label")
+        chosen.append(choice)
     if not chosen:
         raise ValueError("policies is empty; give at least one")
-    if time_limit is not None and not any(choice.policy in PLANNERS for choice in chosen):
+    if time_limit is not None and not any(choice.planned for choice in chosen):
         raise ValueError(f"time_limit {time_limit:g} is for planners, and none of the policies is one; leave it out")
     _check_distinct(chosen)
     return chosen
 
 
-def _checked(label: Any, given: Any) -> tuple[str, Mapping[str, Any]]:
+def _labelled(policies: Policies) -> dict[str, tuple[Any, dict[str, Any]]]:
+    """Policies and their settings by label."""
+    if isinstance(policies, Mapping):
+        return {_checked_label(label): _checked(label, given) for label, given in policies.items()}
+    labelled: dict[str, tuple[Any, dict[str, Any]]] = {}
+    for policy in several(policies):
+        label = policy if isinstance(policy, str) else getattr(policy, "__name__", type(policy).__name__)
+        if not (isinstance(policy, str) or is_brought(policy)):
+            _checked_label(policy)
+        if labelled.setdefault(label, (policy, {}))[0] is not policy and not isinstance(policy, str):
+            raise ValueError(f"two policies are called {label!r}; give a mapping that has a label for each")
+    return labelled
+
+
+def _checked_label(label: Any) -> str:
     if not isinstance(label, str):
         raise ValueError(f"policy {shown(label)} is no name; give one of {', '.join(list_policies())}")
-    if not isinstance(given, Mapping):
-        raise ValueError(
-            f"policies[{label!r}] is {shown(given)}; give the settings of a policy, as {{}} or "
-            "{'policy': 'd4orm', 'num_samples': 128}"
-        )
-    return label, given
+    return label
+
+
+def _checked(label: str, given: Any) -> tuple[Any, dict[str, Any]]:
+    """A policy and its settings."""
+    if isinstance(given, Mapping):
+        settings = dict(given)
+        return settings.pop("policy", label), settings
+    if isinstance(given, str) or is_brought(given):
+        return given, {}
+    raise ValueError(
+        f"policies[{label!r}] is {shown(given)}; give the settings of a policy, as {{}} or "
+        "{'policy': 'd4orm', 'num_samples': 128}, or a policy or function of your own"
+    )
 
 
 def _check_distinct(chosen: Sequence[Configuration]) -> None:

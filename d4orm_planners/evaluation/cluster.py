@@ -10,7 +10,8 @@ from typing import Any
 from d4orm_planners.distributed.ray_connection import RayConnection
 from d4orm_planners.evaluation.schedule import Lost, Message, Sign
 from d4orm_planners.evaluation.store import Trial
-from d4orm_planners.evaluation.trials import Job, describe_error, run_job
+from d4orm_planners.evaluation.trials import Job, run_job
+from d4orm_planners.references import describe
 
 QUEUED = 2
 """Jobs under way per core of the cluster: one that runs, and one that need not be waited for."""
@@ -68,7 +69,7 @@ class RayCrew:
             content: Trial | Sign = self._ray.get(next(task))
         except (self._ray.exceptions.RayError, StopIteration) as error:
             del self._jobs[task]
-            return Lost(f"ChildProcessError: the worker was lost ({describe_error(error)})")
+            return Lost(f"ChildProcessError: the worker was lost ({describe(error)})")
         if content is Sign.ENDED:
             del self._jobs[task]
         return content

@@ -22,6 +22,7 @@ from d4orm_planners.evaluation.store import STORE, Trial, TrialKey, TrialStore
 from d4orm_planners.evaluation.summary import SuccessRate, success_rate
 from d4orm_planners.evaluation.trials import Job
 from d4orm_planners.evaluation.workers import LocalCrew, run_here
+from d4orm_planners.references import check_sendable
 
 Progress = Callable[[str, int, int], Any]
 Scenario = str | os.PathLike[str] | Problem | Callable[..., Problem]
@@ -51,9 +52,11 @@ def evaluate(
     ``table.csv``.
 
     Args:
-        policies: A policy name or several (:func:`d4orm_planners.list_policies`), or settings by label:
-            ``{"d4orm": {}, "d4orm, few": {"policy": "d4orm", "num_samples": 128}}``. Without ``"policy"`` the label is
-            the name.
+        policies: A policy or several: names (:func:`d4orm_planners.list_policies`), ``"package.module:Name"``, or
+            whatever else :func:`d4orm_planners.make_policy` takes. Or by label policies of your own and settings:
+            ``{"mine": MyPolicy(), "f": my_function, "d4orm": {}, "d4orm, few": {"policy": "d4orm", "num_samples":
+            128}}``. Without ``"policy"`` the label is the name. The store tells policies of your own apart by label
+            or import path, settings and the digest of their source file.
         scenarios: Scenarios as for :func:`d4orm_env.make_problem`, or problems.
         out: Folder to write to; made if it does not exist.
         seeds: Each seeds the scenario, the policy and the noise of a trial.
@@ -71,8 +74,8 @@ def evaluate(
         One row per scenario, team size, policy and level of noise, in that order.
 
     Raises:
-        ValueError: For an unknown name, a number that makes no sense, or a store that is something else. Nothing has
-            run then.
+        ValueError: For an unknown name, a number that makes no sense, a policy of your own that worker processes cannot
+            import, or a store that is something else. Nothing has run then.
         ImportError: If a policy, or the cluster, needs a library that is not installed.
         OSError: If the folder or the store cannot be written to, workers do not start, or there is no cluster.
     """
@@ -188,14 +191,13 @@ def _run(
     jobs: Sequence[Job], workers: int | None, ray: str | None, trial_timeout: float | None
 ) -> Generator[list[Trial]]:
     crew: Crew
-    if ray is not None:
-        crew = RayCrew(ray, workers)
-    else:
-        cores = available_cores()
-        size = min(workers or cores, max(len(jobs), 1))
-        if size == 1 and trial_timeout is None:
-            return run_here(jobs)
-        crew = LocalCrew(size, threads=cores if size == 1 else 1)
+    cores = available_cores()
+    size = min(workers or cores, max(len(jobs), 1))
+    if ray is None and size == 1 and trial_timeout is None:
+        return run_here(jobs)
+    for policy in {id(job.policy): job.policy for job in jobs}.values():
+        check_sendable(policy.source, f"policy {policy.label!r}")
+    crew = LocalCrew(size, threads=cores if size == 1 else 1) if ray is None else RayCrew(ray, workers)
     return run_jobs(jobs, crew, trial_timeout)
 
 

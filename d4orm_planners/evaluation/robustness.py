@@ -31,7 +31,7 @@ def robustness(
     that was broken off, or one with more trials, goes on from there.
 
     Args:
-        policies: Policy names, or settings by label; see :func:`~d4orm_planners.evaluation.harness.evaluate`.
+        policies: Policies, or policies and settings by label; see :func:`~d4orm_planners.evaluation.harness.evaluate`.
         out: Folder to keep the trials in; made if it does not exist.
         scenarios: Scenario names, or YAML scenario files.
         robots: Team sizes; ``None`` is the scenario's own.

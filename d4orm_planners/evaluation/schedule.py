@@ -11,7 +11,6 @@ from typing import NamedTuple, Protocol
 
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.trials import Job
-from d4orm_planners.registry import PLANNERS
 
 
 class Sign(Enum):
@@ -108,7 +107,7 @@ class _Schedule:
         run = self.running.pop(ticket)
         left = run.job.noise[run.done :]
         # Without a plan there is nothing to execute, at any level of noise.
-        count = len(left) if run.done == 0 and run.job.policy.policy in PLANNERS else 1
+        count = len(left) if run.done == 0 and run.job.policy.planned else 1
         if left[count:]:
             self.waiting.appendleft(replace(run.job, noise=left[count:]))
         return [run.job.failed(noise, reason) for noise in left[:count]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib.metadata
 import json
 import time
@@ -14,13 +15,15 @@ from typing import Any
 import numpy as np
 
 from d4orm_env import navigation_v0, verify
+from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.core.problem import Problem
 from d4orm_planners.episode import run_episode
 from d4orm_planners.evaluation.store import Trial, TrialKey
 from d4orm_planners.evaluation.timing import describe_machine
 from d4orm_planners.plan import IterationRecord, Plan
 from d4orm_planners.policy import Actions, OpenLoop, Policy
-from d4orm_planners.registry import make_policy, policy_settings
+from d4orm_planners.references import describe
+from d4orm_planners.registry import is_planned, make_policy, policy_settings
 
 LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "pyrvo", "casadi")
 
@@ -31,18 +34,42 @@ class Configuration:
 
     Attributes:
         label: What it is called in the results.
-        policy: Registry name.
+        policy: Its name or import path; the label of one that a program gave itself.
         settings: Those that differ from the defaults.
+        given: What :func:`~d4orm_planners.make_policy` takes for it in any process, if not ``policy``.
     """
 
     label: str
     policy: str
     settings: Mapping[str, Any]
+    given: Any = None
+
+    @property
+    def source(self) -> Any:
+        """What makes the policy, with the settings."""
+        return self.policy if self.given is None else self.given
 
     @cached_property
     def config(self) -> str:
-        """All settings, as JSON with sorted keys."""
-        return json.dumps(policy_settings(self.policy, **self.settings), sort_keys=True)
+        """All settings, and the digest of a user's source, as JSON with sorted keys.
+
+        Raises:
+            ValueError: If a setting has no form in JSON, or a source cannot be read.
+        """
+        try:
+            return json.dumps(policy_settings(self.source, **self.settings), sort_keys=True)
+        except TypeError as error:
+            if isinstance(error, UnknownKeywordError):
+                raise
+            raise ValueError(
+                f"policy {self.label!r} has a setting that cannot be stored ({error}); give numbers, text, truth "
+                "values, lists and mappings of them"
+            ) from None
+
+    @cached_property
+    def planned(self) -> bool:
+        """Whether it is a plan executed open loop."""
+        return is_planned(self.source)
 
 
 @dataclass(frozen=True)
@@ -97,18 +124,13 @@ def run_job(job: Job) -> Iterator[Trial]:
         begin = time.perf_counter()
         error, outcome = "", {}
         try:
-            timed = timed or _TimedPolicy(make_policy(job.policy.policy, **job.policy.settings))
+            timed = timed or _TimedPolicy(make_policy(job.policy.source, **job.policy.settings))
             outcome = _outcome(timed, job, noise)
         except Exception as problem:
-            error = describe_error(problem)
+            error = describe(problem)
         versions, machine = _origin()
         trial = replace(job.failed(noise, error), versions=versions, machine=machine, **outcome)
         yield replace(trial, elapsed=time.perf_counter() - begin)
-
-
-def describe_error(error: BaseException) -> str:
-    """Kind and message on one line."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 def _outcome(policy: _TimedPolicy, job: Job, noise: float) -> dict[str, Any]:
@@ -151,10 +173,8 @@ def compact_history(history: tuple[IterationRecord, ...]) -> str:
 class _TimedPolicy(Policy):
     """A policy with a stopwatch. It keeps the plan of an open-loop policy from one episode to the next."""
 
-    name = "timed"
-
     def __init__(self, policy: Policy) -> None:
-        self._policy = policy
+        self._policy = copy.copy(policy)  # a user's own, which trials must not change
         self.wall_time = 0.0
         self.preparation = 0.0
         self.plan: Plan | None = None
@@ -176,9 +196,6 @@ class _TimedPolicy(Policy):
         if self.plan is None:
             self.wall_time += time.perf_counter() - begin
         return actions
-
-    def _controls(self, joint: Any) -> Any:
-        raise NotImplementedError("act() asks the policy itself")
 
 
 @cache

@@ -124,12 +124,13 @@ def _no_controls(problem: Problem) -> FloatArray:
 
 
 def _plan() -> None:
-    from d4orm_planners.registry import PLANNERS, make_planner
+    from d4orm_planners.names import PLANNERS
+    from d4orm_planners.registry import make_planner
     from d4orm_planners.sampling.optimizer import SamplingPlanner
 
     problem = _smallest_problem(TEAMS[0])
     # A planner that does not sample has nothing to compile that the others have not.
-    for name in (name for name, kind in PLANNERS.items() if issubclass(kind, SamplingPlanner)):
+    for name in (name for name in PLANNERS.own() if issubclass(PLANNERS[name], SamplingPlanner)):
         make_planner(name, engine="cpu", num_samples=32, num_steps=1).solve(problem, max_iterations=1)
 
 

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_planners.policy import Actions, Policy
+from d4orm_planners.policy import Actions, Policy, require_reset, robot_indices
 from d4orm_planners.rl.network import SUFFIX, Network, load_network
 from d4orm_planners.settings import PathText, Settings
 
@@ -47,6 +47,7 @@ class LearnedPolicy(Policy):
         ImportError: For a ``.zip``, if Stable-Baselines3 is not installed.
     """
 
+    name: ClassVar[str]
     config_class: ClassVar[type[Settings] | None] = LearnedConfig
 
     def __init__(self, config: LearnedConfig | None = None) -> None:
@@ -58,21 +59,19 @@ class LearnedPolicy(Policy):
         else:
             self._actor = _NetworkActor(self.name, path)
 
-    def _begin(self, env: Any, seed: int) -> None:
+    def reset(self, env: Any, seed: int = 0) -> None:
+        super().reset(env, seed)
         agent = env.possible_agents[0]
         self._actor.check(self.problem, env.observation_space(agent).shape, env.action_space(agent).shape)
 
     def act(self, observations: dict[str, Any], state: Any) -> Actions:
-        if not hasattr(self, "problem"):
-            raise RuntimeError("the policy has seen no environment yet; call reset(env) before act()")
+        require_reset(self)
         if not observations:
             return {}
-        robots = [int(agent.rsplit("_", 1)[1]) for agent in observations]
         seen = np.stack([np.asarray(observation, np.float32) for observation in observations.values()])
-        return dict(zip(observations, self._actor.controls(seen, self.problem.team.control_limits[robots])))
-
-    def _controls(self, joint: Any) -> Any:
-        raise NotImplementedError("act() goes by the observations")
+        return dict(
+            zip(observations, self._actor.controls(seen, self.problem.team.control_limits[robot_indices(observations)]))
+        )
 
 
 class PPO(LearnedPolicy):
