@@ -180,8 +180,8 @@ def step_worlds_kernel(names: tuple[str, ...]) -> Any:
 def roll_out_kernel(names: tuple[str, ...]) -> Any:
     """A kernel that steps a single world through ``controls`` ``(H+1, K, m)``, keeping every step.
 
-    The first row of the controls is unused. Every output has ``H+1`` rows too, the first for the start. The motion comes first; then 64 moments at a time are
-    judged, as if they were worlds.
+    The first row of the controls is unused. Every output has ``H+1`` rows too, the first for the start. The motion
+    comes first; then 64 moments at a time are judged, as if they were worlds.
     """
     move_robot = robot_mover(names)
 

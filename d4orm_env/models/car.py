@@ -77,8 +77,8 @@ CAR = Model(
     ),
     own_limits=(
         Limit("max_steering", 0.6, most=1.5),
-        Limit("max_steering_rate", 2.0),
-        Limit("wheelbase", 0.2),
+        Limit("max_steering_rate", 1.0),
+        Limit("wheelbase", 0.3),
     ),
     state_limits=((4, MAX_STEERING),),
 )
