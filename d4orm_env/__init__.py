@@ -5,6 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from d4orm_env.core.dynamics import register_model
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.trajectory import Trajectory
@@ -31,6 +32,7 @@ __all__ = [
     "load_problem",
     "make_problem",
     "navigation_v0",
+    "register_model",
     "register_scenario",
     "rollout",
     "save_problem",

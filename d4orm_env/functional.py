@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from d4orm_env.core.problem import Problem, ProblemArrays
+from d4orm_env.core.robot_model import STANDARD_LIMITS
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.engine.jax import Worlds, advance_worlds, judge
@@ -114,7 +115,7 @@ def _arrays(problem: Problem) -> ProblemArrays:
         bounds = jnp.stack([jnp.asarray(world.lower), jnp.asarray(world.upper)])
     return ProblemArrays(
         model_codes=None,
-        limits=jnp.stack([jnp.asarray(x) for x in (team.max_speed, team.max_acceleration, team.max_turn_rate)], axis=1),
+        limits=_limits(team),
         radius=jnp.asarray(team.radius),
         start=problem.start,
         goal=jnp.asarray(problem.goal),
@@ -128,6 +129,19 @@ def _arrays(problem: Problem) -> ProblemArrays:
         squared_goal_radius=jnp.asarray(problem.goal_radius**2, jnp.float32),
         squared_goal_speed=jnp.asarray(goal_speed**2, jnp.float32),
     )
+
+
+def _limits(team: Team) -> Any:
+    """:attr:`Team.limits` of a team whose numbers may be traced."""
+    columns = [jnp.asarray(getattr(team, name)) for name in STANDARD_LIMITS]
+    models = team.robot_models
+    for column in range(max(len(model.own_limits) for model in models)):
+        values = [
+            team.own_limits[model.own_limits[column].name][robot] if column < len(model.own_limits) else 1.0
+            for robot, model in enumerate(models)
+        ]
+        columns.append(jnp.stack([jnp.asarray(value, jnp.float32) for value in values]))
+    return jnp.stack(columns, axis=1)
 
 
 _STATIC = {Problem: ("horizon", "name"), Team: ("models",), World: ("dimension",)}

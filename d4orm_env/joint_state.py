@@ -21,8 +21,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.robot_model import ACCELERATION, SPEED
 
 
 class JointState(NamedTuple):
@@ -93,15 +94,19 @@ def state_bounds(problem: Problem, places: FloatArray, max_cycles: int) -> tuple
     """
     team, dimension = problem.team, problem.dimension
     duration = max_cycles * problem.dt
-    speed, acceleration, turn_rate = (np.asarray(limit, np.float64) for limit in team.limits.T)
+    limits = np.asarray(team.limits, np.float64)
+    speed, acceleration = limits[:, SPEED], limits[:, ACCELERATION]
     # Within a step a robot may exceed the speed limit, which is applied at its end.
     reach = (speed + acceleration * problem.dt / 2) * duration
     high = np.ones((problem.num_robots, problem.state_size))
     for robot, model in enumerate(team.robot_models):
+        high[robot, dimension : model.state_size] = LARGEST  # what no limit bounds
         high[robot, list(model.speed_indices)] = speed[robot]
         if model.heading_index is not None:
             start = abs(float(problem.start[robot, model.heading_index]))
-            high[robot, model.heading_index] = start + 2 * np.pi + turn_rate[robot] * duration
+            high[robot, model.heading_index] = start + 2 * np.pi + model.turn_rate(limits[robot]) * duration
+        for index, column in model.state_limits:
+            high[robot, index] = limits[robot, column]
     low = -high
     low[:, :dimension] = places[0] - reach[:, None]
     high[:, :dimension] = places[1] + reach[:, None]

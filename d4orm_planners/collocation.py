@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.collision import axis_gap
-from d4orm_env.core.dynamics import SPEED, Ops
 from d4orm_env.core.problem import Problem, inverse_initial_distance
+from d4orm_env.core.robot_model import SPEED, Ops
 from d4orm_env.core.transition import TimeStep
 
 OBJECTIVE_SCALE = 10.0
@@ -212,7 +212,8 @@ class TeamProgram:
         step = TimeStep(*(self.problem.dt / part for part in (1, 2, 3, 6)))
         for robot, model in enumerate(self.models):
             x, u = ca.SX.sym("x", model.state_size), ca.SX.sym("u", model.control_size)
-            after = model.functions.integrate(ca.vertsplit(x), ca.vertsplit(u), step, self.ops)
+            limits = self.limits[robot].tolist()
+            after = model.functions.integrate(ca.vertsplit(x), ca.vertsplit(u), limits, step, self.ops)
             advance = ca.Function("advance", [x, u], [ca.vertcat(*after)]).map(self.problem.horizon)
             yield self.states[robot] - advance(self.paths[robot][:, :-1], self.controls[robot]), 0.0, 0.0
             for values, components, limit in self._limited(robot):
@@ -224,6 +225,8 @@ class TeamProgram:
         model, limits = self.models[robot], self.limits[robot]
         if model.speed_indices:
             yield self.states[robot], list(model.speed_indices), float(limits[SPEED])
+        for index, column in model.state_limits:
+            yield self.states[robot], [index], float(limits[column])
         for column in dict.fromkeys(model.control_limits):
             components = [index for index, own in enumerate(model.control_limits) if own == column]
             yield self.controls[robot], components, float(limits[column])
@@ -236,7 +239,9 @@ class TeamProgram:
             yield self._squared_goal_distance(robot)[dock - 1], -np.inf, radius**2
             if problem.goal_speed is not None:
                 variables = self.states[robot][:, dock - 1], self.controls[robot][:, dock - 1]
-                velocity = self.models[robot].functions.velocity(*map(self.casadi.vertsplit, variables), self.ops)
+                x, u = map(self.casadi.vertsplit, variables)
+                limits = self.limits[robot].tolist()
+                velocity = self.models[robot].functions.velocity(x, u, limits, self.ops)
                 yield sum(part**2 for part in velocity), -np.inf, problem.goal_speed**2
 
     def _contact_rows(self, contacts: Contacts, docks: Any) -> Iterator[Rows]:

@@ -130,8 +130,10 @@ def _load_pyrvo() -> Any:
 def _velocities(problem: Problem, joint: JointState) -> FloatArray:
     """``(K, 2)`` present velocities [m/s]; that of a first-order robot is the one it was last told."""
     velocities = [
-        model.functions.velocity(state, control, NUMPY_OPS)
-        for model, state, control in zip(problem.team.robot_models, joint.states, joint.controls, strict=True)
+        model.functions.velocity(state, control, limits, NUMPY_OPS)
+        for model, state, control, limits in zip(
+            problem.team.robot_models, joint.states, joint.controls, problem.team.limits, strict=True
+        )
     ]
     return np.array(velocities, np.float32)
 

@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from engine_support import ENGINE_NAMES, MODEL_NAMES, NUMPY_OPS, PYTHON_OPS
+from engine_support import ENGINE_NAMES, NUMPY_OPS, PYTHON_OPS
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -21,17 +21,23 @@ from d4orm_env.engine.base import get_engine
 JAX_OPS = Ops(jnp.cos, jnp.sin, jnp.sqrt, jnp.minimum, jnp.maximum, jnp.arctan2, jnp.where)
 LIMITS = (2.0, 1.0, 0.5)
 """Speed, acceleration, turn rate: all different, so that none can stand for another."""
+CAR_LIMITS = (*LIMITS, 0.6, 1.5, 0.25)
+"""And steering, steering rate and wheelbase."""
 
 
 def test_the_registry_is_consistent() -> None:
-    assert tuple(MODELS) == ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive")
-    assert MODEL_CODES == {"holonomic2d": 0, "holonomic3d": 1, "velocity2d": 2, "differential_drive": 3}
+    # A code is part of what a problem's digest says.
+    built_in = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive", "unicycle", "car")
+    assert tuple(MODELS) == tuple(MODEL_CODES) == built_in
+    assert list(MODEL_CODES.values()) == [0, 1, 2, 3, 4, 5]
     sizes = {name: (model.dimension, model.state_size, model.control_size) for name, model in MODELS.items()}
     assert sizes == {
         "holonomic2d": (2, 4, 2),
         "holonomic3d": (3, 6, 3),
         "velocity2d": (2, 2, 2),
         "differential_drive": (2, 4, 2),
+        "unicycle": (2, 3, 2),
+        "car": (2, 5, 2),
     }
     for name, model in MODELS.items():
         assert get_model(name) is model
@@ -39,13 +45,13 @@ def test_the_registry_is_consistent() -> None:
         assert model.state_names[: model.dimension] == ("px", "py", "pz")[: model.dimension]
         assert len(model.control_limits) == model.control_size
         x, u = (0.25,) * model.state_size, (0.25,) * model.control_size
-        assert len(model.functions.derivative(x, u, PYTHON_OPS)) == model.state_size
-        assert len(model.functions.velocity(x, u, PYTHON_OPS)) == model.dimension
+        assert len(model.functions.derivative(x, u, CAR_LIMITS, PYTHON_OPS)) == model.state_size
+        assert len(model.functions.velocity(x, u, CAR_LIMITS, PYTHON_OPS)) == model.dimension
 
 
 def test_heading_and_speed_are_where_the_model_says() -> None:
-    assert [model.heading_index for model in MODELS.values()] == [None, None, None, 2]
-    assert [model.speed_indices for model in MODELS.values()] == [(2, 3), (3, 4, 5), (), (3,)]
+    assert [model.heading_index for model in MODELS.values()] == [None, None, None, 2, 2, 2]
+    assert [model.speed_indices for model in MODELS.values()] == [(2, 3), (3, 4, 5), (), (3,), (), (3,)]
 
 
 def test_an_unknown_model_is_named_with_those_there_are() -> None:
@@ -68,12 +74,16 @@ def test_an_unknown_model_is_named_with_those_there_are() -> None:
             (4 * math.sqrt(0.75), 2),
         ),
         ("differential_drive", (1, 2, math.pi, 4), (5, 6), (-4, 0, 5, 6), (-4, 0)),
+        ("unicycle", (1, 2, math.pi / 6), (4, 5), (4 * math.sqrt(0.75), 2, 5), (4 * math.sqrt(0.75), 2)),
+        # It turns at v tan(steering) / wheelbase, here 2 * 1 / 0.25.
+        ("car", (1, 2, math.pi / 2, 2, math.pi / 4), (5, 6), (0, 2, 8, 5, 6), (0, 2)),
+        ("car", (1, 2, 0, -2, math.pi / 4), (5, 6), (-2, 0, -8, 5, 6), (-2, 0)),
     ],
 )
 def test_derivatives_and_velocities(name: str, x: Any, u: Any, derivative: Any, velocity: Any) -> None:
     functions = MODELS[name].functions
-    assert functions.derivative(x, u, PYTHON_OPS) == pytest.approx(derivative, abs=1e-12)
-    assert functions.velocity(x, u, PYTHON_OPS) == pytest.approx(velocity, abs=1e-12)
+    assert functions.derivative(x, u, CAR_LIMITS, PYTHON_OPS) == pytest.approx(derivative, abs=1e-12)
+    assert functions.velocity(x, u, CAR_LIMITS, PYTHON_OPS) == pytest.approx(velocity, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -90,10 +100,12 @@ def test_derivatives_and_velocities(name: str, x: Any, u: Any, derivative: Any, 
         ("differential_drive", (0.7, -3.0), (0.5, -1.0)),  # each component to its own limit
         ("differential_drive", (-0.7, 0.9), (-0.5, 0.9)),
         ("differential_drive", (0.4, 3.0), (0.4, 1.0)),
+        ("unicycle", (-3.0, 0.7), (-2.0, 0.5)),  # speed and turn rate
+        ("car", (-3.0, 2.0), (-1.0, 1.5)),  # acceleration and steering rate
     ],
 )
 def test_control_limits(name: str, u: Any, limited: Any) -> None:
-    assert MODELS[name].functions.limit_control(u, LIMITS, PYTHON_OPS) == pytest.approx(limited, abs=1e-12)
+    assert MODELS[name].functions.limit_control(u, CAR_LIMITS, PYTHON_OPS) == pytest.approx(limited, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -105,10 +117,13 @@ def test_control_limits(name: str, u: Any, limited: Any) -> None:
         ("velocity2d", (70.0, 80.0), (70.0, 80.0)),
         ("differential_drive", (7.0, 8.0, 9.0, 2.5), (7.0, 8.0, 9.0, 2.0)),
         ("differential_drive", (7.0, 8.0, 9.0, -2.5), (7.0, 8.0, 9.0, -2.0)),
+        ("unicycle", (7.0, 8.0, 9.0), (7.0, 8.0, 9.0)),
+        ("car", (7.0, 8.0, 9.0, -2.5, 0.7), (7.0, 8.0, 9.0, -2.0, 0.6)),
+        ("car", (7.0, 8.0, 9.0, 1.5, -0.7), (7.0, 8.0, 9.0, 1.5, -0.6)),
     ],
 )
 def test_speed_limits(name: str, x: Any, limited: Any) -> None:
-    assert MODELS[name].functions.limit_state(x, LIMITS, PYTHON_OPS) == pytest.approx(limited, abs=1e-12)
+    assert MODELS[name].functions.limit_state(x, CAR_LIMITS, PYTHON_OPS) == pytest.approx(limited, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -118,24 +133,26 @@ def test_speed_limits(name: str, x: Any, limited: Any) -> None:
         ("holonomic3d", (1, 2, 3, 4, 5, 6), (1, 2, 3, 0, 0, 0)),
         ("velocity2d", (1, 2), (1, 2)),
         ("differential_drive", (1, 2, 3, 4), (1, 2, 3, 0)),
+        ("unicycle", (1, 2, 3), (1, 2, 3)),
+        ("car", (1, 2, 3, 4, 5), (1, 2, 3, 0, 5)),
     ],
 )
 def test_rest_keeps_place_and_heading(name: str, x: Any, rest: Any) -> None:
     assert MODELS[name].functions.rest(x, 0) == rest
 
 
-@pytest.mark.parametrize("name", MODEL_NAMES)
+@pytest.mark.parametrize("name", MODELS)
 @given(data=st.data())
 def test_limited_controls_keep_the_limits_and_the_direction(name: str, data: st.DataObject) -> None:
     model = MODELS[name]
     number = st.floats(-1e3, 1e3)
     u = tuple(data.draw(number) for _ in range(model.control_size))
-    limited = model.functions.limit_control(u, LIMITS, PYTHON_OPS)
-    again = model.functions.limit_control(limited, LIMITS, PYTHON_OPS)
+    limited = model.functions.limit_control(u, CAR_LIMITS, PYTHON_OPS)
+    again = model.functions.limit_control(limited, CAR_LIMITS, PYTHON_OPS)
     assert again == pytest.approx(limited, rel=1e-12, abs=1e-300)
-    assert all(abs(v) <= LIMITS[column] * (1 + 1e-12) for v, column in zip(limited, model.control_limits))
+    assert all(abs(v) <= CAR_LIMITS[column] * (1 + 1e-12) for v, column in zip(limited, model.control_limits))
     assert all(v * w >= 0 and abs(v) <= abs(w) * (1 + 1e-12) for v, w in zip(limited, u))
-    if name != "differential_drive":
+    if len(set(model.control_limits)) == 1:
         assert math.hypot(*limited) <= LIMITS[model.control_limits[0]] * (1 + 1e-12)
         # Parallel to what was asked for.
         assert math.hypot(*u) * math.hypot(*limited) == pytest.approx(sum(v * w for v, w in zip(limited, u)), abs=1e-9)
@@ -144,21 +161,22 @@ def test_limited_controls_keep_the_limits_and_the_direction(name: str, data: st.
 def cases(name: str) -> list[tuple[np.ndarray, np.ndarray]]:
     """States and controls of one robot, inside and outside its limits."""
     model, generator = MODELS[name], np.random.default_rng(1)
-    return [
-        (generator.uniform(-3, 3, model.state_size), generator.uniform(-2, 2, model.control_size)) for _ in range(20)
-    ]
+    reach = np.full(model.state_size, 3.0)
+    for index, column in model.state_limits:
+        reach[index] = CAR_LIMITS[column]
+    return [(generator.uniform(-reach, reach), generator.uniform(-2, 2, model.control_size)) for _ in range(20)]
 
 
 def next_state(name: str, x: Any, u: Any, ops: Ops, number: Any) -> np.ndarray:
     """The state after one step of 0.1 s, in the precision and with the functions of one library."""
     functions = MODELS[name].functions
-    limits = tuple(number(limit) for limit in LIMITS)
+    limits = tuple(number(limit) for limit in CAR_LIMITS)
     h = TimeStep(*(number(0.1 / part) for part in (1, 2, 3, 6)))
     x, u = tuple(number(value) for value in x), tuple(number(value) for value in u)
     return np.array(advance(functions, x, functions.limit_control(u, limits, ops), limits, h, ops), np.float64)
 
 
-@pytest.mark.parametrize("name", MODEL_NAMES)
+@pytest.mark.parametrize("name", MODELS)
 def test_the_same_source_gives_the_same_step_in_every_library(name: str) -> None:
     for x, u in cases(name):
         python = next_state(name, x, u, PYTHON_OPS, float)
@@ -168,9 +186,10 @@ def test_the_same_source_gives_the_same_step_in_every_library(name: str) -> None
 
 
 @pytest.mark.parametrize("engine", ENGINE_NAMES)
-@pytest.mark.parametrize("name", MODEL_NAMES)
+@pytest.mark.parametrize("name", MODELS)
 def test_the_engines_compile_that_very_step(engine: str, name: str) -> None:
-    team = Team((name,), max_speed=LIMITS[0], max_acceleration=LIMITS[1], max_turn_rate=LIMITS[2])
+    own = {limit.name: value for limit, value in zip(MODELS[name].own_limits, CAR_LIMITS[3:])}
+    team = Team((name,), 0.15, *LIMITS, own)
     problem = Problem(team, np.zeros((1, team.state_size)), np.full((1, team.dimension), 50.0))
     physics = get_engine(engine)
     for x, u in cases(name):
@@ -178,5 +197,5 @@ def test_the_engines_compile_that_very_step(engine: str, name: str) -> None:
         functions = MODELS[name].functions
         np.testing.assert_allclose(result.states[0], next_state(name, x, u, PYTHON_OPS, float), rtol=1e-6, atol=2e-6)
         np.testing.assert_allclose(
-            result.controls[0], functions.limit_control(tuple(u), LIMITS, PYTHON_OPS), rtol=1e-6, atol=1e-6
+            result.controls[0], functions.limit_control(tuple(u), CAR_LIMITS, PYTHON_OPS), rtol=1e-6, atol=1e-6
         )

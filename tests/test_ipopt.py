@@ -21,7 +21,7 @@ from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.collocation import Motion, TeamProgram
 
-MODELS = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive")
+MODELS = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive", "unicycle", "car")
 
 PLANAR_WORLDS = {
     "circle": {"circles": [[0, 0.05, 0.3]]},
@@ -41,8 +41,9 @@ def swap_problem(models: tuple[str, str] = ("holonomic2d", "holonomic2d"), **cha
     team = Team(models)
     start = np.zeros((2, team.state_size))
     start[:, 0] = [-1, 1]
-    if models[1] == "differential_drive":
-        start[1, 2] = np.pi
+    heading = team.robot_models[1].heading_index
+    if heading is not None:
+        start[1, heading] = np.pi
     return Problem(team, start, -start[:, : team.dimension], **({"horizon": 45} | changes))
 
 

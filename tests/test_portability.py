@@ -49,7 +49,7 @@ def kernels() -> Iterator[tuple[str, Any]]:
     yield "average", sampling.average_noise
     yield "project", sampling.project_noise
     yield "softmax", softmax._softmax
-    yield "roll out", worlds.roll_out
+    yield "roll out", worlds.world_kernels(("holonomic2d",)).roll_out
 
 
 @pytest.mark.slow

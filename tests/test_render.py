@@ -87,6 +87,7 @@ PROBLEMS = {
     "obstacles": lambda: ring_problem(
         3, world=World(2, circles=[(1, 0.5, 0.3)], boxes=[(-1, -1, 0, -0.5)], lower=(-3, -3), upper=(3, 3))
     ),
+    "cars and unicycles": lambda: ring_problem(4, ("car", "unicycle") * 2),
     "64 robots": lambda: ring_problem(64, diameter=16.0),
     "space": lambda: ring_problem(5, "holonomic3d", world=cylinders_and_boxes(), radius=0.29),
 }

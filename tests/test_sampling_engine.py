@@ -490,6 +490,8 @@ def test_kernels_of_different_models_share_no_file() -> None:
     teams = [*((name,) for name in MODELS), ("holonomic2d", "differential_drive")]
     files = [score_kernel(models)._cache._impl.filename_base for models in teams]
     assert len(set(files)) == len(files)
-    # All planar models are in the kernel of mixed teams, whoever they are.
+    # All common planar models are in the kernel of mixed teams, whoever they are.
     assert score_kernel(("velocity2d", "holonomic2d")) is score_kernel(teams[-1])
     assert score_kernel(("holonomic2d",) * 5) is score_kernel(("holonomic2d",))
+    # Teams with another model compile no more than the models that they have.
+    assert score_kernel(("car", "holonomic2d")).__name__.endswith("_car_holonomic2d")

@@ -88,7 +88,10 @@ def problems(draw: st.DrawFn) -> Problem:
         return np.array(draw(st.lists(numbers, min_size=size, max_size=size)), np.float32).reshape(shape)
 
     limits = (array(numbers, count) for numbers in (positive, positive, st.floats(2**-10, 2, width=32)))
-    team = Team(models, array(st.floats(2**-20, 0.5, width=32), count), *limits)
+    speed, *others = limits
+    # A car as long as it drives in a second turns no faster than the others.
+    own = {"wheelbase": speed} if "car" in models else {}
+    team = Team(models, array(st.floats(2**-20, 0.5, width=32), count), speed, *others, own_limits=own)
     places = array(offsets, 2, count, dimension)
     places[:, :, 0] += 2 * np.arange(count)
     start = np.zeros((count, team.state_size), np.float32)

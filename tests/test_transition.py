@@ -27,7 +27,7 @@ def time_step(dt: float) -> TimeStep:
 
 def integrate(x: tuple[float, ...], u: tuple[float, ...], duration: float, steps: int) -> np.ndarray:
     for _ in range(steps):
-        x = DIFFERENTIAL_DRIVE.integrate(x, u, time_step(duration / steps), NUMPY_OPS)
+        x = DIFFERENTIAL_DRIVE.integrate(x, u, (), time_step(duration / steps), NUMPY_OPS)
     return np.array(x)
 
 
@@ -59,16 +59,19 @@ def test_the_step_converges_at_order_four() -> None:
 @given(data=st.data())
 def test_a_step_is_runge_kutta_on_the_derivative(name: str, data: st.DataObject) -> None:
     model, number = MODELS[name], st.floats(-3, 3)
-    x = data.draw(st.tuples(*[number] * model.state_size))
+    bounded = dict(model.state_limits)  # a steering angle, whose tangent has no bounds
+    x = data.draw(st.tuples(*(st.floats(-0.6, 0.6) if i in bounded else number for i in range(model.state_size))))
     u = data.draw(st.tuples(*[number] * model.control_size))
+    limits = (1.0, 1.0, 1.0, *(limit.default for limit in model.own_limits))
     dt = data.draw(st.floats(1e-3, 1.0))
-    textbook = rk4(model.functions.derivative, x, u, dt, NUMPY_OPS)
-    np.testing.assert_allclose(model.functions.integrate(x, u, time_step(dt), NUMPY_OPS), textbook, atol=1e-13)
+    textbook = rk4(lambda x, u, ops: model.functions.derivative(x, u, limits, ops), x, u, dt, NUMPY_OPS)
+    after = model.functions.integrate(x, u, limits, time_step(dt), NUMPY_OPS)
+    np.testing.assert_allclose(after, textbook, rtol=1e-11, atol=1e-13)
 
 
 def test_a_double_integrator_moves_exactly() -> None:
     # p + v t + a t^2 / 2 after half a second from (1, 2) at (0.5, -0.25) under (0.2, 0.4).
-    x = HOLONOMIC.integrate((1.0, 2.0, 0.5, -0.25), (0.2, 0.4), time_step(0.5), NUMPY_OPS)
+    x = HOLONOMIC.integrate((1.0, 2.0, 0.5, -0.25), (0.2, 0.4), (), time_step(0.5), NUMPY_OPS)
     assert x == pytest.approx((1.275, 1.925, 0.6, -0.05), abs=1e-14)
 
 
@@ -123,6 +126,8 @@ def test_a_robot_docks_at_no_more_than_the_goal_speed(engine: str, goal_speed: f
         ("holonomic3d", [1.7, 0, 0, 1, 0, 0], [0, 0, 0], [1.8, 0, 0, 0, 0, 0]),
         ("velocity2d", [1.7, 0], [1, 0], [1.8, 0]),
         ("differential_drive", [1.7, 0, 0, 1], [0.5, 0], [1.79996, 0.0025, 0.05, 0]),
+        ("unicycle", [1.7, 0, 0], [1, 0.5], [1.79996, 0.0025, 0.05]),
+        ("car", [1.7, 0, 0, 1, 0.1], [0, 0], [1.79998, 0.00167, 0.03345, 0, 0.1]),
     ],
 )
 def test_a_docked_robot_stays_at_rest_whatever_it_is_told(

@@ -539,7 +539,7 @@ def sampled_positions(problem, controls, pieces):
             u = model.functions.limit_control(tuple(controls[step, robot].tolist()), limits, PYTHON_OPS)
             for _ in range(pieces):
                 if arrival == math.inf:
-                    x = model.functions.integrate(x, u, pace, PYTHON_OPS)
+                    x = model.functions.integrate(x, u, limits, pace, PYTHON_OPS)
                 track.append(x[:2])
             x = model.functions.limit_state(x, limits, PYTHON_OPS)
             if arrival == math.inf and math.dist(x[:2], goal) <= problem.goal_radius:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from d4orm_env.core.dynamics import Ops
+from d4orm_env.core.robot_model import Ops
 
 
 def axis_gap(x: Any, lower: Any, upper: Any, zero: Any, ops: Ops) -> Any:

@@ -1,392 +1,64 @@
-"""Robot models, each written once in scalar style.
-
-A model is a handful of pure functions on tuples of numbers. They contain no loops, no array library and no float
-literals, so that the CPU engine compiles them with numba, the JAX engine traces them over arrays whose last axis is the
-sample, and CasADi can differentiate them, all from the same source and in the caller's precision. Mathematical
-functions come in through :class:`Ops`.
-
-Sources: paper, section IV-B (the double integrators and the differential drive) and section VIII-D (the first-order
-holonomic ground robots).
-"""
+"""The robot models by name: those that come with the package, one file each in :mod:`d4orm_env.models`, and users'."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, NamedTuple
-
-SPEED, ACCELERATION, TURN_RATE = range(3)
-"""Columns of a robot's limits: speed [m/s], acceleration [m/s^2], turn rate [rad/s]."""
-
-
-class Ops(NamedTuple):
-    """The mathematical functions a model may call, from whichever library compiles it."""
-
-    cos: Callable[..., Any]
-    sin: Callable[..., Any]
-    sqrt: Callable[..., Any]
-    minimum: Callable[..., Any]
-    maximum: Callable[..., Any]
-    arctan2: Callable[..., Any]
-    where: Callable[..., Any]
-    """``(condition, a, b) -> a`` where the condition holds, ``b`` elsewhere."""
-
-
-class ModelFunctions(NamedTuple):
-    """What a model computes. ``x`` is the state tuple, ``u`` the control tuple, ``limits`` the robot's three limits."""
-
-    derivative: Callable[..., Any]
-    """``(x, u, ops) -> dx/dt``."""
-    limit_control: Callable[..., Any]
-    """``(u, limits, ops) -> u`` inside the robot's limits."""
-    limit_state: Callable[..., Any]
-    """``(x, limits, ops) -> x`` at no more than the speed limit."""
-    velocity: Callable[..., Any]
-    """``(x, u, ops) -> `` velocity vector in the world frame [m/s]."""
-    rest: Callable[..., Any]
-    """``(x, zero) -> x`` standing still at the same place and heading."""
-    integrate: Callable[..., Any]
-    """``(x, u, h, ops) -> x`` after a :class:`~d4orm_env.core.transition.TimeStep`: what classical Runge-Kutta makes of
-    the derivative with the control held constant, written out without the terms that cancel.
-    """
-    approach: Callable[..., Any]
-    """``(x, goal, limits, h, ops) -> `` fastest velocity straight to the goal from which it can stop there [m/s]."""
-    track: Callable[..., Any]
-    """``(x, velocity, limits, h, ops) -> u`` that would bring it to a velocity within a step; it may exceed the limits.
-    """
-
-
-@dataclass(frozen=True)
-class Model:
-    """A robot model: its sizes, the meaning of its components and its functions.
-
-    Attributes:
-        name: Registry name.
-        dimension: Position dimensions ``d``, 2 or 3; the first ``d`` state components are the position [m].
-        state_names: One name per state component; ``len`` is the model's state size.
-        control_names: One name per control component; ``len`` is the model's control size.
-        control_limits: Column of the robot's limits that bounds each control component.
-        heading_index: State component holding the heading [rad], or ``None`` for a model without one.
-        speed_indices: State components holding velocity or speed [m/s].
-        functions: The scalar-style functions.
-    """
-
-    name: str
-    dimension: int
-    state_names: tuple[str, ...]
-    control_names: tuple[str, ...]
-    control_limits: tuple[int, ...]
-    heading_index: int | None
-    speed_indices: tuple[int, ...]
-    functions: ModelFunctions
-
-    @property
-    def state_size(self) -> int:
-        return len(self.state_names)
-
-    @property
-    def control_size(self) -> int:
-        return len(self.control_names)
-
-
-def norm_scale(square: Any, limit: Any, ops: Ops) -> Any:
-    """Factor that brings a vector of this squared length to at most ``limit``; exactly one for a shorter vector."""
-    return limit / ops.sqrt(ops.maximum(square, limit * limit))
-
-
-def control_scale(square: Any, limit: Any, ops: Ops) -> Any:
-    """As :func:`norm_scale`; NaN where the square has overflowed, lest the control pass for none at all."""
-    return norm_scale(square, limit, ops) + (square - square)
-
-
-def clip(value: Any, limit: Any, ops: Ops) -> Any:
-    return ops.maximum(-limit, ops.minimum(limit, value))
-
-
-def stopping_speed(distance: Any, limits: Any, h: Any, ops: Ops) -> Any:
-    """Fastest speed from which a robot with a limited acceleration stops within a distance."""
-    acceleration = limits[ACCELERATION]
-    # Braking begins with the next step.
-    lost = acceleration * h.half
-    return ops.minimum(limits[SPEED], ops.sqrt((acceleration + acceleration) * distance + lost * lost) - lost)
-
-
-def share(part: Any, whole: Any, other: Any, ops: Ops) -> Any:
-    """``part / whole``, and no division by zero where both are: ``other`` is any number but zero."""
-    return part / ops.where(whole > 0, whole, other)
-
-
-# Double integrator in the plane: x = [px, py, vx, vy], u = [ax, ay].
-
-
-def holonomic2d_derivative(x: Any, u: Any, ops: Ops) -> Any:
-    return (x[2], x[3], u[0], u[1])
-
-
-# A constant acceleration gives a parabola, which Runge-Kutta follows exactly.
-
-
-def holonomic2d_integrate(x: Any, u: Any, h: Any, ops: Ops) -> Any:
-    return (
-        x[0] + h.full * (x[2] + h.half * u[0]),
-        x[1] + h.full * (x[3] + h.half * u[1]),
-        x[2] + h.full * u[0],
-        x[3] + h.full * u[1],
-    )
-
-
-def holonomic2d_limit_control(u: Any, limits: Any, ops: Ops) -> Any:
-    scale = control_scale(u[0] * u[0] + u[1] * u[1], limits[ACCELERATION], ops)
-    return (u[0] * scale, u[1] * scale)
-
-
-def holonomic2d_limit_state(x: Any, limits: Any, ops: Ops) -> Any:
-    scale = norm_scale(x[2] * x[2] + x[3] * x[3], limits[SPEED], ops)
-    return (x[0], x[1], x[2] * scale, x[3] * scale)
-
-
-def holonomic2d_velocity(x: Any, u: Any, ops: Ops) -> Any:
-    return (x[2], x[3])
-
-
-def holonomic2d_rest(x: Any, zero: Any) -> Any:
-    return (x[0], x[1], zero, zero)
-
-
-def holonomic2d_approach(x: Any, goal: Any, limits: Any, h: Any, ops: Ops) -> Any:
-    gap_x, gap_y = goal[0] - x[0], goal[1] - x[1]
-    distance = ops.sqrt(gap_x * gap_x + gap_y * gap_y)
-    pace = share(stopping_speed(distance, limits, h, ops), distance, h.full, ops)
-    return (gap_x * pace, gap_y * pace)
-
-
-def holonomic2d_track(x: Any, velocity: Any, limits: Any, h: Any, ops: Ops) -> Any:
-    return ((velocity[0] - x[2]) / h.full, (velocity[1] - x[3]) / h.full)
-
-
-# Double integrator in space: x = [px, py, pz, vx, vy, vz], u = [ax, ay, az].
-
-
-def holonomic3d_derivative(x: Any, u: Any, ops: Ops) -> Any:
-    return (x[3], x[4], x[5], u[0], u[1], u[2])
-
-
-def holonomic3d_integrate(x: Any, u: Any, h: Any, ops: Ops) -> Any:
-    return (
-        x[0] + h.full * (x[3] + h.half * u[0]),
-        x[1] + h.full * (x[4] + h.half * u[1]),
-        x[2] + h.full * (x[5] + h.half * u[2]),
-        x[3] + h.full * u[0],
-        x[4] + h.full * u[1],
-        x[5] + h.full * u[2],
-    )
-
-
-def holonomic3d_limit_control(u: Any, limits: Any, ops: Ops) -> Any:
-    scale = control_scale(u[0] * u[0] + u[1] * u[1] + u[2] * u[2], limits[ACCELERATION], ops)
-    return (u[0] * scale, u[1] * scale, u[2] * scale)
-
-
-def holonomic3d_limit_state(x: Any, limits: Any, ops: Ops) -> Any:
-    scale = norm_scale(x[3] * x[3] + x[4] * x[4] + x[5] * x[5], limits[SPEED], ops)
-    return (x[0], x[1], x[2], x[3] * scale, x[4] * scale, x[5] * scale)
-
-
-def holonomic3d_velocity(x: Any, u: Any, ops: Ops) -> Any:
-    return (x[3], x[4], x[5])
-
-
-def holonomic3d_rest(x: Any, zero: Any) -> Any:
-    return (x[0], x[1], x[2], zero, zero, zero)
-
-
-def holonomic3d_approach(x: Any, goal: Any, limits: Any, h: Any, ops: Ops) -> Any:
-    gap_x, gap_y, gap_z = goal[0] - x[0], goal[1] - x[1], goal[2] - x[2]
-    distance = ops.sqrt(gap_x * gap_x + gap_y * gap_y + gap_z * gap_z)
-    pace = share(stopping_speed(distance, limits, h, ops), distance, h.full, ops)
-    return (gap_x * pace, gap_y * pace, gap_z * pace)
-
-
-def holonomic3d_track(x: Any, velocity: Any, limits: Any, h: Any, ops: Ops) -> Any:
-    return ((velocity[0] - x[3]) / h.full, (velocity[1] - x[4]) / h.full, (velocity[2] - x[5]) / h.full)
-
-
-# First-order holonomic: x = [px, py], u = [vx, vy].
-
-
-def velocity2d_derivative(x: Any, u: Any, ops: Ops) -> Any:
-    return (u[0], u[1])
-
-
-def velocity2d_integrate(x: Any, u: Any, h: Any, ops: Ops) -> Any:
-    return (x[0] + h.full * u[0], x[1] + h.full * u[1])
-
-
-def velocity2d_limit_control(u: Any, limits: Any, ops: Ops) -> Any:
-    scale = control_scale(u[0] * u[0] + u[1] * u[1], limits[SPEED], ops)
-    return (u[0] * scale, u[1] * scale)
-
-
-def velocity2d_limit_state(x: Any, limits: Any, ops: Ops) -> Any:
-    return x
-
-
-def velocity2d_velocity(x: Any, u: Any, ops: Ops) -> Any:
-    return (u[0], u[1])
-
-
-def velocity2d_rest(x: Any, zero: Any) -> Any:
-    return x
-
-
-def velocity2d_approach(x: Any, goal: Any, limits: Any, h: Any, ops: Ops) -> Any:
-    gap_x, gap_y = goal[0] - x[0], goal[1] - x[1]
-    distance = ops.sqrt(gap_x * gap_x + gap_y * gap_y)
-    # It stops at once, and need only not overshoot within a step.
-    pace = share(ops.minimum(limits[SPEED], distance / h.full), distance, h.full, ops)
-    return (gap_x * pace, gap_y * pace)
-
-
-def velocity2d_track(x: Any, velocity: Any, limits: Any, h: Any, ops: Ops) -> Any:
-    return velocity
-
-
-# Differential drive: x = [px, py, heading, speed], u = [turn rate, acceleration].
-
-
-def differential_drive_derivative(x: Any, u: Any, ops: Ops) -> Any:
-    return (x[3] * ops.cos(x[2]), x[3] * ops.sin(x[2]), u[0], u[1])
-
-
-def differential_drive_integrate(x: Any, u: Any, h: Any, ops: Ops) -> Any:
-    # The heading turns evenly, so that two of the four stages are the same, and what remains is Simpson's rule. The
-    # headings half-way and at the end come from the first one, turned twice by the same angle.
-    turn = h.half * u[0]
-    turn_x, turn_y = ops.cos(turn), ops.sin(turn)
-    x0, y0 = ops.cos(x[2]), ops.sin(x[2])
-    x1, y1 = x0 * turn_x - y0 * turn_y, y0 * turn_x + x0 * turn_y
-    x2, y2 = x1 * turn_x - y1 * turn_y, y1 * turn_x + x1 * turn_y
-    speed1, speed2 = x[3] + h.half * u[1], x[3] + h.full * u[1]
-    twice = speed1 + speed1
-    return (
-        x[0] + (h.sixth * (x[3] * x0 + speed2 * x2) + h.third * (twice * x1)),
-        x[1] + (h.sixth * (x[3] * y0 + speed2 * y2) + h.third * (twice * y1)),
-        x[2] + h.full * u[0],
-        speed2,
-    )
-
-
-def differential_drive_limit_control(u: Any, limits: Any, ops: Ops) -> Any:
-    return (clip(u[0], limits[TURN_RATE], ops), clip(u[1], limits[ACCELERATION], ops))
-
-
-def differential_drive_limit_state(x: Any, limits: Any, ops: Ops) -> Any:
-    return (x[0], x[1], x[2], clip(x[3], limits[SPEED], ops))
-
-
-def differential_drive_velocity(x: Any, u: Any, ops: Ops) -> Any:
-    return (x[3] * ops.cos(x[2]), x[3] * ops.sin(x[2]))
-
-
-def differential_drive_rest(x: Any, zero: Any) -> Any:
-    return (x[0], x[1], x[2], zero)
-
-
-def differential_drive_track(x: Any, velocity: Any, limits: Any, h: Any, ops: Ops) -> Any:
-    """Turn to the wanted direction, and drive as fast as it faces that way."""
-    facing_x, facing_y = ops.cos(x[2]), ops.sin(x[2])
-    along = facing_x * velocity[0] + facing_y * velocity[1]
-    across = facing_x * velocity[1] - facing_y * velocity[0]
-    none = along - along
-    # To stand still no heading is better than the present one.
-    turn = ops.where(along * along + across * across > 0, ops.arctan2(across, along), none)
-    return (clip(turn / h.full, limits[TURN_RATE], ops), (ops.maximum(along, none) - x[3]) / h.full)
-
-
-MODELS: dict[str, Model] = {
-    model.name: model
-    for model in (
-        Model(
-            name="holonomic2d",
-            dimension=2,
-            state_names=("px", "py", "vx", "vy"),
-            control_names=("ax", "ay"),
-            control_limits=(ACCELERATION, ACCELERATION),
-            heading_index=None,
-            speed_indices=(2, 3),
-            functions=ModelFunctions(
-                holonomic2d_derivative,
-                holonomic2d_limit_control,
-                holonomic2d_limit_state,
-                holonomic2d_velocity,
-                holonomic2d_rest,
-                holonomic2d_integrate,
-                holonomic2d_approach,
-                holonomic2d_track,
-            ),
-        ),
-        Model(
-            name="holonomic3d",
-            dimension=3,
-            state_names=("px", "py", "pz", "vx", "vy", "vz"),
-            control_names=("ax", "ay", "az"),
-            control_limits=(ACCELERATION, ACCELERATION, ACCELERATION),
-            heading_index=None,
-            speed_indices=(3, 4, 5),
-            functions=ModelFunctions(
-                holonomic3d_derivative,
-                holonomic3d_limit_control,
-                holonomic3d_limit_state,
-                holonomic3d_velocity,
-                holonomic3d_rest,
-                holonomic3d_integrate,
-                holonomic3d_approach,
-                holonomic3d_track,
-            ),
-        ),
-        Model(
-            name="velocity2d",
-            dimension=2,
-            state_names=("px", "py"),
-            control_names=("vx", "vy"),
-            control_limits=(SPEED, SPEED),
-            heading_index=None,
-            speed_indices=(),
-            functions=ModelFunctions(
-                velocity2d_derivative,
-                velocity2d_limit_control,
-                velocity2d_limit_state,
-                velocity2d_velocity,
-                velocity2d_rest,
-                velocity2d_integrate,
-                velocity2d_approach,
-                velocity2d_track,
-            ),
-        ),
-        Model(
-            name="differential_drive",
-            dimension=2,
-            state_names=("px", "py", "heading", "speed"),
-            control_names=("turn_rate", "acceleration"),
-            control_limits=(TURN_RATE, ACCELERATION),
-            heading_index=2,
-            speed_indices=(3,),
-            functions=ModelFunctions(
-                differential_drive_derivative,
-                differential_drive_limit_control,
-                differential_drive_limit_state,
-                differential_drive_velocity,
-                differential_drive_rest,
-                differential_drive_integrate,
-                holonomic2d_approach,
-                differential_drive_track,
-            ),
-        ),
-    )
-}
-"""All robot models by name, in the order of their codes."""
+import hashlib
+from collections.abc import Iterable
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from d4orm_env.core.robot_model import (
+    ACCELERATION,
+    OWN_LIMITS,
+    PYTHON_OPS,
+    SPEED,
+    TURN_RATE,
+    Model,
+    ModelFunctions,
+    Ops,
+)
+from d4orm_env.core.robot_model import RungeKutta as _RungeKutta
+from d4orm_env.core.source import pieces
+from d4orm_env.core.transition import TimeStep
+from d4orm_env.models.car import CAR
+from d4orm_env.models.differential_drive import DIFFERENTIAL_DRIVE
+from d4orm_env.models.holonomic2d import HOLONOMIC2D
+from d4orm_env.models.holonomic3d import HOLONOMIC3D
+from d4orm_env.models.unicycle import UNICYCLE
+from d4orm_env.models.velocity2d import VELOCITY2D
+
+__all__ = [
+    "ACCELERATION",
+    "COMMON",
+    "MODELS",
+    "MODEL_CODES",
+    "SPEED",
+    "TURN_RATE",
+    "Model",
+    "ModelFunctions",
+    "Ops",
+    "get_model",
+    "model_digest",
+    "names_of_codes",
+    "register_model",
+]
+
+_BUILT_IN = (HOLONOMIC2D, HOLONOMIC3D, VELOCITY2D, DIFFERENTIAL_DRIVE, UNICYCLE, CAR)
+
+MODELS: dict[str, Model] = {model.name: model for model in _BUILT_IN}
+"""All robot models by name, in the order of their codes; :func:`register_model` adds to them."""
 
 MODEL_CODES: dict[str, int] = {name: code for code, name in enumerate(MODELS)}
+
+NUM_BUILT_IN = len(_BUILT_IN)
+"""Codes from this one on go to models in the order in which this process registers them."""
+
+COMMON = tuple(model.name for model in _BUILT_IN[:4])
+"""Models that share compiled kernels, whatever mixture of them a team is. Teams with others have kernels of their own,
+so that nobody waits for the compiler because of a model that they do not use.
+"""
 
 
 def get_model(name: str) -> Model:
@@ -399,3 +71,111 @@ def get_model(name: str) -> Model:
         return MODELS[name]
     except KeyError:
         raise ValueError(f"model {name!r} is unknown; choose one of {', '.join(MODELS)}") from None
+
+
+def names_of_codes(codes: Iterable[int]) -> tuple[str, ...]:
+    """The names of the models with these codes.
+
+    Raises:
+        ValueError: If a code is no model's.
+    """
+    names = tuple(MODELS)
+    for code in codes:
+        if not 0 <= code < len(names):
+            raise ValueError(f"model code {code} is unknown; there are codes 0 to {len(names) - 1}: register the model")
+    return tuple(names[code] for code in codes)
+
+
+@cache
+def model_digest(model: Model) -> str:
+    """SHA-256 over all that a model is, its functions' sources and the constants that they name included."""
+    sha = hashlib.sha256(repr([value for name, value in vars(model).items() if name != "functions"]).encode())
+    for function in model.functions:
+        found = ["Runge-Kutta"] if isinstance(function, _RungeKutta) else pieces(function)
+        sha.update(repr(list(found)).encode())
+    return sha.hexdigest()
+
+
+def register_model(model: Model) -> None:
+    """Add a robot model, which is then known by its name everywhere, to this process.
+
+    Processes that are started to work on problems with it have to register it too: do it where the module that defines
+    it is imported.
+
+    Args:
+        model: The model.
+
+    Raises:
+        ValueError: If another model has its name, a size or an index does not fit, or a function fails on Python's
+            numbers, returns a wrong number of them or names a constant that is a float.
+    """
+    if not isinstance(model, Model):
+        raise ValueError(f"register_model takes a Model, not {model!r}; see docs/own_robot.md")
+    known = MODELS.get(model.name)
+    if known is not None:
+        if model_digest(known) == model_digest(model):
+            return
+        raise ValueError(f"model {model.name!r} exists already; give yours another name")
+    _check_attributes(model)
+    _check_functions(model)
+    MODEL_CODES[model.name] = len(MODELS)
+    MODELS[model.name] = model
+
+
+def _check_attributes(model: Model) -> None:
+    n, m, num_limits = model.state_size, model.control_size, len(model.limit_names)
+    indices = (*model.speed_indices, *(index for index, _ in model.state_limits), model.heading_index or 0)
+    columns = (*model.control_limits, *(column for _, column in model.state_limits))
+    name = model.name
+    checks = (
+        (
+            isinstance(name, str) and name.isidentifier(),
+            f"name is {name!r}; it must be an identifier such as 'my_robot'",
+        ),
+        (model.dimension in (2, 3), f"dimension is {model.dimension}; it must be 2 or 3"),
+        (model.dimension <= n <= 6, f"state_names has {n} names; it must have from {model.dimension} to 6"),
+        (m in (2, 3), f"control_names has {m} names; it must have 2 or 3"),
+        (len(model.control_limits) == m, f"control_limits has {len(model.control_limits)} columns; expected {m}"),
+        (all(0 <= index < n for index in indices), f"an index of a state component is not from 0 to {n - 1}"),
+        (all(0 <= column < num_limits for column in columns), f"a column of limits is not from 0 to {num_limits - 1}"),
+        (len({*model.limit_names, "radius"}) == num_limits + 1, "two limits have the same name; rename yours"),
+        (all(limit.default > 0 for limit in model.own_limits), "a default of own_limits is not positive"),
+    )
+    for holds, complaint in checks:
+        if not holds:
+            raise ValueError(f"model {name!r}: {complaint}")
+
+
+def _check_functions(model: Model) -> None:
+    n, m, d, functions = model.state_size, model.control_size, model.dimension, model.functions
+    x, u = (0.5,) * n, (0.25,) * m
+    limits = (1.0,) * OWN_LIMITS + tuple(limit.default for limit in model.own_limits)
+    h = TimeStep(0.1, 0.1 / 2, 0.1 / 3, 0.1 / 6)
+    calls: dict[str, tuple[int, tuple[Any, ...]]] = {
+        "derivative": (n, (x, u, limits, PYTHON_OPS)),
+        "limit_control": (m, (u, limits, PYTHON_OPS)),
+        "limit_state": (n, (x, limits, PYTHON_OPS)),
+        "velocity": (d, (x, u, limits, PYTHON_OPS)),
+        "rest": (n, (x, 0.0)),
+        "integrate": (n, (x, u, limits, h, PYTHON_OPS)),
+        "approach": (d, (x, (1.0,) * d, limits, h, PYTHON_OPS)),
+        "track": (m, (x, (0.5,) * d, limits, h, PYTHON_OPS)),
+    }
+    for name, (size, arguments) in calls.items():
+        function = getattr(functions, name)
+        try:
+            result = function(*arguments)
+            numbers = np.array([float(value) for value in result])
+        except Exception as error:
+            raise ValueError(f"model {model.name!r}: {name} fails on Python's numbers: {error!r}") from error
+        if not isinstance(result, tuple) or len(result) != size or not np.isfinite(numbers).all():
+            raise ValueError(
+                f"model {model.name!r}: {name} returns {result!r}; expected a tuple of {size} finite numbers"
+            )
+        if not isinstance(function, _RungeKutta):
+            floats = [value for value in pieces(function) if isinstance(value, float)]
+            if floats:
+                raise ValueError(
+                    f"model {model.name!r}: {name} uses the float {floats[0]:g}, which would change an engine's "
+                    f"precision; make it one of own_limits"
+                )

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core.dynamics import Ops
+from d4orm_env.core.robot_model import Ops
 
 Floats = NDArray[np.float64]
 

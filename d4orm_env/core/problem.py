@@ -20,7 +20,8 @@ from d4orm_env.core.arrays import (
     restore_frozen,
     whole_number,
 )
-from d4orm_env.core.dynamics import MODEL_CODES
+from d4orm_env.core.dynamics import MODEL_CODES, NUM_BUILT_IN, model_digest
+from d4orm_env.core.robot_model import SPEED, STANDARD_LIMITS, TURN_RATE, Model
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 
@@ -35,7 +36,7 @@ RESOLUTION = 100
 STEP_RESOLUTION = 10
 """A robot at its speed limit moves at least so many times that in one step."""
 INTEGRATION_ERROR = 0.01
-"""Most that one step of RK4 may be off where a differential drive turns at its limits [m]."""
+"""Most that one step of RK4 may be off where a robot turns at its limits [m]."""
 
 
 class ProblemArrays(NamedTuple):
@@ -82,8 +83,8 @@ class Problem:
 
     The physics is float32 and takes one RK4 step per ``dt``, so a problem that these do not hold is refused: where
     float32 resolves a start or goal to more than a hundredth of the goal radius (with the default of 0.075 m, beyond
-    8192 m from the origin) or to more than a tenth of what a robot moves in a step, and where a differential drive at
-    its limits turns too far. At constant turn rate ``w`` and speed ``v`` RK4 is Simpson's rule, which is off by at
+    8192 m from the origin) or to more than a tenth of what a robot moves in a step, and where a robot at its
+    limits turns too far. At constant turn rate ``w`` and speed ``v`` RK4 is Simpson's rule, which is off by at
     most ``v dt (w dt)^4 / 2880`` per step; that must not exceed 1 cm.
 
     Attributes:
@@ -167,6 +168,13 @@ class Problem:
             limit = float(np.asarray(self.team.max_speed)[robot])
             if speed > limit * (1 + 1e-5):
                 raise ValueError(f"{what} speed of robot_{robot} is {speed:g} m/s, above its limit of {limit:g} m/s")
+            for index, column in model.state_limits:
+                value, limit = float(state[index]), float(self.team.limits[robot, column])
+                if abs(value) > limit * (1 + 1e-5):
+                    raise ValueError(
+                        f"{what} {model.state_names[index]} of robot_{robot} is {value:g}, "
+                        f"above its {model.limit_names[column]} of {limit:g}"
+                    )
             heading = 0.0 if model.heading_index is None else float(state[model.heading_index])
             if abs(heading) > MAX_HEADING:
                 raise ValueError(
@@ -194,18 +202,19 @@ class Problem:
                 )
 
     def _check_turning(self) -> None:
-        """One step of RK4 follows every differential drive that turns as fast as it may."""
+        """One step of RK4 follows every robot that turns as fast as it may."""
+        team_limits = self.team.limits
         for robot, model in enumerate(self.team.robot_models):
             if model.heading_index is None:
                 continue
-            speed, _, turn_rate = (float(limit) for limit in self.team.limits[robot])
-            angle = turn_rate * self.dt
+            speed = float(team_limits[robot, SPEED])
+            angle = model.turn_rate(team_limits[robot]) * self.dt
             error = speed * self.dt * angle**4 / 2880
             if error > INTEGRATION_ERROR:
                 raise ValueError(
                     f"robot_{robot} may turn by {angle:.3g} rad in a step of {self.dt:g} s, and at {speed:g} m/s one "
                     f"step of RK4 may then be {error:.2g} m off (most: {INTEGRATION_ERROR:g} m); use a smaller dt, "
-                    f"max_turn_rate or max_speed"
+                    f"{_turning_limits(model)} or max_speed"
                 )
 
     def _check_places(self, what: str, places: FloatArray) -> None:
@@ -283,7 +292,11 @@ class Problem:
     def digest(self) -> str:
         """SHA-256 over everything that defines the problem, the name left out."""
         sha = hashlib.sha256(repr(self.team.models).encode())
-        for value in self.arrays:
+        arrays = self.arrays
+        if arrays.model_codes.max() >= NUM_BUILT_IN:  # such codes depend on the order of registration
+            sha.update(repr([model_digest(model) for model in self.team.robot_models]).encode())
+            arrays = arrays._replace(model_codes=np.minimum(arrays.model_codes, NUM_BUILT_IN))
+        for value in arrays:
             array: NDArray[Any] = np.ascontiguousarray(value)
             sha.update(f"{array.shape}{array.dtype}".encode())
             sha.update(array.tobytes())
@@ -337,6 +350,13 @@ def inverse_initial_distance(positions: Any, goal: Any, goal_radius: float) -> F
     """``(K,)`` one over the start distance; a robot that starts at its goal counts from the goal radius."""
     distance = np.linalg.norm(np.asarray(goal) - np.asarray(positions), axis=-1)
     return (1.0 / np.maximum(distance, goal_radius)).astype(np.float32)
+
+
+def _turning_limits(model: Model) -> str:
+    """The limits to lower where a robot turns too fast."""
+    if TURN_RATE in model.control_limits:
+        return STANDARD_LIMITS[TURN_RATE]
+    return ", ".join(model.limit_names[column] for _, column in model.state_limits) or "limits"
 
 
 def _point(place: Any) -> str:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, frozen_per_robot, restore_frozen
-from d4orm_env.core.dynamics import ACCELERATION, SPEED, TURN_RATE, Model, get_model
+from d4orm_env.core.arrays import FloatArray, frozen_per_robot, restore_frozen, shown
+from d4orm_env.core.dynamics import get_model
+from d4orm_env.core.robot_model import STANDARD_LIMITS, Limit, Model
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,12 +24,14 @@ class Team:
         radius: ``(K,)`` body radius [m].
         max_speed: ``(K,)`` speed limit [m/s].
         max_acceleration: ``(K,)`` acceleration limit [m/s^2]; no use to a first-order robot.
-        max_turn_rate: ``(K,)`` turn rate limit [rad/s]; of use to differential drives only. How far one may turn in
-            a time step is bounded; see :class:`~d4orm_env.core.problem.Problem`.
+        max_turn_rate: ``(K,)`` turn rate limit [rad/s]; of use to differential drives and unicycles. How far a robot
+            may turn in a time step is bounded; see :class:`~d4orm_env.core.problem.Problem`.
+        own_limits: ``(K,)`` by name for every limit that a model of the team has for itself, such as the ``wheelbase``
+            of a car; of use to its robots only. What is left out has the model's default.
 
     Raises:
-        ValueError: For an unknown model, an empty or mixed-dimension team, or a limit that is not positive or out of
-            range.
+        ValueError: For an unknown model, an empty or mixed-dimension team, a limit that is not positive or out of
+            range, or one that no model of the team has.
     """
 
     models: tuple[str, ...]
@@ -36,6 +39,7 @@ class Team:
     max_speed: FloatArray | float = 1.0
     max_acceleration: FloatArray | float = 1.0
     max_turn_rate: FloatArray | float = float(np.pi / 2)
+    own_limits: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if isinstance(self.models, str) or not isinstance(self.models, Sequence):
@@ -48,9 +52,25 @@ class Team:
             raise ValueError(f"models {sorted(set(self.models))} mix 2D and 3D robots; a team moves in one dimension")
         for name in ("radius", "max_speed", "max_acceleration", "max_turn_rate"):
             object.__setattr__(self, name, frozen_per_robot(getattr(self, name), name, len(self.models)))
+        object.__setattr__(self, "own_limits", self._complete_own_limits(self.own_limits))
+
+    def _complete_own_limits(self, given: Any) -> dict[str, FloatArray]:
+        if not isinstance(given, Mapping):
+            raise ValueError(f"own_limits must be a mapping such as {{'wheelbase': 0.3}}, not {shown(given)}")
+        known = [{limit.name: limit for limit in model.own_limits} for model in self.robot_models]
+        names = dict.fromkeys(name for limits in known for name in limits)
+        for name in given:
+            if name not in names:
+                raise ValueError(
+                    f"own_limits holds {shown(name)}, which no model of the team has; "
+                    f"it has {', '.join(names) or 'none of its own'}"
+                )
+        return {name: _per_robot(name, given.get(name), [limits.get(name) for limits in known]) for name in names}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         restore_frozen(self, state)
+        for array in self.own_limits.values():
+            np.asarray(array).setflags(write=False)
 
     @property
     def num_robots(self) -> int:
@@ -79,11 +99,14 @@ class Team:
 
     @property
     def limits(self) -> FloatArray:
-        """``(K, 3)`` limits in the column order that the models use."""
-        limits = np.empty((self.num_robots, 3), np.float32)
-        limits[:, SPEED] = self.max_speed
-        limits[:, ACCELERATION] = self.max_acceleration
-        limits[:, TURN_RATE] = self.max_turn_rate
+        """``(K, L)`` limits in the order of :attr:`Model.limit_names`; one on padding."""
+        models = self.robot_models
+        limits = np.ones((self.num_robots, max(len(model.limit_names) for model in models)), np.float32)
+        for column, name in enumerate(STANDARD_LIMITS):
+            limits[:, column] = getattr(self, name)
+        for robot, model in enumerate(models):
+            for column, limit in enumerate(model.own_limits, len(STANDARD_LIMITS)):
+                limits[robot, column] = np.asarray(self.own_limits[limit.name])[robot]
         return limits
 
     @property
@@ -103,4 +126,21 @@ class Team:
             np.asarray(self.max_speed)[index],
             np.asarray(self.max_acceleration)[index],
             np.asarray(self.max_turn_rate)[index],
+            self._own_limits_of(index),
         )
+
+    def _own_limits_of(self, robots: list[int]) -> dict[str, FloatArray]:
+        models = self.robot_models
+        names = {limit.name for robot in robots for limit in models[robot].own_limits}
+        return {name: np.asarray(values)[robots] for name, values in self.own_limits.items() if name in names}
+
+
+def _per_robot(name: str, value: Any, limits: list[Limit | None]) -> FloatArray:
+    """``(K,)`` values of a limit, given or default, of robots that have it or ``None``."""
+    if value is None:
+        value = [1.0 if limit is None else limit.default for limit in limits]
+    values = frozen_per_robot(value, name, len(limits))
+    for robot, limit in enumerate(limits):
+        if limit is not None and values[robot] > limit.most:
+            raise ValueError(f"{name} of robot_{robot} is {values[robot]:g}; it must be at most {limit.most:g}")
+    return values

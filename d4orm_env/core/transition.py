@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from d4orm_env.core.dynamics import ModelFunctions, Ops
+from d4orm_env.core.robot_model import ModelFunctions, Ops
 
 
 class TimeStep(NamedTuple):
@@ -23,7 +23,7 @@ class TimeStep(NamedTuple):
 
 def advance(model: ModelFunctions, x: Any, u: Any, limits: Any, h: TimeStep, ops: Ops) -> Any:
     """The state after one step under a control that :meth:`ModelFunctions.limit_control` has clipped."""
-    return model.limit_state(model.integrate(x, u, h, ops), limits, ops)
+    return model.limit_state(model.integrate(x, u, limits, h, ops), limits, ops)
 
 
 def arrives(squared_distance: Any, squared_speed: Any, squared_goal_radius: Any, squared_goal_speed: Any) -> Any:

@@ -17,7 +17,7 @@ from d4orm_env.engine.lanes import TILE
 from d4orm_env.engine.noise import DRAWS, TURNS
 from d4orm_env.engine.proximity import body_boxes, make_scratch, static_boxes
 from d4orm_env.engine.threads import Threads, available_cores
-from d4orm_env.engine.worlds import WorldBatch, advance_worlds, judge_worlds, observe_world, roll_out, step_worlds
+from d4orm_env.engine.worlds import WorldBatch, WorldKernels, judge_worlds, kernels_of_codes
 
 
 class CpuEngine:
@@ -34,7 +34,7 @@ class CpuEngine:
         docked = np.array(arrived, bool)[None]
         collided, violated, rewards = np.empty_like(docked), np.empty_like(docked), np.empty(docked.shape, np.float32)
         arrays = _typed(arrays)
-        step_worlds(
+        _kernels(arrays).step_worlds(
             arrays, *_single(arrays), state, control, docked, collided, violated, rewards, _ONE_WORLD
         )  # fmt: skip
         return StepResult(state[0], control[0], docked[0], collided[0], violated[0], rewards[0])
@@ -73,7 +73,7 @@ class CpuEngine:
         """
         out: FloatArray = np.empty((1, len(states), layout.size), np.float32)
         arrays = _typed(arrays)
-        observe_world(
+        _kernels(arrays).observe_world(
             arrays,
             _single(arrays)[0],
             np.array(states, np.float32)[None],
@@ -108,6 +108,7 @@ class CpuEngine:
             out: ``(B, K, D)`` observations, output; those of skipped worlds are not written.
         """
         arrays = _typed(arrays)
+        advance_worlds = _kernels(arrays).advance_worlds
         self._threads.over(
             -(-len(orders) // TILE),
             lambda part: advance_worlds(
@@ -132,7 +133,7 @@ class CpuEngine:
         rewards = np.empty(docked.shape, np.float32)
         arrays = _typed(problem.arrays)
         goal, inverse = (np.repeat(array, moments, axis=0) for array in _single(arrays))
-        roll_out(arrays, goal, inverse, executed, states, docked, collided, violated, rewards)
+        _kernels(arrays).roll_out(arrays, goal, inverse, executed, states, docked, collided, violated, rewards)
         return Trajectory(
             states=states,
             positions=np.ascontiguousarray(states[..., : problem.dimension]),
@@ -272,6 +273,10 @@ def _by_counter(weights: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 _ONE_WORLD = np.array([0, 1])
+
+
+def _kernels(arrays: ProblemArrays) -> WorldKernels:
+    return kernels_of_codes(arrays.model_codes.tobytes())
 
 
 def _single(arrays: ProblemArrays) -> tuple[FloatArray, FloatArray]:

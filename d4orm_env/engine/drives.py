@@ -5,18 +5,22 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-from numba.np.unsafe import ndarray
-
-from d4orm_env.core import dynamics, transition
+from d4orm_env.core import robot_model, transition
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.engine import lanes, tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.tiles import OPS, OPTIONS, SQUARED_GAP, ZERO, inlined, make_stepper
+from d4orm_env.engine.tiles import (
+    OPS,
+    OPTIONS,
+    SQUARED_GAP,
+    ZERO,
+    inlined,
+    make_stepper,
+    models_key,
+    to_fixed_tuple,
+)
 
-SOURCES = fingerprint((dynamics, transition, lanes, tiles))
-
-to_fixed_tuple: Any = ndarray.to_fixed_tuple
-"""Its calls in compiled code lack the first argument, which type checkers cannot know."""
+SOURCES = fingerprint((robot_model, transition, lanes, tiles))
 
 
 @cache
@@ -26,7 +30,7 @@ def drive_kernel(name: str) -> Any:
     The kernel carries states ``x`` and controls ``u`` of ``B`` ways on in place, each from its time in ``switch`` on:
     straight towards a point until the way has come near to it, and then to the goal. Its arguments:
 
-    - ``limits``: ``(B, 3)``.
+    - ``limits``: ``(B, L)``.
     - ``time_step``: ``(4,)`` see :class:`~d4orm_env.core.transition.TimeStep`.
     - ``docking``: ``(2,)`` squares of the goal radius and of the goal speed.
     - ``near2``: Square of how near to the point is near [m^2].
@@ -36,13 +40,13 @@ def drive_kernel(name: str) -> Any:
     - ``u``: ``(H, B, m)`` likewise, inside the limits; zero after arrival.
     - ``arrived``: ``(B,)`` bool, output.
     """
-    model = MODELS[name]
-    move, dock = make_stepper(model)
-    approach, track = inlined(model.functions.approach), inlined(model.functions.track)
-    limit_control, squared_gap = inlined(model.functions.limit_control), SQUARED_GAP[model.dimension]
-    n, m, d = model.state_size, model.control_size, model.dimension
+    robot = MODELS[name]
+    move, dock = make_stepper(robot)
+    approach, track = inlined(robot.functions.approach), inlined(robot.functions.track)
+    limit_control, squared_gap = inlined(robot.functions.limit_control), SQUARED_GAP[robot.dimension]
+    n, m, d, num_limits = robot.state_size, robot.control_size, robot.dimension, len(robot.limit_names)
 
-    @cached_kernel(SOURCES, variant=name, **OPTIONS)
+    @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
     def drive(
         limits: Any, time_step: Any, docking: Any, near2: Any, goals: Any, vias: Any, switch: Any, x: Any, u: Any,
         arrived: Any,
@@ -50,14 +54,14 @@ def drive_kernel(name: str) -> Any:
         h = transition.TimeStep(time_step[0], time_step[1], time_step[2], time_step[3])
         for b in range(switch.shape[0]):
             own_limits, goal, via = (
-                to_fixed_tuple(limits[b], 3),
+                to_fixed_tuple(limits[b], num_limits),
                 to_fixed_tuple(goals[b], d),
                 to_fixed_tuple(vias[b], d),
             )
             first, standing = switch[b], False
             state = to_fixed_tuple(x[first, b], n)
             if first > 0:
-                state, _, standing = dock(False, state, to_fixed_tuple(u[first - 1, b], m), goal, docking)
+                state, _, standing = dock(False, state, to_fixed_tuple(u[first - 1, b], m), own_limits, goal, docking)
             for t in range(first, u.shape[0]):
                 via = goal if squared_gap(state, via) < near2 else via
                 wanted = track(state, approach(state, via, own_limits, h, OPS), own_limits, h, OPS)
@@ -66,7 +70,7 @@ def drive_kernel(name: str) -> Any:
                     u[t, b, i] = ZERO if standing else control[i]
                 control = to_fixed_tuple(u[t, b], m)
                 state, _, standing = dock(
-                    standing, move(standing, state, control, own_limits, h), control, goal, docking
+                    standing, move(standing, state, control, own_limits, h), control, own_limits, goal, docking
                 )
                 for i in range(n):
                     x[t + 1, b, i] = state[i]

@@ -17,8 +17,9 @@ import numpy as np
 
 from d4orm_env.core import collision, reward, transition
 from d4orm_env.core.arrays import BoolArray, FloatArray
-from d4orm_env.core.dynamics import MODELS, Ops
+from d4orm_env.core.dynamics import MODELS, names_of_codes
 from d4orm_env.core.problem import Problem, ProblemArrays
+from d4orm_env.core.robot_model import Ops
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine import noise
 from d4orm_env.engine.base import (
@@ -73,12 +74,12 @@ def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: World
         model = MODELS[name]
         functions = model.functions
         robots = np.flatnonzero(np.array(models) == name)
-        limits = tuple(arrays.limits[robots, i][:, None] for i in range(3))
+        limits = tuple(arrays.limits[robots, i][:, None] for i in range(len(model.limit_names)))
         x = tuple(worlds.state[robots, i] for i in range(model.state_size))
         u = functions.limit_control(tuple(control[robots, i] for i in range(model.control_size)), limits, OPS)
         y = transition.advance(functions, x, u, limits, h, OPS)
         gap2 = sum((y[i] - arrays.goal[robots, i][:, None]) ** 2 for i in range(model.dimension))
-        speed2 = sum(v * v for v in functions.velocity(y, u, OPS))
+        speed2 = sum(v * v for v in functions.velocity(y, u, limits, OPS))
         arrives = transition.arrives(gap2, speed2, arrays.squared_goal_radius, arrays.squared_goal_speed)
         standing = worlds.docked[robots]
         zero = jnp.zeros_like(gap2)
@@ -288,7 +289,7 @@ class JaxEngine:
 
     def step(self, arrays: ProblemArrays, states: FloatArray, arrived: BoolArray, controls: FloatArray) -> StepResult:
         """See :meth:`d4orm_env.engine.base.Engine.step`."""
-        models = tuple(tuple(MODELS)[code] for code in arrays.model_codes)
+        models = names_of_codes(arrays.model_codes)
         worlds = Worlds(states[..., None], np.asarray(arrived)[..., None], np.zeros_like(controls)[..., None])
         worlds, verdict = _step(models, arrays, worlds, jnp.asarray(controls)[..., None])
         collided, margin_violated, rewards = (np.asarray(value)[..., 0] for value in verdict)

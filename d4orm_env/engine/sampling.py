@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba.extending import register_jitable
 
-from d4orm_env.core import collision, dynamics, reward, transition
-from d4orm_env.core.dynamics import MODELS, Model
+from d4orm_env.core import collision, reward, robot_model, transition
+from d4orm_env.core.dynamics import COMMON, MODELS
 from d4orm_env.engine import lanes, noise, proximity, tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.lanes import (
@@ -41,6 +41,8 @@ from d4orm_env.engine.tiles import (
     compiled,
     inlined,
     make_stepper,
+    models_key,
+    to_fixed_tuple,
 )
 
 # First rows of a robot in the workspace: see tiles, which has others because it keeps more of a robot.
@@ -82,7 +84,7 @@ def make_workspace(num_steps: int, num_robots: int, num_controls: int, dimension
 CONTROL_ROWS = 3
 """Rows of one step's controls."""
 
-SOURCES = fingerprint((dynamics, transition, collision, reward, noise, lanes, tiles, proximity))
+SOURCES = fingerprint((robot_model, transition, collision, reward, noise, lanes, tiles, proximity))
 for _function in (
     noise.xor_shift,
     noise.hash32,
@@ -201,22 +203,26 @@ _TURN = {2: _turn2, 3: _turn3}
 _VECTOR = {2: _vector2, 3: _vector3}
 
 
-def _runner(model: Model) -> Any:
+@cache
+def _runner(name: str) -> Any:
     """The compiled steps of one robot of this model in every sample of a tile, which add its reward without violations.
     The draws and controls are the same few rows for every robot: they stay in cache.
     """
+    model = MODELS[name]
     move, dock = make_stepper(model)
     limit_control = inlined(model.functions.limit_control)
     read_x, write_x = READ[model.state_size], WRITE[model.state_size]
     read_u, write_u = READ[model.control_size], WRITE[model.control_size]
     turn, vector, dimension = _TURN[model.control_size], _VECTOR[model.control_size], model.dimension
+    num_limits = len(model.limit_names)
 
     @compiled
     def run(
-        limits: Any, h: Any, docking: Any, goal: Any, inverse: Any, offset: Any, scale: Any, draws: Any, controls: Any,
-        places: Any, w: Any,
+        all_limits: Any, h: Any, docking: Any, goal: Any, inverse: Any, offset: Any, scale: Any, draws: Any,
+        controls: Any, places: Any, w: Any,
     ) -> None:  # fmt: skip
         use_wide_registers()
+        limits = to_fixed_tuple(all_limits, num_limits)
         goal, count = goal[:dimension], offset.shape[0]
         for i in range(count):
             u = controls[i * CONTROL_ROWS * TILE : (i + 1) * CONTROL_ROWS * TILE]
@@ -236,16 +242,13 @@ def _runner(model: Model) -> Any:
                 write_x(w, STATE * TILE, s, x)
             for s in range(TILE):
                 standing = w[DOCKED * TILE + s] > ZERO
-                x, gap2, docked = dock(standing, read_x(w, STATE * TILE, s), read_u(u, 0, s), goal, docking)
+                x, gap2, docked = dock(standing, read_x(w, STATE * TILE, s), read_u(u, 0, s), limits, goal, docking)
                 write_x(w, STATE * TILE, s, x)
                 w[DOCKED * TILE + s] = ONE if docked else ZERO
                 w[TOTAL * TILE + s] += reward.step_reward(np.sqrt(gap2), inverse, ZERO, ZERO, ONE)
             _copy(w[: dimension * TILE], places[i * dimension * TILE : (i + 1) * dimension * TILE])
 
     return run
-
-
-_RUN = {name: _runner(model) for name, model in MODELS.items()}
 
 
 @inlined
@@ -316,12 +319,11 @@ def _score_tile(
                 _stay(dimension, robot, own_places)
                 enclose(k, radius[k] + HALF * margin, dimension, places, boxes)
                 continue
-            limits = (all_limits[k, 0], all_limits[k, 1], all_limits[k, 2])
             goal = (goals[k, 0], goals[k, 1], goals[k, dimension - 1])
             last = first + count
             run_robot(
-                codes[k], limits, h, docking, goal, inverse[k], offset[first:last, k], scale[first:last, k], draws,
-                controls, own_places, robot,
+                codes[k], all_limits[k], h, docking, goal, inverse[k], offset[first:last, k], scale[first:last, k],
+                draws, controls, own_places, robot,
             )  # fmt: skip
             # Once a robot stands in every sample nothing about it changes any more: neither its place nor its flags
             # towards static obstacles.
@@ -382,8 +384,8 @@ def _score_tiles(
 def score_kernel(models: tuple[str, ...]) -> Any:
     """The first pass for a team of these models.
 
-    Every model has a kernel of its own, because compiling takes seconds a model; mixed teams share one for all
-    models of their dimension.
+    Every model has a kernel of its own, because compiling takes seconds a model; mixed teams of common models
+    share one for all of these that have their dimension.
 
     The kernel fills the columns of ``rewards`` ``(K, M)`` that a range of tiles covers with mean rewards over time. Its
     arguments:
@@ -405,17 +407,17 @@ def score_kernel(models: tuple[str, ...]) -> Any:
     - ``rewards``: Output.
     """
     different = set(models)
-    if len(different) > 1:
+    if len(different) > 1 and different <= set(COMMON):
         dimension = MODELS[models[0]].dimension
-        different = {name for name, model in MODELS.items() if model.dimension == dimension}
+        different = {name for name in COMMON if MODELS[name].dimension == dimension}
     return _score_kernel(tuple(sorted(different)))
 
 
 @cache
 def _score_kernel(models: tuple[str, ...]) -> Any:
-    run_robot = tiles.dispatch({name: _RUN[name] for name in models})
+    run_robot = tiles.dispatch({name: _runner(name) for name in models})
 
-    @cached_kernel(SOURCES, variant="_".join(models), **OPTIONS)
+    @cached_kernel(models_key(SOURCES, models), variant="_".join(models), **OPTIONS)
     def score_tiles(
         arrays: Any, offset: Any, scale: Any, docked: Any, collisions: Any, penalty: Any, moving: Any,
         moving_radius: Any, body_boxes: Any, static: Any, seed: Any, step: Any, tile_range: Any, space: Any,

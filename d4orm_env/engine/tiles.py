@@ -11,14 +11,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numba
 import numpy as np
 from numba.extending import register_jitable
+from numba.np.unsafe import ndarray
 
-from d4orm_env.core import collision, dynamics, reward, transition
-from d4orm_env.core.dynamics import MODEL_CODES, MODELS, Model, ModelFunctions, Ops
+from d4orm_env.core import collision, reward, robot_model, transition
+from d4orm_env.core.dynamics import MODEL_CODES, MODELS, model_digest
+from d4orm_env.core.robot_model import MOVED, Model, ModelFunctions, Ops, RungeKutta, runge_kutta
 from d4orm_env.engine.lanes import TILE, at_most, use_wide_registers, within_2, within_3
 
 ZERO = np.float32(0)
@@ -52,11 +55,15 @@ keep the kernels on disk. And for those that take a problem's arrays, which are 
 inlined = numba.njit(nogil=True, **INLINED)
 
 for _function in (
-    dynamics.norm_scale,
-    dynamics.control_scale,
-    dynamics.clip,
-    dynamics.stopping_speed,
-    dynamics.share,
+    robot_model.norm_scale,
+    robot_model.control_scale,
+    robot_model.clip,
+    robot_model.stopping_speed,
+    robot_model.share,
+    robot_model.planar_approach,
+    robot_model.first_order_approach,
+    robot_model.turn_towards,
+    robot_model.runge_kutta,
     transition.advance,
     transition.arrives,
     collision.axis_gap,
@@ -65,6 +72,10 @@ for _function in (
 ):
     # Lets compiled code call the core's plain Python functions, which stay as they are for everyone else.
     register_jitable(**INLINED)(_function)
+
+
+to_fixed_tuple: Any = ndarray.to_fixed_tuple
+"""Its calls in compiled code lack the first argument, which type checkers cannot know."""
 
 
 @register_jitable(nogil=True, **OPTIONS)
@@ -172,6 +183,11 @@ def _read4(w: Any, o: Any, s: Any) -> Any:
 
 
 @compiled
+def _read5(w: Any, o: Any, s: Any) -> Any:
+    return _read2(w, o, s) + _read3(w, o + 2 * TILE, s)
+
+
+@compiled
 def _read6(w: Any, o: Any, s: Any) -> Any:
     return _read3(w, o, s) + _read3(w, o + 3 * TILE, s)
 
@@ -195,6 +211,12 @@ def _write4(w: Any, o: Any, s: Any, x: Any) -> None:
 
 
 @compiled
+def _write5(w: Any, o: Any, s: Any, x: Any) -> None:
+    _write4(w, o, s, x)
+    w[o + 4 * TILE + s] = x[4]
+
+
+@compiled
 def _write6(w: Any, o: Any, s: Any, x: Any) -> None:
     _write4(w, o, s, x)
     w[o + 4 * TILE + s] = x[4]
@@ -214,6 +236,11 @@ def _pick3(first: Any, x: Any, y: Any) -> Any:
 @compiled
 def _pick4(first: Any, x: Any, y: Any) -> Any:
     return _pick2(first, x, y) + _pick2(first, (x[2], x[3]), (y[2], y[3]))
+
+
+@compiled
+def _pick5(first: Any, x: Any, y: Any) -> Any:
+    return _pick2(first, x, y) + _pick3(first, (x[2], x[3], x[4]), (y[2], y[3], y[4]))
 
 
 @compiled
@@ -241,20 +268,37 @@ def _squared_gap3(x: Any, y: Any) -> Any:
     return _squared_norm3((x[0] - y[0], x[1] - y[1], x[2] - y[2]))
 
 
-READ = {2: _read2, 3: _read3, 4: _read4, 6: _read6}
-WRITE = {2: _write2, 3: _write3, 4: _write4, 6: _write6}
-_PICK = {2: _pick2, 3: _pick3, 4: _pick4, 6: _pick6}
+READ = {2: _read2, 3: _read3, 4: _read4, 5: _read5, 6: _read6}
+WRITE = {2: _write2, 3: _write3, 4: _write4, 5: _write5, 6: _write6}
+_PICK = {2: _pick2, 3: _pick3, 4: _pick4, 5: _pick5, 6: _pick6}
 _SQUARED_NORM = {2: _squared_norm2, 3: _squared_norm3}
 SQUARED_GAP = {2: _squared_gap2, 3: _squared_gap3}
+
+
+def _integrator(function: Any) -> Any:
+    """The function itself, or in scalar style what :class:`RungeKutta` computes."""
+    if not isinstance(function, RungeKutta):
+        return function
+    derivative, moved = inlined(function.derivative), inlined(MOVED[function.state_size])
+
+    def integrate(x: Any, u: Any, limits: Any, h: Any, ops: Any) -> Any:
+        return runge_kutta(derivative, moved, x, u, limits, h, ops)
+
+    return integrate
+
+
+def models_key(sources: str, names: tuple[str, ...]) -> str:
+    """Key in the cache of a kernel made of these sources and models: the codes are in the kernel too."""
+    return f"{sources} {[(name, MODEL_CODES[name], model_digest(MODELS[name])) for name in names]}"
 
 
 def make_stepper(model: Model) -> tuple[Any, Any]:
     """The two halves of the compiled step of one robot of this model in one world, for a control within its limits.
 
-    ``move(standing, x, u, limits, h) -> x`` and ``dock(standing, x, u, goal, docking) -> (x, squared distance to the
-    goal, whether docked)``.
+    ``move(standing, x, u, limits, h) -> x`` and ``dock(standing, x, u, limits, goal, docking) -> (x, squared distance
+    to the goal, whether docked)``.
     """
-    functions = ModelFunctions(*(inlined(function) for function in model.functions))
+    functions = ModelFunctions(*(inlined(_integrator(function)) for function in model.functions))
     pick_x = _PICK[model.state_size]
     squared_norm, squared_gap = _SQUARED_NORM[model.dimension], SQUARED_GAP[model.dimension]
 
@@ -263,9 +307,9 @@ def make_stepper(model: Model) -> tuple[Any, Any]:
         return pick_x(standing, x, transition.advance(functions, x, u, limits, h, OPS))
 
     @inlined
-    def dock(standing: Any, x: Any, u: Any, goal: Any, docking: Any) -> Any:
+    def dock(standing: Any, x: Any, u: Any, limits: Any, goal: Any, docking: Any) -> Any:
         gap2 = squared_gap(x, goal)
-        speed2 = squared_norm(functions.velocity(x, u, OPS))
+        speed2 = squared_norm(functions.velocity(x, u, limits, OPS))
         arrives = transition.arrives(gap2, speed2, docking[0], docking[1])
         return pick_x(arrives, functions.rest(x, ZERO), x), gap2, standing | arrives
 
@@ -282,11 +326,12 @@ def _mover(model: Model) -> Any:
     read_x, write_x = READ[model.state_size], WRITE[model.state_size]
     read_u, write_u, pick_u = READ[model.control_size], WRITE[model.control_size], _PICK[model.control_size]
     read_goal = READ[model.dimension]
-    no_control = (ZERO,) * model.control_size
+    no_control, num_limits = (ZERO,) * model.control_size, len(model.limit_names)
 
     @compiled
-    def run(limits: Any, h: Any, docking: Any, w: Any) -> None:
+    def run(all_limits: Any, h: Any, docking: Any, w: Any) -> None:
         use_wide_registers()
+        limits = to_fixed_tuple(all_limits, num_limits)
         for s in range(TILE):
             standing = w[DOCKED * TILE + s] > ZERO
             u = limit_control(read_u(w, CONTROL * TILE, s), limits, OPS)
@@ -298,7 +343,7 @@ def _mover(model: Model) -> Any:
         for s in range(TILE):
             standing = w[DOCKED * TILE + s] > ZERO
             x, u = read_x(w, STATE * TILE, s), read_u(w, CONTROL * TILE, s)
-            x, gap2, docked = dock(standing, x, u, read_goal(w, GOAL * TILE, s), docking)
+            x, gap2, docked = dock(standing, x, u, limits, read_goal(w, GOAL * TILE, s), docking)
             write_x(w, STATE * TILE, s, x)
             w[DOCKED * TILE + s] = ONE if docked else ZERO
             w[DISTANCE2 * TILE + s] = gap2
@@ -309,7 +354,8 @@ def _mover(model: Model) -> Any:
 def dispatch(branches: Mapping[str, Any]) -> Any:
     """``call(code, *arguments)``: the compiled function of the model with that code, of a table by models' names.
 
-    The codes are those of :data:`~d4orm_env.core.dynamics.MODEL_CODES`; nothing is done for one not in the table.
+    The codes are those of :data:`~d4orm_env.core.dynamics.MODEL_CODES`. Nothing is done for one not in the table, so
+    a kernel is chosen by the codes that it is called with.
     """
     (name, branch), *others = branches.items()
     own_code = MODEL_CODES[name]
@@ -333,16 +379,21 @@ def dispatch(branches: Mapping[str, Any]) -> Any:
     return call
 
 
-_move = dispatch({name: _mover(model) for name, model in MODELS.items()})
+@cache
+def robot_mover(names: tuple[str, ...]) -> Any:
+    """``move_robot(arrays, k, w)`` for robots of these models.
 
+    It moves robot ``k`` one step in every world of the tile; its control rows hold the executed control afterwards.
+    """
+    move = dispatch({name: _mover(MODELS[name]) for name in names})
 
-@inlined
-def move_robot(arrays: Any, k: Any, w: Any) -> None:
-    """Move robot ``k`` one step in every world of the tile; its control rows hold the executed control afterwards."""
-    h = transition.TimeStep(arrays.time_step[0], arrays.time_step[1], arrays.time_step[2], arrays.time_step[3])
-    limits = (arrays.limits[k, 0], arrays.limits[k, 1], arrays.limits[k, 2])
-    docking = (arrays.squared_goal_radius, arrays.squared_goal_speed)
-    _move(arrays.model_codes[k], limits, h, docking, w[k * STRIDE : (k + 1) * STRIDE])
+    @inlined
+    def move_robot(arrays: Any, k: Any, w: Any) -> None:
+        h = transition.TimeStep(arrays.time_step[0], arrays.time_step[1], arrays.time_step[2], arrays.time_step[3])
+        docking = (arrays.squared_goal_radius, arrays.squared_goal_speed)
+        move(arrays.model_codes[k], arrays.limits[k], h, docking, w[k * STRIDE : (k + 1) * STRIDE])
+
+    return move_robot
 
 
 @inlined
@@ -432,26 +483,36 @@ def near_obstacles(arrays: Any, reach: Any, places: Any, spare: Any) -> Any:
 def _motion_reader(model: Model) -> Any:
     velocity_of = inlined(model.functions.velocity)
     read_x, read_u = READ[model.state_size], READ[model.control_size]
-    dimension = model.dimension
+    dimension, num_limits = model.dimension, len(model.limit_names)
 
     @compiled
-    def read(o: Any, s: Any, w: Any, velocity: Any) -> None:
-        v = velocity_of(read_x(w, o + STATE * TILE, s), read_u(w, o + CONTROL * TILE, s), OPS)
+    def read(all_limits: Any, o: Any, s: Any, w: Any, velocity: Any) -> None:
+        limits = to_fixed_tuple(all_limits, num_limits)
+        v = velocity_of(read_x(w, o + STATE * TILE, s), read_u(w, o + CONTROL * TILE, s), limits, OPS)
         for axis in range(dimension):
             velocity[axis] = v[axis]
 
     return read
 
 
-_read_velocity = dispatch({name: _motion_reader(model) for name, model in MODELS.items()})
-_HEADING = np.array([-1 if model.heading_index is None else model.heading_index for model in MODELS.values()])
+@cache
+def motion_reader(names: tuple[str, ...]) -> Any:
+    """``read_motion(arrays, k, s, w, velocity, heading)`` for robots of these models.
 
+    It fills the velocity ``(d,)`` and the heading's cosine and sine ``(2,)`` of robot ``k`` in world ``s``.
+    """
+    read_velocity = dispatch({name: _motion_reader(MODELS[name]) for name in names})
+    headings = np.full(1 + max(MODEL_CODES[name] for name in names), -1)
+    for name in names:
+        index = MODELS[name].heading_index
+        headings[MODEL_CODES[name]] = -1 if index is None else index
 
-@inlined
-def read_motion(arrays: Any, k: Any, s: Any, w: Any, velocity: Any, heading: Any) -> None:
-    """Fill the velocity ``(d,)`` and the heading's cosine and sine ``(2,)`` of robot ``k`` in world ``s``."""
-    code = arrays.model_codes[k]
-    _read_velocity(code, k * STRIDE, s, w, velocity)
-    index = _HEADING[code]
-    heading[0] = cosine(w[k * STRIDE + index * TILE + s]) if index >= 0 else ZERO
-    heading[1] = sine(w[k * STRIDE + index * TILE + s]) if index >= 0 else ZERO
+    @inlined
+    def read_motion(arrays: Any, k: Any, s: Any, w: Any, velocity: Any, heading: Any) -> None:
+        code = arrays.model_codes[k]
+        read_velocity(code, arrays.limits[k], k * STRIDE, s, w, velocity)
+        index = headings[code]
+        heading[0] = cosine(w[k * STRIDE + index * TILE + s]) if index >= 0 else ZERO
+        heading[1] = sine(w[k * STRIDE + index * TILE + s]) if index >= 0 else ZERO
+
+    return read_motion

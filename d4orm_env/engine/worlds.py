@@ -6,13 +6,15 @@ is a batch of one.
 
 from __future__ import annotations
 
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from numba.extending import register_jitable
 
-from d4orm_env.core import collision, dynamics, observation, reward, transition
+from d4orm_env.core import collision, observation, reward, robot_model, transition
+from d4orm_env.core.dynamics import COMMON, MODEL_CODES, names_of_codes
 from d4orm_env.engine import lanes, tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.lanes import TILE, use_wide_registers
@@ -33,9 +35,12 @@ from d4orm_env.engine.tiles import (
     ZERO,
     compiled,
     inlined,
+    models_key,
+    motion_reader,
+    robot_mover,
 )
 
-SOURCES = fingerprint((dynamics, transition, collision, reward, observation, lanes, tiles))
+SOURCES = fingerprint((robot_model, transition, collision, reward, observation, lanes, tiles))
 
 for _function in (
     observation.observe_robot,
@@ -131,14 +136,12 @@ def _judge_all(
         _judge(arrays, inverse, first, w, near, collided, violated, rewards)
 
 
-@cached_kernel(SOURCES, **OPTIONS)
-def step_worlds(
-    arrays: Any, goal: Any, inverse: Any, state: Any, control: Any, docked: Any, collided: Any, violated: Any,
-    rewards: Any, tile_range: Any,
-) -> None:  # fmt: skip
-    """Step ``B`` worlds of one problem in place; each has its own goals and start distances.
+@cache
+def step_worlds_kernel(names: tuple[str, ...]) -> Any:
+    """A kernel that steps ``B`` worlds of one problem in place; each has its own goals and start distances.
 
     Args:
+        names: Models that the kernel is for.
         arrays: The problem.
         goal: ``(B, K, d)``.
         inverse: ``(B, K)`` one over the start distances.
@@ -150,45 +153,60 @@ def step_worlds(
         rewards: ``(B, K)``, output.
         tile_range: First tile of worlds and the one after the last.
     """
-    use_wide_registers()
-    num_robots, dimension = arrays.goal.shape
-    w = tiles.aligned_zeros(num_robots * STRIDE)
-    near = np.empty((num_robots, 2), np.uint64)
-    for index in range(tile_range[0], tile_range[1]):
-        first = index * TILE
-        _load(goal, state, control, docked, first, w)
-        tiles.measure_goal_distance(num_robots, dimension, w)
-        for k in range(num_robots):
-            tiles.move_robot(arrays, k, w)
-        _judge(arrays, inverse, first, w, near, collided, violated, rewards)
-        _store(state, control, docked, first, w)
+    move_robot = robot_mover(names)
+
+    @cached_kernel(models_key(SOURCES, names), variant="_".join(names), **OPTIONS)
+    def step_worlds(
+        arrays: Any, goal: Any, inverse: Any, state: Any, control: Any, docked: Any, collided: Any, violated: Any,
+        rewards: Any, tile_range: Any,
+    ) -> None:  # fmt: skip
+        use_wide_registers()
+        num_robots, dimension = arrays.goal.shape
+        w = tiles.aligned_zeros(num_robots * STRIDE)
+        near = np.empty((num_robots, 2), np.uint64)
+        for index in range(tile_range[0], tile_range[1]):
+            first = index * TILE
+            _load(goal, state, control, docked, first, w)
+            tiles.measure_goal_distance(num_robots, dimension, w)
+            for k in range(num_robots):
+                move_robot(arrays, k, w)
+            _judge(arrays, inverse, first, w, near, collided, violated, rewards)
+            _store(state, control, docked, first, w)
+
+    return step_worlds
 
 
-@cached_kernel(SOURCES, **OPTIONS)
-def roll_out(
-    arrays: Any, goal: Any, inverse: Any, controls: Any, states: Any, docked: Any, collided: Any, violated: Any,
-    rewards: Any,
-) -> None:  # fmt: skip
-    """Step a single world through ``controls`` ``(H+1, K, m)``, the first of which is unused, keeping every step.
+@cache
+def roll_out_kernel(names: tuple[str, ...]) -> Any:
+    """A kernel that steps a single world through ``controls`` ``(H+1, K, m)``, keeping every step.
 
-    Every output has ``H+1`` rows too, the first for the start. The motion comes first; then 64 moments at a time are
-    judged, as if they were worlds.
+    The first row of the controls is unused. Every output has ``H+1`` rows too, the first for the start. The motion
+    comes first; then 64 moments at a time are judged, as if they were worlds.
     """
-    use_wide_registers()
-    num_robots = arrays.radius.shape[0]
-    w = tiles.aligned_zeros(num_robots * STRIDE)
-    near = np.empty((num_robots, 2), np.uint64)
-    for t in range(1, controls.shape[0]):
-        # Loops, because numba takes seconds to compile assignments of slices.
-        for k in range(num_robots):
-            for i in range(states.shape[2]):
-                states[t, k, i] = states[t - 1, k, i]
-            docked[t, k] = docked[t - 1, k]
-        _load_world(goal, states, controls, docked, t, 0, w)
-        for k in range(num_robots):
-            tiles.move_robot(arrays, k, w)
-        _store_world(states, controls, docked, t, 0, w)
-    _judge_all(arrays, goal, inverse, states, controls, docked, collided, violated, rewards, w, near)
+    move_robot = robot_mover(names)
+
+    @cached_kernel(models_key(SOURCES, names), variant="_".join(names), **OPTIONS)
+    def roll_out(
+        arrays: Any, goal: Any, inverse: Any, controls: Any, states: Any, docked: Any, collided: Any, violated: Any,
+        rewards: Any,
+    ) -> None:  # fmt: skip
+        use_wide_registers()
+        num_robots = arrays.radius.shape[0]
+        w = tiles.aligned_zeros(num_robots * STRIDE)
+        near = np.empty((num_robots, 2), np.uint64)
+        for t in range(1, controls.shape[0]):
+            # Loops, because numba takes seconds to compile assignments of slices.
+            for k in range(num_robots):
+                for i in range(states.shape[2]):
+                    states[t, k, i] = states[t - 1, k, i]
+                docked[t, k] = docked[t - 1, k]
+            _load_world(goal, states, controls, docked, t, 0, w)
+            for k in range(num_robots):
+                move_robot(arrays, k, w)
+            _store_world(states, controls, docked, t, 0, w)
+        _judge_all(arrays, goal, inverse, states, controls, docked, collided, violated, rewards, w, near)
+
+    return roll_out
 
 
 @cached_kernel(SOURCES, **OPTIONS)
@@ -225,14 +243,15 @@ def _open_eyes(num_robots: Any, dimension: Any, num_neighbors: Any, num_obstacle
 
 @inlined
 def _observe(
-    arrays: Any, goal: Any, docked: Any, time_left: Any, s: Any, w: Any, bounds: Any, eyes: Any, out: Any
-) -> None:
+    read_motion: Any, arrays: Any, goal: Any, docked: Any, time_left: Any, s: Any, w: Any, bounds: Any, eyes: Any,
+    out: Any,
+) -> None:  # fmt: skip
     """Fill ``out`` ``(K, D)`` with what the robots of the world in lane ``s`` see, inside ``bounds`` ``(2, D)``."""
     num_robots, dimension = goal.shape
     for k in range(num_robots):
         for axis in range(dimension):
             eyes.position[k, axis] = w[k * STRIDE + (STATE + axis) * TILE + s]
-        tiles.read_motion(arrays, k, s, w, eyes.velocity[k], eyes.heading[k])
+        read_motion(arrays, k, s, w, eyes.velocity[k], eyes.heading[k])
         eyes.arrived[k] = ONE if docked[k] else ZERO
         for axis in range(dimension):
             if docked[k]:
@@ -249,17 +268,23 @@ def _observe(
             row[i] = value if value < bounds[1, i] else bounds[1, i]
 
 
-@cached_kernel(SOURCES, **OPTIONS)
-def observe_world(
-    arrays: Any, goal: Any, state: Any, control: Any, docked: Any, time_left: Any, bounds: Any, num_neighbors: Any,
-    num_obstacles: Any, out: Any,
-) -> None:  # fmt: skip
-    """Fill ``out`` ``(1, K, D)`` with what every robot of a single world sees."""
-    num_robots, dimension = arrays.goal.shape
-    w = tiles.aligned_zeros(num_robots * STRIDE)
-    _load_world(goal, state, control, docked, 0, 0, w)
-    eyes = _open_eyes(num_robots, dimension, num_neighbors, num_obstacles)
-    _observe(arrays, goal[0], docked[0], np.float32(time_left), 0, w, bounds, eyes, out[0])
+@cache
+def observe_world_kernel(names: tuple[str, ...]) -> Any:
+    """A kernel that fills ``out`` ``(1, K, D)`` with what every robot of a single world sees."""
+    read_motion = motion_reader(names)
+
+    @cached_kernel(models_key(SOURCES, names), variant="_".join(names), **OPTIONS)
+    def observe_world(
+        arrays: Any, goal: Any, state: Any, control: Any, docked: Any, time_left: Any, bounds: Any, num_neighbors: Any,
+        num_obstacles: Any, out: Any,
+    ) -> None:  # fmt: skip
+        num_robots, dimension = arrays.goal.shape
+        w = tiles.aligned_zeros(num_robots * STRIDE)
+        _load_world(goal, state, control, docked, 0, 0, w)
+        eyes = _open_eyes(num_robots, dimension, num_neighbors, num_obstacles)
+        _observe(read_motion, arrays, goal[0], docked[0], np.float32(time_left), 0, w, bounds, eyes, out[0])
+
+    return observe_world
 
 
 STEP, RESET, LOOK, SKIP = (np.uint8(order) for order in range(4))
@@ -370,7 +395,7 @@ def _tally(batch: Any, max_cycles: Any, b: Any) -> None:
 
 
 @inlined
-def _move_tile(arrays: Any, batch: Any, orders: Any, first: Any, count: Any, w: Any) -> None:
+def _move_tile(move_robot: Any, arrays: Any, batch: Any, orders: Any, first: Any, count: Any, w: Any) -> None:
     """Step the worlds of a tile that are to be stepped; the others wait as if all their robots had docked."""
     num_robots = batch.docked.shape[1]
     for s in range(count):
@@ -378,7 +403,7 @@ def _move_tile(arrays: Any, batch: Any, orders: Any, first: Any, count: Any, w: 
             for k in range(num_robots):
                 w[k * STRIDE + DOCKED * TILE + s] = ONE
     for k in range(num_robots):
-        tiles.move_robot(arrays, k, w)
+        move_robot(arrays, k, w)
     for s in range(count):
         b = first + s
         if orders[b] == STEP:
@@ -387,14 +412,12 @@ def _move_tile(arrays: Any, batch: Any, orders: Any, first: Any, count: Any, w: 
             _load_world(batch.goal, batch.state, batch.control, batch.docked, b, s, w)
 
 
-@cached_kernel(SOURCES, **OPTIONS)
-def advance_worlds(
-    arrays: Any, bounds: Any, num_neighbors: Any, num_obstacles: Any, max_cycles: Any, orders: Any, batch: Any,
-    tile_range: Any, out: Any,
-) -> None:  # fmt: skip
-    """Step, reset and observe worlds, each as it is ordered to.
+@cache
+def advance_worlds_kernel(names: tuple[str, ...]) -> Any:
+    """A kernel that steps, resets and observes worlds, each as it is ordered to.
 
     Args:
+        names: Models that the kernel is for.
         arrays: The problem that the worlds share; its starts and goals are not looked at.
         bounds: ``(2, D)`` lowest and highest observation.
         num_neighbors: Robots in an observation.
@@ -405,34 +428,72 @@ def advance_worlds(
         tile_range: First tile of worlds and the one after the last.
         out: ``(B, K, D)`` observations; those of skipped worlds are not written.
     """
-    use_wide_registers()
-    num_robots, dimension = arrays.goal.shape
-    w = tiles.aligned_zeros(num_robots * STRIDE)
-    near = np.empty((num_robots, 2), np.uint64)
-    eyes = _open_eyes(num_robots, dimension, num_neighbors, num_obstacles)
-    for index in range(tile_range[0], tile_range[1]):
-        first = index * TILE
-        count = min(TILE, orders.shape[0] - first)
-        moving, busy = False, False
-        for s in range(count):
-            order = orders[first + s]
-            moving |= order == STEP
-            busy |= order != SKIP
-            if order == RESET:
-                _restart(batch, first + s)
-        if not busy:
-            continue
-        _load(batch.goal, batch.state, batch.control, batch.docked, first, w)
-        tiles.measure_goal_distance(num_robots, dimension, w)
-        if moving:
-            _move_tile(arrays, batch, orders, first, count, w)
-        _judge(arrays, batch.inverse, first, w, near, batch.collided, batch.violated, batch.rewards)
-        for s in range(count):
-            b = first + s
-            if orders[b] == STEP:
-                _tally(batch, max_cycles, b)
-            if orders[b] != SKIP:
-                for k in range(num_robots):
-                    batch.distance[b, k] = np.sqrt(w[k * STRIDE + DISTANCE2 * TILE + s])
-                time_left = np.float32(max(0.0, 1.0 - batch.steps[b] / max_cycles))
-                _observe(arrays, batch.goal[b], batch.docked[b], time_left, s, w, bounds, eyes, out[b])
+    move_robot = robot_mover(names)
+    read_motion = motion_reader(names)
+
+    @cached_kernel(models_key(SOURCES, names), variant="_".join(names), **OPTIONS)
+    def advance_worlds(
+        arrays: Any, bounds: Any, num_neighbors: Any, num_obstacles: Any, max_cycles: Any, orders: Any, batch: Any,
+        tile_range: Any, out: Any,
+    ) -> None:  # fmt: skip
+        use_wide_registers()
+        num_robots, dimension = arrays.goal.shape
+        w = tiles.aligned_zeros(num_robots * STRIDE)
+        near = np.empty((num_robots, 2), np.uint64)
+        eyes = _open_eyes(num_robots, dimension, num_neighbors, num_obstacles)
+        for index in range(tile_range[0], tile_range[1]):
+            first = index * TILE
+            count = min(TILE, orders.shape[0] - first)
+            moving, busy = False, False
+            for s in range(count):
+                order = orders[first + s]
+                moving |= order == STEP
+                busy |= order != SKIP
+                if order == RESET:
+                    _restart(batch, first + s)
+            if not busy:
+                continue
+            _load(batch.goal, batch.state, batch.control, batch.docked, first, w)
+            tiles.measure_goal_distance(num_robots, dimension, w)
+            if moving:
+                _move_tile(move_robot, arrays, batch, orders, first, count, w)
+            _judge(arrays, batch.inverse, first, w, near, batch.collided, batch.violated, batch.rewards)
+            for s in range(count):
+                b = first + s
+                if orders[b] == STEP:
+                    _tally(batch, max_cycles, b)
+                if orders[b] != SKIP:
+                    for k in range(num_robots):
+                        batch.distance[b, k] = np.sqrt(w[k * STRIDE + DISTANCE2 * TILE + s])
+                    time_left = np.float32(max(0.0, 1.0 - batch.steps[b] / max_cycles))
+                    _observe(read_motion, arrays, batch.goal[b], batch.docked[b], time_left, s, w, bounds, eyes, out[b])
+
+    return advance_worlds
+
+
+class WorldKernels(NamedTuple):
+    """The kernels that step and observe teams of some models."""
+
+    step_worlds: Any
+    roll_out: Any
+    observe_world: Any
+    advance_worlds: Any
+
+
+def world_kernels(models: tuple[str, ...]) -> WorldKernels:
+    """Kernels for a team of these models: the same for all mixtures of common ones, and else of just these."""
+    different = set(models)
+    names = COMMON if different <= set(COMMON) else tuple(sorted(different, key=MODEL_CODES.__getitem__))
+    return WorldKernels(
+        step_worlds_kernel(names), roll_out_kernel(names), observe_world_kernel(names), advance_worlds_kernel(names)
+    )
+
+
+@lru_cache(maxsize=256)
+def kernels_of_codes(codes: bytes) -> WorldKernels:
+    """:func:`world_kernels` by the bytes of ``model_codes``.
+
+    Raises:
+        ValueError: If a code is no model's.
+    """
+    return world_kernels(names_of_codes(np.frombuffer(codes, np.int32)))

@@ -45,10 +45,12 @@ class RobotEntry(Entry):
     velocity: Place | None = None
     heading: Number | None = None
     speed: Squared | None = None
+    state: list[Number] | None = None
     radius: Number = 0.15
     max_speed: Number = 1.0
     max_acceleration: Number = 1.0
     max_turn_rate: Number = float(np.float32(np.pi / 2))
+    own_limits: dict[str, Number] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _fits_model(self) -> RobotEntry:
@@ -57,22 +59,31 @@ class RobotEntry(Entry):
             value = getattr(self, name)
             if value is not None and len(value) != model.dimension:
                 raise ValueError(f"{name} {value} has {len(value)} components; a {model.name} needs {model.dimension}")
-        for name in ("velocity", "heading", "speed"):
+        rest = model.state_names[model.dimension :]
+        if self.state is not None and len(self.state) != len(rest):
+            raise ValueError(f"state {self.state} has {len(self.state)} components; it holds {', '.join(rest)}")
+        for name in ("velocity", "heading", "speed", "state"):
             if getattr(self, name) is not None and name not in start_fields(model):
                 known = ", ".join(("start", *start_fields(model)))
                 raise ValueError(f"a {model.name} starts without {name}; it has {known}")
         return self
 
     @property
-    def state(self) -> list[float]:
+    def start_state(self) -> list[float]:
         """The start state, defaults filled in; a robot with a heading faces its goal."""
         model = get_model(self.model)
         state = list(self.start)
+        way = np.subtract(self.goal, self.start)
+        if "state" in start_fields(model):
+            rest = [0.0] * (model.state_size - model.dimension)
+            if model.heading_index is not None:
+                rest[model.heading_index - model.dimension] = float(arctan2(way[1], way[0]))
+            state += self.state or rest
         if "velocity" in start_fields(model):
             state += self.velocity or [0.0] * model.dimension
         if "heading" in start_fields(model):
-            way = np.subtract(self.goal, self.start)
             state += [float(arctan2(way[1], way[0])) if self.heading is None else self.heading]
+        if "speed" in start_fields(model):
             state += [0.0 if self.speed is None else self.speed]
         return state
 
@@ -151,9 +162,10 @@ class ProblemFile(Entry):
     def build(self) -> Problem:
         limits = ("radius", "max_speed", "max_acceleration", "max_turn_rate")
         columns: dict[str, Any] = {name: [getattr(robot, name) for robot in self.robots] for name in limits}
-        team = Team(tuple(robot.model for robot in self.robots), **columns)
+        models = tuple(robot.model for robot in self.robots)
+        team = Team(models, **columns, own_limits=self._own_limits())
         size = team.state_size  # asks every robot
-        start = [state + [0.0] * (size - len(state)) for state in (robot.state for robot in self.robots)]
+        start = [state + [0.0] * (size - len(state)) for state in (robot.start_state for robot in self.robots)]
         return Problem(
             team=team,
             start=start,
@@ -166,6 +178,19 @@ class ProblemFile(Entry):
             goal_speed=self.goal_speed,
             name=self.name,
         )
+
+    def _own_limits(self) -> dict[str, list[float]]:
+        columns: dict[str, list[float]] = {}
+        for robot, entry in enumerate(self.robots):
+            model = get_model(entry.model)
+            known = {limit.name: limit.default for limit in model.own_limits}
+            for name in entry.own_limits:
+                if name not in known:
+                    has = ", ".join(known) or "none"
+                    raise ValueError(f"robots[{robot}].own_limits: a {model.name} has no {name!r}; it has {has}")
+            for name, value in (known | entry.own_limits).items():
+                columns.setdefault(name, [1.0] * len(self.robots))[robot] = value
+        return columns
 
 
 class ScenarioFile(BaseModel):
@@ -202,10 +227,13 @@ PARTS: dict[tuple[str, ...], type[BaseModel]] = {
 
 
 def start_fields(model: Model) -> tuple[str, ...]:
-    """What a start state of that model holds beside its position."""
-    if model.heading_index is not None:
-        return ("heading", "speed")
-    return ("velocity",) if model.speed_indices else ()
+    """What a start state of that model holds beside its position: named parts, or ``state`` for all that there is."""
+    rest = model.state_names[model.dimension :]
+    if rest in ((), ("heading",), ("heading", "speed")):
+        return rest
+    if model.speed_indices == tuple(range(model.dimension, 2 * model.dimension)) and len(rest) == model.dimension:
+        return ("velocity",)
+    return ("state",)
 
 
 def parse(data: Any) -> Problem:
@@ -248,10 +276,16 @@ def _describe_robot(problem: Problem, robot: int) -> dict[str, Any]:
     entry: dict[str, Any] = {"model": model.name, "start": state[:dimension], "goal": _decimals(problem.goal[robot])}
     if "velocity" in start_fields(model):
         entry["velocity"] = state[dimension:]
-    if "heading" in start_fields(model):
-        entry["heading"], entry["speed"] = state[dimension:]
+    elif "state" in start_fields(model):
+        entry["state"] = state[dimension:]
+    else:
+        entry |= dict(zip(start_fields(model), state[dimension:], strict=True))
     for name in ("radius", "max_speed", "max_acceleration", "max_turn_rate"):
         (entry[name],) = _decimals(np.asarray(getattr(team, name))[[robot]])
+    if model.own_limits:
+        names = [limit.name for limit in model.own_limits]
+        values = _decimals([np.asarray(team.own_limits[name])[robot] for name in names])
+        entry["own_limits"] = dict(zip(names, values, strict=True))
     return entry
 
 

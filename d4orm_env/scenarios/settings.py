@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -41,6 +41,7 @@ class Settings:
         max_speed: Speed limit [m/s], one or ``K``.
         max_acceleration: Acceleration limit [m/s^2], one or ``K``.
         max_turn_rate: Turn rate limit [rad/s], one or ``K``.
+        own_limits: Limits that models have for themselves by name, each one or ``K``.
 
     Raises:
         ValueError: If a value makes no sense; the message names it.
@@ -61,6 +62,7 @@ class Settings:
     max_speed: Any = 1.0
     max_acceleration: Any = 1.0
     max_turn_rate: Any = float(np.pi / 2)
+    own_limits: Any = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, minimum in (("num_robots", 1), ("seed", 0), ("num_obstacles", 0)):
@@ -91,7 +93,9 @@ class Settings:
     @cached_property
     def team(self) -> Team:
         """The robots."""
-        return Team(self.models, self.radius, self.max_speed, self.max_acceleration, self.max_turn_rate)
+        return Team(
+            self.models, self.radius, self.max_speed, self.max_acceleration, self.max_turn_rate, self.own_limits
+        )
 
     @property
     def spacing(self) -> float:

@@ -1,7 +1,9 @@
 """The independent judge of plans: float64, sub-stepped, continuous in time, in plain NumPy.
 
 It shares no code with the engines: of the problem it reads data only, and the models, the integration, the docking and
-the distances are written again here, so that a mistake in the physics of the engines does not excuse itself. What it
+the distances are written again here, so that a mistake in the physics of the engines does not excuse itself. Only of a
+model without equations here, such as a user's, does it take the derivative and the limits from the model itself, and
+integrates them anew (:mod:`d4orm_env.verify.integrated`). What it
 says is a function of its input: the same on every processor, to the bit.
 """
 
@@ -17,7 +19,7 @@ from numpy.typing import NDArray
 from d4orm_env.verify.contact import MAX_NUMBERS, Pairs, Stretch, Watch, surroundings
 from d4orm_env.verify.docking import Docking, find_docking
 from d4orm_env.verify.geometry import Floats, norm
-from d4orm_env.verify.motion import MODELS, Motion
+from d4orm_env.verify.motion import Motion
 from d4orm_env.verify.report import VerificationReport, Violation
 
 if TYPE_CHECKING:
@@ -57,7 +59,7 @@ def verify(problem: Problem, controls: Any) -> VerificationReport:
         The report; ``report.ok`` when there are no violations.
 
     Raises:
-        ValueError: If the controls are not numbers or their shape is another, or a model is unknown here.
+        ValueError: If the controls are not numbers or their shape is another.
     """
     array = _checked_controls(problem, controls)
     if not np.isfinite(array).all():
@@ -121,17 +123,13 @@ class _Course:
 
 
 def _checked_controls(problem: Problem, controls: Any) -> Floats:
-    for robot, name in enumerate(problem.team.models):
-        if name not in MODELS:
-            raise ValueError(f"verify cannot judge model {name!r} of robot_{robot}; it knows {', '.join(MODELS)}")
     try:
         array = np.asarray(controls, np.float64)
     except OverflowError as error:
         raise ValueError("controls hold a whole number too large for float64; keep them within the limits") from error
     except (TypeError, ValueError) as error:
         raise ValueError(f"controls must be an array of numbers, not {type(controls).__name__}") from error
-    # Every model has as many controls as position dimensions.
-    expected = (problem.horizon, *np.shape(problem.goal))
+    expected = (problem.horizon, len(problem.team.models), problem.team.control_size)
     if array.shape != expected:
         raise ValueError(f"controls have shape {array.shape}; expected (H, K, m) = {expected}")
     return array

@@ -1,7 +1,8 @@
 """How robots move under a plan, written again in float64: clipping, the models in continuous time, the speed limit.
 
 Within a control step holonomic robots move on parabolas, integrated in closed form; the heading and speed of a
-differential drive are linear in time and its position is their Simpson quadrature. Robots do not act on each other, so
+differential drive are linear in time and its position is their Simpson quadrature. Other models are
+:mod:`integrated <d4orm_env.verify.integrated>`. Robots do not act on each other, so
 each is moved over the whole horizon at once, as if it never docked. Models and limits: paper, sections III and IV-B.
 """
 
@@ -13,20 +14,21 @@ import numpy as np
 
 from d4orm_env.core import portable
 from d4orm_env.verify.geometry import Floats, norm
+from d4orm_env.verify.integrated import Integrated
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
 
 MODELS = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive")
-"""The models that have equations here."""
+"""The models that have equations here; the others are integrated."""
 
 
 class Motion:
     """All robots under a plan's controls, over the whole horizon.
 
     Attributes:
-        limits: ``(K, d)`` limits of the controls.
-        sizes: ``(H, K, d)`` the quantities that they limit, before clipping: one norm, or turn rate and acceleration.
+        limits: ``(K, m)`` limits of the controls.
+        sizes: ``(H, K, m)`` the quantities that they limit, before clipping: one norm, or turn rate and acceleration.
         pace: ``(H, K)`` speed after each step [m/s].
         bend: ``(H, K)`` bound on the acceleration within each step, curvature included [m/s^2].
         integration_error: ``(H, K)`` bound on what RK4, one step at a time, may differ from this by [m].
@@ -36,12 +38,15 @@ class Motion:
         team, start = problem.team, np.asarray(problem.start, np.float64)
         self.dt, self.size = problem.dt, np.shape(problem.goal)[1]
         self.wheeled = np.array([name == "differential_drive" for name in team.models])
-        self.first_order = np.array([name == "velocity2d" for name in team.models])
+        # Integrated robots stand still as long as the equations are at work.
+        integrated = ~np.isin(team.models, MODELS)
+        self.first_order = integrated | (np.array(team.models) == "velocity2d")
+        self._names = {robot: team.robot_models[robot].control_names for robot in np.flatnonzero(integrated).tolist()}
         self.max_speed, self.max_acceleration, self.max_turn_rate = (
             np.asarray(values, np.float64) for values in (team.max_speed, team.max_acceleration, team.max_turn_rate)
         )
         self.limits = self._limits()
-        commands, self.sizes = self._clip(controls)
+        commands, self.sizes = self._clip(np.where(integrated[:, None], 0.0, controls[..., : self.size]))
         self._turn_rate, self._thrust = (np.where(self.wheeled, commands[..., column], 0.0) for column in (0, 1))
         self._acceleration = np.where((self.wheeled | self.first_order)[:, None], 0.0, commands)
         self._set_velocities(start, commands)
@@ -52,7 +57,28 @@ class Motion:
         # With constant controls RK4 is Simpson's rule, whose error is dt^5/2880 of the fourth derivative.
         angle = turn_rate * self.dt
         error = angle * angle * angle * (fastest * angle + 4 * thrust * self.dt) * self.dt / 2880
+        self.groups = self._integrated(problem, start, controls)
+        self._insert_groups(controls.shape[2], error)
         self.integration_error = np.cumsum(error, axis=0)
+
+    def _integrated(self, problem: Problem, start: Floats, controls: Floats) -> list[Integrated]:
+        models = {problem.team.models[robot]: problem.team.robot_models[robot] for robot in self._names}
+        names = np.array(problem.team.models)
+        return [
+            Integrated(model, np.flatnonzero(names == name), start, controls, problem.team.limits, problem.dt)
+            for name, model in models.items()
+        ]
+
+    def _insert_groups(self, control_size: int, error: Floats) -> None:
+        padding = control_size - self.size
+        self.limits = np.pad(self.limits, ((0, 0), (0, padding)), constant_values=1.0)
+        self.sizes = np.pad(self.sizes, ((0, 0), (0, 0), (0, padding)))
+        for group in self.groups:
+            columns = slice(group.limits.shape[1])
+            self.limits[group.robots, columns] = group.limits
+            self.sizes[:, group.robots, columns] = group.sizes
+            self.pace[:, group.robots], self.bend[:, group.robots] = group.pace, group.bend
+            error[:, group.robots] = group.step_error
 
     def _limits(self) -> Floats:
         limits = np.ones((len(self.wheeled), self.size))  # a column that limits nothing meets sizes of zero
@@ -63,6 +89,8 @@ class Motion:
 
     def limited_quantity(self, robot: int, column: int) -> str:
         """What a column of :attr:`limits` limits, with its unit."""
+        if robot in self._names:
+            return self._names[robot][column]
         if self.wheeled[robot]:
             return ("turn rate [rad/s]", "acceleration [m/s^2]")[column]
         return "speed [m/s]" if self.first_order[robot] else "acceleration [m/s^2]"
@@ -80,7 +108,7 @@ class Motion:
 
     def _set_velocities(self, start: Floats, commands: Floats) -> None:
         """Velocity, heading and speed at the beginning of every step; the speed limit acts between steps."""
-        dt, state = self.dt, np.zeros((len(start), max(4, 2 * self.size)))
+        dt, state = self.dt, np.zeros((len(start), max(4, 2 * self.size, start.shape[1])))
         state[:, : start.shape[1]] = start
         heading, speed = np.where(self.wheeled, state[:, 2], 0.0), np.where(self.wheeled, state[:, 3], 0.0)
         has_velocity = ~(self.wheeled | self.first_order)[:, None]
@@ -104,6 +132,8 @@ class Motion:
         way: Floats = self._velocity[steps, None] * time + self._acceleration[steps, None] * (time * time / 2)
         if self.wheeled.any():
             way[:, 1:, self.wheeled] = self._wheeled_way(steps, sub_steps)
+        for group in self.groups:
+            way[:, :, group.robots] = group.way(steps, sub_steps)
         return way
 
     def _wheeled_way(self, steps: slice, sub_steps: int) -> Floats:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.dynamics import MODELS
+from d4orm_env.core.dynamics import COMMON
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.engine.base import SamplingRules, SamplingTask, get_engine
@@ -45,8 +45,8 @@ class WarmupReport:
     folders: tuple[Path, ...]
 
 
-TEAMS = (*((model, model) for model in MODELS), ("holonomic2d", "differential_drive"))
-"""The smallest teams that have a sampling kernel of their own."""
+TEAMS = (*((model, model) for model in COMMON), ("holonomic2d", "differential_drive"))
+"""The smallest teams of common models that have a sampling kernel of their own."""
 
 
 def compile_for_planning(models: tuple[str, ...], announce: Callable[[], None] = lambda: None) -> None:
@@ -57,12 +57,12 @@ def compile_for_planning(models: tuple[str, ...], announce: Callable[[], None] =
         announce: Called before it begins, if there is anything to do.
     """
     from d4orm_env.engine.sampling import score_kernel
-    from d4orm_env.engine.worlds import roll_out
+    from d4orm_env.engine.worlds import world_kernels
 
-    if has_to_be_compiled(score_kernel(models)) and has_to_be_compiled(roll_out):
+    if has_to_be_compiled(score_kernel(models)) and has_to_be_compiled(world_kernels(models).roll_out):
         announce()
         # Should it fail, the kernel is compiled when it is needed, like any other.
-        other = _in_another_process("roll_out_once()")
+        other = _in_another_process(f"roll_out_once({models!r})")
         sample_once((models,))
         other.wait()
 
@@ -71,9 +71,9 @@ def _in_another_process(call: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-c", f"from {__name__} import roll_out_once, sample_once; {call}"])
 
 
-def roll_out_once() -> None:
-    """Roll out a plan of the smallest problem on the CPU."""
-    problem = _smallest_problem(TEAMS[0])
+def roll_out_once(models: tuple[str, ...]) -> None:
+    """Roll out a plan of the smallest problem of a team of these models on the CPU."""
+    problem = _smallest_problem(models)
     get_engine("cpu").rollout(problem, _no_controls(problem))
 
 
@@ -96,7 +96,7 @@ def warm_up() -> WarmupReport:
     # Before anything runs: what the other process compiles is in the cache when it is needed here.
     missing = [kernel for kernel in _kernels() if has_to_be_compiled(kernel)]
     # The last kernel, for three models, takes as long as two others.
-    other = _in_another_process(f"roll_out_once(); sample_once({TEAMS[1:-1]})")
+    other = _in_another_process(f"roll_out_once({TEAMS[0]}); sample_once({TEAMS[1:-1]})")
     sample_once((TEAMS[0], TEAMS[-1]))
     other.wait()
     sample_once(TEAMS)
@@ -159,9 +159,10 @@ def _kernels() -> list[Any]:
     from d4orm_env import engine
     from d4orm_env.engine.drives import drive_kernel
     from d4orm_env.engine.sampling import score_kernel
+    from d4orm_env.engine.worlds import world_kernels
 
     modules = [import_module(f"{engine.__name__}.{module.name}") for module in pkgutil.iter_modules(engine.__path__)
                if module.name != "jax"]  # fmt: skip
     found = {name: value for module in modules for name, value in vars(module).items() if isinstance(value, Dispatcher)}
-    kernels = [*found.values(), *map(score_kernel, TEAMS), *map(drive_kernel, MODELS)]
+    kernels = [*found.values(), *world_kernels(COMMON), *map(score_kernel, TEAMS), *map(drive_kernel, COMMON)]
     return [kernel for kernel in kernels if kernel.stats.cache_path is not None]

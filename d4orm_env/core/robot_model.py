@@ -1,0 +1,248 @@
+"""What a robot model is: its functions, each written once in scalar style, and what they share.
+
+A model is a handful of pure functions on tuples of numbers. They contain no loops, no array library and no float
+literals, so that the CPU engine compiles them with numba, the JAX engine traces them over arrays whose last axis is the
+sample, and CasADi can differentiate them, all from the same source and in the caller's precision. Mathematical
+functions come in through :class:`Ops`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, NamedTuple
+
+SPEED, ACCELERATION, TURN_RATE = range(3)
+"""First columns of every robot's limits: speed [m/s], acceleration [m/s^2], turn rate [rad/s]."""
+
+STANDARD_LIMITS = ("max_speed", "max_acceleration", "max_turn_rate")
+OWN_LIMITS = len(STANDARD_LIMITS)
+"""Column of the first limit that a model has for itself."""
+
+
+class Ops(NamedTuple):
+    """The mathematical functions a model may call, from whichever library compiles it."""
+
+    cos: Callable[..., Any]
+    sin: Callable[..., Any]
+    sqrt: Callable[..., Any]
+    minimum: Callable[..., Any]
+    maximum: Callable[..., Any]
+    arctan2: Callable[..., Any]
+    where: Callable[..., Any]
+    """``(condition, a, b) -> a`` where the condition holds, ``b`` elsewhere."""
+
+
+PYTHON_OPS = Ops(math.cos, math.sin, math.sqrt, min, max, math.atan2, lambda condition, a, b: a if condition else b)
+"""Over Python's numbers."""
+
+
+class ModelFunctions(NamedTuple):
+    """What a model computes.
+
+    ``x`` is the state tuple, ``u`` the control tuple, ``limits`` the robot's limits: speed, acceleration and turn rate,
+    and then those of :attr:`Model.own_limits`.
+    """
+
+    derivative: Callable[..., Any]
+    """``(x, u, limits, ops) -> dx/dt``."""
+    limit_control: Callable[..., Any]
+    """``(u, limits, ops) -> u`` inside the robot's limits."""
+    limit_state: Callable[..., Any]
+    """``(x, limits, ops) -> x`` at no more than the speed limit."""
+    velocity: Callable[..., Any]
+    """``(x, u, limits, ops) -> `` velocity vector in the world frame [m/s]."""
+    rest: Callable[..., Any]
+    """``(x, zero) -> x`` standing still at the same place and heading."""
+    approach: Callable[..., Any]
+    """``(x, goal, limits, h, ops) -> `` fastest velocity straight to the goal from which it can stop there [m/s]."""
+    track: Callable[..., Any]
+    """``(x, velocity, limits, h, ops) -> u`` that would bring it to a velocity within a step; it may exceed the limits.
+    """
+    integrate: Any = None
+    """``(x, u, limits, h, ops) -> x`` after a :class:`~d4orm_env.core.transition.TimeStep`: what classical
+    Runge-Kutta makes of the derivative with the control held constant, written out without the terms that cancel. A
+    model that leaves it out is integrated by :class:`RungeKutta`.
+    """
+
+
+class Limit(NamedTuple):
+    """A limit or measure of its own that a model has, positive.
+
+    Attributes:
+        name: As in ``Team(own_limits={name: ...})``.
+        default: For robots that are given no other, in SI units.
+        most: Largest value.
+    """
+
+    name: str
+    default: float
+    most: float = math.inf
+
+
+# ``x + h * k`` for states of two to six components, written out for the compiler.
+
+
+def _moved2(x: Any, h: Any, k: Any) -> Any:
+    return (x[0] + h * k[0], x[1] + h * k[1])
+
+
+def _moved3(x: Any, h: Any, k: Any) -> Any:
+    return (x[0] + h * k[0], x[1] + h * k[1], x[2] + h * k[2])
+
+
+def _moved4(x: Any, h: Any, k: Any) -> Any:
+    return (x[0] + h * k[0], x[1] + h * k[1], x[2] + h * k[2], x[3] + h * k[3])
+
+
+def _moved5(x: Any, h: Any, k: Any) -> Any:
+    return (x[0] + h * k[0], x[1] + h * k[1], x[2] + h * k[2], x[3] + h * k[3], x[4] + h * k[4])
+
+
+def _moved6(x: Any, h: Any, k: Any) -> Any:
+    return (x[0] + h * k[0], x[1] + h * k[1], x[2] + h * k[2], x[3] + h * k[3], x[4] + h * k[4], x[5] + h * k[5])
+
+
+MOVED: dict[int, Callable[..., Any]] = {2: _moved2, 3: _moved3, 4: _moved4, 5: _moved5, 6: _moved6}
+
+
+def runge_kutta(derivative: Any, moved: Any, x: Any, u: Any, limits: Any, h: Any, ops: Ops) -> Any:
+    """One step of the classical Runge-Kutta method, the control held constant; ``moved`` is one of :data:`MOVED`."""
+    k1 = derivative(x, u, limits, ops)
+    k2 = derivative(moved(x, h.half, k1), u, limits, ops)
+    k3 = derivative(moved(x, h.half, k2), u, limits, ops)
+    k4 = derivative(moved(x, h.full, k3), u, limits, ops)
+    return moved(moved(moved(moved(x, h.sixth, k1), h.third, k2), h.third, k3), h.sixth, k4)
+
+
+@dataclass(frozen=True)
+class RungeKutta:
+    """:attr:`ModelFunctions.integrate` of a model that has none of its own."""
+
+    derivative: Callable[..., Any]
+    state_size: int
+
+    def __call__(self, x: Any, u: Any, limits: Any, h: Any, ops: Ops) -> Any:
+        return runge_kutta(self.derivative, MOVED[self.state_size], x, u, limits, h, ops)
+
+
+@dataclass(frozen=True)
+class Model:
+    """A robot model: its sizes, the meaning of its components and its functions.
+
+    Attributes:
+        name: Registry name, an identifier.
+        dimension: Position dimensions ``d``, 2 or 3; the first ``d`` state components are the position [m].
+        state_names: One name per state component; ``len`` is the model's state size ``n``, ``d`` to 6.
+        control_names: One name per control component; ``len`` is the model's control size ``m``, 2 or 3.
+        control_limits: Column of the robot's limits that bounds each control component. Components with the same column
+            share it as the limit of their norm.
+        heading_index: State component holding the heading [rad], or ``None`` for a model without one.
+        speed_indices: State components holding velocity or speed [m/s].
+        functions: The scalar-style functions.
+        own_limits: Limits beyond the three that all models have, from column :data:`OWN_LIMITS` on.
+        state_limits: ``(state component, column of the limits)`` for components other than speeds that
+            :attr:`ModelFunctions.limit_state` bounds.
+    """
+
+    name: str
+    dimension: int
+    state_names: tuple[str, ...]
+    control_names: tuple[str, ...]
+    control_limits: tuple[int, ...]
+    heading_index: int | None
+    speed_indices: tuple[int, ...]
+    functions: ModelFunctions
+    own_limits: tuple[Limit, ...] = ()
+    state_limits: tuple[tuple[int, int], ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.functions.integrate is None:
+            integrate = RungeKutta(self.functions.derivative, self.state_size)
+            object.__setattr__(self, "functions", self.functions._replace(integrate=integrate))
+
+    @property
+    def state_size(self) -> int:
+        return len(self.state_names)
+
+    @property
+    def control_size(self) -> int:
+        return len(self.control_names)
+
+    @property
+    def limit_names(self) -> tuple[str, ...]:
+        """The columns of the robot's limits."""
+        return (*STANDARD_LIMITS, *(limit.name for limit in self.own_limits))
+
+    def turn_rate(self, limits: Any) -> float:
+        """Fastest turn of the heading that these limits allow [rad/s], zero without a heading.
+
+        Sought among the states and controls at their limits, which is where models turn fastest.
+        """
+        if self.heading_index is None:
+            return 0.0
+        limits = [float(limit) for limit in limits]
+        bounds = dict(self.state_limits) | dict.fromkeys(self.speed_indices, SPEED)
+        ends = [(-limits[bounds[i]], limits[bounds[i]]) if i in bounds else (0.0,) for i in range(self.state_size)]
+        controls = list(product(*((-limits[column], limits[column]) for column in self.control_limits)))
+        return max(
+            abs(self.functions.derivative(x, u, limits, PYTHON_OPS)[self.heading_index])
+            for x in product(*ends)
+            for u in controls
+        )
+
+
+def norm_scale(square: Any, limit: Any, ops: Ops) -> Any:
+    """Factor that brings a vector of this squared length to at most ``limit``; exactly one for a shorter vector."""
+    return limit / ops.sqrt(ops.maximum(square, limit * limit))
+
+
+def control_scale(square: Any, limit: Any, ops: Ops) -> Any:
+    """As :func:`norm_scale`; NaN where the square has overflowed, lest the control pass for none at all."""
+    return norm_scale(square, limit, ops) + (square - square)
+
+
+def clip(value: Any, limit: Any, ops: Ops) -> Any:
+    return ops.maximum(-limit, ops.minimum(limit, value))
+
+
+def stopping_speed(distance: Any, limits: Any, h: Any, ops: Ops) -> Any:
+    """Fastest speed from which a robot with a limited acceleration stops within a distance."""
+    acceleration = limits[ACCELERATION]
+    # Braking begins with the next step.
+    lost = acceleration * h.half
+    return ops.minimum(limits[SPEED], ops.sqrt((acceleration + acceleration) * distance + lost * lost) - lost)
+
+
+def share(part: Any, whole: Any, other: Any, ops: Ops) -> Any:
+    """``part / whole``, and no division by zero where both are: ``other`` is any number but zero."""
+    return part / ops.where(whole > 0, whole, other)
+
+
+def planar_approach(x: Any, goal: Any, limits: Any, h: Any, ops: Ops) -> Any:
+    """:attr:`ModelFunctions.approach` of a planar model with a limited acceleration."""
+    gap_x, gap_y = goal[0] - x[0], goal[1] - x[1]
+    distance = ops.sqrt(gap_x * gap_x + gap_y * gap_y)
+    pace = share(stopping_speed(distance, limits, h, ops), distance, h.full, ops)
+    return (gap_x * pace, gap_y * pace)
+
+
+def first_order_approach(x: Any, goal: Any, limits: Any, h: Any, ops: Ops) -> Any:
+    """:attr:`ModelFunctions.approach` of a planar model that takes a new speed at once."""
+    gap_x, gap_y = goal[0] - x[0], goal[1] - x[1]
+    distance = ops.sqrt(gap_x * gap_x + gap_y * gap_y)
+    # It stops at once, and need only not overshoot within a step.
+    pace = share(ops.minimum(limits[SPEED], distance / h.full), distance, h.full, ops)
+    return (gap_x * pace, gap_y * pace)
+
+
+def turn_towards(heading: Any, velocity: Any, ops: Ops) -> Any:
+    """The wanted velocity's part along the heading [m/s], and the turn that brings the heading to it [rad]."""
+    facing_x, facing_y = ops.cos(heading), ops.sin(heading)
+    along = facing_x * velocity[0] + facing_y * velocity[1]
+    across = facing_x * velocity[1] - facing_y * velocity[0]
+    none = along - along
+    # To stand still no heading is better than the present one.
+    return along, ops.where(along * along + across * across > 0, ops.arctan2(across, along), none)

@@ -1,0 +1,120 @@
+"""How robots of a model that has no equations in :mod:`~d4orm_env.verify.motion` move: its derivative, in float64.
+
+Of such a model the judge takes its word for the derivative, the limits and the velocity, and integrates anew: classical
+Runge-Kutta in many sub-steps of a control step, with the same bits on every processor.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.core import portable
+from d4orm_env.verify.geometry import Floats, norm
+
+SUB_STEPS = 20
+"""To find how much the way bends within a control step."""
+STATE_ERROR = 1e-7
+"""Largest error of a control step's integration that one with more sub-steps reveals, in SI units."""
+BEND_MARGIN = 1.5
+"""The acceleration is measured between sub-steps, and may be this much larger at one of them."""
+LARGEST_CONTROL = 1e100
+"""Larger controls mean the same once they are limited, and the square of this is a number."""
+
+
+class Integrated:
+    """The robots of one model under a plan's controls; ``R`` robots.
+
+    Attributes:
+        robots: ``(R,)`` which of the team they are.
+        limits: ``(R, m)`` limits of the control components.
+        sizes: ``(H, R, m)`` limit plus what is cut off of each component.
+        pace: ``(H, R)`` speed after each step [m/s].
+        bend: ``(H, R)`` acceleration within each step [m/s^2].
+        step_error: ``(H, R)`` what one step of Runge-Kutta per control step is off by [m].
+    """
+
+    def __init__(
+        self, model: Any, robots: NDArray[np.intp], start: Floats, controls: Floats, limits: Any, dt: float
+    ) -> None:
+        self.robots, self._model, self._dt = robots, model, dt
+        self._limits = tuple(np.asarray(limits, np.float64)[robots].T)
+        asked = np.moveaxis(controls[:, robots, : model.control_size], 2, 0)
+        within = np.clip(asked, -LARGEST_CONTROL, LARGEST_CONTROL)
+        self._commands = self._call(model.functions.limit_control, within)
+        self.limits: Floats = np.stack([self._limits[column] for column in model.control_limits], axis=1)
+        self.sizes: Floats = self.limits + np.moveaxis(np.abs(asked - self._commands), 0, 2)
+        states = self._states(start[robots, : model.state_size].T)
+        self._begins = states[:, :-1]
+        velocity = self._call(model.functions.velocity, states[:, 1:], self._commands)
+        self.pace: Floats = norm(np.moveaxis(velocity, 0, 2))
+        way = self.way(slice(None), SUB_STEPS)
+        change = np.diff(way, n=2, axis=1) * (SUB_STEPS / dt) ** 2
+        self.bend: Floats = BEND_MARGIN * norm(change).max(axis=1)
+        coarse = self._advanced(self._begins, self._commands, dt) - self._begins
+        self.step_error: Floats = norm(np.moveaxis(coarse[: model.dimension], 0, 2) - way[:, -1])
+
+    def _states(self, start: Floats) -> Floats:
+        """``(n, H+1, R)`` at the beginning of every step and after the last, integrated as finely as it takes."""
+        sub_steps = 2
+        while True:
+            states, ends = [start], []
+            for u in np.moveaxis(self._commands, 1, 0):
+                ends.append(self._integrated(states[-1], u, sub_steps))
+                states.append(self._call(self._model.functions.limit_state, ends[-1]))
+            found = np.stack(states, axis=1)
+            finer = self._integrated(found[:, :-1], self._commands, 2 * sub_steps)
+            error = float(np.abs(np.stack(ends, axis=1) - finer).max())
+            if sub_steps >= SUB_STEPS or error <= STATE_ERROR:
+                return found
+            # Of order four: so many times finer, and one more.
+            times_finer = (error / STATE_ERROR) ** 0.25 if np.isfinite(error) else SUB_STEPS
+            sub_steps = int(min(sub_steps * times_finer + 1, SUB_STEPS))
+
+    def _integrated(self, x: Floats, u: Floats, sub_steps: int) -> Floats:
+        for _ in range(sub_steps):
+            x = self._advanced(x, u, self._dt / sub_steps)
+        return x
+
+    def _advanced(self, x: Floats, u: Floats, h: float) -> Floats:
+        k1 = self._slope(x, u)
+        k2 = self._slope(x + h / 2 * k1, u)
+        k3 = self._slope(x + h / 2 * k2, u)
+        k4 = self._slope(x + h * k3, u)
+        moved: Floats = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        return moved
+
+    def _slope(self, x: Floats, u: Floats) -> Floats:
+        return self._call(self._model.functions.derivative, x, u)
+
+    def _call(self, function: Any, *arguments: Floats) -> Floats:
+        """A function of the model over arrays whose first axis is the component; it may return single numbers too."""
+        result = function(*map(tuple, arguments), self._limits, _ops())
+        rows: Floats = np.stack([np.broadcast_to(part, arguments[0].shape[1:]) for part in result])
+        return rows
+
+    def way(self, steps: slice, sub_steps: int) -> Floats:
+        """``(T, S+1, R, d)`` where the robots are at the ends of sub-steps, from where each step began [m]."""
+        x, u = self._begins[:, steps], self._commands[:, steps]
+        begin = x[: self._model.dimension]
+        ways = [np.zeros_like(begin)]
+        for _ in range(sub_steps):
+            x = self._advanced(x, u, self._dt / sub_steps)
+            ways.append(x[: self._model.dimension] - begin)
+        return np.moveaxis(np.stack(ways), (0, 1), (1, 3))
+
+
+def _ops() -> Any:
+    """The portable functions, which compute sine and cosine of the same array once: they take most of the time."""
+    known: list[tuple[Any, Any]] = []
+
+    def sin_cos(x: Any) -> Any:
+        for asked, answer in known:
+            if asked is x:
+                return answer
+        known.append((x, portable.sin_cos(x)))
+        return known[-1][1]
+
+    return portable.NUMPY_OPS._replace(sin=lambda x: sin_cos(x)[0], cos=lambda x: sin_cos(x)[1])
