@@ -191,7 +191,11 @@ def test_registered_names_go_wherever_names_go(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("tables")
 def test_taken_names_and_bad_ones_are_refused() -> None:
     register_policy("push", Push)
-    register_policy("push", Push)
+    register_policy("push", type("Push", (Push,), {"__module__": Push.__module__}))  # a cell that is run again
+    register_policy("path", "test_own:push")
+    register_policy("path", ":".join(["test_own", "push"]))
+    with pytest.raises(ValueError, match="'path' is taken"):
+        register_policy("path", "test_own:push_one")
     for register, name in ((register_policy, "push"), (register_policy, "d4orm"), (register_planner, "goal"),
                            (register_planner, "mppi")):  # fmt: skip
         with pytest.raises(ValueError, match=f"{name!r} .*register yours under another"):
