@@ -265,7 +265,7 @@ def compare(policies: Any, out: Path, **settings: Any) -> list[Any]:
 def test_a_comparison_takes_a_mixture(tmp_path: Path) -> None:
     policies = {
         "mine": Push(), "weak": Push(0.5), "f": push, "class": {"policy": Push, "strength": 0.25}, "goal": {},
-        "path": "test_own:Push", "duck": Duck(),
+        "path": "test_own:Push", "duck": Duck(), "one": push_one,
     }  # fmt: skip
     rows = compare(policies, tmp_path)
     assert [row.label for row in rows] == list(policies)
@@ -281,7 +281,7 @@ def test_a_comparison_takes_a_mixture(tmp_path: Path) -> None:
     # Nothing is left to do, although the instances have been used.
     counts: list[tuple[int, int]] = []
     compare(policies, tmp_path, progress=lambda what, done, total: counts.append((done, total)))
-    assert counts == [(14, 14)]
+    assert counts == [(16, 16)]
 
 
 def test_policies_without_labels_have_their_own_names(tmp_path: Path) -> None:
