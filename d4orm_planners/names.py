@@ -28,7 +28,7 @@ class Registry(Mapping[str, Any]):
         self._registered: dict[str, Any] = {}
 
     def add(self, name: str, thing: Any) -> None:
-        """Register a thing, or the text ``"package.module:Name"`` of one.
+        """Register a thing, or the text ``"package.module:Name"`` of one; again if defined anew, as in a notebook.
 
         Raises:
             ValueError: If the name is none, or taken by another.
@@ -37,8 +37,10 @@ class Registry(Mapping[str, Any]):
             raise ValueError(
                 f"{self.what} name {shown(name)} is none; give one of letters, digits, hyphens, dots and underscores"
             )
-        if self._registered.setdefault(name, thing) is not thing:
+        known = self._registered.get(name, thing)
+        if known is not thing and _place(known) != _place(thing):
             raise ValueError(f"{self.what} name {name!r} is taken; register yours under another")
+        self._registered[name] = thing
 
     def own(self) -> tuple[str, ...]:
         """Names registered in this process, in order."""
@@ -132,12 +134,18 @@ def is_planner_class(thing: Any) -> bool:
     return isinstance(thing, type) and issubclass(thing, Planner)
 
 
+def _place(thing: Any) -> Any:
+    """Where a class or function is defined; anything else is told from others by what it is."""
+    name = getattr(thing, "__qualname__", "<")
+    return thing if "<" in name else (thing.__module__, name)
+
+
 def _refuse_name_of(other: Registry, name: Any) -> None:
     if name in other.own():
         raise ValueError(f"{other.what} {name!r} has that name already; register yours under another")
 
 
-for _name, _place in {
+for _name, _path in {
     "d4orm": "d4orm:D4orm",
     "d4orm-d": "d4orm_d:D4ormD",
     "d-d4orm": "d_d4orm:DD4orm",
@@ -147,9 +155,9 @@ for _name, _place in {
     "i-mbd": "mbd:IterativeMBD",
     "ipopt": "ipopt:Ipopt",
 }.items():
-    register_planner(_name, f"d4orm_planners.{_place}")
+    register_planner(_name, f"d4orm_planners.{_path}")
 
-for _name, _place in {
+for _name, _path in {
     "d4orm-c2f": "d4orm_c2f:D4ormC2F",
     "goal": "policy:DriveToGoal",
     "random": "policy:RandomControls",
@@ -157,4 +165,4 @@ for _name, _place in {
     "ppo": "rl.learned:PPO",
     "sac": "rl.learned:SAC",
 }.items():
-    register_policy(_name, f"d4orm_planners.{_place}")
+    register_policy(_name, f"d4orm_planners.{_path}")

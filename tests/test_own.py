@@ -191,7 +191,11 @@ def test_registered_names_go_wherever_names_go(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("tables")
 def test_taken_names_and_bad_ones_are_refused() -> None:
     register_policy("push", Push)
-    register_policy("push", Push)
+    register_policy("push", type("Push", (Push,), {"__module__": Push.__module__}))  # a cell that is run again
+    register_policy("path", "test_own:push")
+    register_policy("path", ":".join(["test_own", "push"]))
+    with pytest.raises(ValueError, match="'path' is taken"):
+        register_policy("path", "test_own:push_one")
     for register, name in ((register_policy, "push"), (register_policy, "d4orm"), (register_planner, "goal"),
                            (register_planner, "mppi")):  # fmt: skip
         with pytest.raises(ValueError, match=f"{name!r} .*register yours under another"):
@@ -261,7 +265,7 @@ def compare(policies: Any, out: Path, **settings: Any) -> list[Any]:
 def test_a_comparison_takes_a_mixture(tmp_path: Path) -> None:
     policies = {
         "mine": Push(), "weak": Push(0.5), "f": push, "class": {"policy": Push, "strength": 0.25}, "goal": {},
-        "path": "test_own:Push", "duck": Duck(),
+        "path": "test_own:Push", "duck": Duck(), "one": push_one,
     }  # fmt: skip
     rows = compare(policies, tmp_path)
     assert [row.label for row in rows] == list(policies)
@@ -277,7 +281,7 @@ def test_a_comparison_takes_a_mixture(tmp_path: Path) -> None:
     # Nothing is left to do, although the instances have been used.
     counts: list[tuple[int, int]] = []
     compare(policies, tmp_path, progress=lambda what, done, total: counts.append((done, total)))
-    assert counts == [(14, 14)]
+    assert counts == [(16, 16)]
 
 
 def test_policies_without_labels_have_their_own_names(tmp_path: Path) -> None:

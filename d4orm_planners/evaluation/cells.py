@@ -75,7 +75,7 @@ def _checked(label: str, given: Any) -> tuple[Any, dict[str, Any]]:
     if isinstance(given, Mapping):
         settings = dict(given)
         return settings.pop("policy", label), settings
-    if isinstance(given, str) or is_brought(given):
+    if is_brought(given) or (isinstance(given, str) and ":" in given):
         return given, {}
     raise ValueError(
         f"policies[{label!r}] is {shown(given)}; give the settings of a policy, as {{}} or "
