@@ -179,10 +179,10 @@ def test_the_command_line_takes_an_import_path(
 
 
 def test_evaluate_takes_callables(tmp_path: Path) -> None:
-    results = evaluate(
-        policies=["goal"], scenarios=[still], num_robots=[2], seeds=range(1), out=tmp_path / "store", workers=1
+    (row,) = evaluate(
+        policies=["goal"], scenarios=[still], num_robots=[2], seeds=range(2), out=tmp_path / "store", workers=1
     )
-    assert results is not None
+    assert (row.scenario, row.robots, row.trials, row.errors, row.rate) == ("still", 2, 2, 0, 1.0)
 
 
 def test_what_draws_draws_anew_and_the_seed_says_what() -> None:
