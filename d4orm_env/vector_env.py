@@ -227,7 +227,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         """Put the robots elsewhere; see :meth:`d4orm_env.navigation_v0.parallel_env.set_state`.
 
         Args:
-            states: ``(B, K, n)`` of all robots. Where an episode has ended they do not matter: the next step resets it.
+            states: ``(B, K, n)`` of all robots. A world whose episode has ended is reset all the same.
 
         Returns:
             Observations ``(B, K * D)`` and infos, as at a reset.
@@ -239,10 +239,9 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         from d4orm_env.engine.worlds import LOOK
 
         self._require_reset()
-        worlds = self._worlds
-        shape = worlds.state.shape
-        bounds = self._template.state_bounds
-        np.copyto(worlds.state, checked_states(self.problem, states, worlds.docked, bounds, shape))
+        worlds, bounds = self._worlds, self._template.state_bounds
+        docked = worlds.docked & ~self._ended[:, None]
+        np.copyto(worlds.state, checked_states(self.problem, states, docked, bounds, worlds.state.shape))
         observations = self._advance(np.full(self.num_envs, LOOK))
         return observations, self._infos(np.ones(self.num_envs, np.bool_))
 

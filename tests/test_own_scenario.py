@@ -71,6 +71,11 @@ def test_a_callable_gets_seed_team_and_settings_and_gives_its_name() -> None:
     assert make_problem(lambda seed, num_robots, **settings: still(**settings), 2, gap=0.5) == lanes(0, 2, gap=0.5)
 
 
+def test_a_setting_that_is_needed_is_asked_for() -> None:
+    with pytest.raises(TypeError, match=r"scenario '<lambda>': missing a required argument: 'gap'; give it by name"):
+        make_problem(lambda seed, num_robots, gap: still(gap=gap), 2)
+
+
 @pytest.mark.parametrize("make", ["parallel", "joint", "batched"])
 def test_every_environment_takes_a_callable_and_a_file(make: str, tmp_path: Path) -> None:
     save_problem(lanes(3, 2), tmp_path / "two.yaml")
@@ -179,10 +184,10 @@ def test_the_command_line_takes_an_import_path(
 
 
 def test_evaluate_takes_callables(tmp_path: Path) -> None:
-    results = evaluate(
-        policies=["goal"], scenarios=[still], num_robots=[2], seeds=range(1), out=tmp_path / "store", workers=1
+    (row,) = evaluate(
+        policies=["goal"], scenarios=[still], num_robots=[2], seeds=range(2), out=tmp_path / "store", workers=1
     )
-    assert results is not None
+    assert (row.scenario, row.robots, row.trials, row.errors, row.rate) == ("still", 2, 2, 0, 1.0)
 
 
 def test_what_draws_draws_anew_and_the_seed_says_what() -> None:

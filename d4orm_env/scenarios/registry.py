@@ -80,7 +80,7 @@ class Scenario:
 
     def __post_init__(self) -> None:
         try:
-            inspect.signature(self.generator).bind_partial(0, DEFAULT_ROBOTS)
+            self._signature.bind_partial(0, DEFAULT_ROBOTS)
         except (TypeError, ValueError):
             raise ValueError(
                 f"scenario {self.name!r} is {shown(self.generator)}; it must be a callable "
@@ -93,10 +93,14 @@ class Scenario:
         return (inspect.getdoc(self.generator) or "").partition("\n")[0]
 
     @cached_property
-    def _parameters(self) -> list[inspect.Parameter]:
-        return list(inspect.signature(self.generator).parameters.values())
+    def _signature(self) -> inspect.Signature:
+        return inspect.signature(self.generator)
 
-    @cached_property
+    @property
+    def _parameters(self) -> list[inspect.Parameter]:
+        return list(self._signature.parameters.values())
+
+    @property
     def arguments(self) -> tuple[str, ...]:
         """All arguments of :func:`make_problem` for this scenario."""
         if isinstance(self.generator, BuiltIn):
@@ -104,13 +108,13 @@ class Scenario:
         settings = [parameter.name for parameter in self._parameters[2:] if parameter.kind in _KEYWORDS]
         return (*settings, "num_robots", "seed")
 
-    @cached_property
+    @property
     def takes_any(self) -> bool:
         """Whether the generator looks at its settings itself."""
         several = any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in self._parameters)
         return several and not isinstance(self.generator, BuiltIn)
 
-    @cached_property
+    @property
     def has_own_size(self) -> bool:
         """Whether the generator has a team size of its own, for when none is asked for."""
         second = self._parameters[1:2]
@@ -120,12 +124,17 @@ class Scenario:
         """The problem for that seed, checked to be one and to have that many robots.
 
         Raises:
+            TypeError: If a setting is missing that the generator needs.
             ValueError: For a bad argument, or if the generator returns something else.
         """
         seed = 0 if seed is None else whole_number(seed, "seed", 0)
         if num_robots is None and not self.has_own_size:
             num_robots = DEFAULT_ROBOTS
         size = () if num_robots is None else (whole_number(num_robots, "num_robots", 1),)
+        try:
+            self._signature.bind(seed, *size, **settings)
+        except TypeError as error:
+            raise UnknownKeywordError(f"scenario {self.name!r}: {error}; give it by name") from None
         problem = self.generator(seed, *size, **settings)
         if not isinstance(problem, Problem):
             raise ValueError(f"scenario {self.name!r} returned {shown(problem)}; it must return a d4orm_env.Problem")
