@@ -111,7 +111,7 @@ def _policy_config(name: str, config: Mapping[str, Any]) -> Any:
         kind.config_class.check_names(config, f"policy {name!r}")
         return kind.config_class(**config)
     if config:
-        raise UnknownKeywordError(f"policy {name!r} takes no settings, but was given {', '.join(config)}")
+        raise UnknownKeywordError(f"policy {name!r} takes no settings, but was given {', '.join(map(shown, config))}")
     return None
 
 

@@ -156,6 +156,16 @@ def test_a_damaged_file_is_called_damaged(tmp_path: Path) -> None:
         TrialStore.existing(path).trials()
 
 
+def test_columns_and_texts_that_are_damaged_are_called_so(tmp_path: Path) -> None:
+    path = tmp_path / "trials.sqlite"
+    TrialStore(path).add(trial())
+    content = path.read_bytes()
+    for good, bad in ((b"collided INTEGER", b"collidex INTEGER"), (b"goal", b"g\xffal")):
+        path.write_bytes(content.replace(good, bad))
+        with pytest.raises(ValueError, match=r"trial store .* is damaged \(.*\); put a copy in its place"):
+            TrialStore.existing(path).trials()
+
+
 READ = """
 import os, sys
 from d4orm_planners.evaluation.store import TrialStore
