@@ -294,6 +294,24 @@ def test_a_candidate_counts_for_what_it_is_not_for_what_is_claimed() -> None:
     assert box.false_claims == 1
 
 
+@pytest.mark.parametrize(
+    ("share", "feasible", "false"), [(1, True, False), (1, False, True), (0.5, True, True), (2, True, True)]
+)
+def test_a_claim_is_false_where_either_of_its_parts_is(share: float, feasible: bool, false: bool) -> None:
+    near = Problem(PROBLEM.team, PROBLEM.start, PROBLEM.start[:, :2] + [0.05, 0], horizon=4)
+    controls = np.zeros(SHAPE, np.float32)
+    found = evaluate_controls(get_engine("cpu"), near, controls)
+    assert found.solved
+    network = LocalNetwork()
+    own, other = network.join(), network.join()
+    box = Inbox(near, get_engine("cpu"), own, 2, own=0)
+    reward = float(found.trajectory.rewards.mean())
+    other.publish(encode(message(controls=controls, reward=share * reward, feasible=feasible), near))
+    (report,) = box.receive()
+    assert report.candidate.solved
+    assert box.false_claims == false
+
+
 def test_what_arrives_is_gone_on_from_as_planned_and_counts_as_executed() -> None:
     box, other = inbox()
     planned = 5 * np.sign(message().controls)
