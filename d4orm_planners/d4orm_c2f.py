@@ -524,4 +524,6 @@ class _Background:
 
 def _yield_to_others() -> None:
     """Lower the priority of the calling thread; on Linux that is what a thread's number stands for here."""
-    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
+    thread = threading.get_native_id()
+    # Where all of the process yields more than that, only root could take some of it back.
+    os.setpriority(os.PRIO_PROCESS, thread, max(10, os.getpriority(os.PRIO_PROCESS, thread)))

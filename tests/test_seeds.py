@@ -84,6 +84,7 @@ def test_repairs_of_one_iteration_start_apart() -> None:
 def test_streams_keep_their_numbers() -> None:
     names = """
         SAMPLES DEFORMATION_START REPAIR REPAIR_ORDER DETOURS CHOICE NODE PERTURBATION COARSE_PLAN REFINEMENT
-        CONTROL_LOOP CONTROLLER_NOISE RANDOM_CONTROLS PREFERRED_DIRECTION CONTROL_NOISE TRAINING_WORLDS TRAINING TAKEOVER
+        CONTROL_LOOP CONTROLLER_NOISE RANDOM_CONTROLS PREFERRED_DIRECTION CONTROL_NOISE TRAINING_WORLDS TRAINING
+        TAKEOVER
     """
     assert {stream.name: stream.value for stream in Stream} == {name: i for i, name in enumerate(names.split())}

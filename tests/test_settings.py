@@ -133,6 +133,8 @@ def test_the_time_limit_is_the_same_in_every_spelling() -> None:
         ("d-d4orm", {"num_samples": 10**21}, "num_samples is about 1e21; it must be at most 9.2"),
         ("d-d4orm", {"num_samples": 1e21}, "num_samples must be a whole number, not 1e\\+21"),
         ("d4orm", {"num_samples": "1e21"}, "num_samples must be a whole number, not '1e21'"),
+        ("d4orm", {"num_samples": 10**7 + 1}, "num_samples is 10000001; it must be at most 1e\\+07"),
+        ("d4orm", {"num_steps": 10**6 + 1}, "num_steps is 1000001; it must be at most 1e\\+06"),
         ("ppo", {"path": [1]}, r"path must be text, not \[1\]"),
         ("d4orm-c2f", {"beta_start": "0.5"}, "beta_start 0.5 is above beta_end 0.02"),
     ],
