@@ -259,8 +259,6 @@ class D4ormC2F(Policy):
         """The guidance with what is left of it from a waypoint on made better, if that succeeds (line 4)."""
         factor = self.config.coarse_factor
         left, controls = rest_of(guidance, index, factor)
-        if not len(controls):
-            return guidance
         search = Search(self._planner, left, seed, controls, self._refiner)
         search.advance()
         done = guidance.problem.horizon - left.horizon

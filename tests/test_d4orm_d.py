@@ -233,6 +233,7 @@ def test_failures_name_robots_and_reasons() -> None:
         f"robot_{k}": "comes within the margin of " + ", ".join(f"robot_{i}" for i in range(4) if i != k)
         for k in range(4)
     }
+    assert (plan.history[0].num_not_arrived, plan.history[0].num_margin_violated) == (0, 4)
     still = make_planner("d4orm-d", engine="cpu").solve(problem, max_iterations=10)
     assert still.solved
     assert still.failures == {}

@@ -369,6 +369,14 @@ def test_the_word_to_stop_ends_judging_and_denoising() -> None:
 # The planner.
 
 
+def test_a_node_whose_time_is_over_makes_no_other_round() -> None:
+    end, engine = LocalNetwork().join(), get_engine("cpu")
+    for limit, again in ((3600.0, True), (1e-9, False)):
+        node = Node(0, 1, cheap_planner("d4orm"), PROBLEM, 0, None, engine, end, Selection("max", 1))
+        node.search.time_limit = limit
+        assert node.step(threading.Event(), patience=0.0, improve=True) is again
+
+
 def test_engines_that_share_the_cores_use_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("D4ORM_NUM_THREADS", "4")
     together = threading.Barrier(4, timeout=30)
