@@ -369,6 +369,19 @@ def test_the_word_to_stop_ends_judging_and_denoising() -> None:
 # The planner.
 
 
+def test_a_node_that_closes_lets_its_planner_finish() -> None:
+    finished = []
+
+    class Finishing(D4orm):
+        def finish(self, search: Search) -> None:
+            finished.append(search)
+
+    end, engine = LocalNetwork().join(), get_engine("cpu")
+    node = Node(0, 1, Finishing(D4ormConfig()), PROBLEM, 0, None, engine, end, Selection("max", 1))
+    node.close()
+    assert finished == [node.search]
+
+
 def test_a_node_whose_time_is_over_makes_no_other_round() -> None:
     end, engine = LocalNetwork().join(), get_engine("cpu")
     for limit, again in ((3600.0, True), (1e-9, False)):
