@@ -27,7 +27,7 @@ from d4orm_env.engine.base import (
 )
 from d4orm_env.verify import verify
 from d4orm_planners.plan import IterationRecord, Plan, failed_robots
-from d4orm_planners.settings import Count, EngineName, Settings
+from d4orm_planners.settings import CheckedSettings, Count, EngineName
 
 Callback = Callable[[IterationRecord], Any]
 
@@ -70,7 +70,7 @@ class Stopwatch:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlannerConfig(Settings):
+class PlannerConfig(CheckedSettings):
     """Settings that every planner takes.
 
     Attributes:

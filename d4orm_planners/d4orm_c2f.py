@@ -34,12 +34,12 @@ from d4orm_planners.policy import StatePolicy
 from d4orm_planners.sampling.schedule import annealed
 from d4orm_planners.sampling.weights import SoftmaxWeights
 from d4orm_planners.settings import (
+    CheckedSettings,
     Count,
     EngineName,
     NotNegative,
     Positive,
     Samples,
-    Settings,
     Steps,
     Variance,
     one_of,
@@ -63,7 +63,7 @@ NEARER = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
-class D4ormC2FConfig(Settings):
+class D4ormC2FConfig(CheckedSettings):
     """Settings of :class:`D4ormC2F`.
 
     Attributes:
@@ -171,7 +171,7 @@ class D4ormC2F(StatePolicy):
     """
 
     name = "d4orm-c2f"
-    config_class: ClassVar[type[Settings] | None] = D4ormC2FConfig
+    config_class: ClassVar[type[CheckedSettings] | None] = D4ormC2FConfig
     guidance: Guidance
 
     def __init__(self, config: D4ormC2FConfig | None = None) -> None:
@@ -259,8 +259,6 @@ class D4ormC2F(StatePolicy):
         """The guidance with what is left of it from a waypoint on made better, if that succeeds (line 4)."""
         factor = self.config.coarse_factor
         left, controls = rest_of(guidance, index, factor)
-        if not len(controls):
-            return guidance
         search = Search(self._planner, left, seed, controls, self._refiner)
         search.advance()
         done = guidance.problem.horizon - left.horizon
@@ -524,4 +522,6 @@ class _Background:
 
 def _yield_to_others() -> None:
     """Lower the priority of the calling thread; on Linux that is what a thread's number stands for here."""
-    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
+    thread = threading.get_native_id()
+    # Where all of the process yields more than that, only root could take some of it back.
+    os.setpriority(os.PRIO_PROCESS, thread, max(10, os.getpriority(os.PRIO_PROCESS, thread)))

@@ -18,7 +18,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.joint_state import JointState
 from d4orm_planners.policy import StatePolicy
-from d4orm_planners.settings import NotNegative, Positive, Settings, Whole
+from d4orm_planners.settings import CheckedSettings, NotNegative, Positive, Whole
 from d4orm_planners.steering import preferred_velocities, track_velocities
 
 CORNERS = 16
@@ -29,7 +29,7 @@ Neighbors = Annotated[Whole, Field(ge=0, le=10**6)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class OrcaConfig(Settings):
+class OrcaConfig(CheckedSettings):
     """Settings of :class:`Orca`.
 
     Attributes:
@@ -63,7 +63,7 @@ class Orca(StatePolicy):
     """
 
     name = "orca"
-    config_class: ClassVar[type[Settings] | None] = OrcaConfig
+    config_class: ClassVar[type[CheckedSettings] | None] = OrcaConfig
 
     def __init__(self, config: OrcaConfig | None = None) -> None:
         self.config = config or OrcaConfig()

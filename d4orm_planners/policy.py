@@ -17,7 +17,7 @@ from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_planners.base import Planner
 from d4orm_planners.plan import Plan
-from d4orm_planners.settings import Settings
+from d4orm_planners.settings import CheckedSettings
 from d4orm_planners.steering import drive_to_goal
 
 Actions = dict[str, FloatArray]
@@ -30,11 +30,11 @@ class Policy(ABC):
 
     Attributes:
         problem: Problem of the present episode, from the reset on.
-        config_class: :class:`~d4orm_planners.settings.Settings` of the policy, of which the constructor then takes an
-            instance. Without one, settings are keyword arguments of the constructor.
+        config_class: :class:`~d4orm_planners.settings.CheckedSettings` of the policy, of which the constructor then
+            takes an instance. Without one, settings are keyword arguments of the constructor.
     """
 
-    config_class: ClassVar[type[Settings] | None] = None
+    config_class: ClassVar[type[CheckedSettings] | None] = None
     problem: Problem
 
     def reset(self, env: Any, seed: int = 0) -> None:
@@ -67,7 +67,7 @@ class Policy(ABC):
         By default the settings in ``config``, if it has any, else its attributes that are numbers or text.
         """
         config = getattr(self, "config", None)
-        return asdict(config) if isinstance(config, Settings) else plain_attributes(self)
+        return asdict(config) if isinstance(config, CheckedSettings) else plain_attributes(self)
 
 
 def plain_attributes(thing: Any) -> dict[str, Any]:

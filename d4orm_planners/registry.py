@@ -251,7 +251,7 @@ def _check_keywords(kind: Any, config: Mapping[str, Any], owner: str) -> None:
 
 def _refuse_settings(config: Mapping[str, Any], owner: str) -> None:
     if config:
-        raise UnknownKeywordError(f"{owner} takes no settings, but was given {', '.join(config)}")
+        raise UnknownKeywordError(f"{owner} takes no settings, but was given {', '.join(map(shown, config))}")
 
 
 def _time_limit(config: dict[str, Any]) -> float | None:

@@ -84,7 +84,7 @@ EngineName = Annotated[str, one_of(ENGINES)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings:
+class CheckedSettings:
     """What settings have in common; a subclass is a frozen dataclass with fields of the types above.
 
     Raises:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import sys
+import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,11 +17,15 @@ from d4orm_env.core.dynamics import ACCELERATION
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
+from d4orm_env.engine.base import get_engine
 from d4orm_env.engine.cpu import CpuEngine
+from d4orm_env.joint_state import JointState
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Episode, make_policy, run_episode
-from d4orm_planners.d4orm_c2f import D4ormC2F
+from d4orm_planners.d4orm_c2f import D4ormC2F, _Background
+from d4orm_planners.guidance import coarse_problem
+from d4orm_planners.steering import straight_drives
 
 CASES = [
     pytest.param({"scenario": "circle", "num_robots": 16}, id="circle-16"),
@@ -246,6 +254,115 @@ def test_the_guidance_is_planned_anew_for_robots_pushed_away() -> None:
             actions = {agent: -action for agent, action in actions.items()}
         observations = env.step(actions)[0]
     assert any(loop.replanned for loop in policy.loops[10:])
+
+
+def test_refined_guidance_is_one_plan_from_beginning_to_end() -> None:
+    problem = circle(4)
+    policy = controller(refine="sync", refine_every=2)
+    episode(policy, problem)
+    assert any(loop.refined for loop in policy.loops)
+    guidance = policy.guidance
+    plan = get_engine("cpu").rollout(guidance.problem, guidance.controls)
+    # Who has docked by the waypoint from which the rest is refined may drive on a little.
+    places = guidance.states[..., : problem.dimension]
+    np.testing.assert_allclose(places, plan.positions, atol=problem.goal_radius)
+    np.testing.assert_array_equal(guidance.path[:: policy.config.coarse_factor], places)
+
+
+def test_a_job_in_the_background_is_one_at_a_time_and_gives_its_result_once() -> None:
+    background, go = _Background(), threading.Event()
+    assert background.result() == (True, None)
+    background.start(lambda: go.wait(60))
+    assert background.result() == (False, None)
+    go.set()
+    background._job.result()  # type: ignore[union-attr]
+    assert background.result() == (True, True)
+    assert background.result() == (True, None)
+
+
+def test_the_control_loop_is_compiled_before_the_first_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    prepared = []
+    monkeypatch.setattr(
+        CpuEngine, "prepare", lambda self, task, rules, scale, samples: prepared.append((task.problem.horizon, samples))
+    )
+    env = navigation_v0.parallel_env(problem=circle(2))
+    env.reset(seed=0)
+    controller(predict_horizon=13, num_samples=72).reset(env, seed=0)
+    assert (13, 72) in prepared
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads have priorities of their own on Linux only")
+@pytest.mark.parametrize(("own", "refining"), [(0, 10), (15, 15)])
+def test_refinement_yields_to_the_control_loop_and_takes_no_priority(
+    monkeypatch: pytest.MonkeyPatch, own: int, refining: int
+) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(os, "getpriority", lambda which, who: own)
+    monkeypatch.setattr(os, "setpriority", lambda which, who, priority: asked.append(priority))
+    for background in (_Background(), _Background(yielding=True)):
+        background.start(lambda: None)
+        background.forget()
+    assert asked == [refining]
+
+
+def replanned(
+    monkeypatch: pytest.MonkeyPatch, policy: D4ormC2F, step: Callable[[dict[str, Any]], dict[str, Any]], **env: Any
+) -> list[tuple[JointState, Any, int, Any, int]]:
+    """Where it was replanned, from which controls and with how many iterations, and the guidance until then."""
+    calls = []
+    plan = D4ormC2F._coarse_plan
+
+    def coarse_plan(self: D4ormC2F, joint: JointState, initial: Any, iterations: int) -> Any:
+        if initial is not None:
+            calls.append((joint, initial.copy(), iterations, self.guidance, self._index))
+        return plan(self, joint, initial, iterations)
+
+    monkeypatch.setattr(D4ormC2F, "_coarse_plan", coarse_plan)
+    world = navigation_v0.parallel_env(**env)
+    observations, _ = world.reset(seed=0)
+    policy.reset(world, seed=0)
+    while world.agents:
+        actions = policy.act({agent: observations[agent] for agent in world.agents}, world.state())
+        observations = world.step(step(actions))[0]
+    return calls
+
+
+def straight(problem: Problem, joint: JointState, factor: int) -> Any:
+    return straight_drives(coarse_problem(problem.moment(joint.states, joint.goals), factor)).controls[:, :, 0]
+
+
+def test_who_lost_the_guidance_begins_anew_straight_to_the_goals(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = circle(4)
+    policy = controller(replan_distance=0.2, patience=1000, coarse_iterations=3, replan_iterations=2)
+    steps = iter(range(10**6))
+
+    def pushed(actions: dict[str, Any]) -> dict[str, Any]:
+        return {agent: -action for agent, action in actions.items()} if 10 <= next(steps) < 25 else actions
+
+    calls = replanned(monkeypatch, policy, pushed, problem=problem)
+    assert calls[0][0].steps < 30
+    for joint, initial, iterations, *_ in calls:
+        assert iterations == 3
+        np.testing.assert_array_equal(initial, straight(problem, joint, policy.config.coarse_factor))
+
+
+def test_with_new_goals_for_some_the_others_keep_what_is_left_of_the_guidance(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = make_problem("random", num_robots=3, seed=1)
+    policy = controller(replan_distance=50.0, patience=1000, coarse_iterations=3, replan_iterations=2)
+    factor = policy.config.coarse_factor
+    calls = replanned(monkeypatch, policy, lambda actions: actions, problem=problem, lifelong=True, max_cycles=80)
+    goals, some = problem.goal, 0
+    for joint, initial, iterations, guidance, index in calls:
+        changed = (joint.goals != goals).any(axis=1)
+        goals = joint.goals
+        if iterations == 3:  # at the end of the guidance
+            continue
+        assert iterations == 2
+        some += changed.any() and not changed.all()
+        rest = guidance.controls[index // factor :]
+        np.testing.assert_array_equal(initial[: len(rest), ~changed], rest[: len(initial), ~changed])
+        np.testing.assert_array_equal(initial[:, changed], straight(problem, joint, factor)[:, changed])
+    assert some
 
 
 @pytest.mark.slow

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from planner_support import walled_in_problem
+from planner_support import hop_problem, walled_in_problem
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.engine.base import SamplingResult
+from d4orm_env.engine.base import SamplingResult, SamplingTask
 from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
@@ -145,6 +145,56 @@ def test_a_repair_that_makes_things_worse_is_not_taken_over() -> None:
     np.testing.assert_array_equal(search.current.trajectory.states, before.trajectory.states)
 
 
+class Recorded(Astray):
+    """Keeps how it was asked to sample."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tasks: list[SamplingTask] = []
+        self.scales: list[float] = []
+
+    def prepare(self, *arguments: Any) -> None:
+        """Nothing has to be compiled for what it does."""
+
+    def denoise(self, task: Any, rules: Any, mean: Any, noise_scale: Any, *more: Any, **options: Any) -> Any:
+        self.tasks.append(task)
+        self.scales.append(float(np.max(noise_scale)))
+        return super().denoise(task, rules, mean, noise_scale, *more, **options)
+
+
+def test_robots_that_were_repaired_in_vain_are_repaired_jointly_and_every_other_noise_is_wider() -> None:
+    """Two robots meet in a lane where neither can pass the other, whatever they are told."""
+    start = [[0, 0, 0, 0], [2, 0, 0, 0]]
+    lane = World(lower=[-1, -0.25], upper=[3, 0.25])
+    problem = Problem(Team(("holonomic2d",) * 2), start, [[2, 0], [0, 0]], lane, horizon=60)
+    engine = Recorded()
+    towards = np.zeros((60, 2, 2), np.float32)
+    towards[:, :, 0] = [0.2, -0.2]
+    search = Search(make_planner("d4orm-d", engine="cpu"), problem, 0, towards, engine)
+    for _ in range(7):
+        search.advance()
+        assert search.current.failed.all()
+    # Six repairs, one robot at a time: before the fourth, one of them had been repaired in vain only once.
+    assert [task.credit for task in engine.tasks] == ["robot"] * 6 + ["team"]
+    assert [task.problem.num_robots for task in engine.tasks] == [1] * 6 + [2]
+    assert search.memory["vain"].min() >= 3
+    np.testing.assert_allclose(np.divide(engine.scales, engine.scales[0]), [1, 2, 1, 2, 1, 2, 1], rtol=1e-6)
+
+
+def test_who_arrives_without_conflict_was_not_repaired_in_vain() -> None:
+    """Few samples end somewhere; from there everybody turns straight home."""
+    search = search_of(hop_problem(2), 1, start="team", **FEW)
+    assert not search.current.failed.any()
+    assert search.memory["vain"].tolist() == [0, 0]
+
+
+def test_teams_of_more_than_32_are_sampled_half_as_often() -> None:
+    for robots, samples in ((32, 256), (33, 128)):
+        search = search_of(make_problem("random", num_robots=robots, size=12.0), num_samples=256)
+        assert isinstance(search.planner, D4ormD)
+        assert search.planner.num_samples(search) == samples
+
+
 @pytest.mark.parametrize(("scenario", "straight"), [("circle", False), ("random", True)])
 def test_sparse_teams_start_straight(scenario: str, straight: bool) -> None:
     search = search_of(make_problem(scenario, num_robots=16, seed=0), iterations=1)
@@ -183,6 +233,7 @@ def test_failures_name_robots_and_reasons() -> None:
         f"robot_{k}": "comes within the margin of " + ", ".join(f"robot_{i}" for i in range(4) if i != k)
         for k in range(4)
     }
+    assert (plan.history[0].num_not_arrived, plan.history[0].num_margin_violated) == (0, 4)
     still = make_planner("d4orm-d", engine="cpu").solve(problem, max_iterations=10)
     assert still.solved
     assert still.failures == {}

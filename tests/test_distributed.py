@@ -294,6 +294,24 @@ def test_a_candidate_counts_for_what_it_is_not_for_what_is_claimed() -> None:
     assert box.false_claims == 1
 
 
+@pytest.mark.parametrize(
+    ("share", "feasible", "false"), [(1, True, False), (1, False, True), (0.5, True, True), (2, True, True)]
+)
+def test_a_claim_is_false_where_either_of_its_parts_is(share: float, feasible: bool, false: bool) -> None:
+    near = Problem(PROBLEM.team, PROBLEM.start, PROBLEM.start[:, :2] + [0.05, 0], horizon=4)
+    controls = np.zeros(SHAPE, np.float32)
+    found = evaluate_controls(get_engine("cpu"), near, controls)
+    assert found.solved
+    network = LocalNetwork()
+    own, other = network.join(), network.join()
+    box = Inbox(near, get_engine("cpu"), own, 2, own=0)
+    reward = float(found.trajectory.rewards.mean())
+    other.publish(encode(message(controls=controls, reward=share * reward, feasible=feasible), near))
+    (report,) = box.receive()
+    assert report.candidate.solved
+    assert box.false_claims == false
+
+
 def test_what_arrives_is_gone_on_from_as_planned_and_counts_as_executed() -> None:
     box, other = inbox()
     planned = 5 * np.sign(message().controls)
@@ -349,6 +367,27 @@ def test_the_word_to_stop_ends_judging_and_denoising() -> None:
 
 
 # The planner.
+
+
+def test_a_node_that_closes_lets_its_planner_finish() -> None:
+    finished = []
+
+    class Finishing(D4orm):
+        def finish(self, search: Search) -> None:
+            finished.append(search)
+
+    end, engine = LocalNetwork().join(), get_engine("cpu")
+    node = Node(0, 1, Finishing(D4ormConfig()), PROBLEM, 0, None, engine, end, Selection("max", 1))
+    node.close()
+    assert finished == [node.search]
+
+
+def test_a_node_whose_time_is_over_makes_no_other_round() -> None:
+    end, engine = LocalNetwork().join(), get_engine("cpu")
+    for limit, again in ((3600.0, True), (1e-9, False)):
+        node = Node(0, 1, cheap_planner("d4orm"), PROBLEM, 0, None, engine, end, Selection("max", 1))
+        node.search.time_limit = limit
+        assert node.step(threading.Event(), patience=0.0, improve=True) is again
 
 
 def test_engines_that_share_the_cores_use_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None:

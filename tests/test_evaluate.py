@@ -86,6 +86,12 @@ def test_a_planners_trial_says_everything(tmp_path: Path) -> None:
     assert row.compute == pytest.approx(stored.wall_time / (stored.steps * 0.1))  # type: ignore[operator]
 
 
+def test_the_time_of_a_controller_is_that_of_its_preparation_and_of_its_steps(tmp_path: Path) -> None:
+    evaluate({"goal": {}}, out=tmp_path, num_robots=2, seeds=[4], workers=1)
+    (stored,) = TrialStore(tmp_path / STORE).trials()
+    assert 0 < stored.preparation < stored.wall_time < stored.elapsed  # type: ignore[operator]
+
+
 def test_the_judge_sees_what_was_executed(tmp_path: Path) -> None:
     evaluate(["goal", "orca"], out=tmp_path, control_noise_std=[0.0, 0.2], **TINY)
     stored = TrialStore(tmp_path / STORE).trials()

@@ -37,7 +37,7 @@ from d4orm_planners.evaluation.robustness import robustness
 from d4orm_planners.evaluation.store import STORE, TrialStore
 from d4orm_planners.names import PLANNERS, POLICIES
 from d4orm_planners.registry import describe_policy
-from d4orm_planners.settings import Positive, Settings
+from d4orm_planners.settings import CheckedSettings, Positive
 
 ROOT = Path(__file__).resolve().parents[1]
 PROBLEM = line_problem([9.0, 9.0, 9.0], horizon=20)
@@ -54,7 +54,7 @@ class Push(Policy):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PullConfig(Settings):
+class PullConfig(CheckedSettings):
     strength: Positive = 1.0
 
 

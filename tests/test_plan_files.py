@@ -9,7 +9,7 @@ import pickle
 import stat
 import zipfile
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import FrozenInstanceError, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +67,13 @@ def test_a_plan_comes_back_to_the_bit(case: dict[str, Any], tmp_path: Path) -> N
     loaded = Plan.load(str(tmp_path / "plan.npz"))
     assert_equal(plan, loaded)
     assert loaded.problem.name == plan.problem.name
+
+
+def test_plans_and_trajectories_stay_what_they_are_and_equal_only_themselves(plan: Plan) -> None:
+    for thing in (plan, plan.trajectory):
+        assert len({thing, thing, replace(thing)}) == 2  # type: ignore[type-var]
+        with pytest.raises(FrozenInstanceError):
+            setattr(thing, fields(thing)[0].name, None)
 
 
 @pytest.mark.parametrize("planner", ["mppi", "cem", "i-mbd"])

@@ -158,7 +158,7 @@ def test_every_planner_is_a_policy() -> None:
     ("name", "config", "message"),
     [
         ("gaol", {}, "policy 'gaol' is unknown; choose one of .*goal"),
-        ("goal", {"speed": 1}, "policy 'goal' takes no settings, but was given speed"),
+        ("goal", {"speed": 1}, "policy 'goal' takes no settings, but was given 'speed'"),
         ("random", {"seed": 1}, "policy 'random' takes no settings"),
         ("orca", {"speed": 1}, "'speed' is no setting of policy 'orca'; it takes time_horizon"),
         ("orca", {"time_horizon": 0}, "time_horizon is 0"),

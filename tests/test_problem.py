@@ -409,3 +409,10 @@ def test_the_callers_arrays_are_not_frozen_or_shared() -> None:
     problem = two_robots(goal=goal)
     goal[0, 0] = 2
     assert problem.goal[0, 0] == 1
+
+
+def test_models_are_kept_as_they_were_given() -> None:
+    models = ["holonomic2d", "velocity2d"]
+    team = Team(models)
+    models.reverse()
+    assert team.models == ("holonomic2d", "velocity2d")

@@ -46,6 +46,25 @@ def test_literal_features_of_a_robot_and_one_neighbor() -> None:
     np.testing.assert_allclose(features[0, -9:], expected[-9:], atol=1e-6)
 
 
+def test_literal_features_of_a_robot_on_its_way_past_a_neighbor_and_an_obstacle() -> None:
+    # Faces up the y axis and drives there at half its speed limit of 2 m/s, the goal 3 m ahead. What stands at 9 is
+    # not looked at.
+    own = [0, 1, 0, 1, 9, 0, 3, 0.25, 9, 0.15, 2, 3]
+    # 1 m to its right, nearest in one second, and by its left an obstacle 0.4 m off.
+    neighbor, obstacle = [1, 1, 0, -0.5, 0.5, 0.2], [1, -4, 3, 0.4]
+    observation = np.array([own + neighbor + obstacle], np.float32)
+    features, frames = Features(2, 1, 1, turned=True).encode(observation)
+    gap, miss = 0.65, np.sqrt(0.5) - 0.35
+    expected = [0.5, 0, 1, 0, 1, 0, 1 / 4, np.exp(-12), 0.25, 0.15, 1.5]
+    expected += [1, 0, -1, 1 / (1 + gap), np.exp(-4 * gap), 0.125, 0.125, 1 / 5, np.exp(-4 * miss)]
+    expected += [1, 0.6, 0.8, 1 / 1.4, np.exp(-1.6)]
+    np.testing.assert_allclose(frames, [[0, 1]], atol=1e-6)
+    np.testing.assert_allclose(features[0], expected, atol=1e-6)
+    # What is not there is all zeros, whatever stands in its place.
+    observation[0, [12, 18]] = 0
+    np.testing.assert_allclose(Features(2, 1, 1, turned=True).encode(observation)[0][0, 11:], 0, atol=1e-6)
+
+
 @given(angle=st.floats(-3.1, 3.1), seed=st.integers(0, 50))
 def test_a_turned_world_looks_the_same_and_is_answered_by_turned_controls(angle: float, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -16,12 +16,14 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from d4orm_planners import cli, make_policy
 from d4orm_planners.evaluation import robustness as robustness_module
+from d4orm_planners.evaluation import store as store_module
 from d4orm_planners.evaluation import trials as trials_module
 from d4orm_planners.evaluation import workers as workers_module
 from d4orm_planners.evaluation.robustness import robustness
@@ -154,6 +156,35 @@ def test_a_damaged_file_is_called_damaged(tmp_path: Path) -> None:
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"trial store .* is damaged \(database disk image is malformed\); put a copy"):
         TrialStore.existing(path).trials()
+
+
+def test_columns_and_texts_that_are_damaged_are_called_so(tmp_path: Path) -> None:
+    path = tmp_path / "trials.sqlite"
+    TrialStore(path).add(trial())
+    content = path.read_bytes()
+    for good, bad in ((b"collided INTEGER", b"collidex INTEGER"), (b"goal", b"g\xffal")):
+        path.write_bytes(content.replace(good, bad))
+        with pytest.raises(ValueError, match=r"trial store .* is damaged \(.*\); put a copy in its place"):
+            TrialStore.existing(path).trials()
+
+
+def test_who_never_has_the_store_alone_gives_up_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 1000.0
+
+    class Busy:
+        def execute(self, statement: str) -> None:
+            error = sqlite3.OperationalError("database is locked")
+            error.sqlite_errorcode = sqlite3.SQLITE_BUSY
+            raise error
+
+    def sleep(seconds: float) -> None:
+        nonlocal now
+        now += 1
+
+    monkeypatch.setattr(store_module, "time", SimpleNamespace(monotonic=lambda: now, sleep=sleep))
+    with pytest.raises(sqlite3.OperationalError, match="locked"):
+        store_module._use_wal(Busy())  # type: ignore[arg-type]
+    assert store_module.PATIENCE < now - 1000 <= store_module.PATIENCE + 1
 
 
 READ = """

@@ -79,3 +79,12 @@ def test_repairs_of_one_iteration_start_apart() -> None:
     base = np.zeros((30, 2, 2), np.float32)
     starts = [search.planner.start(search, base, number) for number in range(3)]
     assert not any(np.allclose(a, b) for a, b in ((starts[0], starts[1]), (starts[1], starts[2])))
+
+
+def test_streams_keep_their_numbers() -> None:
+    names = """
+        SAMPLES DEFORMATION_START REPAIR REPAIR_ORDER DETOURS CHOICE NODE PERTURBATION COARSE_PLAN REFINEMENT
+        CONTROL_LOOP CONTROLLER_NOISE RANDOM_CONTROLS PREFERRED_DIRECTION CONTROL_NOISE TRAINING_WORLDS TRAINING
+        TAKEOVER
+    """
+    assert {stream.name: stream.value for stream in Stream} == {name: i for i, name in enumerate(names.split())}

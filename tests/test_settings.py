@@ -15,9 +15,9 @@ import pytest
 from d4orm_env.core.arrays import positive_number, whole_number
 from d4orm_planners import list_policies, make_planner, make_policy
 from d4orm_planners.registry import PLANNERS, POLICIES, policy_settings
-from d4orm_planners.settings import Settings, UnknownKeywordError
+from d4orm_planners.settings import CheckedSettings, UnknownKeywordError
 
-KINDS: dict[str, type[Settings]] = {
+KINDS: dict[str, type[CheckedSettings]] = {
     name: kind.config_class for name, kind in {**PLANNERS, **POLICIES}.items() if kind.config_class is not None
 }
 
@@ -42,7 +42,7 @@ def numbers() -> Iterator[Any]:
 NUMBERS = pytest.mark.parametrize(("kind", "setting", "number"), tuple(numbers()))
 
 
-def made(kind: type[Settings], setting: str, value: Any) -> Settings:
+def made(kind: type[CheckedSettings], setting: str, value: Any) -> CheckedSettings:
     return kind(**({"node": 0} | NETWORK if setting == "node" else {}) | {setting: value})
 
 
@@ -53,7 +53,9 @@ def test_the_numbers_of_all_kinds_are_looked_at() -> None:
 
 
 @NUMBERS
-def test_every_spelling_of_a_number_is_the_same_setting(kind: type[Settings], setting: str, number: type) -> None:
+def test_every_spelling_of_a_number_is_the_same_setting(
+    kind: type[CheckedSettings], setting: str, number: type
+) -> None:
     default = getattr(kind(), setting)
     value = number(0 if setting == "node" else 0.01 if default is None else default)
     expected = made(kind, setting, value)
@@ -75,7 +77,7 @@ NO_NUMBERS = (
 
 
 @NUMBERS
-def test_what_is_no_such_number_is_refused_by_name(kind: type[Settings], setting: str, number: type) -> None:
+def test_what_is_no_such_number_is_refused_by_name(kind: type[CheckedSettings], setting: str, number: type) -> None:
     for value in NO_NUMBERS:
         with pytest.raises(ValueError, match=rf"^{setting} (is|must be) ") as caught:
             made(kind, setting, value)
@@ -84,7 +86,7 @@ def test_what_is_no_such_number_is_refused_by_name(kind: type[Settings], setting
 
 
 @NUMBERS
-def test_none_is_no_number_unless_it_means_something(kind: type[Settings], setting: str, number: type) -> None:
+def test_none_is_no_number_unless_it_means_something(kind: type[CheckedSettings], setting: str, number: type) -> None:
     if type(None) in get_args(get_type_hints(kind)[setting]):
         assert getattr(kind(**{setting: None}), setting) is None
     else:
@@ -93,7 +95,7 @@ def test_none_is_no_number_unless_it_means_something(kind: type[Settings], setti
 
 
 @pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
-def test_what_is_no_text_or_truth_is_refused_by_name(kind: type[Settings]) -> None:
+def test_what_is_no_text_or_truth_is_refused_by_name(kind: type[CheckedSettings]) -> None:
     for setting, hint in get_type_hints(kind).items():
         wrong = {str: (3, ["auto"], "no such"), bool: (1, 0.0, "yes", None, np.True_)}.get(hint, ())
         for value in wrong:
@@ -133,6 +135,8 @@ def test_the_time_limit_is_the_same_in_every_spelling() -> None:
         ("d-d4orm", {"num_samples": 10**21}, "num_samples is about 1e21; it must be at most 9.2"),
         ("d-d4orm", {"num_samples": 1e21}, "num_samples must be a whole number, not 1e\\+21"),
         ("d4orm", {"num_samples": "1e21"}, "num_samples must be a whole number, not '1e21'"),
+        ("d4orm", {"num_samples": 10**7 + 1}, "num_samples is 10000001; it must be at most 1e\\+07"),
+        ("d4orm", {"num_steps": 10**6 + 1}, "num_steps is 1000001; it must be at most 1e\\+06"),
         ("ppo", {"path": [1]}, r"path must be text, not \[1\]"),
         ("d4orm-c2f", {"beta_start": "0.5"}, "beta_start 0.5 is above beta_end 0.02"),
     ],

@@ -126,3 +126,20 @@ def test_an_engine_stops_between_steps(engine: str) -> None:
     nothing = run(9, lambda: True)
     np.testing.assert_array_equal(nothing.mean, mean)
     assert len(nothing.rewards) == 0
+
+
+def test_a_stopwatch_leaves_pauses_out_also_while_they_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 100.0
+    monkeypatch.setattr("time.perf_counter", lambda: now)
+    watch = Stopwatch()
+    now = 103.0
+    with watch.paused():
+        now = 105.0
+        assert watch.paused_seconds == 2
+    now = 110.0
+    watch.leave_out(1.5)
+    assert (watch.elapsed, watch.paused_seconds) == (6.5, 3.5)
+    with watch.paused():
+        now = 111.0
+        assert watch.paused_seconds == 4.5
+    assert (watch.elapsed, watch.paused_seconds) == (6.5, 4.5)

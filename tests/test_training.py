@@ -174,6 +174,11 @@ def test_a_trained_policy_acts_as_its_model_does(trained: tuple[TrainingSettings
     np.testing.assert_allclose(mine(features), model.predict(normalized, deterministic=True)[0], atol=1e-5)
 
 
+def test_the_last_two_checkpoints_are_kept(trained: tuple[TrainingSettings, Path]) -> None:
+    _, out = trained
+    assert sorted(path.name for path in (out / "checkpoints").iterdir()) == ["000003", "000004"]
+
+
 def test_a_trained_policy_runs_in_the_environment(trained: tuple[TrainingSettings, Path]) -> None:
     settings, out = trained
     policy = make_policy(settings.algorithm, path=str(out / "policy.safetensors"))

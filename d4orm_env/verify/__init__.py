@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from d4orm_env.verify.contact import MAX_NUMBERS, Pairs, Stretch, Watch, surroundings
 from d4orm_env.verify.docking import Docking, find_docking
 from d4orm_env.verify.geometry import Floats, norm
-from d4orm_env.verify.motion import Motion
+from d4orm_env.verify.motion import TeamMotion
 from d4orm_env.verify.report import VerificationReport, Violation
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def verify(problem: Problem, controls: Any) -> VerificationReport:
     array = _checked_controls(problem, controls)
     if not np.isfinite(array).all():
         return _unjudged(problem, _non_finite(array, problem.dt))
-    motion = Motion(problem, array)
+    motion = TeamMotion(problem, array)
     sub_steps = np.ceil(problem.dt * np.sqrt(motion.bend / (8 * CHORD_ERROR)))
     if sub_steps.max() > MAX_SUB_STEPS:
         return _unjudged(problem, list(_too_violent(sub_steps, motion, problem.dt)))
@@ -93,7 +93,7 @@ def verify(problem: Problem, controls: Any) -> VerificationReport:
 class _Course:
     """Where all robots are over the whole horizon, some steps at a time."""
 
-    def __init__(self, motion: Motion, sub_steps: int, start: Floats) -> None:
+    def __init__(self, motion: TeamMotion, sub_steps: int, start: Floats) -> None:
         self._motion, self._sub_steps = motion, sub_steps
         horizon, num_robots = motion.pace.shape
         self._numbers = (2 * sub_steps + 1) * num_robots * motion.size  # of one step
@@ -149,7 +149,7 @@ def _non_finite(controls: Floats, dt: float) -> list[Violation]:
     return sorted(violations, key=lambda violation: violation.time)
 
 
-def _too_violent(sub_steps: Floats, motion: Motion, dt: float) -> Iterator[Violation]:
+def _too_violent(sub_steps: Floats, motion: TeamMotion, dt: float) -> Iterator[Violation]:
     for robot in np.flatnonzero((sub_steps > MAX_SUB_STEPS).any(axis=0)):
         step = int(np.argmax(sub_steps[:, robot] > MAX_SUB_STEPS))
         detail = (
@@ -159,7 +159,7 @@ def _too_violent(sub_steps: Floats, motion: Motion, dt: float) -> Iterator[Viola
         yield Violation("not judged", (int(robot),), step * dt, detail)
 
 
-def _control_limits(motion: Motion, docked_after: NDArray[np.intp]) -> Iterator[Violation]:
+def _control_limits(motion: TeamMotion, docked_after: NDArray[np.intp]) -> Iterator[Violation]:
     """Controls above a limit before docking, one entry for each robot and limit."""
     sizes, limits = motion.sizes, motion.limits
     before_docking = np.arange(len(sizes))[:, None] < docked_after

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.verify.geometry import Floats, norm
-from d4orm_env.verify.motion import Motion
+from d4orm_env.verify.motion import TeamMotion
 from d4orm_env.verify.report import Violation
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class Docking:
         return f"; rounding decides whether robot_{robot} docks at {steps[0] * dt:.3f} s, and both are judged"
 
 
-def find_docking(problem: Problem, motion: Motion, ends: Floats) -> Docking:
+def find_docking(problem: Problem, motion: TeamMotion, ends: Floats) -> Docking:
     """The readings of every robot's docking; ``ends`` are its ``(H+1, K, d)`` positions if it drives on [m]."""
     distance = norm(ends[1:] - np.asarray(problem.goal, np.float64))
     possible, certain = _docks(problem, motion, ends, distance)
@@ -78,7 +78,7 @@ def find_docking(problem: Problem, motion: Motion, ends: Floats) -> Docking:
     return Docking(np.array(robots), np.array(steps), np.array(times), np.array(last), violations)
 
 
-def _docks(problem: Problem, motion: Motion, ends: Floats, distance: Floats) -> tuple[NDArray[np.bool_], ...]:
+def _docks(problem: Problem, motion: TeamMotion, ends: Floats, distance: Floats) -> tuple[NDArray[np.bool_], ...]:
     """``(H, K)`` where a robot may dock, as rounding has it, and where it does beyond doubt."""
     extent = np.maximum.accumulate(np.abs(ends).max(axis=2), axis=0)[1:]
     doubt = np.maximum(DOCKING_TOLERANCE, ROUNDING * extent) + motion.integration_error

@@ -23,7 +23,7 @@ MODELS = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive")
 """The models that have equations here; the others are integrated."""
 
 
-class Motion:
+class TeamMotion:
     """All robots under a plan's controls, over the whole horizon.
 
     Attributes:

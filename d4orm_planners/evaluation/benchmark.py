@@ -17,7 +17,7 @@ from d4orm_env.scenarios import make_problem
 from d4orm_planners.evaluation.probes import measure_memory, measure_startup
 from d4orm_planners.evaluation.timing import Spread, measure
 from d4orm_planners.registry import make_planner
-from d4orm_planners.settings import Count, Positive, Samples, Settings, Steps, Whole
+from d4orm_planners.settings import CheckedSettings, Count, Positive, Samples, Steps, Whole
 
 ENGINES = ("cpu", "jax", "plain")
 MODELS = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive")
@@ -28,7 +28,7 @@ Robots = Annotated[Count, Field(le=10_000)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchmarkSettings(Settings):
+class BenchmarkSettings(CheckedSettings):
     """What to measure, and how long.
 
     Attributes:

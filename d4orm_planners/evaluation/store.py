@@ -242,6 +242,9 @@ class TrialStore:
             with closing(self._opened()) as connection:
                 yield connection
         except sqlite3.OperationalError as error:
+            # A statement does not fit the tables, or without a code of SQLite's, a text is no UTF-8.
+            if getattr(error, "sqlite_errorcode", sqlite3.SQLITE_ERROR) & 0xFF == sqlite3.SQLITE_ERROR:
+                raise self._damaged(str(error)) from error
             action, remedy = (
                 ("read", "copy it with all files beside it to a folder that can be written to")
                 if self._read_only

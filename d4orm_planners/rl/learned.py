@@ -11,13 +11,13 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray
 from d4orm_planners.policy import Actions, Policy, require_reset, robot_indices
 from d4orm_planners.rl.network import SUFFIX, Network, load_network
-from d4orm_planners.settings import PathText, Settings
+from d4orm_planners.settings import CheckedSettings, PathText
 
 SHIPPED = Path(__file__).parent / "policies"
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearnedConfig(Settings):
+class LearnedConfig(CheckedSettings):
     """Settings of a learned policy.
 
     Attributes:
@@ -48,7 +48,7 @@ class LearnedPolicy(Policy):
     """
 
     name: ClassVar[str]
-    config_class: ClassVar[type[Settings] | None] = LearnedConfig
+    config_class: ClassVar[type[CheckedSettings] | None] = LearnedConfig
 
     def __init__(self, config: LearnedConfig | None = None) -> None:
         self.config = config or LearnedConfig()

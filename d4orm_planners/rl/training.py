@@ -29,7 +29,7 @@ from d4orm_planners.rl.curriculum import Lesson, common_batch, make_lessons, tea
 from d4orm_planners.rl.curve import Evaluation, evaluate_network, write_curve
 from d4orm_planners.rl.network import CLIP, EPSILON, Network, network_of
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
-from d4orm_planners.settings import Count, Settings, Whole, one_of
+from d4orm_planners.settings import CheckedSettings, Count, Whole, one_of
 
 Progress = Callable[[str, int, int], Any]
 _VALIDATION_SEED = 0
@@ -43,7 +43,7 @@ Seed = Annotated[Whole, Field(ge=0)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainingSettings(Settings):
+class TrainingSettings(CheckedSettings):
     """What to train on, and how long.
 
     Attributes:

@@ -24,8 +24,7 @@ TEXT = st.one_of(NUMBER_LIKE, WORD, SCALAR.map(str)).filter(lambda text: "\0" no
 FILE = st.sampled_from(["small.yaml", "taken", "taken/x.npz", "absent.yaml", "absent/x.npz", ".", "", "/proc/x.npz"])
 TARGET = st.sampled_from(["taken", "absent/x.npz", "x.txt", ".", "", "new.npz", "new.png"])
 NAME = st.one_of(st.sampled_from(["small.yaml", "nope", "", "circle,small.yaml"]), TEXT)
-SETTING_NAMES = sorted({field.name for kind in PLANNERS.values() for field in fields(kind.config_class)} - {"nodes"})
-# Not the number of nodes: a crew of 10^30 of them is made node by node.
+SETTING_NAMES = sorted({field.name for kind in PLANNERS.values() for field in fields(kind.config_class)})
 SETTING = st.one_of(st.builds("{}={}".format, st.sampled_from(SETTING_NAMES), st.one_of(NUMBER_LIKE, TEXT)), TEXT)
 ACTOR = st.sampled_from([name for name in list_policies() if name not in ("ppo", "sac", "ipopt")])
 TOLD = st.builds("{}:{}={}".format, ACTOR, st.sampled_from(["extra_margin", "deadline", "temperature", "x"]), TEXT)
@@ -124,7 +123,7 @@ def test_every_call_works_or_says_in_one_line_what_is_wrong(folder: Path, argume
 @few(60)
 @given(planner=st.sampled_from(list_planners()), data=st.data())
 def test_every_setting_of_every_planner_works_or_is_refused(folder: Path, planner: str, data: st.DataObject) -> None:
-    known = [field.name for field in fields(PLANNERS[planner].config_class) if field.name != "nodes"]
+    known = [field.name for field in fields(PLANNERS[planner].config_class)]
     small = [f"--set={name}={value}" for name, value in CHEAP.items() if name in known]
     setting = f"--set={data.draw(st.sampled_from(known))}={data.draw(NUMBER_LIKE)}"
     call_and_check(folder, ["plan", "--quiet", "--scenario=small.yaml", f"--planner={planner}", *small, setting])
