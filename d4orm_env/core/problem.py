@@ -148,6 +148,7 @@ class Problem:
         self._check_places("goal", self.goal)
 
     def _check_start_states(self) -> None:
+        limits = self.team.limits
         for robot, model in enumerate(self.team.robot_models):
             state = self.start[robot]
             if state[model.state_size :].any():
@@ -160,7 +161,7 @@ class Problem:
             if speed > limit * (1 + 1e-5):
                 raise ValueError(f"start speed of robot_{robot} is {speed:g} m/s, above its limit of {limit:g} m/s")
             for index, column in model.state_limits:
-                value, limit = float(state[index]), float(self.team.limits[robot, column])
+                value, limit = float(state[index]), float(limits[robot, column])
                 if abs(value) > limit * (1 + 1e-5):
                     raise ValueError(
                         f"start {model.state_names[index]} of robot_{robot} is {value:g}, "
