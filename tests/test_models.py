@@ -14,12 +14,22 @@ import numpy as np
 import pytest
 from engine_support import ENGINE_NAMES, PYTHON_OPS, random_controls
 
-from d4orm_env import Problem, Team, load_problem, make_problem, register_model, rollout, save_problem, verify
+from d4orm_env import (
+    Problem,
+    Team,
+    functional,
+    load_problem,
+    make_problem,
+    register_model,
+    rollout,
+    save_problem,
+    verify,
+)
 from d4orm_env.core.dynamics import MODEL_CODES, MODELS, get_model, model_digest
 from d4orm_env.core.observation import ObservationLayout
 from d4orm_env.core.transition import TimeStep, advance
 from d4orm_env.engine.base import get_engine
-from d4orm_env.engine.worlds import kernels_of_codes
+from d4orm_env.engine.worlds import kernels_of_codes, world_kernels
 from d4orm_env.models import OWN_LIMITS, SPEED, Limit, Model, ModelFunctions, clip
 from d4orm_env.verify.integrated import Integrated
 from d4orm_env.verify.motion import Motion
@@ -165,6 +175,14 @@ def test_a_code_that_is_no_models_is_refused(engine: str) -> None:
         get_engine(engine).step(arrays, problem.start, np.zeros(2, bool), np.zeros((2, 2), np.float32))
 
 
+def test_teams_of_common_models_share_kernels_that_know_no_other(boat: Model) -> None:
+    common = world_kernels(("holonomic2d",))
+    assert world_kernels(("velocity2d", "differential_drive")) == common
+    with_boat = world_kernels(("holonomic2d", "boat"))
+    assert with_boat.roll_out is not common.roll_out
+    assert with_boat.roll_out.py_func.__qualname__.endswith("_holonomic2d_boat")
+
+
 def test_the_page_about_own_robots_runs(tmp_path: Path) -> None:
     program = tmp_path / "mecanum.py"
     program.write_text(PAGE.read_text().split("```python\n")[1].partition("```")[0])
@@ -276,6 +294,16 @@ def test_own_limits_have_defaults_and_belong_to_the_robots_that_have_them() -> N
     assert team.select([2]).own_limits["wheelbase"].tolist() == [0.5]
     assert team.select([1]).own_limits == {}
     assert car_problem(wheelbase=0.4) != car_problem(wheelbase=0.5)
+
+
+def test_the_functional_step_reads_own_limits() -> None:
+    problem = car_problem(wheelbase=[0.4, 1.0, 0.5])
+    problem = problem.replace(start=problem.start + np.float32([[0, 0, 0, 0.5, 0.25], [0] * 5, [0, 0, 0, 0.5, 0.25]]))
+    controls = random_controls(problem, 3)
+    state, _ = functional.step(problem, functional.reset(problem, None), controls[0])
+    after = rollout(problem, controls, engine="cpu").states[1]
+    np.testing.assert_allclose(state.states, after, atol=1e-6)
+    assert abs(after[0, 2] - problem.start[0, 2]) > 0.02
 
 
 def test_own_limits_survive_a_file(tmp_path: Path) -> None:

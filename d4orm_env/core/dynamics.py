@@ -18,8 +18,8 @@ from d4orm_env.core.robot_model import (
     Model,
     ModelFunctions,
     Ops,
+    RungeKutta,
 )
-from d4orm_env.core.robot_model import RungeKutta as _RungeKutta
 from d4orm_env.core.source import pieces
 from d4orm_env.core.transition import TimeStep
 from d4orm_env.models.car import CAR
@@ -34,6 +34,7 @@ __all__ = [
     "COMMON",
     "MODELS",
     "MODEL_CODES",
+    "NUM_BUILT_IN",
     "SPEED",
     "TURN_RATE",
     "Model",
@@ -91,7 +92,7 @@ def model_digest(model: Model) -> str:
     """SHA-256 over all that a model is, its functions' sources and the constants that they name included."""
     sha = hashlib.sha256(repr([value for name, value in vars(model).items() if name != "functions"]).encode())
     for function in model.functions:
-        found = ["Runge-Kutta"] if isinstance(function, _RungeKutta) else pieces(function)
+        found = ["Runge-Kutta"] if isinstance(function, RungeKutta) else pieces(function)
         sha.update(repr(list(found)).encode())
     return sha.hexdigest()
 
@@ -172,7 +173,7 @@ def _check_functions(model: Model) -> None:
             raise ValueError(
                 f"model {model.name!r}: {name} returns {result!r}; expected a tuple of {size} finite numbers"
             )
-        if not isinstance(function, _RungeKutta):
+        if not isinstance(function, RungeKutta):
             floats = [value for value in pieces(function) if isinstance(value, float)]
             if floats:
                 raise ValueError(

@@ -157,6 +157,7 @@ class Problem:
         Raises:
             ValueError: If padding is not zero, or a speed or heading too large; the message names the robot.
         """
+        limits = self.team.limits
         for robot, model in enumerate(self.team.robot_models):
             state = states[robot]
             if state[model.state_size :].any():
@@ -169,7 +170,7 @@ class Problem:
             if speed > limit * (1 + 1e-5):
                 raise ValueError(f"{what} speed of robot_{robot} is {speed:g} m/s, above its limit of {limit:g} m/s")
             for index, column in model.state_limits:
-                value, limit = float(state[index]), float(self.team.limits[robot, column])
+                value, limit = float(state[index]), float(limits[robot, column])
                 if abs(value) > limit * (1 + 1e-5):
                     raise ValueError(
                         f"{what} {model.state_names[index]} of robot_{robot} is {value:g}, "
