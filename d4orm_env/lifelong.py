@@ -38,7 +38,7 @@ def reached_goals(problem: Problem, goals: FloatArray, states: FloatArray, contr
     squared_speed = np.zeros(len(states), np.float32)
     if problem.goal_speed is not None:
         for robot, model in enumerate(problem.team.robot_models):
-            velocity = model.functions.velocity(states[robot], controls[robot], NUMPY_OPS)
+            velocity = model.functions.velocity(states[robot], controls[robot], problem.arrays.limits[robot], NUMPY_OPS)
             squared_speed[robot] = sum(component * component for component in velocity)
     arrays = problem.arrays
     reached: BoolArray = arrives(
