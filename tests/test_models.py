@@ -32,7 +32,7 @@ from d4orm_env.engine.base import get_engine
 from d4orm_env.engine.worlds import kernels_of_codes, world_kernels
 from d4orm_env.models import OWN_LIMITS, SPEED, Limit, Model, ModelFunctions, clip
 from d4orm_env.verify.integrated import Integrated
-from d4orm_env.verify.motion import Motion
+from d4orm_env.verify.motion import TeamMotion
 from d4orm_planners import make_planner
 
 PAGE = Path(__file__).parents[1] / "docs" / "own_robot.md"
@@ -256,7 +256,7 @@ def test_the_judge_integrates_what_it_has_equations_for_to_the_same_motion() -> 
     problem = make_problem("circle", num_robots=3, model="differential_drive")
     controls = random_controls(problem, 2).astype(np.float64)
     start = np.asarray(problem.start, np.float64)
-    exact = Motion(problem, controls)
+    exact = TeamMotion(problem, controls)
     model, robots = get_model("differential_drive"), np.arange(3)
     found = Integrated(model, robots, start, controls, problem.team.limits, problem.dt)
     steps = slice(None)

@@ -112,7 +112,6 @@ def controls(policy: Any) -> np.ndarray:
         "test_own:Push", "test_own:push", "test_own:push_one", "test_own:make_push", "test_own:Ahead",
         f"{__file__}:Duck",
     ],
-    ids=str,
 )  # fmt: skip
 def test_an_episode_takes_whatever_acts(policy: Any) -> None:
     np.testing.assert_array_equal(controls(policy), controls("test_own:Push"))

@@ -105,7 +105,6 @@ def test_every_environment_takes_a_callable_and_a_file(make: str, tmp_path: Path
         ("json:", "not of the form package.module:Name"),
         (5, "scenario 5 is unknown; choose one of circle"),
     ],
-    ids=str,
 )
 def test_what_is_no_scenario_is_named(scenario: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message) as error:

@@ -127,7 +127,6 @@ def test_the_paper_is_the_default() -> None:
         (lambda step: [1.0, np.nan], "returned nan for robot_1; rewards must be finite"),
         (lambda step: "much", "reward '<lambda>': it does not hold numbers only"),
     ],
-    ids=str,
 )
 def test_a_bad_reward_is_named(reward: Any, message: str) -> None:
     def run() -> None:
