@@ -13,7 +13,6 @@ from d4orm_env.core.dynamics import MODELS, Model
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.transition import TimeStep
-from d4orm_env.engine.drives import drive_kernel
 
 NEAR_VIA = np.float32(0.25)
 """Square of how near to a point on its way a robot turns to its goal [m^2]."""
@@ -121,6 +120,8 @@ def detours(problem: Problem, vias: FloatArray) -> Drives:
 
 def prepare_drives(problem: Problem) -> None:
     """Compile what drives of this team need, if it is not yet."""
+    from d4orm_env.engine.drives import drive_kernel
+
     if not all(drive_kernel(name).signatures for name in set(problem.team.models)):
         straight_drives(problem)
 
@@ -138,6 +139,8 @@ def _standing(problem: Problem) -> tuple[FloatArray, FloatArray]:
 
 def _drive_teams(problem: Problem, states: FloatArray, controls: FloatArray, switch: Any, vias: FloatArray) -> Drives:
     """Every robot on each of its ways: as controlled until ``switch`` ``(R, V)``, then by ``vias`` ``(R, V, d)``."""
+    from d4orm_env.engine.drives import drive_kernel  # here, because importing numba takes long
+
     num_ways, arrays = switch.shape[1], problem.arrays
     u = np.repeat(np.asarray(controls, np.float32)[:, :, None], num_ways, axis=2)
     x = np.repeat(np.asarray(states, np.float32)[:, :, None], num_ways, axis=2)

@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env.engine.softmax import softmax_weights
-
 
 @dataclass(frozen=True)
 class SoftmaxWeights:
@@ -30,6 +28,9 @@ class SoftmaxWeights:
         none.
         """
         if xp is np:
+            # Imported here: numba takes longer to import than most commands take.
+            from d4orm_env.engine.softmax import softmax_weights
+
             return softmax_weights(rewards, self.temperature, self.cutoff, log_ratio)
         usable = rewards > -xp.inf
         count = xp.maximum(usable.sum(-1, keepdims=True), 1).astype(rewards.dtype)
