@@ -161,7 +161,8 @@ def test_ctrl_c_stops_ipopt(monkeypatch: pytest.MonkeyPatch) -> None:
     timer = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
 
     def solve_and_be_interrupted(*arguments: Any) -> Any:
-        timer.start()
+        if timer.ident is None:  # not started yet
+            timer.start()
         return solve(*arguments)
 
     monkeypatch.setattr(TeamProgram, "solve", solve_and_be_interrupted)
