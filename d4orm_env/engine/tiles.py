@@ -39,7 +39,7 @@ NOWHERE = np.uint64(0)
 OPTIONS: dict[str, Any] = {"error_model": "numpy"}
 """No fast mathematics: only what IEEE 754 defines to the bit, in the order in which it is written. Multiply-adds do not
 fuse, sums are not regrouped, nothing is estimated; so a kernel gives the same bits on every processor, however wide its
-registers. This costs some 10%, which is measured in docs/performance.md."""
+registers. What it costs is measured in docs/performance.md."""
 
 UNCOUNTED: dict[str, Any] = OPTIONS | {"_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 """For everything that kernels call: without numba's reference counts, which would cost more than the sums they
