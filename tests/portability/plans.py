@@ -43,6 +43,8 @@ CASES = {
     "mixed models": Case("d4orm", {}, "heterogeneous", {"num_robots": 6}),
     "differential drives": Case("d4orm-d", {}, "random", {"num_robots": 8, "model": "differential_drive"}, 30),
     "first-order robots": Case("d4orm", {}, "circle", {"num_robots": 6, "model": "velocity2d"}),
+    "unicycles": Case("d4orm", {}, "circle", {"num_robots": 4, "model": "unicycle"}),
+    "cars": Case("d4orm", {}, "circle", {"num_robots": 4, "model": "car"}),
     "in space": Case("d4orm", {}, "sphere", {"num_robots": 8}),
 }
 
