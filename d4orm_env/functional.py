@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from d4orm_env.core.problem import Problem, ProblemArrays
 from d4orm_env.core.robot_model import STANDARD_LIMITS
@@ -120,14 +121,34 @@ def _arrays(problem: Problem) -> ProblemArrays:
         start=problem.start,
         goal=jnp.asarray(problem.goal),
         inverse_initial_distance=1 / distance,
-        balls=world.balls,
-        cylinders=world.cylinders,
-        boxes=world.boxes,
+        boxes=_rounded_boxes(world),
+        triangles=_triangles(world),
+        index=None,
         bounds=bounds,
         time_step=jnp.stack([jnp.asarray(dt / part, jnp.float32) for part in (1, 2, 3, 6)]),
         margin=jnp.asarray(problem.margin, jnp.float32),
         squared_goal_radius=jnp.asarray(problem.goal_radius**2, jnp.float32),
         squared_goal_speed=jnp.asarray(goal_speed**2, jnp.float32),
+    )
+
+
+def _rounded_boxes(world: World) -> Any:
+    """The boxes of :attr:`World.shapes` of a world whose numbers may be traced."""
+    d = world.dimension
+    balls, cylinders = jnp.asarray(world.balls), jnp.asarray(world.cylinders)
+    rows = [jnp.concatenate([balls[:, :d], balls], axis=1)]
+    if d == 3:
+        end = jnp.full((len(cylinders), 1), jnp.inf)
+        rows.append(jnp.concatenate([cylinders[:, :2], -end, cylinders[:, :2], end, cylinders[:, 2:]], axis=1))
+    rows.append(jnp.pad(jnp.asarray(world.boxes), ((0, 0), (0, 1))))
+    return jnp.concatenate(rows)
+
+
+def _triangles(world: World) -> Any:
+    """The triangles of :attr:`World.shapes` of a world whose numbers may be traced."""
+    pairs = zip(world.polygons, world.triangles, strict=True)
+    return jnp.concatenate(
+        [jnp.zeros((0, 6)), *(jnp.asarray(corners)[np.array(own)].reshape(-1, 6) for corners, own in pairs)]
     )
 
 
@@ -144,7 +165,7 @@ def _limits(team: Team) -> Any:
     return jnp.stack(columns, axis=1)
 
 
-_STATIC = {Problem: ("horizon", "name"), Team: ("models",), World: ("dimension",)}
+_STATIC = {Problem: ("horizon", "name"), Team: ("models",), World: ("dimension", "triangles")}
 
 
 def _register(kind: type) -> None:

@@ -152,7 +152,7 @@ class Simulation:
         if self.redraws:
             self.problem = self.draw_instance(self._random)
         problem = self.problem
-        self.arrays = problem.arrays
+        self.arrays = problem.arrays_to_observe(self.layout.num_obstacles)
         self.states = problem.start
         self.arrived = np.zeros(problem.num_robots, np.bool_)
         self.controls = np.zeros((problem.num_robots, problem.control_size), np.float32)
@@ -272,7 +272,7 @@ class Simulation:
         # Read-only like the arrays they replace: the engine compiles anew for writable ones.
         goals.setflags(write=False)
         inverse_initial_distance.setflags(write=False)
-        self.arrays = self.problem.arrays._replace(goal=goals, inverse_initial_distance=inverse_initial_distance)
+        self.arrays = self.arrays._replace(goal=goals, inverse_initial_distance=inverse_initial_distance)
 
 
 def checked_cycles(value: Any) -> int:

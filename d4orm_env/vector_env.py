@@ -30,7 +30,7 @@ _NOISE_STEPS = 32
 
 _OWN_ARRAYS = ("start", "goal", "inverse_initial_distance")
 """What differs from world to world in one kernel call."""
-_WORLD_ARRAYS = ("balls", "cylinders", "boxes", "bounds")
+_WORLD_ARRAYS = ("boxes", "triangles", "bounds")
 """What may differ too, at the price of a call for each world; all the rest of a problem is shared."""
 _READ_BEFORE = ("state", "distance", "docked", "total_reward")
 """What rewards are computed from that a step overwrites."""
@@ -123,7 +123,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         self._engine = CpuEngine(threads)
         start, goal, inverse = (np.repeat(getattr(problem.arrays, name)[None], count, axis=0) for name in _OWN_ARRAYS)
         self._worlds = WorldBatch.of(start, goal, inverse, problem.control_size)
-        self._arrays: list[ProblemArrays] = [problem.arrays] * count
+        self._arrays: list[ProblemArrays] = [problem.arrays_to_observe(self._template.layout.num_obstacles)] * count
         self._apart = False
         self.robot_rewards = np.zeros((count, problem.num_robots), np.float32)
         shape = (count, problem.num_robots, self._template.layout.size)
@@ -289,7 +289,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         out = observations.reshape(self._observations.shape)
         advance, layout, cycles = self._engine.advance, template.layout, self.max_cycles
         if not self._apart:
-            advance(self.problem.arrays, layout, cycles, orders, self._worlds, out)
+            advance(self._arrays[0], layout, cycles, orders, self._worlds, out)
         else:
             for world, arrays in enumerate(self._arrays):
                 one = slice(world, world + 1)
@@ -344,7 +344,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
                 problem = self._next_instance(episode)
                 self._worlds.start[world], self._worlds.goal[world] = problem.start, problem.goal
                 self._worlds.inverse[world] = problem.arrays.inverse_initial_distance
-                self._arrays[world] = problem.arrays
+                self._arrays[world] = problem.arrays_to_observe(self._template.layout.num_obstacles)
                 self._apart |= bool(_differing(problem, self.problem, _WORLD_ARRAYS))
 
     def _next_instance(self, random: np.random.Generator) -> Problem:
@@ -358,7 +358,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
     def _drawn(self, random: np.random.Generator) -> Problem:
         """A new instance that differs from the first in places and obstacles only."""
         drawn = self._template.draw_instance(random)
-        shared = set(drawn.arrays._fields) - {*_OWN_ARRAYS, *_WORLD_ARRAYS}
+        shared = set(drawn.arrays._fields) - {*_OWN_ARRAYS, *_WORLD_ARRAYS, "index"}
         differing = _differing(drawn, self.problem, shared)
         if differing:
             raise ValueError(

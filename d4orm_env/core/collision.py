@@ -19,3 +19,32 @@ def axis_gap(x: Any, lower: Any, upper: Any, zero: Any, ops: Ops) -> Any:
 def leaves(x: Any, reach: Any, lower: Any, upper: Any) -> Any:
     """Whether a body of that reach at ``x`` touches or leaves the interval from ``lower`` to ``upper``."""
     return (x - reach <= lower) | (x + reach >= upper)
+
+
+def meets_edge(x: Any, y: Any, along_x: Any, along_y: Any, reach: Any, zero: Any, ops: Ops) -> Any:
+    """Whether a disc of that reach at ``(x, y)`` touches the edge from the origin to ``(along_x, along_y)``."""
+    square = along_x * along_x + along_y * along_y
+    share = ops.minimum(ops.maximum(x * along_x + y * along_y, zero), square) / square
+    gap_x, gap_y = x - share * along_x, y - share * along_y
+    return gap_x * gap_x + gap_y * gap_y <= reach * reach
+
+
+def lies_left(x: Any, y: Any, along_x: Any, along_y: Any, zero: Any) -> Any:
+    """Whether ``(x, y)`` lies on the line from the origin to ``(along_x, along_y)`` or to the left of it."""
+    return along_x * y - along_y * x >= zero
+
+
+def meets_triangle(corners: Any, x: Any, y: Any, reach: Any, zero: Any, ops: Ops) -> Any:
+    """Whether a disc of that reach at ``(x, y)`` touches a triangle, ``corners`` being ``x, y`` of each in turn."""
+    ax, ay, bx, by, cx, cy = corners
+    edges = (
+        meets_edge(x - ax, y - ay, bx - ax, by - ay, reach, zero, ops)
+        | meets_edge(x - bx, y - by, cx - bx, cy - by, reach, zero, ops)
+        | meets_edge(x - cx, y - cy, ax - cx, ay - cy, reach, zero, ops)
+    )
+    inside = (
+        lies_left(x - ax, y - ay, bx - ax, by - ay, zero)
+        & lies_left(x - bx, y - by, cx - bx, cy - by, zero)
+        & lies_left(x - cx, y - cy, ax - cx, ay - cy, zero)
+    )
+    return edges | inside

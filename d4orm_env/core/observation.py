@@ -108,7 +108,7 @@ def _corners(problem: Problem) -> list[Any]:
     """Extreme points of the world's obstacles and bounds, to bound distances to them."""
     world, d = problem.world, problem.dimension
     corners = [world.balls[:, :d] + sign * world.balls[:, d:] for sign in (-1, 1)]
-    corners += [world.boxes[:, :d], world.boxes[:, d:]]
+    corners += [world.boxes[:, :d], world.boxes[:, d:], *world.polygons]
     if len(world.cylinders):
         xy = np.concatenate([world.cylinders[:, :2] + sign * world.cylinders[:, 2:] for sign in (-1, 1)])
         corners.append(np.concatenate([xy, np.zeros((len(xy), 1))], axis=1))
@@ -214,19 +214,21 @@ def _find_nearest_robots(k: Any, position: Any, nearest: Any) -> None:
 def _find_nearest_obstacles(place: Any, arrays: Any, nearest: Any) -> None:
     d = place.shape[0]
     nearest[:, 0] = np.inf
-    for ball in arrays.balls:
-        _insert_round(place, ball[:d], ball[d], nearest)
-    for cylinder in arrays.cylinders:
-        _insert_round(place, cylinder[:2], cylinder[2], nearest)
-    for box in arrays.boxes:
-        gap2 = 0.0
-        for axis in range(d):
-            gap = max(max(box[axis] - place[axis], place[axis] - box[d + axis]), 0)
-            gap2 += gap * gap
-        row = insert_nearest(np.sqrt(gap2), nearest)
-        if row >= 0:
-            for axis in range(d):
-                nearest[row, 1 + axis] = min(max(place[axis], box[axis]), box[d + axis]) - place[axis]
+    index, count = arrays.index, arrays.boxes.shape[0] + arrays.triangles.shape[0]
+    begin, end, cell, listed = 0, count, 0, (count > 0) & (index.nearest >= nearest.shape[0])
+    for axis in range(d):
+        step = (place[axis] - index.low[axis]) * index.scale
+        # Beyond the grid every obstacle may be among the nearest.
+        listed &= (step >= 0) & (step < index.size[axis])
+        cell = cell * index.size[axis] + int(step) if listed else 0
+    if listed:
+        begin, end = index.first[cell], index.first[cell + 1]
+    for number in range(begin, end):
+        item = index.items[number] if listed else number
+        if item < arrays.boxes.shape[0]:
+            _insert_box(place, arrays.boxes[item], nearest)
+        else:
+            _insert_triangle(place, arrays.triangles[item - arrays.boxes.shape[0]], nearest)
     for axis in range(d):
         for side in range(2):
             gap = arrays.bounds[side, axis] - place[axis]
@@ -236,15 +238,35 @@ def _find_nearest_obstacles(place: Any, arrays: Any, nearest: Any) -> None:
                 nearest[row, 1 + axis] = gap
 
 
-def _insert_round(place: Any, centre: Any, radius: Any, nearest: Any) -> None:
-    gap = centre[0] - place[0]
+def _insert_box(place: Any, box: Any, nearest: Any) -> None:
+    d = place.shape[0]
+    gap = min(max(place[0], box[0]), box[d]) - place[0]
     distance2 = gap * gap
-    for axis in range(1, centre.shape[0]):
-        gap = centre[axis] - place[axis]
+    for axis in range(1, d):
+        gap = min(max(place[axis], box[axis]), box[d + axis]) - place[axis]
         distance2 += gap * gap
-    distance = np.sqrt(distance2)
+    distance, radius = np.sqrt(distance2), box[2 * d]
     row = insert_nearest(distance - radius, nearest)
     if row >= 0:
-        nearest[row, 1:] = 0
-        for axis in range(centre.shape[0]):
-            nearest[row, 1 + axis] = (centre[axis] - place[axis]) * (distance - radius) / max(distance, 1e-6)
+        # Inside a box, whose radius is zero, the vector is too.
+        share = (distance - radius) / max(distance, 1e-6) if radius > 0 else 1.0
+        for axis in range(d):
+            nearest[row, 1 + axis] = (min(max(place[axis], box[axis]), box[d + axis]) - place[axis]) * share
+
+
+def _insert_triangle(place: Any, corners: Any, nearest: Any) -> None:
+    inside, nearest_x, nearest_y, least = True, 0.0, 0.0, np.inf
+    for edge in range(3):
+        after = (edge + 1) % 3
+        along_x, along_y = corners[2 * after] - corners[2 * edge], corners[2 * after + 1] - corners[2 * edge + 1]
+        offset_x, offset_y = place[0] - corners[2 * edge], place[1] - corners[2 * edge + 1]
+        inside &= along_x * offset_y - along_y * offset_x >= 0
+        share = (offset_x * along_x + offset_y * along_y) / (along_x * along_x + along_y * along_y)
+        share = min(max(share, 0.0), 1.0)
+        gap_x, gap_y = share * along_x - offset_x, share * along_y - offset_y
+        if gap_x * gap_x + gap_y * gap_y < least:
+            least, nearest_x, nearest_y = gap_x * gap_x + gap_y * gap_y, gap_x, gap_y
+    row = insert_nearest(0.0 if inside else np.sqrt(least), nearest)
+    if row >= 0:
+        nearest[row, 1] = 0.0 if inside else nearest_x
+        nearest[row, 2] = 0.0 if inside else nearest_y

@@ -49,9 +49,9 @@ class ProblemArrays(NamedTuple):
         start: ``(K, n)``.
         goal: ``(K, d)``.
         inverse_initial_distance: ``(K,)`` one over the distance from start to goal (at least the goal radius).
-        balls: ``(., d + 1)`` circles in the plane, spheres in space.
-        cylinders: ``(., 3)``.
-        boxes: ``(., 2 d)``.
+        boxes: ``(., 2 d + 1)`` obstacles, see :class:`~d4orm_env.core.shapes.Shapes`.
+        triangles: ``(., 6)`` more of them.
+        index: Where they are.
         bounds: ``(2, d)``, infinite where open.
         time_step: ``(4,)`` dt, dt/2, dt/3, dt/6.
         margin: ``()``.
@@ -65,9 +65,9 @@ class ProblemArrays(NamedTuple):
     start: Any
     goal: Any
     inverse_initial_distance: Any
-    balls: Any
-    cylinders: Any
     boxes: Any
+    triangles: Any
+    index: Any
     bounds: Any
     time_step: Any
     margin: Any
@@ -275,9 +275,9 @@ class Problem:
             inverse_initial_distance=inverse_initial_distance(
                 self.start[:, : self.dimension], self.goal, self.goal_radius
             ),
-            balls=self.world.balls,
-            cylinders=self.world.cylinders,
-            boxes=self.world.boxes,
+            boxes=self.world.shapes.boxes,
+            triangles=self.world.shapes.triangles,
+            index=self.world.index(float(self.team.radius.max()) + self.margin),
             bounds=self.world.bounds,
             time_step=np.array([self.dt, self.dt / 2, self.dt / 3, self.dt / 6], np.float32),
             margin=np.float32(self.margin),
@@ -289,6 +289,11 @@ class Problem:
                 array.setflags(write=False)
         return arrays
 
+    def arrays_to_observe(self, num_obstacles: int) -> ProblemArrays:
+        """:attr:`arrays` with an index that finds so many of the nearest obstacles of any place."""
+        index = self.world.index(float(self.team.radius.max()) + self.margin, max(num_obstacles, 1))
+        return self.arrays._replace(index=index)
+
     @cached_property
     def digest(self) -> str:
         """SHA-256 over everything that defines the problem, the name left out."""
@@ -297,7 +302,9 @@ class Problem:
         if arrays.model_codes.max() >= NUM_BUILT_IN:  # such codes depend on the order of registration
             sha.update(repr([model_digest(model) for model in self.team.robot_models]).encode())
             arrays = arrays._replace(model_codes=np.minimum(arrays.model_codes, NUM_BUILT_IN))
-        for value in arrays:
+        world = self.world
+        obstacles = (world.balls, world.cylinders, world.boxes, *world.polygons)
+        for value in (*arrays[:6], *obstacles, *arrays[9:]):
             array: NDArray[Any] = np.ascontiguousarray(value)
             sha.update(f"{array.shape}{array.dtype}".encode())
             sha.update(array.tobytes())

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from d4orm_env.core.arrays import LARGEST, FloatArray, frozen_array, restore_frozen
+from d4orm_env.core.polygon import check_polygon, triangulate
+from d4orm_env.core.shapes import Shapes
+from d4orm_env.core.world_index import WorldIndex, build_index, nearest_distance
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,6 +25,7 @@ class World:
         spheres: ``(., 4)`` centre x, y, z and radius [m]; spatial worlds only.
         cylinders: ``(., 3)`` axis x, y and radius [m], vertical and unbounded in z; spatial worlds only.
         boxes: ``(., 2 * dimension)`` lower corner, then upper corner [m], axis-aligned.
+        polygons: Each ``(v, 2)`` corners in order, either way round [m]; simple, convex or not; planar worlds only.
         lower: ``(dimension,)`` lower bounds of the world [m], or ``None`` for an open world.
         upper: ``(dimension,)`` upper bounds, given together with ``lower``.
 
@@ -32,6 +38,7 @@ class World:
     spheres: Any = ()
     cylinders: Any = ()
     boxes: Any = ()
+    polygons: Any = ()
     lower: Any = None
     upper: Any = None
 
@@ -51,6 +58,13 @@ class World:
         for index, box in enumerate(self.boxes):
             if (box[: self.dimension] >= box[self.dimension :]).any():
                 raise ValueError(f"boxes[{index}] is {box.tolist()}; its lower corner must lie below its upper corner")
+        if len(self.polygons) and self.dimension != 2:
+            raise ValueError(f"polygons need a world of dimension 2, and this one has {self.dimension}")
+        polygons = []
+        for index, corners in enumerate(self.polygons):
+            polygons.append(frozen_array(corners, f"polygons[{index}]", (None, 2), largest=LARGEST))
+            check_polygon(polygons[-1], f"polygons[{index}]")
+        object.__setattr__(self, "polygons", tuple(polygons))
         if (self.lower is None) != (self.upper is None):
             raise ValueError("bounds need both lower and upper; give both, or neither for an open world")
         if self.lower is not None:
@@ -60,13 +74,19 @@ class World:
             if (self.lower >= self.upper).any():
                 raise ValueError(f"bounds lower {self.lower.tolist()} must lie below upper {self.upper.tolist()}")
 
+    def __getstate__(self) -> dict[str, Any]:
+        # What is cached is made anew in a copy.
+        return {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
+
     def __setstate__(self, state: dict[str, Any]) -> None:
         restore_frozen(self, state)
+        for corners in self.polygons:
+            corners.setflags(write=False)
 
     @property
     def num_obstacles(self) -> int:
         """Obstacles of all kinds, bounds not counted."""
-        return sum(len(kind) for kind in (self.circles, self.spheres, self.cylinders, self.boxes))
+        return sum(len(kind) for kind in (self.circles, self.spheres, self.cylinders, self.boxes, self.polygons))
 
     @property
     def balls(self) -> FloatArray:
@@ -81,8 +101,53 @@ class World:
             return np.array([[-np.inf] * self.dimension, [np.inf] * self.dimension], np.float32)
         return np.stack([self.lower, self.upper])
 
+    @cached_property
+    def triangles(self) -> tuple[tuple[tuple[int, ...], ...], ...]:
+        """For each polygon the triangles that fill it, each three numbers of corners."""
+        return tuple(tuple(map(tuple, triangulate(corners).tolist())) for corners in self.polygons)
+
+    @cached_property
+    def shapes(self) -> Shapes:
+        """All obstacles as rounded boxes and triangles, in the order circles, spheres, cylinders, boxes, polygons."""
+        d = self.dimension
+        centres, size = self.balls[:, :d], self.balls[:, d:]
+        rows = [np.hstack([centres, centres, size])]
+        if d == 3:
+            end = np.full((len(self.cylinders), 1), np.inf, np.float32)
+            axis, size = self.cylinders[:, :2], self.cylinders[:, 2:]
+            rows.append(np.hstack([axis, -end, axis, end, size]))
+        rows.append(np.hstack([self.boxes, np.zeros((len(self.boxes), 1), np.float32)]))
+        triangles = [
+            corners[np.array(own)].reshape(-1, 6) for corners, own in zip(self.polygons, self.triangles, strict=True)
+        ]
+        boxes: FloatArray = np.concatenate(rows)
+        angular: FloatArray = np.concatenate([np.empty((0, 6), np.float32), *triangles])
+        for table in (boxes, angular):
+            table.setflags(write=False)
+        return Shapes(boxes, angular)
+
+    @cached_property
+    def _indices(self) -> dict[tuple[float, int], WorldIndex]:
+        return {}
+
+    def index(self, reach: float, nearest: int = 1) -> WorldIndex:
+        """The grid that finds obstacles, made once for distances of about the same size.
+
+        Args:
+            reach: The largest distance from an obstacle that is asked about [m].
+            nearest: How many of the nearest obstacles it is to find.
+        """
+        reach = 2.0 ** math.ceil(math.log2(max(reach, 1e-3)))
+        key = (reach, nearest)
+        if key not in self._indices:
+            # Cells of half a reach leave few points undecided; more of the nearest are found in larger ones.
+            self._indices[key] = build_index(self.shapes, reach / 4 * nearest, reach, nearest)
+        return self._indices[key]
+
     def clearance(self, positions: Any) -> np.ndarray:
         """Distance from points to the nearest obstacle surface or bound, negative inside [m], in float64.
+
+        Inside a polygon it is the distance to the nearest edge of one of the triangles that it is made of.
 
         Args:
             positions: ``(..., dimension)``.
@@ -91,14 +156,10 @@ class World:
             ``(...)`` distances; infinite in an empty open world.
         """
         points = np.asarray(positions, np.float64)
-        gaps = [np.full(points.shape[:-1], np.inf)]
-        for ball in self.balls.astype(np.float64):
-            gaps.append(np.linalg.norm(points - ball[:-1], axis=-1) - ball[-1])
-        for cylinder in self.cylinders.astype(np.float64):
-            gaps.append(np.linalg.norm(points[..., :2] - cylinder[:2], axis=-1) - cylinder[2])
-        for box in self.boxes.astype(np.float64):
-            outside = np.maximum(box[: self.dimension] - points, points - box[self.dimension :])
-            gaps.append(np.linalg.norm(np.maximum(outside, 0), axis=-1) + np.minimum(outside.max(axis=-1), 0))
         bounds = self.bounds.astype(np.float64)
-        gaps.append(np.minimum(points - bounds[0], bounds[1] - points).min(axis=-1))
-        return np.min(gaps, axis=0)
+        to_bounds = np.minimum(points - bounds[0], bounds[1] - points).min(axis=-1)
+        if not self.shapes.count:
+            return to_bounds
+        index = next(iter(self._indices.values()), None) or self.index(0.25)
+        flat = points.reshape(-1, self.dimension)
+        return np.minimum(nearest_distance(self.shapes, index, flat).reshape(to_bounds.shape), to_bounds)

@@ -15,7 +15,7 @@ from d4orm_env.engine import noise, sampling
 from d4orm_env.engine.base import SamplingResult, SamplingRules, SamplingTask, StepResult, checked_controls
 from d4orm_env.engine.lanes import TILE
 from d4orm_env.engine.noise import DRAWS, TURNS
-from d4orm_env.engine.proximity import body_boxes, make_scratch, static_boxes
+from d4orm_env.engine.proximity import body_boxes, bound_boxes, make_scratch
 from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_env.engine.worlds import WorldBatch, WorldKernels, judge_worlds, kernels_of_codes
 
@@ -205,7 +205,7 @@ class _Sampling:
         else:
             self.moving = np.ascontiguousarray(task.moving.positions, np.float32)
             self.moving_radius = np.ascontiguousarray(task.moving.radius, np.float32)
-        self.static = static_boxes(self.arrays)
+        self.static = bound_boxes(self.arrays)
         self.body_boxes = body_boxes(self.moving, self.moving_radius, self.arrays.margin)
         self.seed = np.array(noise.seed_words(seed), np.uint32)
         self.rewards = np.empty((problem.num_robots, num_samples), np.float32)

@@ -108,21 +108,64 @@ def moving_contacts(arrays: ProblemArrays, place: Any, obstacle: Any, radius: An
 
 def obstacle_contacts(arrays: ProblemArrays, place: Any, extra: Any) -> Any:
     """``(K, S)`` bool: the same towards static obstacles and bounds."""
-    d = place.shape[1]
     reach = (arrays.radius + extra)[:, None]
     hit = jnp.zeros((place.shape[0], place.shape[2]), bool)
-    for axis in range(d):
+    for axis in range(place.shape[1]):
         hit |= collision.leaves(place[:, axis], reach, arrays.bounds[0, axis], arrays.bounds[1, axis])
-    for kind, axes in ((arrays.balls, d), (arrays.cylinders, 2)):
-        if len(kind):
-            gaps = (place[:, None, :axes] - kind[None, :, :axes, None]) ** 2
-            total = reach[:, None] + kind[None, :, axes, None]
-            hit |= (gaps.sum(axis=2) <= total * total).any(axis=1)
+    if len(arrays.boxes) + len(arrays.triangles) > FEW and arrays.index is not None:
+        return hit | _indexed_contacts(arrays, place, reach)
     if len(arrays.boxes):
-        lower, upper = arrays.boxes[None, :, :d, None], arrays.boxes[None, :, d:, None]
-        gaps = collision.axis_gap(place[:, None], lower, upper, jnp.float32(0), OPS) ** 2
-        hit |= (gaps.sum(axis=2) <= (reach * reach)[:, None]).any(axis=1)
+        box = jnp.moveaxis(arrays.boxes, 1, 0)[..., None, :, None]
+        hit |= _touches_box(box, reach[:, None], place[:, None]).any(axis=1)
+    if len(arrays.triangles):
+        corners = jnp.moveaxis(arrays.triangles, 1, 0)[..., None, :, None]
+        hit |= _touches_triangle(corners, reach[:, None], place[:, None]).any(axis=1)
     return hit
+
+
+FEW = 8
+"""So many obstacles are sooner tested all than looked up."""
+
+
+def _touches_box(box: Any, reach: Any, place: Any) -> Any:
+    """Where places ``(K, ., d, S)`` are within reach of rounded boxes, ``box`` being their ``2 d + 1`` columns."""
+    d, gap2 = place.shape[-2], jnp.float32(0)
+    for axis in range(d):
+        gap = collision.axis_gap(place[..., axis, :], box[axis], box[d + axis], jnp.float32(0), OPS)
+        gap2 = gap2 + gap * gap
+    total = reach + box[2 * d]
+    return gap2 <= total * total
+
+
+def _touches_triangle(corners: Any, reach: Any, place: Any) -> Any:
+    """The same for triangles, ``corners`` being their six columns."""
+    return collision.meets_triangle(corners, place[..., 0, :], place[..., 1, :], reach, jnp.float32(0), OPS)
+
+
+def _indexed_contacts(arrays: ProblemArrays, place: Any, reach: Any) -> Any:
+    """``(K, S)`` bool: contacts with obstacles, see :mod:`d4orm_env.engine.obstacles`."""
+    index, cell = arrays.index, jnp.int32(0)
+    for axis in range(place.shape[1]):
+        step = (place[:, axis] - index.low[axis]) * index.scale
+        # Asked this way round, what is not a number counts as zero.
+        step = jnp.minimum(jnp.where(step > 0, step, 0), (index.size[axis] - 1).astype(jnp.float32))
+        cell = cell * index.size[axis] + step.astype(jnp.int32)
+    clearance, begin, end = index.clearance[cell], index.first[cell], index.first[cell + 1]
+    sure, near = clearance <= reach - index.slack, clearance <= reach + index.slack
+    num_boxes = len(arrays.boxes)
+
+    def test(number: Any, hit: Any) -> Any:
+        item = index.items[jnp.minimum(begin + number, end - 1)]
+        here = jnp.zeros_like(hit)
+        if num_boxes:
+            box = jnp.moveaxis(arrays.boxes[jnp.minimum(item, num_boxes - 1)], -1, 0)
+            here |= _touches_box(box, reach, place) & (item < num_boxes)
+        if len(arrays.triangles):
+            corners = jnp.moveaxis(arrays.triangles[jnp.maximum(item - num_boxes, 0)], -1, 0)
+            here |= _touches_triangle(corners, reach, place) & (item >= num_boxes)
+        return hit | (near & here)
+
+    return jax.lax.fori_loop(jnp.int32(0), index.longest, test, sure)
 
 
 def goal_distance(arrays: ProblemArrays, place: Any) -> Any:

@@ -29,6 +29,7 @@ from d4orm_env.engine.lanes import (
     worlds_overlap_2,
     worlds_overlap_3,
 )
+from d4orm_env.engine.obstacles import may_touch
 from d4orm_env.engine.tiles import NOWHERE, compiled, inlined
 
 SLACK = np.float32(1e-4)
@@ -67,24 +68,16 @@ def make_scratch(num_robots: int, dimension: int) -> Scratch:
     )  # fmt: skip
 
 
-def static_boxes(arrays: Any) -> FloatArray:
-    """``(S, d, 2)`` ends of the boxes round obstacles and round what lies beyond each of the bounds, widened by half of
-    the margin.
-    """
+def bound_boxes(arrays: Any) -> FloatArray:
+    """``(S, d, 2)`` ends of the boxes round what lies beyond each of the bounds, widened by half of the margin."""
     dimension = arrays.goal.shape[1]
-    centres, reaches = [arrays.balls[:, :dimension]], [arrays.balls[:, dimension:]]
-    for x, y, radius in arrays.cylinders:
-        centres.append([(x, y, 0)])
-        reaches.append([(radius, radius, _INFINITY)])
-    low = [*(np.subtract(*pair) for pair in zip(centres, reaches, strict=True)), arrays.boxes[:, :dimension]]
-    high = [*(np.add(*pair) for pair in zip(centres, reaches, strict=True)), arrays.boxes[:, dimension:]]
+    low, high = np.full((2, 0, dimension), np.float32(0))
     for side, axis in np.argwhere(np.isfinite(arrays.bounds)):
         beyond = np.full((2, 1, dimension), _INFINITY)
         beyond[0] = -_INFINITY
         beyond[1 - side, 0, axis] = arrays.bounds[side, axis]
-        low.append(beyond[0])
-        high.append(beyond[1])
-    return _widened(np.concatenate(low), np.concatenate(high), arrays.margin)
+        low, high = np.concatenate([low, beyond[0]]), np.concatenate([high, beyond[1]])
+    return _widened(low, high, arrays.margin)
 
 
 def body_boxes(moving: FloatArray, radius: FloatArray, margin: Any) -> FloatArray:
@@ -233,9 +226,15 @@ def mark_robots(
 
 
 @inlined
-def near_static(k: Any, dimension: Any, static: Any, boxes: Any) -> Any:
-    """Whether any sample of robot ``k`` may be within the margin of a static thing, ``(S, d, 2)``, in this block."""
-    limits, touch = static.reshape(-1), False
-    for thing in range(static.shape[0]):
-        touch |= _meets(k, thing, dimension, boxes, limits)
+def near_static(arrays: Any, k: Any, bounds: Any, boxes: Any) -> Any:
+    """Whether in this block any sample of robot ``k`` may be within the margin of an obstacle, or of ``bounds``, see
+    :func:`bound_boxes`.
+    """
+    dimension, limits, touch = arrays.goal.shape[1], bounds.reshape(-1), False
+    if arrays.index.clearance.shape[0] > 0:
+        # The boxes are wider than the places by the radius and half of the margin.
+        reach, half = arrays.radius[k] + arrays.margin, arrays.radius[k] + _HALF * arrays.margin + SLACK
+        touch = may_touch(arrays.index, reach, half, boxes, box_of(k, dimension) + 2 * TILE, BOX)
+    for bound in range(bounds.shape[0]):
+        touch |= _meets(k, bound, dimension, boxes, limits)
     return touch

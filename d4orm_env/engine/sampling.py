@@ -16,7 +16,7 @@ from numba.extending import register_jitable
 
 from d4orm_env.core import collision, reward, robot_model, transition
 from d4orm_env.core.dynamics import COMMON, MODELS
-from d4orm_env.engine import lanes, noise, proximity, tiles
+from d4orm_env.engine import lanes, noise, obstacles, proximity, tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.lanes import (
     BLOCK,
@@ -84,7 +84,7 @@ def make_workspace(num_steps: int, num_robots: int, num_controls: int, dimension
 CONTROL_ROWS = 3
 """Rows of one step's controls."""
 
-SOURCES = fingerprint((robot_model, transition, collision, reward, noise, lanes, tiles, proximity))
+SOURCES = fingerprint((robot_model, transition, collision, reward, noise, lanes, obstacles, tiles, proximity))
 for _function in (
     noise.xor_shift,
     noise.hash32,
@@ -333,10 +333,10 @@ def _score_tile(
                 rest = num_steps - (first + count)
                 _add_standing(goals[k], inverse[k], np.float32(rest), robot)
             enclose(k, radius[k] + HALF * margin, dimension, places, boxes)
-            if near_static(k, dimension, static, boxes):
+            if near_static(arrays, k, static, boxes):
                 for step in range(count):
                     rows = own_places[step * dimension * TILE : (step + 1) * dimension * TILE]
-                    touch = tiles.near_obstacles(arrays, radius[k] + margin, rows, scratch.spare)
+                    touch = obstacles.near_obstacles(arrays, radius[k] + margin, rows, scratch.spare)
                     steps = np.float32(1 + rest if step == count - 1 else 1)
                     subtract_where(robot, TOTAL * TILE, touch, steps * penalty)
         if collisions:

@@ -68,6 +68,9 @@ for _function in (
     transition.arrives,
     collision.axis_gap,
     collision.leaves,
+    collision.meets_edge,
+    collision.lies_left,
+    collision.meets_triangle,
     reward.step_reward,
 ):
     # Lets compiled code call the core's plain Python functions, which stay as they are for everyone else.
@@ -443,41 +446,6 @@ def near_round(reach: Any, centre: Any, axes: Any, places: Any, spare: Any) -> A
         for s in range(TILE):
             spare[s] = _squared_gap3(_read3(places, 0, s), spot)
     return at_most(spare, 0, reach * reach)
-
-
-@inlined
-def _near_box(reach: Any, box: Any, dimension: Any, places: Any, spare: Any) -> Any:
-    for s in range(TILE):
-        gap2 = ZERO
-        for axis in range(dimension):
-            gap = collision.axis_gap(places[axis * TILE + s], box[axis], box[dimension + axis], ZERO, OPS)
-            gap2 += gap * gap
-        spare[s] = gap2
-    return at_most(spare, 0, reach * reach)
-
-
-@inlined
-def near_obstacles(arrays: Any, reach: Any, places: Any, spare: Any) -> Any:
-    """Where a body of this reach, its centre in the first rows of ``places``, touches an obstacle or the bounds.
-
-    ``spare`` is a row to overwrite.
-    """
-    dimension = arrays.goal.shape[1]
-    mask = NOWHERE
-    for i in range(arrays.balls.shape[0]):
-        mask |= near_round(reach + arrays.balls[i, dimension], arrays.balls[i], dimension, places, spare)
-    for i in range(arrays.cylinders.shape[0]):
-        mask |= near_round(reach + arrays.cylinders[i, 2], arrays.cylinders[i], 2, places, spare)
-    for i in range(arrays.boxes.shape[0]):
-        mask |= _near_box(reach, arrays.boxes[i], dimension, places, spare)
-    for axis in range(dimension):
-        lower, upper = arrays.bounds[0, axis], arrays.bounds[1, axis]
-        if lower > -np.inf or upper < np.inf:
-            row = places[axis * TILE : (axis + 1) * TILE]
-            for s in range(TILE):
-                spare[s] = ZERO if collision.leaves(row[s], reach, lower, upper) else ONE
-            mask |= at_most(spare, 0, ZERO)
-    return mask
 
 
 def _motion_reader(model: Model) -> Any:

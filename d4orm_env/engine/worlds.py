@@ -15,7 +15,7 @@ from numba.extending import register_jitable
 
 from d4orm_env.core import collision, observation, reward, robot_model, transition
 from d4orm_env.core.dynamics import COMMON, MODEL_CODES, names_of_codes
-from d4orm_env.engine import lanes, tiles
+from d4orm_env.engine import lanes, obstacles, tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.lanes import TILE, use_wide_registers
 from d4orm_env.engine.tiles import (
@@ -40,14 +40,15 @@ from d4orm_env.engine.tiles import (
     robot_mover,
 )
 
-SOURCES = fingerprint((robot_model, transition, collision, reward, observation, lanes, tiles))
+SOURCES = fingerprint((robot_model, transition, collision, reward, observation, lanes, obstacles, tiles))
 
 for _function in (
     observation.observe_robot,
     observation.insert_nearest,
     observation._find_nearest_robots,
     observation._find_nearest_obstacles,
-    observation._insert_round,
+    observation._insert_box,
+    observation._insert_triangle,
 ):
     register_jitable(**INLINED)(_function)
 
@@ -113,7 +114,7 @@ def _judge(
         for k in range(num_robots):
             robot = w[k * STRIDE : (k + 1) * STRIDE]
             places, spare = robot[STATE * TILE : CONTROL * TILE], robot[SPARE * TILE : (SPARE + 1) * TILE]
-            near[k, OBSTACLE] |= tiles.near_obstacles(arrays, arrays.radius[k] + extra, places, spare)
+            near[k, OBSTACLE] |= obstacles.near_obstacles(arrays, arrays.radius[k] + extra, places, spare)
         for s in range(min(TILE, collided.shape[0] - first)):
             for k in range(num_robots):
                 flags[first + s, k] = _bit(near[k, ROBOT] | near[k, OBSTACLE], s) != NOWHERE

@@ -1,0 +1,93 @@
+"""Obstacles as two tables: rounded boxes and triangles.
+
+A rounded box is whatever comes within a radius of a box: a circle or a sphere is one of no size, an upright cylinder is
+one without end, and a box has the radius zero. Polygons are cut into triangles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.core.arrays import FloatArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """The obstacles of a world of dimension ``d``, numbered through: first the rounded boxes, then the triangles.
+
+    Attributes:
+        boxes: ``(B, 2 d + 1)`` float32 lower corner, upper corner, radius [m]; corners may be infinitely far.
+        triangles: ``(T, 6)`` float32 corners ``x, y, x, y, x, y``, counterclockwise [m]; none in space.
+    """
+
+    boxes: FloatArray
+    triangles: FloatArray
+
+    @property
+    def dimension(self) -> int:
+        """``d``."""
+        return self.boxes.shape[1] // 2
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self.boxes) + len(self.triangles)
+
+    def extent(self) -> tuple[Floats, Floats]:
+        """Lowest and highest corner of all, zero along an axis where none of them ends; there must be some."""
+        d = self.dimension
+        boxes, triangles = self.boxes.astype(np.float64), self.triangles.astype(np.float64).reshape(-1, 2)
+        low, high = boxes[:, :d] - boxes[:, 2 * d :], boxes[:, d : 2 * d] + boxes[:, 2 * d :]
+        corners = np.concatenate([low, high, triangles]) if d == 2 else np.concatenate([low, high])
+        finite = np.isfinite(corners)
+        lowest = np.where(finite, corners, np.inf).min(axis=0)
+        highest = np.where(finite, corners, -np.inf).max(axis=0)
+        ends = finite.any(axis=0)
+        return np.where(ends, lowest, 0.0), np.where(ends, highest, 0.0)
+
+    def signed_distance(self, points: Floats, items: NDArray[np.int64]) -> Floats:
+        """``(N,)`` distance from each point to the surface of the obstacle of that number, negative inside [m].
+
+        Args:
+            points: ``(N, d)``.
+            items: ``(N,)``.
+        """
+        if not len(self.triangles):
+            return _box_distance(points, self.boxes[items].astype(np.float64))
+        distance, angular = np.empty(len(points)), items >= len(self.boxes)
+        distance[~angular] = _box_distance(points[~angular], self.boxes[items[~angular]].astype(np.float64))
+        corners = self.triangles[items[angular] - len(self.boxes)].astype(np.float64)
+        distance[angular] = _triangle_distance(points[angular], corners)
+        return distance
+
+
+def _box_distance(points: Floats, boxes: Floats) -> Floats:
+    d = points.shape[1]
+    square, deepest = np.zeros(len(points)), np.full(len(points), -np.inf)
+    for axis in range(d):
+        x = points[:, axis]
+        outside = np.maximum(boxes[:, axis] - x, x - boxes[:, d + axis])
+        beyond = np.maximum(outside, 0.0)
+        square += beyond * beyond
+        deepest = np.maximum(deepest, outside)
+    distance: Floats = np.sqrt(square) + np.minimum(deepest, 0.0) - boxes[:, 2 * d]
+    return distance
+
+
+def _triangle_distance(points: Floats, corners: Floats) -> Floats:
+    nearest, inside = np.full(len(points), np.inf), np.ones(len(points), bool)
+    for edge in range(3):
+        begin, end = corners[:, 2 * edge : 2 * edge + 2], np.roll(corners, -2, axis=1)[:, 2 * edge : 2 * edge + 2]
+        along, offset = end - begin, points - begin
+        square = along[:, 0] * along[:, 0] + along[:, 1] * along[:, 1]
+        share = np.clip((offset[:, 0] * along[:, 0] + offset[:, 1] * along[:, 1]) / square, 0.0, 1.0)
+        x, y = offset[:, 0] - share * along[:, 0], offset[:, 1] - share * along[:, 1]
+        nearest = np.minimum(nearest, x * x + y * y)
+        inside &= along[:, 0] * offset[:, 1] - along[:, 1] * offset[:, 0] >= 0
+    distance: Floats = np.where(inside, -1.0, 1.0) * np.sqrt(nearest)
+    return distance

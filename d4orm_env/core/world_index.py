@@ -1,0 +1,234 @@
+"""Where the obstacles are: a grid that answers for any point which of them can be nearest, however many there are.
+
+Every cell keeps the clearance at its centre and the obstacles that are nearest to some point in it. Clearance changes
+by no more than the distance between two points (it is 1-Lipschitz), so what it is at the centre decides nearly every
+question about a point of the cell; where it does not, the cell's few obstacles do. Nothing is approximated.
+
+The grid is refined from coarse to fine: what cannot be nearest in a cell cannot be so in its parts. A world too large
+for cells of the size asked for gets larger ones, which cost time and no exactness.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.shapes import Shapes
+
+MAX_BYTES = 64 * 2**20
+"""Memory of an index."""
+
+MAX_CELLS = 2**21
+
+FREE_CELLS, CELLS_PER_OBSTACLE = 2**15, 2**8
+"""No more cells than these allow: more would take longer to make than they save."""
+
+_PAIRS_AT_ONCE = 2**18
+"""Cells times obstacles whose distances are worked out in one go."""
+
+_EPSILON = float(np.finfo(np.float32).eps)
+
+Ints = NDArray[np.int32]
+Floats = NDArray[np.float64]
+
+
+class WorldIndex(NamedTuple):
+    """A grid over a world of dimension ``d``; cells are numbered with the last axis fastest.
+
+    Attributes:
+        low: ``(d,)`` float32 lowest corner [m].
+        scale: ``()`` float32 one over the size of a cell [1/m].
+        size: ``(d,)`` int32 cells along each axis; all zero in a world without obstacles.
+        slack: ``()`` float32 by how much the clearance at the centre of its cell and that at a point may differ [m],
+            rounding included.
+        clearance: ``(C,)`` float32 at the centres [m], negative inside an obstacle.
+        first: ``(C + 1,)`` int32 where each cell's part of ``items`` begins.
+        items: int32 numbers of the obstacles, as in :class:`~d4orm_env.core.shapes.Shapes`.
+        longest: ``()`` int32 the most obstacles of any cell.
+        nearest: ``()`` int32 how many of the nearest obstacles of any of its points a cell is sure to have.
+    """
+
+    low: FloatArray
+    scale: np.float32
+    size: Ints
+    slack: np.float32
+    clearance: FloatArray
+    first: Ints
+    items: Ints
+    longest: np.int32
+    nearest: np.int32
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory of the grid."""
+        return self.clearance.nbytes + self.first.nbytes + self.items.nbytes
+
+
+class _Cells(NamedTuple):
+    """Cells of one size: ``place`` ``(C, d)``, and pairs of a cell and an obstacle, sorted by cell."""
+
+    place: NDArray[np.int64]
+    cell: NDArray[np.int64]
+    item: NDArray[np.int64]
+
+
+def build_index(shapes: Shapes, cell: float, reach: float, nearest: int = 1) -> WorldIndex:
+    """The index of some obstacles.
+
+    Args:
+        shapes: The obstacles.
+        cell: Size of a cell [m]; larger where there would be more cells than is worthwhile.
+        reach: Clearance up to which the grid reaches round the obstacles [m].
+        nearest: How many of the nearest obstacles of any point a cell's list is sure to hold.
+    """
+    if not shapes.count:
+        return _frozen(np.zeros(shapes.dimension), 1.0, np.zeros(shapes.dimension), 0.0, *np.zeros((3, 0)), nearest)
+    while True:
+        low, size, cell = _layout(shapes, cell, reach)
+        index = _filled(shapes, low, size, cell, nearest)
+        if index.num_bytes <= MAX_BYTES or index.size.max() == 1:
+            return index
+        cell *= 1.5
+
+
+def nearest_distance(shapes: Shapes, index: WorldIndex, points: Floats) -> Floats:
+    """``(N,)`` signed distance from points ``(N, d)`` to the nearest of the obstacles [m]; there must be some."""
+    distance = np.empty(len(points))
+    place = (points - index.low) * index.scale
+    inside = ((place > 0) & (place < index.size)).all(axis=1)
+    cell = np.zeros(len(points), np.int64)
+    cell[inside] = np.ravel_multi_index(tuple(place[inside].astype(np.int64).T), tuple(index.size))
+    # Beyond the grid every obstacle may be the nearest.
+    begin = np.where(inside, index.first[cell], 0)
+    count = np.where(inside, index.first[cell + 1] - begin, shapes.count)
+    ends = np.cumsum(count)
+    done = 0
+    while done < len(points):
+        before = ends[done - 1] if done else 0
+        last = max(done + 1, int(np.searchsorted(ends, before + _PAIRS_AT_ONCE)))
+        own, starts = count[done:last], ends[done:last] - count[done:last] - before
+        number = np.arange(own.sum()) - np.repeat(starts, own) + np.repeat(begin[done:last], own)
+        items = np.where(
+            np.repeat(inside[done:last], own), index.items[np.minimum(number, len(index.items) - 1)], number
+        )
+        gaps = shapes.signed_distance(np.repeat(points[done:last], own, axis=0), items)
+        distance[done:last] = np.minimum.reduceat(gaps, starts)
+        done = last
+    return distance
+
+
+def _layout(shapes: Shapes, cell: float, reach: float) -> tuple[Floats, NDArray[np.int64], float]:
+    lower, upper = shapes.extent()
+    most = min(MAX_CELLS, FREE_CELLS + CELLS_PER_OBSTACLE * shapes.count)
+    while True:
+        # So far that even a point beyond the grid is found to be clear in the outermost cell next to it.
+        pad = reach + (1.5 + 2 * np.sqrt(len(lower)) / 2) * cell + 1e-3 * cell
+        size = np.ceil((upper - lower + 2 * pad) / cell)
+        if size.prod() <= most:
+            return (lower + upper - size * cell) / 2, size.astype(np.int64), cell
+        cell *= 1.1 * max(1.0, (size.prod() / most) ** (1 / len(lower)))
+
+
+def _filled(shapes: Shapes, low: Floats, size: NDArray[np.int64], cell: float, nearest: int) -> WorldIndex:
+    largest = np.abs([low, low + size * cell]).max()
+    rounding = 1e-3 * cell + 16 * _EPSILON * largest
+    slack = cell * np.sqrt(len(low)) / 2 + rounding
+    leaves = list(_refined(shapes, low, size, cell, rounding, nearest))
+    number = [np.ravel_multi_index(tuple(part.place.T), tuple(size)) for part, _ in leaves]
+    clearance, counts = np.empty(size.prod()), np.empty(size.prod(), np.int64)
+    for own, (part, gap) in zip(number, leaves, strict=True):
+        clearance[own], counts[own] = gap, np.bincount(part.cell, minlength=len(own))
+    first = np.concatenate([[0], np.cumsum(counts)])
+    items = np.empty(first[-1], np.int32)
+    for own, (part, _) in zip(number, leaves, strict=True):
+        before = np.arange(len(part.cell)) - np.searchsorted(part.cell, part.cell)
+        items[first[own[part.cell]] + before] = part.item
+    return _frozen(low, 1 / cell, size, slack, clearance, first, items, nearest)
+
+
+def _refined(
+    shapes: Shapes, low: Floats, size: NDArray[np.int64], cell: float, rounding: float, nearest: int
+) -> Iterator[tuple[_Cells, Floats]]:
+    """All cells of the grid with the obstacles that count there, and the clearance at their centres, part by part."""
+    levels = 0
+    while shapes.count * np.ceil(size / 2**levels).prod() > _PAIRS_AT_ONCE and 2**levels < size.max():
+        levels += 1
+    coarse = np.stack(np.meshgrid(*(np.arange(np.ceil(n / 2**levels)) for n in size), indexing="ij"), axis=-1)
+    place = coarse.reshape(-1, len(size)).astype(np.int64)
+    every = np.repeat(np.arange(len(place)), shapes.count)
+    waiting = [(levels, _Cells(place, every, np.tile(np.arange(shapes.count), len(place))))]
+    while waiting:
+        level, cells = waiting.pop()
+        width = cell * 2**level
+        centre = low + (cells.place + 0.5) * width
+        distance = shapes.signed_distance(centre[cells.cell], cells.item)
+        bounds = np.searchsorted(cells.cell, np.arange(len(cells.place)))
+        bar = _smallest(distance, cells.cell, bounds, nearest)
+        keep = distance <= (bar + width * np.sqrt(len(size)) + 2 * rounding)[cells.cell]
+        cells = _Cells(cells.place, cells.cell[keep], cells.item[keep])
+        if level == 0:
+            yield cells, np.minimum.reduceat(distance, bounds)
+            continue
+        for part in _halved(cells):
+            waiting.append((level - 1, _split(part, np.ceil(size / 2 ** (level - 1)))))
+
+
+def _smallest(distance: Floats, cell: NDArray[np.int64], bounds: NDArray[np.int64], nearest: int) -> Floats:
+    """``(C,)`` distance of the obstacle of this rank in every cell; of the last one where there are fewer."""
+    if nearest == 1:
+        smallest: Floats = np.minimum.reduceat(distance, bounds)
+        return smallest
+    ordered = distance[np.lexsort((distance, cell))]
+    last = np.append(bounds[1:], len(cell)) - 1
+    ranked: Floats = ordered[np.minimum(bounds + nearest - 1, last)]
+    return ranked
+
+
+def _halved(cells: _Cells) -> Iterator[_Cells]:
+    """The cells, in parts small enough to be split."""
+    parts = -(-(len(cells.item) << cells.place.shape[1]) // _PAIRS_AT_ONCE)
+    ends = np.searchsorted(cells.cell, np.linspace(0, len(cells.place), min(parts, len(cells.place)) + 1).astype(int))
+    for begin, end in zip(ends[:-1], ends[1:], strict=True):
+        if begin < end:
+            first, last = cells.cell[begin], cells.cell[end - 1]
+            yield _Cells(cells.place[first : last + 1], cells.cell[begin:end] - first, cells.item[begin:end])
+
+
+def _split(cells: _Cells, size: Floats) -> _Cells:
+    """Every cell cut in two along each axis; parts beyond the grid are left out."""
+    places, owners, items, count = [], [], [], 0
+    for corner in product((0, 1), repeat=len(size)):
+        place = 2 * cells.place + corner
+        inside = (place < size).all(axis=1)
+        kept = inside[cells.cell]
+        places.append(place[inside])
+        owners.append(count + (np.cumsum(inside) - 1)[cells.cell[kept]])
+        items.append(cells.item[kept])
+        count += int(inside.sum())
+    return _Cells(np.concatenate(places), np.concatenate(owners), np.concatenate(items))
+
+
+def _frozen(
+    low: Floats,
+    scale: float,
+    size: Floats | NDArray[np.int64],
+    slack: float,
+    clearance: Floats,
+    first: Floats | NDArray[np.int64],
+    items: Floats | Ints,
+    nearest: int,
+) -> WorldIndex:
+    index = WorldIndex(
+        low.astype(np.float32), np.float32(scale), size.astype(np.int32), np.float32(slack),
+        clearance.astype(np.float32), first.astype(np.int32), items.astype(np.int32),
+        np.int32(np.diff(first).max(initial=0)), np.int32(nearest),
+    )  # fmt: skip
+    for array in index:
+        if isinstance(array, np.ndarray):
+            array.setflags(write=False)
+    return index

@@ -1,0 +1,172 @@
+"""The index of obstacles against testing all of them, in every engine, and polygons against shapely."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
+from d4orm_env.core.world_index import MAX_BYTES, build_index
+from d4orm_env.engine.base import get_engine
+
+ENGINES = pytest.mark.parametrize("engine", ["cpu", "jax"])
+
+
+def star(random: np.random.Generator, corners: int, size: float) -> Any:
+    """A simple polygon round the origin, convex or not."""
+    angle = 2 * np.pi * (np.arange(corners) + random.uniform(0.1, 0.9, corners)) / corners
+    radius = random.uniform(0.3, 1, corners) * size
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)[:: random.choice([-1, 1])]
+
+
+def random_world(seed: int, dimension: int, count: int) -> World:
+    """About ``4 count`` obstacles of all kinds, small and large, in a cube of 8 m."""
+    random = np.random.default_rng(seed)
+    place = random.uniform(-4, 4, (4, count, dimension))
+    size = random.uniform(0.01, 1.0, (4, count, 1)) * 4 / count ** (1 / dimension)
+    boxes = np.hstack([place[0], place[0] + size[0] * random.uniform(0.1, 1, (count, dimension))])
+    balls = np.hstack([place[1], size[1] / 2])
+    bounds: dict[str, Any] = {} if seed % 3 else {"lower": [-5] * dimension, "upper": [4.5] * dimension}
+    if dimension == 3:
+        cylinders = np.hstack([place[2, :, :2], size[2] / 4])
+        return World(dimension=3, boxes=boxes, spheres=balls, cylinders=cylinders, **bounds)
+    polygons = [
+        at + star(random, random.integers(3, 9), float(extent[0])) for at, extent in zip(place[2], size[2], strict=True)
+    ]
+    return World(boxes=boxes, circles=balls, polygons=polygons, **bounds)
+
+
+def all_clearances(world: World, points: Any) -> Any:
+    """The clearance of points, all obstacles looked at."""
+    every = np.repeat(np.arange(world.shapes.count), len(points))
+    gaps = world.shapes.signed_distance(np.tile(points, (world.shapes.count, 1)), every).reshape(-1, len(points))
+    bounds = np.minimum(points - world.bounds[0], world.bounds[1] - points).min(axis=1)
+    return np.minimum(gaps.min(axis=0), bounds)
+
+
+worlds = given(
+    seed=st.integers(0, 10**6), dimension=st.sampled_from([2, 3]), count=st.integers(1, 30),
+    radius=st.sampled_from([0.01, 0.15, 1.0]),
+)  # fmt: skip
+
+
+@worlds
+@settings(max_examples=30, deadline=None)
+def test_index_finds_the_nearest_obstacle(seed: int, dimension: int, count: int, radius: float) -> None:
+    world = random_world(seed, dimension, count)
+    points = np.random.default_rng(seed).uniform(-7, 7, (200, dimension))
+    world.index(radius)
+    np.testing.assert_array_equal(world.clearance(points), all_clearances(world, points))
+    np.testing.assert_array_equal(world.clearance(points[7]), world.clearance(points)[7])
+
+
+@worlds
+@settings(max_examples=30, deadline=None)
+def test_index_finds_several_of_the_nearest(seed: int, dimension: int, count: int, radius: float) -> None:
+    world = random_world(seed, dimension, count)
+    index, random = world.index(radius, nearest=3), np.random.default_rng(seed)
+    inside = index.low + random.uniform(0, 1, (50, dimension)) * index.size / index.scale
+    for point in inside:
+        cell = np.ravel_multi_index(tuple(((point - index.low) * index.scale).astype(int)), tuple(index.size))
+        items = index.items[index.first[cell] : index.first[cell + 1]].astype(int)
+        every = np.arange(world.shapes.count)
+        gaps = world.shapes.signed_distance(np.repeat(point[None], len(every), axis=0), every)
+        np.testing.assert_array_equal(np.sort(gaps[items])[:3], np.sort(gaps)[:3])
+
+
+@ENGINES
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize(("seed", "count", "radius"), [(1, 1, 0.15), (2, 20, 0.01), (3, 20, 0.15), (4, 5, 1.0)])
+def test_engines_flag_what_all_obstacles_would(
+    engine: str, seed: int, dimension: int, count: int, radius: float
+) -> None:
+    world, random = random_world(seed, dimension, count), np.random.default_rng(seed)
+    model = "holonomic2d" if dimension == 2 else "holonomic3d"
+    start = random.uniform(-6, 6, (256, dimension)).astype(np.float32)
+    start = start[all_clearances(world, start) > radius + 1e-3][:8]
+    # Robots pass through everything; what they touch on the way is flagged.
+    team = Team((model,) * len(start), radius=radius, max_speed=100.0, max_acceleration=1000.0)
+    problem = unchecked(team, start, world)
+    controls = random.normal(0, 300, (40, len(start), dimension)).astype(np.float32)
+    trajectory = get_engine(engine).rollout(problem, controls)
+    clearance = all_clearances(world, trajectory.positions.reshape(-1, dimension).astype(float))
+    gap = clearance.reshape(trajectory.collided.shape) - radius
+    alone = ~near_each_other(trajectory.positions, 2 * radius + problem.margin)
+    for flags, reach in ((trajectory.collided, 0.0), (trajectory.margin_violated, problem.margin)):
+        decided = alone & (np.abs(gap - reach) > 2e-5)
+        np.testing.assert_array_equal(flags[decided], (gap <= reach)[decided])
+
+
+def unchecked(team: Team, start: Any, world: World) -> Problem:
+    """A problem whose robots may touch each other."""
+    apart = np.zeros_like(start)
+    apart[:, 0] = 1e3 + 50 * np.arange(len(start))
+    states = np.concatenate([start, np.zeros_like(start)], axis=1)
+    far = Problem(
+        team, np.concatenate([apart, apart * 0], axis=1), apart, World(team.dimension), goal_radius=0.2, horizon=40
+    )
+    return far.moment(states, apart, world=world)
+
+
+def near_each_other(positions: Any, reach: float) -> Any:
+    """``(H+1, K)`` robots whose centres are about within reach of another's."""
+    gaps = np.linalg.norm(positions[:, :, None] - positions[:, None], axis=-1)
+    gaps[:, np.arange(gaps.shape[1]), np.arange(gaps.shape[1])] = np.inf
+    return (gaps <= reach + 1e-4).any(axis=2)
+
+
+@given(seed=st.integers(0, 10**6), corners=st.integers(3, 20))
+@settings(max_examples=50, deadline=None)
+def test_polygons_are_those_of_shapely(seed: int, corners: int) -> None:
+    random = np.random.default_rng(seed)
+    outline = star(random, corners, 2.0).astype(np.float32)
+    if not shapely.Polygon(outline).is_valid:
+        with pytest.raises(ValueError, match="cross or touch"):
+            World(polygons=[outline])
+        return
+    polygon, points = shapely.Polygon(outline), random.uniform(-3, 3, (200, 2))
+    clearance = World(polygons=[outline]).clearance(points)
+    expected = shapely.distance(polygon, shapely.points(points))
+    outside = expected > 0
+    np.testing.assert_allclose(clearance[outside], expected[outside], atol=1e-9)
+    assert (clearance[~outside] <= 0).all()
+
+
+@pytest.mark.parametrize(
+    ("corners", "message"),
+    [
+        ([(0, 0), (1, 0)], "has 2 corners; a polygon needs three or more"),
+        ([(0, 0), (0, 0), (1, 1)], "corner 0 and the one after it are both at"),
+        ([(0, 0), (1, 1), (1, 0), (0, 1)], "edges from corner 0 and from corner 2 cross or touch"),
+        ([(0, 0), (1, 0), (2, 0)], "cross or touch"),
+        ([(0, 0), (4, 0), (4, 4), (2, 0), (0, 4)], "cross or touch"),
+        ([(0, 0), (np.nan, 0), (1, 1)], "polygons"),
+        ([(0, 0, 0), (1, 0, 0), (1, 1, 0)], "polygons"),
+    ],
+)  # fmt: skip
+def test_degenerate_polygons_are_refused(corners: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        World(polygons=[corners])
+
+
+def test_polygons_are_for_the_plane() -> None:
+    with pytest.raises(ValueError, match="polygons need a world of dimension 2"):
+        World(dimension=3, polygons=[[(0, 0), (1, 0), (0, 1)]])
+
+
+@pytest.mark.parametrize("extent", [1.0, 1e3, 9e5])
+def test_an_index_is_bounded_in_memory(extent: float) -> None:
+    random = np.random.default_rng(0)
+    low = random.uniform(-extent, extent, (500, 2))
+    world = World(boxes=np.hstack([low, low + extent / 100]))
+    index = build_index(world.shapes, 0.05, 0.2)
+    assert index.num_bytes <= MAX_BYTES
+    points = random.uniform(-extent, extent, (500, 2))
+    np.testing.assert_array_equal(world.clearance(points), all_clearances(world, points))
