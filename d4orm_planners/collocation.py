@@ -187,6 +187,19 @@ class TeamProgram:
             yield lambda p, c=centre, r=radius, n=axes: self._norm(p[:n, :] - ca.repmat(ca.DM(c), 1, p.shape[1])) - r
         for box in world.boxes.astype(float):
             yield lambda p, low=box[:dimension], high=box[dimension:]: self._box_gap(p, low, high)
+        for corners in world.shapes.triangles.astype(float).reshape(-1, 3, 2):
+            yield lambda p, corners=corners: self._triangle_gap(p, corners)
+
+    def _triangle_gap(self, points: Any, corners: Floats) -> Any:
+        ca = self.casadi
+        deepest, nearest = [], []
+        for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            along, offset = end - begin, points - ca.repmat(ca.DM(begin), 1, points.shape[1])
+            share = ca.fmin(ca.fmax((along[0] * offset[0, :] + along[1] * offset[1, :]) / (along @ along), 0.0), 1.0)
+            nearest.append(self._norm(offset - ca.DM(along) @ share))
+            deepest.append((along[1] * offset[0, :] - along[0] * offset[1, :]) / np.hypot(*along))
+        depth = ca.fmax(ca.fmax(*deepest[:2]), deepest[2])
+        return ca.if_else(depth < 0, depth, ca.fmin(ca.fmin(*nearest[:2]), nearest[2]))
 
     def _box_gap(self, points: Any, lower: Floats, upper: Floats) -> Any:
         ca = self.casadi

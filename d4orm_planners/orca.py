@@ -144,6 +144,10 @@ def _walls(problem: Problem) -> Iterator[FloatArray]:
         yield _disc(*circle)
     for box in problem.world.boxes:
         yield _rectangle(*box)
+    for corners, triangles in zip(problem.world.polygons, problem.world.triangles, strict=True):
+        # The triangles are counter-clockwise, and one that has an edge of the outline shows which way round it goes.
+        forward = any((b - a) % len(corners) == 1 for t in triangles for a, b in zip(t, (*t[1:], t[0]), strict=True))
+        yield corners if forward else corners[::-1]
     if problem.world.lower is not None:
         yield _rectangle(*problem.world.lower, *problem.world.upper)[::-1]
 

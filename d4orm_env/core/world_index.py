@@ -11,7 +11,7 @@ for cells of the size asked for gets larger ones, which cost time and no exactne
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import product
+from itertools import pairwise, product
 from typing import NamedTuple
 
 import numpy as np
@@ -193,7 +193,7 @@ def _halved(cells: _Cells) -> Iterator[_Cells]:
     """The cells, in parts small enough to be split."""
     parts = -(-(len(cells.item) << cells.place.shape[1]) // _PAIRS_AT_ONCE)
     ends = np.searchsorted(cells.cell, np.linspace(0, len(cells.place), min(parts, len(cells.place)) + 1).astype(int))
-    for begin, end in zip(ends[:-1], ends[1:], strict=True):
+    for begin, end in pairwise(ends):
         if begin < end:
             first, last = cells.cell[begin], cells.cell[end - 1]
             yield _Cells(cells.place[first : last + 1], cells.cell[begin:end] - first, cells.item[begin:end])

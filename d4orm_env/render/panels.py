@@ -76,6 +76,9 @@ def view_limits(problem: Problem, points: Any = ()) -> Array:
     for box in world.boxes:
         lows.append(box[:d])
         highs.append(box[d:])
+    for corners in world.polygons:
+        lows.append(corners.min(axis=0))
+        highs.append(corners.max(axis=0))
     lower, upper = np.min(lows, axis=0), np.max(highs, axis=0)
     span = float(np.max(upper - lower))
     room = max(1.5 * reach, 0.05 * span)
@@ -167,7 +170,7 @@ def draw_world(panel: Panel, problem: Problem) -> None:
             panel.polygons(panel.outlines(discs[:, :2], discs[:, -1]), **solid)
         corners = [(0, 1), (2, 1), (2, 3), (0, 3)]
         flat = world.boxes[:, [0, 1, problem.dimension, problem.dimension + 1]]
-        panel.polygons([box[np.array(corner)] for box in flat for corner in [corners]], **solid)
+        panel.polygons([*(box[np.array(corners)] for box in flat), *world.polygons], **solid)
     if world.lower is not None:
         x, y = world.bounds[:, :2].T
         rectangle = np.array([(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1]), (x[0], y[0])])
@@ -179,20 +182,24 @@ def draw_world(panel: Panel, problem: Problem) -> None:
 def _draw_solids(panel: Panel, problem: Problem) -> None:
     """The obstacles of a view of space, translucent: nothing may hide behind them."""
     style = {"facecolors": (*to_rgb(OBSTACLE), 0.4), "edgecolors": (*to_rgb(OBSTACLE_EDGE), 0.6), "zorder": 1}
+    faces: list[Array] = []
+    rings: list[Array] = []
+    sides: list[Array] = []
+    planes = np.stack([np.column_stack([_CIRCLE, 0 * _ANGLES]), np.column_stack([0 * _ANGLES, _CIRCLE])])
     for *centre, radius in problem.world.spheres:
-        panel.polygons(panel.outlines([centre], radius), linewidths=0.8, **style)
-        rings = np.stack([np.column_stack([_CIRCLE, 0 * _ANGLES]), np.column_stack([0 * _ANGLES, _CIRCLE])])
-        panel.polygons(np.array(centre) + radius * rings, **(style | {"facecolors": "none", "linewidths": 0.4}))
+        faces.extend(panel.outlines([centre], radius))
+        rings.extend(np.array(centre) + radius * planes)
     for x, y, radius in problem.world.cylinders:
         ring = np.array([x, y]) + radius * _CIRCLE
         low, high = (np.column_stack([ring, np.full(len(ring), z)]) for z in panel.limits[:, 2])
-        sides = np.stack([low, np.roll(low, 1, axis=0), np.roll(high, 1, axis=0), high], axis=1)
-        panel.polygons(sides, **(style | {"edgecolors": "none"}))
-        panel.polygons([low, high], linewidths=0.8, **style)
+        sides.extend(np.stack([low, np.roll(low, 1, axis=0), np.roll(high, 1, axis=0), high], axis=1))
+        faces += [low, high]
+    corners = [(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5)]
     for box in problem.world.boxes:
-        corners = np.array(list(product(*box.reshape(2, 3).T)))
-        faces = [(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5)]
-        panel.polygons(corners[np.array(faces)], linewidths=0.8, **style)
+        faces.extend(np.array(list(product(*box.reshape(2, 3).T)))[np.array(corners)])
+    panel.polygons(sides, **(style | {"edgecolors": "none"}))
+    panel.polygons(faces, linewidths=0.8, **style)
+    panel.polygons(rings, **(style | {"facecolors": "none", "linewidths": 0.4}))
 
 
 class TeamLayer:

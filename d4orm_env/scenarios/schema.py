@@ -129,6 +129,12 @@ class BoxEntry(Entry):
         return [*self.lower, *self.upper]
 
 
+class PolygonEntry(Entry):
+    """A simple polygon: its corners x, y in order, either way round [m]."""
+
+    corners: list[PlanarPlace] = Field(min_length=3)
+
+
 class WorldEntry(Entry):
     """Obstacles and bounds; an open world without bounds."""
 
@@ -137,13 +143,15 @@ class WorldEntry(Entry):
     spheres: list[SphereEntry] = []
     cylinders: list[RoundEntry] = []
     boxes: list[BoxEntry] = []
+    polygons: list[PolygonEntry] = []
 
     def build(self, dimension: int) -> World:
         rows = {
             kind: [entry.row for entry in getattr(self, kind)] for kind in ("circles", "spheres", "cylinders", "boxes")
         }
         lower, upper = (self.bounds.lower, self.bounds.upper) if self.bounds else (None, None)
-        return World(dimension, **rows, lower=lower, upper=upper)
+        polygons = [entry.corners for entry in self.polygons]
+        return World(dimension, **rows, polygons=polygons, lower=lower, upper=upper)
 
 
 class ProblemFile(Entry):
@@ -222,6 +230,7 @@ PARTS: dict[tuple[str, ...], type[BaseModel]] = {
     ("world", "spheres"): SphereEntry,
     ("world", "cylinders"): RoundEntry,
     ("world", "boxes"): BoxEntry,
+    ("world", "polygons"): PolygonEntry,
 }
 """The schema of each part of the explicit form."""
 
@@ -299,6 +308,7 @@ def _describe_world(problem: Problem) -> dict[str, Any]:
         content[kind] = [{"center": row[:-1], "radius": row[-1]} for row in rows]
     boxes = [_decimals(row) for row in world.boxes]
     content["boxes"] = [{"lower": row[:dimension], "upper": row[dimension:]} for row in boxes]
+    content["polygons"] = [{"corners": [_decimals(corner) for corner in corners]} for corners in world.polygons]
     return {kind: entries for kind, entries in content.items() if entries}
 
 
