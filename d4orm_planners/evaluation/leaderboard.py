@@ -5,10 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 
-from d4orm_planners.evaluation.report import table
+from d4orm_planners.evaluation.report import HEADER, cells, deadline_table, errors, panels, table
 from d4orm_planners.evaluation.store import Trial
-from d4orm_planners.evaluation.summary import SuccessRate, success_by, success_rate
-from d4orm_planners.evaluation.tables import HEADER, cells, deadline_table, errors, panels
+from d4orm_planners.evaluation.summary import SuccessRate, success_by, success_rates
 
 INTRODUCTION = """\
 # Leaderboard
@@ -37,7 +36,7 @@ def leaderboard(trials: Sequence[Trial], deadlines: Sequence[float] = ()) -> str
     if not trials:
         raise ValueError("the store holds no trials yet; run `d4orm evaluate` first")
     groups = _groups(trials)
-    rates = [success_rate(group, label) for (label, *_), group in groups.items()]
+    rates = success_rates((label, group) for (label, *_), group in groups.items())
     blocks = [INTRODUCTION, "## Success", *_matrices(rates), "## Scenario by scenario"]
     for (scenario, robots, model), panel in panels(rates).items():
         # The best first, at every level of noise.
@@ -45,7 +44,7 @@ def leaderboard(trials: Sequence[Trial], deadlines: Sequence[float] = ()) -> str
         blocks.append(table(f"{scenario}, {robots} robots, {model}", HEADER, [cells(rate) for rate in ranked]))
     if deadlines:
         blocks += ["## Success within a deadline for planning", WITHIN, *_deadlines(groups, deadlines)]
-    return "\n\n".join([*blocks, *errors(rates), origin(trials)]) + "\n"
+    return "\n\n".join([*blocks, *errors((rate.label, rate.error) for rate in rates), origin(trials)]) + "\n"
 
 
 def _groups(trials: Sequence[Trial]) -> dict[tuple[str, str, int, str, float], list[Trial]]:

@@ -190,7 +190,6 @@ def softmax_mean(rewards: Any, samples: Any, temperature: float) -> Any:
 def denoise(
     model: str,
     team: PlainTeam,
-    base: Any,
     mean: Any,
     noise_scale: Any,
     key: Any,
@@ -203,8 +202,7 @@ def denoise(
     Args:
         model: Model name.
         team: The problem.
-        base: ``(H, K, m)`` controls that the deformation is added to.
-        mean: ``(H, K, m)`` deformation to sample around at first.
+        mean: ``(H, K, m)`` controls to sample around at first.
         noise_scale: ``(N,)`` standard deviation at every step.
         key: A key of ``jax.random``.
         num_samples: ``M``.
@@ -218,7 +216,7 @@ def denoise(
     def update(mean: Any, xs: Any) -> Any:
         sigma, step_key = xs
         samples = mean[None] + sigma * jax.random.normal(step_key, (num_samples, *mean.shape))
-        rewards = score(model, team, base[None] + samples, collisions).mean(axis=1)
+        rewards = score(model, team, samples, collisions).mean(axis=1)
         return softmax_mean(rewards, samples, temperature), rewards.mean()
 
     return jax.lax.scan(update, mean, (noise_scale, jax.random.split(key, len(noise_scale))))[0]
@@ -245,7 +243,5 @@ def denoise_around_rest(
     """
     model, team = plain_team(problem)
     zero = jnp.zeros((problem.horizon, problem.num_robots, problem.control_size))
-    mean = denoise(
-        model, team, zero, zero, noise_scale, jax.random.key(seed), num_samples, temperature, collisions
-    )  # fmt: skip
-    return np.asarray(mean)
+    key = jax.random.key(seed)
+    return np.asarray(denoise(model, team, zero, noise_scale, key, num_samples, temperature, collisions))
