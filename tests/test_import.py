@@ -8,7 +8,7 @@ import sys
 import pytest
 
 HEAVY = ("torch", "ray", "casadi", "plotly", "matplotlib", "jax", "stable_baselines3", "supersuit", "zenoh", "pyrvo",
-         "pandas", "pyarrow", "scipy")  # fmt: skip
+         "pandas", "pyarrow", "scipy.stats")  # fmt: skip
 CONTRACT = (
     "navigation_v0",
     "make_problem",
