@@ -129,6 +129,25 @@ def test_a_finished_trial_stays_and_a_failed_one_is_replaced(tmp_path: Path) -> 
     assert store.trials() == [trial(), trial(1)]
 
 
+def test_the_table_is_that_of_the_files_that_are_out_there(tmp_path: Path) -> None:
+    TrialStore(tmp_path / "new.sqlite")
+    with closing(sqlite3.connect(tmp_path / "new.sqlite")) as connection:
+        (made,) = connection.execute("SELECT sql FROM sqlite_schema WHERE name = 'trials'").fetchone()
+    assert made.split() == FIRST_SCHEMA.split()
+
+
+FIRST_SCHEMA = """
+CREATE TABLE trials (policy TEXT NOT NULL, config TEXT NOT NULL, problem TEXT NOT NULL, noise REAL NOT NULL,
+seed INTEGER NOT NULL, label TEXT NOT NULL, scenario TEXT NOT NULL, robots INTEGER NOT NULL, model TEXT NOT NULL,
+dt REAL NOT NULL, versions TEXT NOT NULL, machine TEXT NOT NULL, date TEXT NOT NULL, success INTEGER NOT NULL,
+verified INTEGER, violation TEXT NOT NULL, collided INTEGER NOT NULL, arrived INTEGER NOT NULL, travel_time REAL,
+makespan REAL, reward REAL, mean_squared_jerk REAL, steps INTEGER NOT NULL, iterations INTEGER, status TEXT NOT NULL,
+wall_time REAL, preparation REAL, elapsed REAL, history TEXT NOT NULL, messages INTEGER, message_bytes INTEGER,
+waiting_share REAL, error TEXT NOT NULL, PRIMARY KEY (policy, config, problem, noise, seed)) WITHOUT ROWID
+"""
+"""Of version 4, which the files that are out there have."""
+
+
 def test_a_seed_that_the_store_has_no_room_for_is_refused(tmp_path: Path) -> None:
     store = TrialStore(tmp_path / "trials.sqlite")
     with pytest.raises(ValueError, match=f"seed is {2**63}; a store has room for seeds up to {2**63 - 1}"):

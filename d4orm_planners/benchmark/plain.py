@@ -20,39 +20,22 @@ from d4orm_env.core.problem import Problem
 
 
 class PlainTeam(NamedTuple):
-    """A problem of one robot model, as arrays.
+    """A problem of one robot model, as arrays; obstacles and bounds as in :class:`~d4orm_env.core.world.World`."""
 
-    Attributes:
-        start: ``(K, n)``.
-        goal: ``(K, d)``.
-        radius: ``(K,)``.
-        max_speed: ``(K,)``.
-        max_acceleration: ``(K,)``.
-        max_turn_rate: ``(K,)``.
-        balls: ``(., d + 1)`` centre and radius of circles or spheres.
-        cylinders: ``(., 3)`` axis and radius of vertical cylinders.
-        boxes: ``(., 2 d)`` lower and upper corner.
-        bounds: ``(2, d)``.
-        dt: ``()``.
-        margin: ``()``.
-        goal_radius: ``()``.
-        goal_speed: ``()``, infinite without a limit.
-    """
-
-    start: Any
-    goal: Any
-    radius: Any
-    max_speed: Any
-    max_acceleration: Any
-    max_turn_rate: Any
-    balls: Any
-    cylinders: Any
-    boxes: Any
-    bounds: Any
+    start: Any  # (K, n)
+    goal: Any  # (K, d)
+    radius: Any  # (K,)
+    max_speed: Any  # (K,)
+    max_acceleration: Any  # (K,)
+    max_turn_rate: Any  # (K,)
+    balls: Any  # (., d + 1) centre and radius of circles or spheres
+    cylinders: Any  # (., 3) axis and radius of vertical cylinders
+    boxes: Any  # (., 2 d) lower and upper corner
+    bounds: Any  # (2, d)
     dt: Any
     margin: Any
     goal_radius: Any
-    goal_speed: Any
+    goal_speed: Any  # infinite without a limit
 
 
 def plain_team(problem: Problem) -> tuple[str, PlainTeam]:

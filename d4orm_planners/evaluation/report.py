@@ -24,7 +24,7 @@ def write_results(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) 
 
     Args:
         folder: Where the store is.
-        rates: What :func:`~d4orm_planners.evaluate` returned.
+        rates: What :func:`~d4orm_planners.evaluation.evaluate.evaluate` returned.
 
     Returns:
         The paths; ``trials.parquet`` is not among them, and not written, where pyarrow is not installed.
@@ -46,7 +46,7 @@ def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate
 
     Args:
         folder: Where to.
-        rates: What :func:`~d4orm_planners.evaluate` returned.
+        rates: What :func:`~d4orm_planners.evaluation.evaluate.evaluate` returned.
 
     Returns:
         The three paths.
@@ -131,17 +131,14 @@ def robustness_markdown(rates: Sequence[SuccessRate]) -> str:
     header = (*HEADER[:4], *HEADER[5:-1])
 
     def row(rate: SuccessRate) -> tuple[str, ...]:
-        first, (travel_time, planning, _) = cells(rate)[:8], cells(rate)[8:]
-        return *first[:4], *first[5:], travel_time.partition(" ")[0], planning
+        cell = cells(rate)
+        return *cell[:4], *cell[5:8], cell[8].partition(" ")[0], cell[9]
 
     return _tables(rates, header, row)
 
 
 def _tables(rates: Sequence[SuccessRate], header: Sequence[str], row: Callable[[SuccessRate], tuple[str, ...]]) -> str:
-    blocks = [
-        table(f"{scenario}, {robots} robots, {model}", header, [row(rate) for rate in group])
-        for (scenario, robots, model), group in panels(rates).items()
-    ]
+    blocks = [table(title, header, [row(rate) for rate in group]) for title, group in panels(rates).items()]
     return "\n\n".join([*blocks, *errors((rate.label, rate.error) for rate in rates)]) + "\n"
 
 
@@ -172,19 +169,24 @@ def table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> s
     return "\n".join(lines + [f"| {' | '.join(row)} |" for row in rows])
 
 
+def share(rate: SuccessRate | SuccessWithin) -> str:
+    """A success rate with its interval in brackets."""
+    return f"{rate.rate:.0%} ({rate.lower:.0%} to {rate.upper:.0%})"
+
+
 def deadline_table(title: str, rows: Iterable[tuple[str, Sequence[SuccessWithin]]]) -> str:
     """Success by deadline: one row per policy, one column per deadline."""
     listed = list(rows)
     header = ("policy", *(f"{within.deadline:g} s" for within in listed[0][1]))
-    lines = [(label, *(f"{w.rate:.0%} ({w.lower:.0%} to {w.upper:.0%})" for w in line)) for label, line in listed]
+    lines = [(label, *map(share, line)) for label, line in listed]
     return table(title, header, lines)
 
 
-def panels(rates: Iterable[SuccessRate]) -> dict[tuple[str, int, str], list[SuccessRate]]:
-    """Rates by scenario, team size and models, in order of appearance."""
-    groups: dict[tuple[str, int, str], list[SuccessRate]] = {}
+def panels(rates: Iterable[SuccessRate]) -> dict[str, list[SuccessRate]]:
+    """Rates by scenario, team size and models, as titles, in order of appearance."""
+    groups: dict[str, list[SuccessRate]] = {}
     for rate in rates:
-        groups.setdefault((rate.scenario, rate.robots, rate.model), []).append(rate)
+        groups.setdefault(f"{rate.scenario}, {rate.robots} robots, {rate.model}", []).append(rate)
     return groups
 
 
@@ -206,15 +208,14 @@ def _draw(path: Path, rates: Sequence[SuccessRate]) -> None:
     axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
     for ax in axes[len(groups) :]:
         ax.set_visible(False)
-    for ax, ((scenario, robots, model), group) in zip(axes, groups.items()):
+    for ax, (title, group) in zip(axes, groups.items()):
         for policy in dict.fromkeys(rate.label for rate in group):
             line = sorted((rate for rate in group if rate.label == policy), key=lambda rate: rate.noise)
             noise = [rate.noise for rate in line]
             (drawn,) = ax.plot(noise, [rate.rate for rate in line], marker="o", label=policy, clip_on=False)
             lower, upper = [rate.lower for rate in line], [rate.upper for rate in line]
             ax.fill_between(noise, lower, upper, color=drawn.get_color(), alpha=0.15, linewidth=0)
-        ax.set(title=f"{scenario}, {robots} robots, {model}", ylim=(0, 1))
-        ax.set(xlabel="standard deviation of the control noise", ylabel="success rate")
+        ax.set(title=title, xlabel="standard deviation of the control noise", ylabel="success rate", ylim=(0, 1))
         ax.grid(alpha=0.3)
     axes[0].legend(loc="best")
     figure.savefig(path, dpi=150)

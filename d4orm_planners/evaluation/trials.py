@@ -87,11 +87,6 @@ class Job:
     seed: int
     noise: tuple[float, ...]
 
-    @property
-    def name(self) -> str:
-        """For people who watch."""
-        return f"{self.policy.label}, {self.problem.name}, {self.problem.num_robots} robots"
-
     def key(self, noise: float) -> TrialKey:
         """Of the trial at one level of noise."""
         return TrialKey(self.policy.policy, self.policy.config, self.problem.digest, noise, self.seed)

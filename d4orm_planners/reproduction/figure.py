@@ -39,7 +39,7 @@ class Section:
 
     Attributes:
         title: The paper's name of it.
-        policies: Settings by label, see :func:`~d4orm_planners.evaluate`.
+        policies: Settings by label, see :func:`~d4orm_planners.evaluation.evaluate.evaluate`.
         scenarios: Scenario names.
         robots: Team sizes; ``None`` is the scenario's own.
         quick_robots: Those of the quick version.
