@@ -20,7 +20,20 @@ from d4orm_planners.commands.evaluate import evaluate
 from d4orm_planners.commands.inputs import check_target, find_here, make_folder, parse_settings, refuse_options
 from d4orm_planners.commands.leaderboard import leaderboard
 from d4orm_planners.commands.node import node
-from d4orm_planners.commands.options import Model, Quiet
+from d4orm_planners.commands.options import (
+    Engine,
+    MaxIterations,
+    Model,
+    Obstacles,
+    PlannerName,
+    Preset,
+    Quiet,
+    Robots,
+    Scenario,
+    Seed,
+    Settings,
+    TimeLimit,
+)
 from d4orm_planners.commands.reproduce import reproduce
 from d4orm_planners.commands.robustness import robustness
 from d4orm_planners.commands.train import train
@@ -59,25 +72,6 @@ def options(
     """Plan and run teams of robots that cross each other's way without touching."""
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
-
-
-Scenario = Annotated[
-    str,
-    typer.Option(
-        "--scenario", "-s", help="Scenario name (see `d4orm scenarios`), a YAML file or package.module:function."
-    ),
-]
-Robots = Annotated[int | None, typer.Option("--robots", "-k", help="Number of robots; the scenario's own by default.")]
-Obstacles = Annotated[int | None, typer.Option("--obstacles", help="Random obstacles to add.")]
-Seed = Annotated[int, typer.Option("--seed", help="Seed of the scenario and of the planner.")]
-PlannerName = Annotated[
-    str, typer.Option("--planner", "-p", help="Planner (see `d4orm planners`), or package.module:Name.")
-]
-Preset = Annotated[str | None, typer.Option("--preset", help="`paper` for the paper's parameters.")]
-Settings = Annotated[list[str] | None, typer.Option("--set", help="A planner setting, as num_samples=512; repeatable.")]
-Engine = Annotated[str, typer.Option("--engine", help="auto, cpu or jax.")]
-TimeLimit = Annotated[float | None, typer.Option("--time-limit", help="Seconds for planning.")]
-MaxIterations = Annotated[int | None, typer.Option("--max-iterations", help="Iterations for planning.")]
 
 
 @app.command()
@@ -266,7 +260,7 @@ def _solve(
     quiet: bool,
 ) -> Plan:
     from d4orm_env.engine.base import get_engine
-    from d4orm_planners.commands.progress import SolveProgress
+    from d4orm_planners.commands.progress import solve_progress
     from d4orm_planners.commands.warmup import compile_for_planning
     from d4orm_planners.registry import make_planner
 
@@ -274,10 +268,8 @@ def _solve(
     if get_engine(chosen.config.engine).name == "cpu":
         compile_for_planning(problem.team.models, lambda: typer.echo("compiling, once per installation ...", err=True))
     limit = max_iterations if max_iterations is not None else chosen.config.max_iterations
-    with SolveProgress(planner, problem.num_robots, limit, enabled=not quiet) as progress:
-        return chosen.solve(
-            problem, seed=seed, time_limit=time_limit, max_iterations=max_iterations, callback=progress.update
-        )
+    with solve_progress(planner, problem.num_robots, limit, enabled=not quiet) as progress:
+        return chosen.solve(problem, seed=seed, time_limit=time_limit, max_iterations=max_iterations, callback=progress)
 
 
 def _execute(plan: Plan, seed: int) -> Any:

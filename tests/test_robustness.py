@@ -495,6 +495,22 @@ def test_settings_reach_the_policies_that_have_them(d4orm, monkeypatch: pytest.M
         "cem": {"num_samples": 32, "preset": "paper"},
         "orca": {"time_horizon": 2},
     }
+    seen.clear()
+    d4orm(
+        "--policy",
+        "d4orm:num_samples=32",
+        "--policy",
+        "d4orm,mppi",
+        "--set",
+        "num_samples=64",
+        "--set",
+        "d4orm.credit=team",
+    )
+    assert seen == {
+        "d4orm:num_samples=32": {"num_samples": 32, "credit": "team"},
+        "d4orm": {"num_samples": 64, "credit": "team"},
+        "mppi": {"num_samples": 64},
+    }
 
 
 # Bad input.

@@ -28,7 +28,7 @@ def bench(
     """Measure the engines, the environments and the planner on this machine."""
     from d4orm_planners.benchmark.benchmark import QUICK, BenchmarkSettings, parts, run_parts
     from d4orm_planners.benchmark.report import circumstances, write_report
-    from d4orm_planners.commands.progress import PartsProgress
+    from d4orm_planners.commands.progress import parts_progress
 
     given: dict[str, Any] = {
         "robots": numbers("--robots", robots),
@@ -40,8 +40,8 @@ def bench(
     settings = BenchmarkSettings(**{**(QUICK if quick else {}), **chosen})
     make_folder(out)
     begun = circumstances(" ".join(["d4orm", *sys.argv[1:]]))
-    with PartsProgress(enabled=not quiet) as progress:
-        results = run_parts(list(parts(settings)), progress.update)
+    with parts_progress(enabled=not quiet) as progress:
+        results = run_parts(list(parts(settings)), progress)
     for path in write_report(out, settings, begun, results):
         if not quiet:
             typer.echo(f"wrote {path}")

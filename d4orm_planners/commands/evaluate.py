@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from d4orm_planners.commands.dataclass_options import takes
 from d4orm_planners.commands.inputs import (
     MOST_SEEDS,
     decimals,
@@ -18,7 +19,7 @@ from d4orm_planners.commands.inputs import (
     numbers,
     parse_settings,
 )
-from d4orm_planners.commands.options import Model, Quiet, Robots, takes
+from d4orm_planners.commands.options import Model, Quiet, TimeLimit
 
 if TYPE_CHECKING:
     from d4orm_planners.evaluation.summary import SuccessRate
@@ -44,14 +45,16 @@ class StudyOptions:
     scenario: Annotated[
         str, typer.Option("--scenario", "--scenarios", "-s", help="Scenarios or YAML files, separated by commas.")
     ] = "circle"
-    robots: Robots = None
+    robots: Annotated[
+        str | None, typer.Option("--robots", "-k", help="Team sizes, as 4,8; the scenario's own by default.")
+    ] = None
     model: Model = None
     noise: Noise = "0"
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="A setting of all policies that have it, or of one, as orca.time_horizon=2."),
     ] = None
-    time_limit: Annotated[float | None, typer.Option("--time-limit", help="Seconds for planning.")] = None
+    time_limit: TimeLimit = None
     trial_timeout: Annotated[
         float | None, typer.Option("--trial-timeout", help="Seconds after which a trial ends with an error.")
     ] = None
@@ -85,7 +88,7 @@ class StudyOptions:
         make_folder(self.out)
         how: dict[str, Any] = {"trial_timeout": self.trial_timeout, "workers": self.workers, "ray": self.ray}
         with resumable(f"the finished trials are kept in {self.out}", enabled=not self.quiet) as progress:
-            return success_rates(run_study(study, self.out, **how, progress=progress.update))
+            return success_rates(run_study(study, self.out, **how, progress=progress))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,41 +1,27 @@
-"""Commands whose options are the fields of a dataclass, and options that several commands have."""
+"""Options that several commands share."""
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable
-from functools import wraps
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import Annotated
 
 import typer
 
-T = TypeVar("T")
-
-Robots = Annotated[
-    str | None, typer.Option("--robots", "-k", help="Team sizes, as 4,8; the scenario's own by default.")
+Scenario = Annotated[
+    str,
+    typer.Option(
+        "--scenario", "-s", help="Scenario name (see `d4orm scenarios`), a YAML file or package.module:function."
+    ),
 ]
+Robots = Annotated[int | None, typer.Option("--robots", "-k", help="Number of robots; the scenario's own by default.")]
 Model = Annotated[str | None, typer.Option("--model", "-m", help="Robot model; the scenario's own by default.")]
+Obstacles = Annotated[int | None, typer.Option("--obstacles", help="Random obstacles to add.")]
+Seed = Annotated[int, typer.Option("--seed", help="Seed of the scenario and of the planner.")]
+PlannerName = Annotated[
+    str, typer.Option("--planner", "-p", help="Planner (see `d4orm planners`), or package.module:Name.")
+]
+Preset = Annotated[str | None, typer.Option("--preset", help="`paper` for the paper's parameters.")]
+Settings = Annotated[list[str] | None, typer.Option("--set", help="A planner setting, as num_samples=512; repeatable.")]
+Engine = Annotated[str, typer.Option("--engine", help="auto, cpu or jax.")]
+TimeLimit = Annotated[float | None, typer.Option("--time-limit", help="Seconds for planning.")]
+MaxIterations = Annotated[int | None, typer.Option("--max-iterations", help="Iterations for planning.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no tables.")]
-
-
-def takes(options: type[T]) -> Callable[[Callable[[T], None]], Callable[..., None]]:
-    """Make a command of a function of one argument: a dataclass, whose fields are the command's options.
-
-    Args:
-        options: The dataclass; the fields' types are annotated as those of parameters are for Typer.
-    """
-
-    def decorate(function: Callable[[T], None]) -> Callable[..., None]:
-        @wraps(function)
-        def command(**given: Any) -> None:
-            function(options(**given))
-
-        hints = get_type_hints(options, include_extras=True)
-        fields = inspect.signature(options).parameters.values()
-        command.__annotations__ = hints
-        command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-            [field.replace(annotation=hints[field.name]) for field in fields]
-        )
-        return command
-
-    return decorate

@@ -8,8 +8,9 @@ from typing import Annotated
 
 import typer
 
+from d4orm_planners.commands.dataclass_options import takes
 from d4orm_planners.commands.inputs import MOST_SEEDS, make_folder, refuse_options
-from d4orm_planners.commands.options import Quiet, takes
+from d4orm_planners.commands.options import Quiet
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +63,7 @@ def reproduce(options: ReproduceOptions) -> None:
     else:
         warm_up()  # the time of a controller would include its compilation
     with resumable(f"the finished trials are kept in {folder}", enabled=not options.quiet) as progress:
-        groups = run(figure, folder, seeds=options.seeds, workers=options.workers, progress=progress.update)
+        groups = run(figure, folder, seeds=options.seeds, workers=options.workers, progress=progress)
     written = write_reproduction(folder, figure, groups)
     if not options.quiet:
         tell_results(markdown(figure, groups), written)

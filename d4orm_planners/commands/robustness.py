@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
+from d4orm_planners.commands.dataclass_options import takes
 from d4orm_planners.commands.evaluate import Noise, Out, StudyOptions, require_trials
 from d4orm_planners.commands.inputs import MOST_SEEDS
-from d4orm_planners.commands.options import takes
 
 
 @dataclass(frozen=True, kw_only=True)

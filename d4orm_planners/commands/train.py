@@ -11,8 +11,9 @@ from typing import Annotated, Any
 
 import typer
 
+from d4orm_planners.commands.dataclass_options import takes
 from d4orm_planners.commands.inputs import make_folder, parse_settings
-from d4orm_planners.commands.options import Model, takes
+from d4orm_planners.commands.options import Model
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +58,7 @@ def train(options: TrainOptions) -> None:
 
     with resumable(f"the checkpoints are kept in {folder}", enabled=not options.quiet) as progress:
         command = shlex.join(["d4orm", *sys.argv[1:]])
-        result = training.train(settings, folder, progress=progress.update, command=command)
+        result = training.train(settings, folder, progress=progress, command=command)
     if not options.quiet:
         best = max(result.curve, key=lambda evaluation: evaluation.rank)
         tell_results(
