@@ -61,6 +61,10 @@ def test_the_environment_does_without_jax_and_matplotlib() -> None:
     assert loaded_by("from d4orm_env import navigation_v0\nnavigation_v0.parallel_env(num_robots=2)") == set()
 
 
+def test_comparing_policies_loads_nothing_heavy_before_there_is_something_to_report() -> None:
+    assert loaded_by("from d4orm_planners import evaluate") == set()
+
+
 @pytest.mark.parametrize("name", CONTRACT)
 def test_the_public_names_are_there(name: str) -> None:
     import d4orm_env

@@ -146,6 +146,25 @@ def test_d4orm_solves_no_less_than_mppi_and_cem_with_as_many_samples(tmp_path: P
     assert solved["d4orm"] == 2 >= max(solved.values())
 
 
+@pytest.mark.slow
+def test_coarser_guidance_and_other_schedules_solve_as_well(tmp_path: Path) -> None:
+    coarse = {
+        f"{factor}, {refine}": {"policy": "d4orm-c2f", "coarse_factor": factor, "refine": refine}
+        for factor in (1, 4)
+        for refine in ("off", "background")
+    }
+    schedules = {f"{last}": {"policy": "d4orm", "beta_start": 1e-4, "beta_end": last} for last in (0.01, 0.05)}
+    circle = Section(title="Circle", policies=schedules, scenarios=("circle",), robots=(4,))
+    sections = (
+        Section(title="Obstacles", policies=coarse, scenarios=("four_obstacles",), robots=(4,)),
+        circle,
+        replace(circle, title="Drives", model="differential_drive"),
+    )
+    rows = [measured(group) for group in reproduce(figure(sections=sections), tmp_path, seeds=1)]
+    assert [row.successes for row in rows] == [1] * (4 + 2 + 2)
+    assert all(4.5 < row.travel_time <= row.makespan < 10 for row in rows)  # type: ignore[operator]
+
+
 # What counts as solved, and when.
 
 

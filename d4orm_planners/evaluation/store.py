@@ -46,12 +46,9 @@ class TrialKey(NamedTuple):
 class Trial:
     """One episode of one policy and how it ended: a row of the store, with a column per field, in this order.
 
+    The first five fields are its :class:`TrialKey`.
+
     Attributes:
-        policy: This and the next four are the :class:`TrialKey`.
-        config: See there.
-        problem: See there.
-        noise: See there.
-        seed: See there.
         label: What the policy with these settings was called.
         scenario: Name of the scenario.
         robots: Team size.

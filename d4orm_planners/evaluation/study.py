@@ -26,17 +26,8 @@ Scenarios: TypeAlias = Scenario | Iterable[Scenario]
 class Study:
     """Every policy on every scenario and team size, with every seed at every level of noise.
 
-    Attributes:
-        policies: A policy, several, or policies or settings by label. A policy is a name, an import path or whatever
-            else :func:`~d4orm_planners.make_policy` takes; what has no label is called by its name. A label with
-            settings is the policy's name, unless the settings have another policy as ``policy``.
-        scenarios: Scenario names, callables or ``"package.module:function"``, YAML files (``.yaml``, ``.yml``) or
-            problems; the latter two have a team of their own and are the same for all seeds.
-        seeds: Each seeds the scenario, the policy and the noise of a trial.
-        control_noise_std: Standard deviations of the Gaussian noise added to the controls, in their units.
-        num_robots: Team sizes for scenarios by name; ``None`` is the scenario's own.
-        model: Robot model for scenarios by name; ``None`` is the scenario's own.
-        time_limit: Seconds for planning, for every planner that has no ``time_limit`` among its settings.
+    The attributes are the arguments of the same names of :func:`~d4orm_planners.evaluation.evaluate.evaluate`. Scenario
+    files and problems have a team of their own, and are the same for all seeds.
     """
 
     policies: Policies
