@@ -11,14 +11,16 @@ from d4orm_env.core.trajectory import Trajectory
 
 
 def arrival_times(arrived: Any, dt: float) -> np.ndarray:
-    """``(K,)`` time at which each robot docked [s]; infinite for one that never did.
+    """``(K,)`` time from which on each robot is at its goal [s]; infinite for one that is not there at the end.
 
     Args:
         arrived: ``(H+1, K)`` bool.
         dt: Time step [s].
     """
     arrived = np.asarray(arrived)
-    return np.where(arrived.any(axis=0), arrived.argmax(axis=0) * dt, np.inf)
+    last_away = len(arrived) - (~arrived[::-1]).argmax(axis=0)
+    since = np.where(arrived.all(axis=0), 0, last_away)
+    return np.where(arrived[-1], since * dt, np.inf)
 
 
 def mean_squared_jerk(controls: Any, arrived: Any, dt: float) -> float:

@@ -277,7 +277,7 @@ class Problem:
             ),
             boxes=self.world.shapes.boxes,
             triangles=self.world.shapes.triangles,
-            index=self.world.index(float(self.team.radius.max()) + self.margin),
+            index=self.world.index(float(np.max(self.team.radius)) + self.margin),
             bounds=self.world.bounds,
             time_step=np.array([self.dt, self.dt / 2, self.dt / 3, self.dt / 6], np.float32),
             margin=np.float32(self.margin),
@@ -291,7 +291,7 @@ class Problem:
 
     def arrays_to_observe(self, num_obstacles: int) -> ProblemArrays:
         """:attr:`arrays` with an index that finds so many of the nearest obstacles of any place."""
-        index = self.world.index(float(self.team.radius.max()) + self.margin, max(num_obstacles, 1))
+        index = self.world.index(float(np.max(self.team.radius)) + self.margin, max(num_obstacles, 1))
         return self.arrays._replace(index=index)
 
     @cached_property

@@ -2,7 +2,8 @@
 
 The order is the definition of a step for every engine: the control is clipped to the limits, RK4 integrates the model
 over ``dt``, the speed limit is applied, and a robot within its goal radius at no more than the goal speed has arrived.
-From then on it stands where it docked (paper, section III; docking as in the paper's reference code).
+From then on it stands where it docked (paper, section III; docking as in the paper's reference code), unless the
+problem says that who has arrived may be moved again: then it has arrived for as long as it is there.
 """
 
 from __future__ import annotations
@@ -29,3 +30,8 @@ def advance(model: ModelFunctions, x: Any, u: Any, limits: Any, h: TimeStep, ops
 def arrives(squared_distance: Any, squared_speed: Any, squared_goal_radius: Any, squared_goal_speed: Any) -> Any:
     """Whether a robot at this distance from its goal, at this speed, docks there."""
     return (squared_distance <= squared_goal_radius) & (squared_speed <= squared_goal_speed)
+
+
+def stands(arrived: Any, docks: Any) -> Any:
+    """Whether a robot that has arrived stays where it is, whatever its control; ``docks`` says whether any does."""
+    return arrived & docks

@@ -81,10 +81,11 @@ def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: World
         gap2 = sum((y[i] - arrays.goal[robots, i][:, None]) ** 2 for i in range(model.dimension))
         speed2 = sum(v * v for v in functions.velocity(y, u, limits, OPS))
         arrives = transition.arrives(gap2, speed2, arrays.squared_goal_radius, arrays.squared_goal_speed)
-        standing = worlds.docked[robots]
+        standing = transition.stands(worlds.docked[robots], arrays.docks)
+        docks = transition.stands(arrives, arrays.docks)
         zero = jnp.zeros_like(gap2)
         for i, (old, rest, new) in enumerate(zip(x, functions.rest(y, zero), y, strict=True)):
-            state = state.at[robots, i].set(jnp.where(standing, old, jnp.where(arrives, rest, new)))
+            state = state.at[robots, i].set(jnp.where(standing, old, jnp.where(docks, rest, new)))
         for i, component in enumerate(u):
             executed = executed.at[robots, i].set(jnp.where(standing, zero, component))
         docked = docked.at[robots].set(standing | arrives)

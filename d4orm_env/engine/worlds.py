@@ -311,7 +311,7 @@ class WorldBatch(NamedTuple):
         terminated: ``(B,)`` bool: all have docked.
         truncated: ``(B,)`` bool: out of time before that.
         total_reward: ``(B,)`` float64 sum over robots and steps of the episode.
-        arrival: ``(B, K)`` int64 step of docking, 0 for not yet.
+        arrival: ``(B, K)`` int64 step since which a robot is at its goal, 0 for not there.
         contacts: ``(B, K)`` int64 steps in contact.
         violations: ``(B, K)`` int64 steps within the margin.
     """
@@ -386,7 +386,9 @@ def _tally(batch: Any, max_cycles: Any, b: Any) -> None:
         total += batch.rewards[b, k]
         batch.contacts[b, k] += batch.collided[b, k]
         batch.violations[b, k] += batch.violated[b, k]
-        if batch.docked[b, k] and batch.arrival[b, k] == 0:
+        if not batch.docked[b, k]:
+            batch.arrival[b, k] = 0
+        elif batch.arrival[b, k] == 0:
             batch.arrival[b, k] = batch.steps[b]
         everybody &= batch.docked[b, k]
     batch.reward[b] = total / num_robots
