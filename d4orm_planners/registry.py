@@ -9,10 +9,11 @@ from typing import Any, TypeAlias
 
 from d4orm_env.core.arrays import duration, shown
 from d4orm_env.core.errors import UnknownKeywordError
+from d4orm_env.core.registry import load_reference
 from d4orm_planners.base import Planner
 from d4orm_planners.names import PLANNERS, POLICIES, is_planner_class
 from d4orm_planners.policy import OpenLoop, Policy, RobotFunction, TeamFunction, plain_attributes
-from d4orm_planners.references import load_reference, source_digest, written
+from d4orm_planners.references import source_digest, written
 
 PolicyLike: TypeAlias = str | Policy | Planner | type[Any] | Callable[..., Any]
 """What :func:`make_policy` takes; other objects with ``reset`` and ``act`` as well."""

@@ -9,20 +9,16 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeAlias, TypeGuard
 
 import numpy as np
 
 from d4orm_env.core.arrays import shown, whole_number
 from d4orm_env.core.errors import UnknownKeywordError
-from d4orm_env.core.plugins import entry_point_names, import_object, load_entry_point
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.registry import Registry
 from d4orm_env.scenarios import generators
 from d4orm_env.scenarios.settings import Settings
-
-ENTRY_POINTS = "d4orm.scenarios"
-"""The group of entry points in which installed packages offer scenarios."""
 
 DEFAULT_ROBOTS = 8
 COMMON_ARGUMENTS = tuple(attribute.name for attribute in fields(Settings) if attribute.name != "scenario")
@@ -33,12 +29,15 @@ class BuiltIn:
 
     Args:
         function: The generator, ``(Settings, **own arguments) -> Problem``.
+        draws: Whether every seed is known to give other places, and never another team; ``False`` leaves it to be found
+            out.
         **defaults: Where its defaults differ from those of :class:`~d4orm_env.scenarios.settings.Settings`.
     """
 
-    def __init__(self, function: Callable[..., Problem], **defaults: Any) -> None:
+    def __init__(self, function: Callable[..., Problem], *, draws: bool = False, **defaults: Any) -> None:
         self.__name__, self.__doc__ = function.__name__, function.__doc__
         self._function, self._defaults = function, defaults
+        self.draws = draws
         self._own = tuple(inspect.signature(function).parameters)[1:]
         self.arguments = self._own + COMMON_ARGUMENTS
 
@@ -115,6 +114,11 @@ class Scenario:
         return several and not isinstance(self.generator, BuiltIn)
 
     @property
+    def draws(self) -> bool:
+        """Whether every seed is known to give other places, and never another team."""
+        return isinstance(self.generator, BuiltIn) and self.generator.draws
+
+    @property
     def has_own_size(self) -> bool:
         """Whether the generator has a team size of its own, for when none is asked for."""
         second = self._parameters[1:2]
@@ -146,14 +150,18 @@ class Scenario:
         return problem.replace(name=self.name) if problem.name == "custom" else problem
 
 
+ScenarioLike: TypeAlias = str | os.PathLike[str] | Callable[..., Problem] | Scenario
+"""A name, a YAML file, a callable, or where to import one, ``"package.module:function"``."""
+
 _KEYWORDS = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-_REGISTERED: dict[str, Scenario] = {}
 
-SCENARIOS: Mapping[str, Scenario] = MappingProxyType(_REGISTERED)
-"""All registered scenarios by name; :func:`register_scenario` adds to them."""
+SCENARIOS = Registry(
+    "scenario", "d4orm.scenarios", lambda name, generator: Scenario(name.rpartition(":")[2], generator)
+)
+"""All scenarios by name; :func:`register_scenario` adds to them."""
 
 
-def is_scenario_file(scenario: Any) -> bool:
+def is_scenario_file(scenario: object) -> TypeGuard[str | os.PathLike[str]]:
     """Whether what is given as a scenario is the path of a file."""
     if isinstance(scenario, str):
         return Path(scenario).suffix in (".yaml", ".yml")
@@ -164,28 +172,26 @@ def register_scenario(name: str, generator: Callable[..., Problem]) -> None:
     """Make a scenario known by name, wherever one is asked for.
 
     Args:
-        name: The name; neither of a file nor of an import path.
+        name: Its name.
         generator: ``(seed, num_robots, **settings) -> Problem``, called with the first two by position. The same
             arguments must give the same problem. A problem called ``"custom"`` gets the scenario's name. The first line
             of the docstring describes the scenario.
 
     Raises:
-        ValueError: If the name is taken or none, or the generator cannot be called like that.
+        ValueError: If the name is taken or no name, or the generator cannot be called like that.
     """
-    if not isinstance(name, str) or not name or ":" in name or is_scenario_file(name):
-        raise ValueError(f"scenario name {shown(name)} must be text without a colon that is no .yaml file")
-    if name in _REGISTERED:
-        raise ValueError(f"scenario {name!r} is registered already; choose another name")
-    _REGISTERED[name] = Scenario(name, generator)
+    if is_scenario_file(name):
+        raise ValueError(f"scenario name {shown(name)} is that of a file; give one that does not end in .yaml")
+    SCENARIOS.add(name, generator)
 
 
-_IN_SPACE = {"model": "holonomic3d"}
-_AMSWARM = {**_IN_SPACE, "num_robots": 10, "radius": 0.29, "margin": 0.05}
+_IN_SPACE: dict[str, Any] = {"model": "holonomic3d"}
+_AMSWARM: dict[str, Any] = {**_IN_SPACE, "num_robots": 10, "radius": 0.29, "margin": 0.05}
 
 for _scenario in (
     BuiltIn(generators.circle),
     BuiltIn(generators.sphere, **_IN_SPACE),
-    BuiltIn(generators.random),
+    BuiltIn(generators.random, draws=True),
     BuiltIn(generators.four_obstacles),
     BuiltIn(generators.heterogeneous, model=None, max_acceleration=None),
     BuiltIn(generators.swap),
@@ -198,22 +204,7 @@ for _scenario in (
     register_scenario(_scenario.__name__, _scenario)
 
 
-def get_scenario(name: str) -> Scenario:
-    """Look a scenario up by name: those registered, then those that installed packages offer.
-
-    Raises:
-        ValueError: If there is no such scenario, or it cannot be loaded; the message lists those there are.
-    """
-    if isinstance(name, str) and name not in SCENARIOS:
-        offered = load_entry_point(ENTRY_POINTS, name, "scenario")
-        if offered is not None:
-            register_scenario(name, offered)
-    if not isinstance(name, str) or name not in SCENARIOS:
-        raise ValueError(f"scenario {shown(name)} is unknown; choose one of {', '.join(list_scenarios())}")
-    return SCENARIOS[name]
-
-
-def find_scenario(scenario: Any) -> Scenario:
+def find_scenario(scenario: ScenarioLike) -> Scenario:
     """The scenario that a name, a YAML file, a ``"package.module:function"`` or a callable stands for.
 
     Raises:
@@ -223,16 +214,14 @@ def find_scenario(scenario: Any) -> Scenario:
         return scenario
     if is_scenario_file(scenario):
         return Scenario(Path(scenario).stem, _File(scenario))
-    if isinstance(scenario, str) and ":" in scenario:
-        return Scenario(scenario.rpartition(":")[2], import_object(scenario, "scenario"))
     if callable(scenario):
         return Scenario(getattr(scenario, "__name__", type(scenario).__name__), scenario)
-    return get_scenario(scenario)
+    return SCENARIOS.find(scenario)
 
 
 def list_scenarios() -> tuple[str, ...]:
     """The names :func:`make_problem` knows."""
-    return tuple(dict.fromkeys((*SCENARIOS, *entry_point_names(ENTRY_POINTS))))
+    return tuple(SCENARIOS)
 
 
 def describe_scenario(name: str) -> str:
@@ -241,10 +230,10 @@ def describe_scenario(name: str) -> str:
     Raises:
         ValueError: If there is no such scenario.
     """
-    return get_scenario(name).description
+    return SCENARIOS.look_up(name).description
 
 
-def unknown_argument(scenario: Any, names: Iterable[str], others: Iterable[str] = ()) -> str:
+def unknown_argument(scenario: ScenarioLike | None, names: Iterable[str], others: Iterable[str] = ()) -> str:
     """What is wrong with the first of ``names`` that is no argument of that scenario; the empty string if none is.
 
     Args:
@@ -255,7 +244,7 @@ def unknown_argument(scenario: Any, names: Iterable[str], others: Iterable[str] 
     Raises:
         ValueError: If there is no such scenario.
     """
-    entries = tuple(SCENARIOS.values()) if scenario is None else (find_scenario(scenario),)
+    entries = [SCENARIOS[name] for name in SCENARIOS.own()] if scenario is None else [find_scenario(scenario)]
     if scenario is not None and entries[0].takes_any:
         return ""
     known = sorted({*others, *(name for entry in entries for name in entry.arguments)})
@@ -268,7 +257,9 @@ def unknown_argument(scenario: Any, names: Iterable[str], others: Iterable[str] 
     return ""
 
 
-def make_problem(scenario: Any, num_robots: int | None = None, seed: int | None = None, **arguments: Any) -> Problem:
+def make_problem(
+    scenario: ScenarioLike, num_robots: int | None = None, seed: int | None = None, **arguments: Any
+) -> Problem:
     """A problem of a scenario. The same arguments give the same problem, to the bit.
 
     Every scenario of this package takes ``num_robots`` (default 8; AMSwarm has 10), ``seed`` (0), ``model``
