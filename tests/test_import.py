@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-HEAVY = ("torch", "ray", "casadi", "plotly", "matplotlib", "jax", "stable_baselines3", "supersuit", "zenoh", "pyrvo",
+HEAVY = ("torch", "ray", "casadi", "matplotlib", "jax", "stable_baselines3", "supersuit", "zenoh", "pyrvo",
          "pandas", "pyarrow")  # fmt: skip
 CONTRACT = (
     "navigation_v0",
@@ -53,7 +53,7 @@ def test_making_and_judging_a_problem_loads_nothing_heavy() -> None:
 
 
 def test_the_cpu_engine_does_without_jax() -> None:
-    code = "from d4orm_env.engine.base import get_engine\nassert get_engine('cpu').name == 'cpu'"
+    code = "from d4orm_env.engine.choice import get_engine\nassert get_engine('cpu').name == 'cpu'"
     assert loaded_by(code) == set()
 
 

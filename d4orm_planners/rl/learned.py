@@ -105,9 +105,9 @@ class _NetworkActor:
                 f"the policy in {self.path.name} was trained for {header.model} robots, and this team has "
                 f"{', '.join(sorted(set(problem.team.models)))}; train one for them with 'd4orm train --model'"
             )
-        if observation_shape != (features.observation_size,):
+        if observation_shape != (features.slices.size,):
             raise ValueError(
-                f"the policy in {self.path.name} was trained for observations of {features.observation_size} numbers, "
+                f"the policy in {self.path.name} was trained for observations of {features.slices.size} numbers, "
                 f"and this environment's have shape {observation_shape}; make it with observed_robots="
                 f"{header.num_neighbors}, observed_obstacles={header.num_obstacles}, and do not wrap its observations"
             )

@@ -212,9 +212,9 @@ class _Run:
         return {
             "algorithm": self.settings.algorithm,
             "model": problem.team.models[0],
-            "dimension": features.dimension,
-            "num_neighbors": features.num_neighbors,
-            "num_obstacles": features.num_obstacles,
+            "dimension": features.slices.dimension,
+            "num_neighbors": features.slices.num_neighbors,
+            "num_obstacles": features.slices.num_obstacles,
             "training": {"command": self._command, "lesson": index + 1, **asdict(self.settings)},
         }
 
