@@ -17,14 +17,8 @@ from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.engine.base import (
-    Engine,
-    SamplingResult,
-    SamplingRules,
-    SamplingTask,
-    checked_controls,
-    get_engine,
-)
+from d4orm_env.engine.base import Engine, SamplingResult, SamplingRules, SamplingTask, checked_controls
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.verify import verify
 from d4orm_planners.plan import IterationRecord, Plan, failed_robots
 from d4orm_planners.settings import CheckedSettings, Count, EngineName

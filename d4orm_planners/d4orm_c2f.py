@@ -17,7 +17,8 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed, generator
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.engine.base import SamplingRules, SamplingTask, get_engine
+from d4orm_env.engine.base import SamplingRules, SamplingTask
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_planners.base import Search
 from d4orm_planners.d4orm_d import D4ormD, D4ormDConfig

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, SkipValidation
 
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.threads import available_cores
 from d4orm_planners.base import Iteration, Planner, Search
 from d4orm_planners.d4orm import D4orm

@@ -17,7 +17,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from d4orm_env.core.arrays import LARGEST, LARGEST_NUMBER, LARGEST_WHOLE, shown
 from d4orm_env.core.errors import UnknownKeywordError
-from d4orm_env.engine.base import ENGINES
+from d4orm_env.engine.choice import ENGINES
 
 
 def _truth(value: Any) -> Any:

@@ -139,23 +139,23 @@ def _standing(problem: Problem) -> tuple[FloatArray, FloatArray]:
 
 def _drive_teams(problem: Problem, states: FloatArray, controls: FloatArray, switch: Any, vias: FloatArray) -> Drives:
     """Every robot on each of its ways: as controlled until ``switch`` ``(R, V)``, then by ``vias`` ``(R, V, d)``."""
-    from d4orm_env.engine.drives import drive_kernel  # here, because importing numba takes long
+    # Here, because importing numba takes long.
+    from d4orm_env.engine.drives import DriveRules, Ways, drive_kernel
 
     num_ways, arrays = switch.shape[1], problem.arrays
     u = np.repeat(np.asarray(controls, np.float32)[:, :, None], num_ways, axis=2)
     x = np.repeat(np.asarray(states, np.float32)[:, :, None], num_ways, axis=2)
     arrived = np.zeros(switch.shape, bool)
     docking = np.array([arrays.squared_goal_radius, arrays.squared_goal_speed])
+    rules = DriveRules(arrays.time_step, docking, NEAR_VIA)
     for model, robots in _by_model(problem):
         # One lane for every robot and way.
         lanes_x, lanes_u = (array[:, robots].reshape(len(array), -1, array.shape[-1]) for array in (x, u))
         limits, goals = (np.repeat(rows[robots], num_ways, axis=0) for rows in (arrays.limits, problem.goal))
         targets = np.ascontiguousarray(vias[robots], np.float32).reshape(goals.shape)
         lanes_arrived = np.empty(len(goals), bool)
-        drive_kernel(model.name)(
-            limits, arrays.time_step, docking, NEAR_VIA, goals, targets, switch[robots].ravel(), lanes_x, lanes_u,
-            lanes_arrived,
-        )  # fmt: skip
+        ways = Ways(limits, goals, targets, switch[robots].ravel())
+        drive_kernel(model.name)(rules, ways, lanes_x, lanes_u, lanes_arrived)
         x[:, robots] = lanes_x.reshape(len(x), len(robots), num_ways, -1)
         u[:, robots] = lanes_u.reshape(len(u), len(robots), num_ways, -1)
         arrived[robots] = lanes_arrived.reshape(len(robots), num_ways)

@@ -17,7 +17,7 @@ from d4orm_env.core.dynamics import ACCELERATION
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.joint_state import JointState
 from d4orm_env.scenarios import make_problem

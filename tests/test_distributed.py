@@ -22,7 +22,7 @@ from network_support import PATIENCE, wait_until
 from planner_support import cheap_planner, hop_problem, walled_in_problem
 
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.threads import Threads
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify

@@ -21,8 +21,9 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.transition import TimeStep, advance
 from d4orm_env.engine import threads, tiles
-from d4orm_env.engine.base import ENGINES, StepResult, get_engine
+from d4orm_env.engine.base import StepResult
 from d4orm_env.engine.caching import fingerprint
+from d4orm_env.engine.choice import ENGINES, get_engine
 from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.engine.jax import JaxEngine
 from d4orm_env.engine.threads import Threads, available_cores

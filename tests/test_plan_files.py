@@ -19,7 +19,7 @@ from planner_support import cheap_planner, hop_problem
 
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.scenarios import make_problem
-from d4orm_planners import Plan
+from d4orm_planners import Plan, load_plan
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def assert_equal(a: Plan, b: Plan) -> None:
 def test_a_plan_comes_back_to_the_bit(case: dict[str, Any], tmp_path: Path) -> None:
     plan = cheap_planner("d4orm").solve(make_problem(**case), seed=1)
     plan.save(tmp_path / "plan.npz")
-    loaded = Plan.load(str(tmp_path / "plan.npz"))
+    loaded = load_plan(str(tmp_path / "plan.npz"))
     assert_equal(plan, loaded)
     assert loaded.problem.name == plan.problem.name
 

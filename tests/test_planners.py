@@ -21,7 +21,7 @@ from planner_support import (
 from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from planner_support import cheap_planner, hop_problem, walled_in_problem
 
-from d4orm_env.engine.base import SamplingRules, SamplingTask, get_engine
+from d4orm_env.engine.base import SamplingRules, SamplingTask
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import Plan, list_planners, make_planner
 from d4orm_planners.base import Search, Stopwatch

@@ -9,7 +9,7 @@ from math import ceil
 from typing import Any, NamedTuple
 
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.threads import available_cores
 from d4orm_planners.base import Iteration, Planner, Search, evaluate_controls
 from d4orm_planners.distributed.messages import Message, decode, encode

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_planners.d4orm import D4orm, D4ormConfig
 from d4orm_planners.distributed.transport import Transport
