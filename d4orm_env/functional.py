@@ -19,11 +19,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from d4orm_env.core.problem import Problem, ProblemArrays
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.robot_model import STANDARD_LIMITS
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.engine.jax import Worlds, advance_worlds, judge
+
+__all__ = ["State", "Step", "reset", "step"]
 
 
 class State(NamedTuple):
@@ -35,9 +38,9 @@ class State(NamedTuple):
         steps: ``()`` int32, steps taken.
     """
 
-    states: Any
-    arrived: Any
-    steps: Any
+    states: jax.Array
+    arrived: jax.Array
+    steps: jax.Array
 
 
 class Step(NamedTuple):
@@ -52,15 +55,15 @@ class Step(NamedTuple):
         controls: ``(K, m)`` as executed.
     """
 
-    rewards: Any
-    arrived: Any
-    collided: Any
-    margin_violated: Any
-    truncated: Any
-    controls: Any
+    rewards: jax.Array
+    arrived: jax.Array
+    collided: jax.Array
+    margin_violated: jax.Array
+    truncated: jax.Array
+    controls: jax.Array
 
 
-def reset(problem: Problem, key: Any) -> State:
+def reset(problem: Problem, key: jax.Array) -> State:
     """The team at its start.
 
     Args:
@@ -75,7 +78,7 @@ def reset(problem: Problem, key: Any) -> State:
     return State(jnp.asarray(problem.start), jnp.zeros(num_robots, bool), jnp.int32(0))
 
 
-def step(problem: Problem, state: State, controls: Any) -> tuple[State, Step]:
+def step(problem: Problem, state: State, controls: jax.Array) -> tuple[State, Step]:
     """One time step, as every engine takes it.
 
     Args:
@@ -113,25 +116,26 @@ def _arrays(problem: Problem) -> ProblemArrays:
         bounds = jnp.array([[-jnp.inf] * team.dimension, [jnp.inf] * team.dimension], jnp.float32)
     else:
         bounds = jnp.stack([jnp.asarray(world.lower), jnp.asarray(world.upper)])
-    return ProblemArrays(
-        model_codes=None,
-        limits=_limits(team),
-        radius=jnp.asarray(team.radius),
-        start=problem.start,
-        goal=jnp.asarray(problem.goal),
-        inverse_initial_distance=1 / distance,
-        balls=world.balls,
-        cylinders=world.cylinders,
-        boxes=world.boxes,
-        bounds=bounds,
-        time_step=jnp.stack([jnp.asarray(dt / part, jnp.float32) for part in (1, 2, 3, 6)]),
-        margin=jnp.asarray(problem.margin, jnp.float32),
-        squared_goal_radius=jnp.asarray(problem.goal_radius**2, jnp.float32),
-        squared_goal_speed=jnp.asarray(goal_speed**2, jnp.float32),
-    )
+    arrays: dict[str, Any] = {  # traced, which the engine does not mind
+        "model_codes": None,
+        "limits": _limits(team),
+        "radius": jnp.asarray(team.radius),
+        "start": problem.start,
+        "goal": jnp.asarray(problem.goal),
+        "inverse_initial_distance": 1 / distance,
+        "balls": world.balls,
+        "cylinders": world.cylinders,
+        "boxes": world.boxes,
+        "bounds": bounds,
+        "time_step": jnp.stack([jnp.asarray(dt / part, jnp.float32) for part in (1, 2, 3, 6)]),
+        "margin": jnp.asarray(problem.margin, jnp.float32),
+        "squared_goal_radius": jnp.asarray(problem.goal_radius**2, jnp.float32),
+        "squared_goal_speed": jnp.asarray(goal_speed**2, jnp.float32),
+    }
+    return ProblemArrays(**arrays)
 
 
-def _limits(team: Team) -> Any:
+def _limits(team: Team) -> jax.Array:
     """:attr:`Team.limits` of a team whose numbers may be traced."""
     columns = [jnp.asarray(getattr(team, name)) for name in STANDARD_LIMITS]
     models = team.robot_models
@@ -151,12 +155,12 @@ def _register(kind: type) -> None:
     static = _STATIC[kind]
     names = tuple(field.name for field in fields(kind) if field.name not in static)
 
-    def flatten(value: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    def flatten(value: object) -> tuple[tuple[object, ...], tuple[object, ...]]:
         return tuple(getattr(value, name) for name in names), tuple(getattr(value, name) for name in static)
 
-    def unflatten(metadata: tuple[Any, ...], children: tuple[Any, ...]) -> Any:
+    def unflatten(metadata: tuple[object, ...], children: tuple[object, ...]) -> object:
         # Not through __init__: tracers cannot be validated, and the problem they stand for has been.
-        value: Any = object.__new__(kind)
+        value: object = object.__new__(kind)
         for name, part in zip((*names, *static), (*children, *metadata), strict=True):
             object.__setattr__(value, name, part)
         return value
