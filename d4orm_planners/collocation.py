@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.collision import axis_gap
-from d4orm_env.core.problem import Problem, inverse_initial_distance
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_arrays import inverse_initial_distance
 from d4orm_env.core.robot_model import SPEED, Ops
 from d4orm_env.core.transition import TimeStep
 
