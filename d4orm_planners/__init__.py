@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from d4orm_planners.episode import Episode, run_episode
     from d4orm_planners.evaluation.harness import evaluate
     from d4orm_planners.names import register_planner, register_policy
-    from d4orm_planners.plan import IterationRecord, Plan
+    from d4orm_planners.plan import IterationRecord, Plan, load_plan
     from d4orm_planners.policy import OpenLoop, Policy
     from d4orm_planners.registry import list_planners, list_policies, make_planner, make_policy
 
@@ -27,6 +27,7 @@ __all__ = [
     "evaluate",
     "list_planners",
     "list_policies",
+    "load_plan",
     "make_planner",
     "make_policy",
     "register_planner",
@@ -39,7 +40,7 @@ _HOMES = {
     "episode": ("Episode", "run_episode"),
     "evaluation.harness": ("evaluate",),
     "names": ("register_planner", "register_policy"),
-    "plan": ("IterationRecord", "Plan"),
+    "plan": ("IterationRecord", "Plan", "load_plan"),
     "policy": ("OpenLoop", "Policy"),
     "registry": ("list_planners", "list_policies", "make_planner", "make_policy"),
 }

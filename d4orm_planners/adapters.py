@@ -15,6 +15,8 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray
 from d4orm_planners.policy import Actions, Policy
 
+__all__ = ["SharedPolicy", "from_rllib", "from_sb3", "from_torchrl"]
+
 
 class SharedPolicy(Policy):
     """Every robot by itself maps what it observes to its control, all by one function of stacked observations.

@@ -187,6 +187,11 @@ class Plan:
         return replace(plan, solved=solved, status="refuted" if refuted else plan.status)
 
 
+def load_plan(path: str | os.PathLike[str]) -> Plan:
+    """:meth:`Plan.load`, beside :func:`d4orm_env.load_problem`."""
+    return Plan.load(path)
+
+
 def failed_robots(trajectory: Trajectory) -> BoolArray:
     """``(K,)`` who does not arrive, or violates the margin at some step.
 
