@@ -8,8 +8,6 @@ from d4orm_env.core.arrays import shown
 from d4orm_env.core.registry import Registry
 from d4orm_planners.base import Planner
 
-__all__ = ["PLANNERS", "POLICIES", "is_planner_class", "register_planner", "register_policy"]
-
 
 def is_planner_class(thing: Any) -> bool:
     """Whether a thing is a subclass of Planner."""

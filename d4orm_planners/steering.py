@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
-from d4orm_env.core.dynamics import MODELS, Model
+from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.robot_model import Model
 from d4orm_env.core.transition import TimeStep
 
 NEAR_VIA = np.float32(0.25)

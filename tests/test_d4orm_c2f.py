@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from d4orm_env import navigation_v0
-from d4orm_env.core.dynamics import ACCELERATION
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.robot_model import ACCELERATION
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.engine.choice import get_engine

@@ -10,17 +10,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.registry import Registry
-from d4orm_env.core.robot_model import (
-    ACCELERATION,
-    OWN_LIMITS,
-    PYTHON_OPS,
-    SPEED,
-    TURN_RATE,
-    Model,
-    ModelFunctions,
-    Ops,
-    RungeKutta,
-)
+from d4orm_env.core.robot_model import OWN_LIMITS, PYTHON_OPS, Model, RungeKutta
 from d4orm_env.core.source import pieces
 from d4orm_env.core.transition import TimeStep
 from d4orm_env.models.car import CAR
@@ -29,23 +19,6 @@ from d4orm_env.models.holonomic2d import HOLONOMIC2D
 from d4orm_env.models.holonomic3d import HOLONOMIC3D
 from d4orm_env.models.unicycle import UNICYCLE
 from d4orm_env.models.velocity2d import VELOCITY2D
-
-__all__ = [
-    "ACCELERATION",
-    "COMMON",
-    "MODELS",
-    "MODEL_CODES",
-    "NUM_BUILT_IN",
-    "SPEED",
-    "TURN_RATE",
-    "Model",
-    "ModelFunctions",
-    "Ops",
-    "get_model",
-    "model_digest",
-    "names_of_codes",
-    "register_model",
-]
 
 _BUILT_IN = (HOLONOMIC2D, HOLONOMIC3D, VELOCITY2D, DIFFERENTIAL_DRIVE, UNICYCLE, CAR)
 

@@ -102,9 +102,10 @@ class Registry(Mapping[str, T]):
         if not isinstance(text, str) or text in self or ":" not in text:
             return self.look_up(text)
         try:
-            return self._admit(text, load_reference(text))
+            thing = load_reference(text)
         except ValueError as error:
             raise ValueError(f"{self.what} {error}") from error
+        return self._admit(text, thing)
 
     def __getitem__(self, name: str) -> T:
         if name not in self._admitted:

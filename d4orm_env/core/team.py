@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
@@ -76,6 +77,10 @@ class Team:
                 )
         return {name: _per_robot(name, given.get(name), [limits.get(name) for limits in known]) for name in names}
 
+    def __getstate__(self) -> dict[str, object]:
+        # What is cached is looked up anew in a copy.
+        return {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
+
     def __setstate__(self, state: dict[str, object]) -> None:
         restore_frozen(self, state)
         for array in self.own_limits.values():
@@ -86,7 +91,7 @@ class Team:
         """``K``."""
         return len(self.models)
 
-    @property
+    @cached_property
     def robot_models(self) -> tuple[Model, ...]:
         """The ``K`` models themselves."""
         return tuple(get_model(name) for name in self.models)

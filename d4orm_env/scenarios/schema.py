@@ -11,9 +11,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from d4orm_env.core.dynamics import Model, get_model
+from d4orm_env.core.dynamics import get_model
 from d4orm_env.core.portable import arctan2
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.robot_model import Model
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.registry import SCENARIOS, make_problem, unknown_argument
