@@ -1,4 +1,4 @@
-"""What users hand to the batched environment, checked."""
+"""What users hand to the batched environment, checked; it says what is raised."""
 
 from __future__ import annotations
 
@@ -12,17 +12,7 @@ from d4orm_env.env_inputs import check_options
 
 
 def reset_mask(options: Mapping[str, object] | None, running: BoolArray) -> BoolArray:
-    """``(B,)`` bool: which worlds ``reset(options=...)`` resets.
-
-    Args:
-        options: Those of the reset.
-        running: ``(B,)`` bool: worlds in which an episode has begun.
-
-    Raises:
-        TypeError: If the mask is not an array of bool.
-        ValueError: If it has another length or names no world, or an option is unknown.
-        RuntimeError: If the first reset leaves worlds out.
-    """
+    """``(B,)`` bool: which worlds ``reset(options=...)`` resets, of which these are ``running`` ``(B,)``."""
     check_options(options, ("reset_mask",))
     if options is None or "reset_mask" not in options:
         return np.ones_like(running)
@@ -40,11 +30,7 @@ def reset_mask(options: Mapping[str, object] | None, running: BoolArray) -> Bool
 
 
 def world_seeds(seed: int | Sequence[int | None] | None, num_worlds: int) -> list[int | None]:
-    """One seed for each world, from the argument of ``reset``.
-
-    Raises:
-        ValueError: If they are of another number, or one is no whole number of zero or more.
-    """
+    """One seed for each world, from the argument of ``reset``."""
     if seed is None:
         return [None] * num_worlds
     if not isinstance(seed, (Sequence, np.ndarray)) or isinstance(seed, str):
@@ -56,11 +42,7 @@ def world_seeds(seed: int | Sequence[int | None] | None, num_worlds: int) -> lis
 
 
 def checked_autoreset_mode(value: str | AutoresetMode) -> AutoresetMode:
-    """The mode itself, or by its value.
-
-    Raises:
-        ValueError: If there is no such mode.
-    """
+    """The mode itself, or by its value."""
     try:
         return AutoresetMode(value)
     except ValueError:

@@ -15,25 +15,13 @@ from d4orm_env.core.problem import Problem
 
 
 class OwnParts(NamedTuple):
-    """What a robot sees of itself, from the first component on; ``d`` position dimensions.
+    """Where a robot sees itself; ``d`` position dimensions, lengths in m and speeds in m/s."""
 
-    Attributes:
-        velocity: ``d`` [m/s].
-        heading: Cosine and sine, both zero for a model without a heading.
-        speed: [m/s].
-        goal: ``d`` vector to the goal [m].
-        time_left: Share of the time that is left, 1 to 0.
-        arrived: 0 or 1.
-        radius: [m].
-        max_speed: [m/s].
-        max_acceleration: [m/s^2].
-    """
-
-    velocity: slice
-    heading: slice
+    velocity: slice  # d
+    heading: slice  # cosine and sine, both zero for a model without a heading
     speed: slice
-    goal: slice
-    time_left: slice
+    goal: slice  # d, vector to the goal
+    time_left: slice  # share of the time that is left, 1 to 0
     arrived: slice
     radius: slice
     max_speed: slice
@@ -41,33 +29,20 @@ class OwnParts(NamedTuple):
 
 
 class NeighborParts(NamedTuple):
-    """What it sees of another robot, from the first component of that one on; all zeros for an absent one.
-
-    Attributes:
-        present: 0 or 1.
-        position: ``d`` relative to its own [m].
-        velocity: ``d`` relative to its own [m/s].
-        radius: [m].
-    """
+    """Where it sees another robot, in the row of that one; all zeros for an absent one."""
 
     present: slice
-    position: slice
-    velocity: slice
+    position: slice  # d, relative to its own
+    velocity: slice  # d, relative to its own
     radius: slice
 
 
 class ObstacleParts(NamedTuple):
-    """What it sees of an obstacle or a wall of the bounds, likewise.
-
-    Attributes:
-        present: 0 or 1.
-        position: ``d`` vector to the nearest point of the surface [m].
-        gap: Between the two surfaces [m].
-    """
+    """Where it sees an obstacle or a wall of the bounds, likewise."""
 
     present: slice
-    position: slice
-    gap: slice
+    position: slice  # d, vector to the nearest point of the surface
+    gap: slice  # between the two surfaces
 
 
 @dataclass(frozen=True)

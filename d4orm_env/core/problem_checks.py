@@ -1,4 +1,4 @@
-"""What the physics asks of a problem: float32 and one step of RK4 hold it, and nothing touches anything."""
+"""What the physics asks of a problem; each refusal is a ``ValueError`` that names the robot."""
 
 from __future__ import annotations
 
@@ -20,16 +20,7 @@ INTEGRATION_ERROR = 0.01
 
 
 def check_states(team: Team, states: FloatArray, what: str = "start") -> None:
-    """Whether robots may be in these states, wherever that is.
-
-    Args:
-        team: The robots.
-        states: ``(K, n)``.
-        what: What to call them in an error.
-
-    Raises:
-        ValueError: If padding is not zero, or a speed or heading too large; the message names the robot.
-    """
+    """Refuse states (``what``) ``(K, n)`` whose padding is not zero, or whose speed or heading is too large."""
     limits = team.limits
     for robot, model in enumerate(team.robot_models):
         state = states[robot]
@@ -58,17 +49,7 @@ def check_states(team: Team, states: FloatArray, what: str = "start") -> None:
 
 
 def check_resolution(team: Team, places: FloatArray, dt: float, goal_radius: float) -> None:
-    """Whether float32 tells places apart that the goal radius, and a step of a robot, tell apart.
-
-    Args:
-        team: The robots.
-        places: ``(K, .)`` coordinates of each robot's start and goal [m].
-        dt: Time step [s].
-        goal_radius: See :class:`~d4orm_env.core.problem.Problem` [m].
-
-    Raises:
-        ValueError: If not; the message names the robot.
-    """
+    """Refuse ``places`` ``(K, .)`` that float32 does not resolve as the goal radius, and a step of a robot, ask."""
     farthest = np.abs(places).max(axis=1)
     grain = np.spacing(farthest).astype(np.float64)
     stride = team.max_speed.astype(np.float64) * dt
@@ -87,11 +68,7 @@ def check_resolution(team: Team, places: FloatArray, dt: float, goal_radius: flo
 
 
 def check_turning(team: Team, dt: float) -> None:
-    """Whether one step of RK4 follows every robot that turns as fast as it may.
-
-    Raises:
-        ValueError: If not; the message names the robot.
-    """
+    """Refuse a time step in which one step of RK4 does not follow a robot that turns as fast as it may."""
     team_limits = team.limits
     for robot, model in enumerate(team.robot_models):
         if model.heading_index is None:
@@ -108,17 +85,7 @@ def check_turning(team: Team, dt: float) -> None:
 
 
 def check_places(team: Team, world: World, what: str, places: FloatArray) -> None:
-    """Whether every start, or every goal, lies inside the world and touches nothing.
-
-    Args:
-        team: The robots.
-        world: Obstacles and bounds.
-        what: What to call the places in an error.
-        places: ``(K, d)`` [m].
-
-    Raises:
-        ValueError: If one does not; the message names the robot.
-    """
+    """Refuse starts or goals (``what``) ``(K, d)`` outside the world, or that touch something."""
     radius = team.radius.astype(np.float64)
     clearance = world.clearance(places) - radius
     for robot in np.flatnonzero(clearance <= 0):

@@ -78,9 +78,8 @@ class Registry(Mapping[str, T]):
         if not claims:
             raise KeyError(name)
         if len(claims) > 1:
-            raise ValueError(
-                f"{self.what} name {name!r} is claimed by {' and '.join(map(shown, claims))}; uninstall one of them"
-            )
+            owners = " and ".join(claim if isinstance(claim, str) else shown(claim) for claim in claims)
+            raise ValueError(f"{self.what} name {name!r} is claimed by {owners}; uninstall one of them")
         return claims[0]
 
     def look_up(self, name: object) -> T:

@@ -38,7 +38,7 @@ class DriveRules(NamedTuple):
 
     time_step: FloatArray
     docking: FloatArray
-    near2: float
+    near2: np.float32
 
 
 class Ways(NamedTuple):

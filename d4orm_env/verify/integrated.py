@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core import portable
-from d4orm_env.core.arrays import FloatArray
 from d4orm_env.verify.geometry import Floats, norm
+
+Limits = NDArray[np.float32]
 
 SUB_STEPS = 20
 """To find how much the way bends within a control step."""
@@ -39,7 +40,13 @@ class Integrated:
     """
 
     def __init__(
-        self, model: Any, robots: NDArray[np.intp], start: Floats, controls: Floats, limits: FloatArray, dt: float
+        self,
+        model: Any,
+        robots: NDArray[np.intp],
+        start: Floats,
+        controls: Floats,
+        limits: NDArray[np.float32],
+        dt: float,
     ) -> None:
         self.robots, self._model, self._dt = robots, model, dt
         self._limits = tuple(limits.astype(np.float64)[robots].T)
