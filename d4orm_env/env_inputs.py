@@ -115,9 +115,8 @@ def joint_controls(actions: ArrayLike, shape: tuple[int, ...], num_robots: int) 
     if controls.shape != shape:
         raise ValueError(f"{noun} shape {controls.shape}; expected {axes} = {shape}")
     controls = controls.reshape(*shape[:-1], num_robots, -1)
-    fine = usable(controls).all(axis=-1)
-    if not fine.all():
-        *world, robot = np.argwhere(~fine)[0].tolist()
+    if not usable(controls).all():
+        *world, robot = np.argwhere(~usable(controls).all(axis=-1))[0].tolist()
         raise ValueError(
             f"action of robot_{robot}{f' in world {world[0]}' if world else ''} is "
             f"{controls[*world, robot].tolist()}; every value must be finite and at most {MAX_ACTION:g} in magnitude"

@@ -53,9 +53,9 @@ def observe_robot(
     _see_itself(k, arrays, goal, eyes, out)
     out[2 * d + 3] = time_left
     _find_nearest_robots(k, eyes.position, eyes.nearest_robots)
-    _see_robots(k, arrays.radius, eyes, out[neighbors:obstacles])
+    _see_robots(k, arrays.radius, eyes, neighbors, out)
     _find_nearest_obstacles(eyes.position[k], arrays, eyes.nearest_obstacles)
-    _see_obstacles(arrays.radius[k], eyes.nearest_obstacles, out[obstacles:])
+    _see_obstacles(arrays.radius[k], eyes.nearest_obstacles, obstacles, out)
 
 
 def _see_itself(k: int, arrays: ProblemArrays, goal: FloatArray, eyes: Eyes, out: FloatArray) -> None:
@@ -75,8 +75,9 @@ def _see_itself(k: int, arrays: ProblemArrays, goal: FloatArray, eyes: Eyes, out
     out[2 * d + 7] = arrays.limits[k, 1]
 
 
-def _see_robots(k: int, radius: FloatArray, eyes: Eyes, out: FloatArray) -> None:
-    d, i = eyes.position.shape[1], 0
+def _see_robots(k: int, radius: FloatArray, eyes: Eyes, i: int, out: FloatArray) -> None:
+    """Fill the rows of neighbours, from component ``i`` on."""
+    d = eyes.position.shape[1]
     for row in range(eyes.nearest_robots.shape[0]):
         present = eyes.nearest_robots[row, 0] < np.inf
         other = int(eyes.nearest_robots[row, 1]) if present else k
@@ -88,8 +89,9 @@ def _see_robots(k: int, radius: FloatArray, eyes: Eyes, out: FloatArray) -> None
         i += 2 + 2 * d
 
 
-def _see_obstacles(radius: float, nearest: FloatArray, out: FloatArray) -> None:
-    d, i = nearest.shape[1] - 1, 0
+def _see_obstacles(radius: float, nearest: FloatArray, i: int, out: FloatArray) -> None:
+    """Fill the rows of obstacles, from component ``i`` on."""
+    d = nearest.shape[1] - 1
     for row in range(nearest.shape[0]):
         present = nearest[row, 0] < np.inf
         out[i] = 1 if present else 0

@@ -19,15 +19,9 @@ if TYPE_CHECKING:
     from d4orm_env.engine.worlds import WorldBatch
 
 __all__ = [
-    "Engine",
-    "MovingObstacles",
-    "SamplingResult",
-    "SamplingRules",
-    "SamplingTask",
-    "StepResult",
-    "WorldEngine",
+    "Engine", "MovingObstacles", "SamplingResult", "SamplingRules", "SamplingTask", "StepResult", "WorldEngine",
     "checked_controls",
-]
+]  # fmt: skip
 
 
 class StepResult(NamedTuple):

@@ -61,11 +61,8 @@ class Ways(NamedTuple):
 def drive_kernel(name: str) -> Any:
     """The compiled drives of robots of the model with this name, each as if nobody else were there.
 
-    The kernel takes :class:`DriveRules`, the :class:`Ways`, and carries their states and controls on in place:
-
-    - ``x``: ``(H+1, B, n)``; up to ``switch`` given, then output.
-    - ``u``: ``(H, B, m)`` likewise, inside the limits; zero after arrival.
-    - ``arrived``: ``(B,)`` bool, output.
+    The kernel carries states ``x`` ``(H+1, B, n)`` and controls ``u`` ``(H, B, m)`` on in place, given up to ``switch``
+    and inside the limits from there on, zero after arrival; ``arrived`` ``(B,)`` is output.
     """
     robot = MODELS[name]
     move, dock = make_stepper(robot)

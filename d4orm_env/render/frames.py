@@ -98,8 +98,6 @@ class FrameRenderer:
             ValueError: If the states have another shape or are not finite.
             RuntimeError: After :meth:`close`.
         """
-        if self._closed:
-            raise RuntimeError("this renderer is closed; make a new one to draw again")
         team, d = self._checked(np.asarray(states)), self.problem.dimension
         docked = np.asarray(arrived, bool)
         places = self.problem.goal if goals is None else np.asarray(goals)
@@ -112,6 +110,8 @@ class FrameRenderer:
         return self._paint()
 
     def _checked(self, states: Array) -> Array:
+        if self._closed:
+            raise RuntimeError("this renderer is closed; make a new one to draw again")
         expected = (self.problem.num_robots, self.problem.state_size)
         if states.shape != expected or not np.isfinite(states).all():
             raise ValueError(f"states must be finite and of shape (K, n) = {expected}; these have {states.shape}")

@@ -11,13 +11,8 @@ if TYPE_CHECKING:
     from d4orm_env.scenarios.files import load_problem, save_problem
 
 __all__ = [
-    "describe_scenario",
-    "list_scenarios",
-    "load_problem",
-    "make_problem",
-    "register_scenario",
-    "save_problem",
-]
+    "describe_scenario", "list_scenarios", "load_problem", "make_problem", "register_scenario", "save_problem",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -17,6 +17,8 @@ from d4orm_env.verify.geometry import Floats, norm
 
 Limits = NDArray[np.float32]
 
+Limits = NDArray[np.float32]
+
 SUB_STEPS = 20
 """To find how much the way bends within a control step."""
 STATE_ERROR = 1e-7
@@ -40,13 +42,7 @@ class Integrated:
     """
 
     def __init__(
-        self,
-        model: Any,
-        robots: NDArray[np.intp],
-        start: Floats,
-        controls: Floats,
-        limits: NDArray[np.float32],
-        dt: float,
+        self, model: Any, robots: NDArray[np.intp], start: Floats, controls: Floats, limits: Limits, dt: float
     ) -> None:
         self.robots, self._model, self._dt = robots, model, dt
         self._limits = tuple(limits.astype(np.float64)[robots].T)
