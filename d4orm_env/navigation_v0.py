@@ -20,7 +20,7 @@ from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 from d4orm_env.core.arrays import FloatArray, as_float32, whole_number
 from d4orm_env.env_inputs import MAX_ACTION, check_options, checked_cycles, usable
 from d4orm_env.options import EnvOptions
-from d4orm_env.scenarios.registry import ScenarioLike
+from d4orm_env.scenarios.problems import ScenarioLike
 from d4orm_env.shell import EnvironmentShell
 from d4orm_env.team_step import AgentInfos, TeamStep, agent_infos
 from d4orm_env.viewer import RENDER_MODES

@@ -13,7 +13,7 @@ from d4orm_env.core.arrays import shown
 from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.core.problem import Problem
 from d4orm_env.rewards import RewardFunction
-from d4orm_env.scenarios.registry import ScenarioLike, find_scenario, make_problem, unknown_argument
+from d4orm_env.scenarios.problems import ScenarioLike, find_scenario, make_problem, unknown_argument
 
 __all__ = ["EnvOptions"]
 

@@ -19,7 +19,7 @@ from d4orm_env.episode_record import EpisodeCounts, episode_metrics
 from d4orm_env.joint_env import joint_spaces
 from d4orm_env.options import EnvOptions
 from d4orm_env.rewards import RewardInput, compute_rewards
-from d4orm_env.scenarios.registry import ScenarioLike
+from d4orm_env.scenarios.problems import ScenarioLike
 from d4orm_env.simulation import Simulation
 from d4orm_env.team_step import Info
 from d4orm_env.vector_infos import final_infos, masked

@@ -283,7 +283,7 @@ def _or_error(describe: Callable[[str], str], name: str) -> str:
 
 def _problem(scenario: str, robots: int | None, model: str | None, obstacles: int | None, seed: int) -> Problem:
     from d4orm_env.scenarios import load_problem, make_problem
-    from d4orm_env.scenarios.registry import is_scenario_file
+    from d4orm_env.scenarios.problems import is_scenario_file
 
     if is_scenario_file(scenario):
         given = {"--robots": robots, "--model": model, "--obstacles": obstacles}

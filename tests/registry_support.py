@@ -11,10 +11,11 @@ from d4orm_env.core.registry import Registry
 
 @contextmanager
 def forgetting(*tables: Registry) -> Iterator[None]:
-    """Forget what is registered meanwhile, and look for entry points anew."""
+    """Forget what is registered meanwhile, and look things up anew."""
     dictionaries = [MODEL_CODES, *(vars(table)[name] for table in tables for name in ("_registered", "_admitted"))]
     before = [dict(each) for each in dictionaries]
     for table in tables:
+        table._admitted.clear()
         vars(table).pop("_entry_points", None)
     try:
         yield

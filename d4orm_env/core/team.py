@@ -59,10 +59,10 @@ class Team:
         if len({get_model(name).dimension for name in models}) > 1:
             raise ValueError(f"models {sorted(set(models))} mix 2D and 3D robots; a team moves in one dimension")
         restore_frozen(self, {"models": tuple(models)})
-        given = {"radius": radius, "max_speed": max_speed, "max_acceleration": max_acceleration}
-        for name, value in (given | {"max_turn_rate": max_turn_rate}).items():
+        for name, value in zip(STANDARD_LIMITS, (max_speed, max_acceleration, max_turn_rate), strict=True):
             restore_frozen(self, {name: frozen_per_robot(value, name, len(models))})
-        restore_frozen(self, {"own_limits": self._complete_own_limits(own_limits)})
+        own = self._complete_own_limits(own_limits)
+        restore_frozen(self, {"radius": frozen_per_robot(radius, "radius", len(models)), "own_limits": own})
 
     def _complete_own_limits(self, given: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
         if not isinstance(given, Mapping):

@@ -31,7 +31,7 @@ class DriveRules(NamedTuple):
     """What holds for all ways.
 
     Attributes:
-        time_step: ``(4,)`` see :class:`~d4orm_env.core.transition.TimeStep`.
+        time_step: ``(4,)`` see :class:`~d4orm_env.core.robot_model.TimeStep`.
         docking: ``(2,)`` squares of the goal radius and of the goal speed.
         near2: Square of how near to a point is near [m^2].
     """

@@ -188,17 +188,9 @@ class WindowRenderer:
     def _forget_window(self, event: object) -> None:
         self._manager = None
 
-    def draw(
-        self,
-        states: ArrayLike,
-        arrived: ArrayLike,
-        collided: ArrayLike,
-        goals: ArrayLike | None = None,
-        trail: ArrayLike | None = None,
-        **marks: Any,
-    ) -> NDArray[np.uint8]:
+    def draw(self, *moment: ArrayLike, **marks: Any) -> NDArray[np.uint8]:
         """Draw one moment as :meth:`FrameRenderer.draw` does, show it, and wait until it is time for the next."""
-        frame = self._frames.draw(states, arrived, collided, goals, trail, **marks)
+        frame = self._frames.draw(*moment, **marks)
         if self._manager is not None:
             canvas = self._manager.canvas
             self._image.set_data(frame)

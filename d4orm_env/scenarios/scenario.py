@@ -1,10 +1,10 @@
-"""What a scenario is: a function that makes problems, the package's own, a file's or a user's."""
+"""What a scenario is: a function that makes problems, the package's own or a user's."""
 
 from __future__ import annotations
 
+import difflib
 import inspect
-import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -47,18 +47,6 @@ class BuiltIn:
             return self._function(Settings(scenario=self.__name__, seed=seed, **common), **own)
 
 
-class File:
-    """A scenario file as a generator: the same problem for every seed."""
-
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        self._path = path
-
-    def __call__(self, seed: int = 0, num_robots: int | None = None) -> Problem:
-        from d4orm_env.scenarios.files import load_problem
-
-        return load_problem(self._path)
-
-
 @dataclass(frozen=True)
 class Scenario:
     """Something that makes problems.
@@ -98,7 +86,7 @@ class Scenario:
 
     @property
     def arguments(self) -> tuple[str, ...]:
-        """All arguments of :func:`make_problem` for this scenario."""
+        """All arguments of :meth:`problem`."""
         if isinstance(self.generator, BuiltIn):
             return self.generator.arguments
         settings = [parameter.name for parameter in self._parameters[2:] if parameter.kind in _KEYWORDS]
@@ -121,13 +109,26 @@ class Scenario:
         second = self._parameters[1:2]
         return bool(second) and second[0].default is not inspect.Parameter.empty
 
-    def make(self, num_robots: int | None, seed: int | None, settings: Mapping[str, Any]) -> Problem:
-        """The problem for that seed, checked to be one and to have that many robots.
+    def complaint(self, names: Iterable[str], others: Iterable[str] = ()) -> str:
+        """What is wrong with the first of ``names`` that is no argument of this; the empty string if none is.
 
-        Raises:
-            TypeError: If a setting is missing that the generator needs.
-            ValueError: For a bad argument, or if the generator returns something else.
+        Args:
+            names: The arguments given.
+            others: Further arguments that the caller takes.
         """
+        return "" if self.takes_any else complain(f"scenario {self.name!r}", {*others, *self.arguments}, names)
+
+    def problem(self, num_robots: int | None = None, seed: int | None = None, **arguments: Any) -> Problem:
+        """See :func:`~d4orm_env.scenarios.problems.make_problem`."""
+        given = {name: value for name, value in arguments.items() if value is not None}
+        # Whatever the scenario, leaving a common argument out is no mistake.
+        complaint = self.complaint(name for name in arguments if name in given or name not in COMMON_ARGUMENTS)
+        if complaint:
+            raise UnknownKeywordError(complaint)
+        return self._make(num_robots, seed, given)
+
+    def _make(self, num_robots: int | None, seed: int | None, settings: Mapping[str, Any]) -> Problem:
+        """The problem for that seed, checked to be one and to have that many robots."""
         seed = 0 if seed is None else whole_number(seed, "seed", 0)
         if num_robots is None and not self.has_own_size:
             num_robots = DEFAULT_ROBOTS
@@ -145,3 +146,14 @@ class Scenario:
                 f"{num_robots}; it must return as many as it is asked for"
             )
         return problem.replace(name=self.name) if problem.name == "custom" else problem
+
+
+def complain(owner: str, known: Iterable[str], names: Iterable[str]) -> str:
+    """What is wrong with the first of ``names`` that is not ``known``; the empty string if all are."""
+    known = sorted(known)
+    for name in names:
+        if name not in known:
+            close = difflib.get_close_matches(name, known, 1)
+            hint = f"; did you mean {close[0]!r}?" if close else ""
+            return f"{owner} takes no argument {name!r}; it takes {', '.join(known)}{hint}"
+    return ""

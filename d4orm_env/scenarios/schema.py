@@ -17,7 +17,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_model import Model
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.registry import SCENARIOS, make_problem, unknown_argument
+from d4orm_env.scenarios.registry import SCENARIOS
 
 FLOAT32_MAX = float(str(np.finfo(np.float32).max))
 VERSION = 1
@@ -196,7 +196,7 @@ class ProblemFile(Entry):
 
 
 class ScenarioFile(BaseModel):
-    """The short form: a scenario's name and arguments, which :func:`make_problem` checks."""
+    """The short form: a scenario's name and arguments, which :class:`~d4orm_env.scenarios.scenario.Scenario` checks."""
 
     model_config = ConfigDict(extra="allow", strict=True, frozen=True)
 
@@ -208,10 +208,10 @@ class ScenarioFile(BaseModel):
         arguments = self.model_extra or {}
         # A name only: a file neither imports code nor reads other files.
         scenario = SCENARIOS.look_up(self.scenario)
-        complaint = unknown_argument(scenario, arguments)
+        complaint = scenario.complaint(arguments)
         if complaint:
             raise ValueError(complaint)
-        problem = make_problem(scenario, **arguments)
+        problem = scenario.problem(**arguments)
         return problem if self.name is None else problem.replace(name=self.name)
 
 

@@ -17,8 +17,6 @@ from d4orm_env.verify.geometry import Floats, norm
 
 Limits = NDArray[np.float32]
 
-Limits = NDArray[np.float32]
-
 SUB_STEPS = 20
 """To find how much the way bends within a control step."""
 STATE_ERROR = 1e-7

@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.scenarios import make_problem
-from d4orm_env.scenarios.registry import unknown_argument
+from d4orm_env.scenarios.problems import unknown_argument
 from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm
 from d4orm_planners.rl.checkpoints import Checkpoints
 from d4orm_planners.rl.curriculum import Lesson, common_batch, make_lessons, team_sizes
