@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from d4orm_planners.base import Iteration, Planner, PlannerConfig, Search
     from d4orm_planners.episode import Episode, run_episode
-    from d4orm_planners.evaluation.harness import evaluate
+    from d4orm_planners.evaluation.evaluate import evaluate
     from d4orm_planners.names import register_planner, register_policy
     from d4orm_planners.plan import IterationRecord, Plan, load_plan
     from d4orm_planners.policy import OpenLoop, Policy
@@ -38,7 +38,7 @@ __all__ = [
 _HOMES = {
     "base": ("Iteration", "Planner", "PlannerConfig", "Search"),
     "episode": ("Episode", "run_episode"),
-    "evaluation.harness": ("evaluate",),
+    "evaluation.evaluate": ("evaluate",),
     "names": ("register_planner", "register_policy"),
     "plan": ("IterationRecord", "Plan", "load_plan"),
     "policy": ("OpenLoop", "Policy"),

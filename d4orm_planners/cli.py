@@ -15,16 +15,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from d4orm_planners.commands.evaluate import evaluate, leaderboard
-from d4orm_planners.commands.inputs import (
-    MOST_SEEDS,
-    check_target,
-    make_folder,
-    names,
-    numbers,
-    parse_settings,
-    refuse_options,
-)
+from d4orm_planners.commands.bench import bench
+from d4orm_planners.commands.evaluate import evaluate
+from d4orm_planners.commands.inputs import check_target, make_folder, parse_settings, refuse_options
+from d4orm_planners.commands.leaderboard import leaderboard
 from d4orm_planners.commands.node import node
 from d4orm_planners.commands.options import (
     Engine,
@@ -59,7 +53,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-for command in (evaluate, leaderboard, node, reproduce, robustness, train):
+for command in (bench, evaluate, leaderboard, node, reproduce, robustness, train):
     app.command()(command)
 
 
@@ -195,48 +189,9 @@ def run(
 
 
 @app.command()
-def bench(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write bench.json and bench.md to.")] = Path(
-        "bench"
-    ),
-    quick: Annotated[bool, typer.Option("--quick", help="Small sizes and few repetitions, about a minute.")] = False,
-    robots: Annotated[str | None, typer.Option("--robots", "-k", help="Team sizes, as 4,8,16.")] = None,
-    models: Annotated[str | None, typer.Option("--models", help="Robot models, separated by commas.")] = None,
-    engines: Annotated[str | None, typer.Option("--engines", help="Of cpu, jax and plain, with commas.")] = None,
-    seeds: Annotated[
-        int | None, typer.Option("--seeds", max=MOST_SEEDS, help="Seeds for the first feasible plan.")
-    ] = None,
-    quiet: Quiet = False,
-) -> None:
-    """Measure the engines, the environments and the planner on this machine."""
-    from datetime import UTC, datetime
-
-    from d4orm_planners.evaluation.benchmark import QUICK, BenchmarkSettings, parts, run_parts
-    from d4orm_planners.evaluation.live import PartsProgress
-    from d4orm_planners.evaluation.report import write_report
-    from d4orm_planners.evaluation.timing import describe_machine
-
-    given: dict[str, Any] = {
-        "robots": numbers("--robots", robots),
-        "models": names(models),
-        "engines": names(engines),
-    }
-    chosen = {name: value for name, value in {**given, "seeds": seeds}.items() if value is not None}
-    settings = BenchmarkSettings(**{**(QUICK if quick else {}), **chosen})
-    make_folder(out)
-    machine, date = describe_machine(), datetime.now(UTC).isoformat(timespec="seconds")
-    with PartsProgress(enabled=not quiet) as progress:
-        results = run_parts(list(parts(settings)), progress.update)
-    command = " ".join(["d4orm", *sys.argv[1:]])
-    for path in write_report(out, settings, machine, command, date, results):
-        if not quiet:
-            typer.echo(f"wrote {path}")
-
-
-@app.command()
 def warmup(quiet: Quiet = False) -> None:
     """Compile ahead what planning and the environments need, so that the next start is quick."""
-    from d4orm_planners.evaluation.warmup import warm_up
+    from d4orm_planners.commands.warmup import warm_up
 
     report = warm_up()
     if not quiet:
@@ -304,18 +259,16 @@ def _solve(
     quiet: bool,
 ) -> Plan:
     from d4orm_env.engine.choice import get_engine
-    from d4orm_planners.evaluation.warmup import compile_for_planning
-    from d4orm_planners.progress import SolveProgress
+    from d4orm_planners.commands.progress import solve_progress
+    from d4orm_planners.commands.warmup import compile_for_planning
     from d4orm_planners.registry import make_planner
 
     chosen = make_planner(planner, **settings)
     if get_engine(chosen.config.engine).name == "cpu":
         compile_for_planning(problem.team.models, lambda: typer.echo("compiling, once per installation ...", err=True))
     limit = max_iterations if max_iterations is not None else chosen.config.max_iterations
-    with SolveProgress(planner, problem.num_robots, limit, enabled=not quiet) as progress:
-        return chosen.solve(
-            problem, seed=seed, time_limit=time_limit, max_iterations=max_iterations, callback=progress.update
-        )
+    with solve_progress(planner, problem.num_robots, limit, enabled=not quiet) as progress:
+        return chosen.solve(problem, seed=seed, time_limit=time_limit, max_iterations=max_iterations, callback=progress)
 
 
 def _execute(plan: Plan, seed: int) -> Any:
