@@ -8,7 +8,7 @@ Programming, 2006.
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import chain
 from threading import Event, current_thread, main_thread
@@ -82,7 +82,12 @@ class TeamProgram:
         ]
 
     def solve(
-        self, guess: Motion, contacts: Contacts, docks: Any, options: dict[str, Any], should_stop: Callable[[], bool]
+        self,
+        guess: Motion,
+        contacts: Contacts,
+        docks: Any,
+        options: Mapping[str, object],
+        should_stop: Callable[[], bool],
     ) -> tuple[Motion, str]:
         """Solve from a guess.
 

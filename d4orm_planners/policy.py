@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import asdict
 from functools import partial
 from typing import Any, ClassVar
 
@@ -15,8 +14,8 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.joint_state import JointState, split_state
-from d4orm_planners.base import Planner
 from d4orm_planners.plan import Plan
+from d4orm_planners.planner import Planner
 from d4orm_planners.settings import CheckedSettings
 from d4orm_planners.steering import drive_to_goal
 
@@ -67,7 +66,7 @@ class Policy(ABC):
         By default the settings in ``config``, if it has any, else its attributes that are numbers or text.
         """
         config = getattr(self, "config", None)
-        return asdict(config) if isinstance(config, CheckedSettings) else plain_attributes(self)
+        return config.keywords() if isinstance(config, CheckedSettings) else plain_attributes(self)
 
 
 def plain_attributes(thing: Any) -> dict[str, Any]:
@@ -166,7 +165,7 @@ class OpenLoop(StatePolicy):
 
     def identity(self) -> dict[str, Any]:
         if self.planner is not None:
-            config = asdict(self.planner.config)
+            config = self.planner.config.keywords()
             return {"planner": self.planner.name, **config, "time_limit": self.time_limit}
         assert self.plan is not None
         return {"controls": hashlib.sha256(self.plan.controls.tobytes()).hexdigest()}

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from typing import Any, TypeAlias
 
 from d4orm_env.core.arrays import duration, shown
 from d4orm_env.core.errors import UnknownKeywordError
-from d4orm_planners.base import Planner
 from d4orm_planners.names import PLANNERS, POLICIES, is_planner_class
+from d4orm_planners.planner import Planner
 from d4orm_planners.policy import OpenLoop, Policy, RobotFunction, TeamFunction, plain_attributes
 from d4orm_planners.references import load_reference, source_digest, written
+from d4orm_planners.settings import NOTHING
 
 PolicyLike: TypeAlias = str | Policy | Planner | type[Any] | Callable[..., Any]
 """What :func:`make_policy` takes; other objects with ``reset`` and ``act`` as well."""
@@ -55,8 +55,9 @@ def make_planner(name: str | type[Planner], *, preset: str | None = None, **conf
     if preset is not None and not (isinstance(preset, str) and preset in kind.presets):
         raise ValueError(f"preset {shown(preset)} of {owner} is unknown; choose one of {', '.join(kind.presets)}")
     settings = {} if preset is None else kind.presets[preset]
-    kind.config_class.check_names(config, owner)
-    return kind(kind.config_class(**{**settings, **config}))
+    known = kind.config_class.setting_names({**settings, **config})
+    applying = {name: value for name, value in settings.items() if name in known}
+    return kind(kind.config_class.from_keywords({**applying, **config}, owner))
 
 
 def make_policy(name: PolicyLike, **config: Any) -> Policy:
@@ -83,8 +84,7 @@ def make_policy(name: PolicyLike, **config: Any) -> Policy:
         _refuse_settings(config, owner)
         return _as_policy(kind, owner)
     if (config_class := getattr(kind, "config_class", None)) is not None:
-        config_class.check_names(config, owner)
-        return _as_policy(kind(config_class(**config)), owner)
+        return _as_policy(kind(config_class.from_keywords(config, owner)), owner)
     _check_keywords(kind, config, owner)
     return _as_policy(kind(**config), owner)
 
@@ -135,16 +135,26 @@ def makes_policy(kind: Any) -> bool:
     return isinstance(kind, type) or (not _acts(kind) and callable(kind) and _required(kind) == 0)
 
 
-def setting_names(policy: Any) -> tuple[str, ...]:
-    """Settings that :func:`make_policy` takes for a policy."""
+def setting_names(policy: Any, given: Mapping[str, object] = NOTHING) -> tuple[str, ...]:
+    """Settings that :func:`make_policy` takes for a policy, where these are given."""
     kind = find_policy(policy)
     if is_planner_class(kind):
-        return (*kind.config_class.setting_names(), "preset", "time_limit")
+        return (*kind.config_class.setting_names(given), "preset", "time_limit")
     if not makes_policy(kind):
         return ()
     if (config_class := getattr(kind, "config_class", None)) is not None:
-        return tuple(config_class.setting_names())
+        return tuple(config_class.setting_names(given))
     return tuple(inspect.signature(kind).parameters)
+
+
+def default_settings(policy: str) -> dict[str, object]:
+    """Settings of a planner's or policy's configuration class, with their defaults.
+
+    Raises:
+        ValueError: If there is no such planner or policy.
+    """
+    config_class = getattr(find_policy(policy), "config_class", None)
+    return {} if config_class is None else config_class().keywords()
 
 
 def policy_settings(name: Any, **config: Any) -> dict[str, Any]:
@@ -161,14 +171,13 @@ def policy_settings(name: Any, **config: Any) -> dict[str, Any]:
     if is_planner_class(kind):
         time_limit = _time_limit(config)
         planner = make_planner(name if isinstance(name, str) else kind, **config)
-        settings = {**asdict(planner.config), "time_limit": time_limit}
+        settings = {**planner.config.keywords(), "time_limit": time_limit}
     elif not makes_policy(kind):
         _refuse_settings(config, owner)
         policy = _as_policy(kind, owner)
         settings = policy.identity() if isinstance(kind, Policy | Planner) else plain_attributes(kind)
     elif (config_class := getattr(kind, "config_class", None)) is not None:
-        config_class.check_names(config, owner)
-        settings = asdict(config_class(**config))
+        settings = config_class.from_keywords(config, owner).keywords()
     else:
         _check_keywords(kind, config, owner)
         settings = dict(config)
@@ -184,6 +193,8 @@ def _planner_class(name: Any) -> type[Planner]:
     if not is_planner_class(kind):
         if kind is not name:
             raise ValueError(f"planner {name!r} is {shown(kind)}; it must be a subclass of d4orm_planners.Planner")
+        if isinstance(name, str) and name in POLICIES:
+            raise ValueError(f"{name!r} is no planner but a policy, which acts step by step; use make_policy({name!r})")
         raise ValueError(f"planner {shown(name)} is unknown; choose one of {', '.join(PLANNERS)}")
     if inspect.isabstract(kind):
         raise ValueError(f"planner {_called(name)!r} lacks iterate; define it in the class")

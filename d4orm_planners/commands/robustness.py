@@ -87,7 +87,10 @@ def _settings_by_policy(policies: Sequence[str], settings: dict[str, Any]) -> di
     from d4orm_planners.registry import setting_names
 
     find_here(policies)
-    known = {policy: setting_names(policy) for policy in policies}
+    known = {
+        policy: setting_names(policy, {name.removeprefix(f"{policy}."): value for name, value in settings.items()})
+        for policy in policies
+    }
     chosen: dict[str, dict[str, Any]] = {policy: {} for policy in policies}
     # A setting of one policy counts more than one of all, whichever was given first.
     for name, value in sorted(settings.items(), key=lambda setting: "." in setting[0]):
