@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +22,7 @@ from d4orm_env.engine.base import (
     checked_controls,
     get_engine,
 )
-from d4orm_planners.candidate import evaluate_controls
+from d4orm_planners.candidate import Candidate, evaluate_controls
 from d4orm_planners.plan import IterationRecord, Plan, Status
 from d4orm_planners.stopwatch import Stopwatch
 
@@ -30,6 +32,14 @@ if TYPE_CHECKING:
 
 class Search:
     """One solve on its way.
+
+    Args:
+        planner: What iterates.
+        problem: The problem.
+        seed: Non-negative.
+        initial_controls: ``(H, K, m)`` to start from; zeros by default.
+        engine: What rolls out and samples, if not the planner's own.
+        judge: What makes a candidate of an iteration's controls, if not :func:`evaluate_controls`.
 
     Attributes:
         problem: The problem.
@@ -52,6 +62,7 @@ class Search:
         seed: int,
         initial_controls: ArrayLike | None = None,
         engine: Engine | None = None,
+        judge: Callable[[FloatArray], Candidate] | None = None,
     ) -> None:
         self.planner = planner
         self.problem = problem
@@ -70,6 +81,7 @@ class Search:
             # The first rollout may compile.
             self.engine.rollout(problem, controls)
         self.current = self.best = evaluate_controls(self.engine, problem, controls)
+        self._judge = judge or partial(evaluate_controls, self.engine, problem)
         self.iteration = 0
         self.denoising_steps = 0
         self.history: list[IterationRecord] = []
@@ -116,7 +128,7 @@ class Search:
         if not self._began:
             self.state, self._began = self.planner.init(self), True
         self.state, iteration = self.planner.iterate(self, self.state)
-        self.current = iteration.judged or evaluate_controls(self.engine, self.problem, iteration.controls)
+        self.current = iteration.judged or self._judge(iteration.controls)
         self.iteration += 1
         self.denoising_steps += iteration.denoising_steps
         if self.current.rank > self.best.rank:

@@ -370,7 +370,7 @@ def test_the_word_to_stop_ends_judging_and_denoising() -> None:
     node = alone(cheap_planner("d4orm"), judge)
     with pytest.raises(Stopped):
         node.refine()
-    assert node.search.planner.inner.iterate(node.search, None)[1].denoising_steps == 0
+    assert node.search.planner.iterate(node.search, None)[1].denoising_steps == 0
 
 
 # The planner.

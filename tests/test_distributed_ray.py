@@ -57,14 +57,14 @@ def kill(restarts, mode):
     try:
         notes.append(search.advance().note)
         crew = search.state.crew
-        before = [node.search.planner.inner.process for node in crew.alive]
+        before = [node.search.planner.process for node in crew.alive]
         # Into an iteration, or nearly.
         timer = threading.Timer(0.1, os.kill, (before[1], signal.SIGKILL))
         timer.start()
         while len(notes) < 8 and not any(notes):
             notes.append(search.advance().note)
         timer.join()
-        after = [node.search.planner.inner.process for node in crew.alive]
+        after = [node.search.planner.process for node in crew.alive]
     finally:
         search.close()
     plan = search.plan("stopped")

@@ -57,9 +57,8 @@ class Window:
 
     def no_controls(self) -> FloatArray:
         """``(H_predict, K, m)`` zeros."""
-        return np.zeros(
-            (self._config.predict_horizon, self._problem.num_robots, self._problem.control_size), np.float32
-        )
+        shape = (self._config.predict_horizon, self._problem.num_robots, self._problem.control_size)
+        return np.zeros(shape, np.float32)
 
     def predict(
         self,
@@ -81,6 +80,19 @@ class Window:
             seed: Of the samples.
         """
         problem, config = self._problem, self._config
+        task = self._task(joint, docked, subgoals, base)
+        result = self._engine.denoise(
+            task, self._rules, np.zeros_like(base), self._noise_scale, config.num_samples, seed
+        )
+        limit = problem.team.control_limits
+        controls = np.clip(base + result.mean, -limit, limit).astype(np.float32)
+        radius = problem.goal_radius if self._docks else NOT_AT_SUBGOALS
+        truth = problem.moment(joint.states, joint.goals, horizon=config.predict_horizon, goal_radius=radius)
+        return self._safe_mix(truth, controls, before, docked)
+
+    def _task(self, joint: JointState, docked: BoolArray, subgoals: FloatArray, base: FloatArray) -> SamplingTask:
+        """Deform ``base`` so that everybody heads for its subgoal, or its goal where that is near."""
+        problem, config = self._problem, self._config
         near = np.linalg.norm(subgoals - joint.goals, axis=1) <= problem.goal_radius
         goals = np.where((near | docked)[:, None], joint.goals, subgoals)
         window = problem.moment(
@@ -91,22 +103,9 @@ class Window:
             goal_radius=problem.goal_radius if near.any() and self._docks else NOT_AT_SUBGOALS,
         )
         ahead = problem.dt * config.subgoal_offset * float(np.max(np.asarray(problem.team.max_speed)))
-        task = SamplingTask(
-            window,
-            base,
-            credit=config.credit,
-            arrived=docked,
-            penalty=config.penalty,
-            reference_distance=ahead,
+        return SamplingTask(
+            window, base, credit=config.credit, arrived=docked, penalty=config.penalty, reference_distance=ahead
         )
-        result = self._engine.denoise(
-            task, self._rules, np.zeros_like(base), self._noise_scale, config.num_samples, seed
-        )
-        limit = problem.team.control_limits
-        controls = np.clip(base + result.mean, -limit, limit).astype(np.float32)
-        radius = problem.goal_radius if self._docks else NOT_AT_SUBGOALS
-        truth = problem.moment(joint.states, joint.goals, horizon=config.predict_horizon, goal_radius=radius)
-        return self._safe_mix(truth, controls, before, docked)
 
     def _with_stop(self, window: Problem, controls: FloatArray, steps: int, docked: BoolArray) -> FloatArray:
         """The first ``steps`` controls, and after them those that bring everyone to rest as soon as can be.

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import replace
-from typing import Any
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.base import Engine
 from d4orm_planners.candidate import Candidate, evaluate_controls
-from d4orm_planners.planner import Iteration, Planner
-from d4orm_planners.search import Search
 
 
 class Stopped(Exception):
@@ -61,29 +57,3 @@ class Judge:
     def received(self, controls: FloatArray) -> Candidate:
         """Judge what has arrived; the very controls that a node of this process has made are known already."""
         return self._known.get(controls.tobytes()) or evaluate_controls(self.engine, self.problem, controls)
-
-
-class JudgedPlanner(Planner):
-    """A planner whose candidates a common judge looks at.
-
-    Attributes:
-        inner: The planner.
-    """
-
-    def __init__(self, inner: Planner, judge: Judge) -> None:
-        super().__init__(inner.config)
-        self.inner = inner
-        self._judge = judge
-
-    def init(self, search: Search) -> Any:
-        """See :meth:`Planner.init`."""
-        return self.inner.init(search)
-
-    def iterate(self, search: Search, state: Any) -> tuple[Any, Iteration]:
-        """See :meth:`Planner.iterate`."""
-        state, iteration = self.inner.iterate(search, state)
-        return state, replace(iteration, judged=self._judge.own(iteration.controls))
-
-    def finish(self, search: Search, state: Any) -> None:
-        """See :meth:`Planner.finish`."""
-        self.inner.finish(search, state)

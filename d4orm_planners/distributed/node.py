@@ -13,7 +13,7 @@ from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_planners.candidate import Candidate
 from d4orm_planners.distributed.events import Event, Observer
 from d4orm_planners.distributed.inbox import TOLERANCE, Inbox
-from d4orm_planners.distributed.judge import Judge, JudgedPlanner
+from d4orm_planners.distributed.judge import Judge
 from d4orm_planners.distributed.messages import Message, encode
 from d4orm_planners.distributed.meter import Meter
 from d4orm_planners.distributed.selection import choose
@@ -89,7 +89,7 @@ class Node:
     ) -> None:
         self.number = number
         seed = node_seed(task.seed, number)
-        self.search = Search(JudgedPlanner(planner, judge), judge.problem, seed, task.controls, judge.engine)
+        self.search = Search(planner, judge.problem, seed, task.controls, judge.engine, judge.own)
         self.search.cancelled = judge.stop
         self.candidate = self.search.current
         self.transport = Meter(transport)
