@@ -89,7 +89,7 @@ def make_policy(name: PolicyLike, **config: Any) -> Policy:
     return _as_policy(kind(**config), owner)
 
 
-def find_policy(policy: Any) -> Any:
+def find_policy(policy: object) -> Any:
     """What stands behind a policy's name or import path; anything but text is returned as it is.
 
     Raises:
@@ -111,12 +111,12 @@ def find_policy(policy: Any) -> Any:
     )
 
 
-def is_brought(policy: Any) -> bool:
+def is_brought(policy: object) -> bool:
     """Whether a policy is given itself, rather than by name or import path."""
     return callable(policy) or isinstance(policy, Planner) or _acts(policy)
 
 
-def origin(policy: Any) -> Any:
+def origin(policy: object) -> Any:
     """What :func:`make_policy` takes for a policy in any process, whatever was registered there."""
     for table in (PLANNERS, POLICIES):
         if isinstance(policy, str) and policy in table:
@@ -124,18 +124,18 @@ def origin(policy: Any) -> Any:
     return policy
 
 
-def is_planned(policy: Any) -> bool:
+def is_planned(policy: object) -> bool:
     """Whether a policy is a planner, whose plan is executed open loop."""
     kind = find_policy(policy)
     return is_planner_class(kind) or isinstance(kind, Planner)
 
 
-def makes_policy(kind: Any) -> bool:
+def makes_policy(kind: object) -> bool:
     """Whether something that :func:`find_policy` found takes settings and makes a policy, rather than acts itself."""
     return isinstance(kind, type) or (not _acts(kind) and callable(kind) and _required(kind) == 0)
 
 
-def setting_names(policy: Any, given: Mapping[str, object] = NOTHING) -> tuple[str, ...]:
+def setting_names(policy: object, given: Mapping[str, object] = NOTHING) -> tuple[str, ...]:
     """Settings that :func:`make_policy` takes for a policy, where these are given."""
     kind = find_policy(policy)
     if is_planner_class(kind):
@@ -157,7 +157,7 @@ def default_settings(policy: str) -> dict[str, object]:
     return {} if config_class is None else config_class().keywords()
 
 
-def policy_settings(name: Any, **config: Any) -> dict[str, Any]:
+def policy_settings(name: object, **config: Any) -> dict[str, object]:
     """All that tells ``make_policy(name, **config)`` from other policies of that name.
 
     These are its settings, defaults filled in where a configuration class has them; a preset has become its settings.
@@ -167,7 +167,7 @@ def policy_settings(name: Any, **config: Any) -> dict[str, Any]:
         ValueError, TypeError: As :func:`make_policy`; also if there is no source to be read.
     """
     kind, owner = find_policy(name), f"policy {_called(name)!r}"
-    settings: dict[str, Any]
+    settings: dict[str, object]
     if is_planner_class(kind):
         time_limit = _time_limit(config)
         planner = make_planner(name if isinstance(name, str) else kind, **config)
@@ -201,7 +201,7 @@ def _planner_class(name: Any) -> type[Planner]:
     return kind
 
 
-def _acts(thing: Any) -> bool:
+def _acts(thing: object) -> bool:
     return callable(getattr(thing, "reset", None)) and callable(getattr(thing, "act", None))
 
 
@@ -238,7 +238,7 @@ def _required(function: Any) -> int | None:
     return None if not count and any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters) else count
 
 
-def _check_keywords(kind: Any, config: Mapping[str, Any], owner: str) -> None:
+def _check_keywords(kind: Any, config: Mapping[str, object], owner: str) -> None:
     """Refuse what a function or class that makes a policy does not take, and what it lacks."""
     if inspect.isabstract(kind):
         raise ValueError(f"{owner} lacks {', '.join(sorted(kind.__abstractmethods__))}; define it in the class")
@@ -260,21 +260,21 @@ def _check_keywords(kind: Any, config: Mapping[str, Any], owner: str) -> None:
         raise ValueError(f"{owner} cannot be made: {error}; give it as a setting") from None
 
 
-def _refuse_settings(config: Mapping[str, Any], owner: str) -> None:
+def _refuse_settings(config: Mapping[str, object], owner: str) -> None:
     if config:
         raise UnknownKeywordError(f"{owner} takes no settings, but was given {', '.join(map(shown, config))}")
 
 
-def _time_limit(config: dict[str, Any]) -> float | None:
+def _time_limit(config: dict[str, object]) -> float | None:
     """Take the budget of the solve out of a planner's settings."""
     limit = config.pop("time_limit", None)
     return None if limit is None else duration(limit, "time_limit")
 
 
-def _called(thing: Any) -> str:
+def _called(thing: object) -> str:
     """What to call a policy in messages."""
     return thing if isinstance(thing, str) else getattr(thing, "__name__", type(thing).__name__)
 
 
-def _summary(kind: Any) -> str:
+def _summary(kind: object) -> str:
     return (kind.__doc__ or "").strip().partition("\n")[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from d4orm_planners.d4orm_c2f.window import Prediction, Window
 from d4orm_planners.guidance import Guidance
 from d4orm_planners.policy import StatePolicy
 from d4orm_planners.settings import CheckedSettings
+
+if TYPE_CHECKING:
+    from pettingzoo import ParallelEnv
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,7 @@ class D4ormC2F(StatePolicy):
         """What is followed at present."""
         return self._guide.guidance
 
-    def _begin(self, env: Any, seed: int) -> None:
+    def _begin(self, env: ParallelEnv, seed: int) -> None:
         self._seed = seed
         self._random = generator(seed, Stream.CONTROLLER_NOISE)
         self._refinement.forget()

@@ -8,11 +8,11 @@ scales that resolve it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.observation import ObservationLayout
 
 TURNED_MODELS = frozenset({"holonomic2d", "holonomic3d", "velocity2d"})
 """Models whose controls are vectors of the world."""
@@ -45,7 +45,7 @@ class Features:
     turned: bool
 
     @classmethod
-    def of(cls, layout: Any, model: str) -> Features:
+    def of(cls, layout: ObservationLayout, model: str) -> Features:
         """For an :class:`~d4orm_env.core.observation.ObservationLayout` and the model of the robots."""
         return cls(layout.dimension, layout.num_neighbors, layout.num_obstacles, model in TURNED_MODELS)
 
@@ -142,23 +142,23 @@ class Features:
         return features
 
 
-def _scales(gap: Any) -> tuple[FloatArray, FloatArray]:
+def _scales(gap: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Two functions of a distance [m], one that resolves metres and one that resolves centimetres."""
     return 1 / (1 + gap), np.exp(-4 * gap)
 
 
-def _dot(one: Any, two: Any) -> FloatArray:
+def _dot(one: FloatArray, two: FloatArray) -> FloatArray:
     """``(..., 1)`` products of ``(..., d)``; several times quicker than a sum over the short last axis."""
     products: FloatArray = np.einsum("...i,...i->...", one, two)[..., None]
     return products
 
 
-def _norm(vectors: Any) -> FloatArray:
+def _norm(vectors: FloatArray) -> FloatArray:
     """``(..., 1)`` lengths of ``(..., d)``."""
     return np.sqrt(_dot(vectors, vectors))
 
 
-def _unit(vectors: Any) -> FloatArray:
+def _unit(vectors: FloatArray) -> FloatArray:
     """``(..., d)`` of length one; zero stays zero."""
     units: FloatArray = vectors / np.maximum(_norm(vectors), 1e-6)
     return units
