@@ -7,11 +7,8 @@ Programming, 2006.
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from itertools import chain
-from threading import Event, current_thread, main_thread
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,12 +19,16 @@ from d4orm_env.core.collision import axis_gap
 from d4orm_env.core.problem import Problem, inverse_initial_distance
 from d4orm_env.core.robot_model import SPEED, Ops
 from d4orm_env.core.transition import TimeStep
+from d4orm_planners.abandoning import run_or_abandon
 
 OBJECTIVE_SCALE = 10.0
 """Of the mean cost of a step, so that IPOPT's tolerance tells good motions from bad ones."""
 
 FEASIBILITY = 1e-5
 """Largest violation of a constraint that IPOPT may leave, in SI units; the clearance makes up for it."""
+
+ABANDONED = "Abandoned_At_Time_Limit"
+"""How a run ended that was left before IPOPT could end it."""
 
 TINY = 1e-9
 """Added to squared distances, since the square root has no derivative at zero [m^2]."""
@@ -97,14 +98,34 @@ class TeamProgram:
             contacts: What is kept clear of what, and when.
             docks: ``(K,)`` steps by which the robots are at their goals, and from which on they stand there.
             options: IPOPT's.
-            should_stop: Asked after each of IPOPT's iterations whether it is to be the last one.
+            should_stop: Asked every hundredth of a second whether to end; it ends within a tenth, even where writing
+                the program or one of IPOPT's iterations takes longer.
 
         Returns:
-            The motion that IPOPT ended with, feasible or not, and its word for how it ended.
-
-        Raises:
-            KeyboardInterrupt: On Ctrl-C, which ends IPOPT's iteration.
+            The motion that IPOPT came to, feasible or not, and its word for how it ended.
         """
+        reached = self._packed(guess)
+
+        def keep(values: Any) -> None:
+            nonlocal reached
+            reached = values
+
+        ended = run_or_abandon(lambda ends: self._run_ipopt(guess, contacts, docks, options, keep, ends), should_stop)
+        # IPOPT gives up where a function has no value; the guess is then the best there is.
+        values = np.asarray(reached).ravel()
+        motion = self._unpacked(values) if np.isfinite(values).all() else guess
+        return motion, ABANDONED if ended is None else ended
+
+    def _run_ipopt(
+        self,
+        guess: Motion,
+        contacts: Contacts,
+        docks: IntArray,
+        options: Options,
+        keep: Callable[[Any], None],
+        ends: Callable[[], bool],
+    ) -> str:
+        """Hand IPOPT's variables to ``keep`` after every iteration and at the end; return how it ended."""
         ca = self.casadi
         rows = [*self._motion_rows(), *self._goal_rows(docks), *self._contact_rows(contacts, docks)]
         program = {
@@ -115,16 +136,12 @@ class TeamProgram:
         sizes = [row.numel() for row, _, _ in rows]
         lower, upper = (np.repeat([row[bound] for row in rows], sizes) for bound in (1, 2))
         lowest, highest = self._variable_bounds()
-        numbers = {name: part.numel() for name, part in program.items()}
-        with _ctrl_c_kept() as ctrl_c:
-            stopper = _stopper(ca, numbers, lambda: ctrl_c.is_set() or should_stop())
-            settings = {"ipopt": {**IPOPT, **options}, **CASADI, "iteration_callback": stopper}
-            solver = ca.nlpsol("team", "ipopt", program, settings)
-            solution = solver(x0=self._packed(guess), lbx=lowest, ubx=highest, lbg=lower, ubg=upper)
-        values = np.asarray(solution["x"]).ravel()
-        # IPOPT gives up where a function has no value; the guess is then the best there is.
-        motion = self._unpacked(values) if np.isfinite(values).all() else guess
-        return motion, str(solver.stats()["return_status"])
+        stopper = _stopper(ca, {name: part.numel() for name, part in program.items()}, keep, ends)
+        settings = {"ipopt": {**IPOPT, **options}, **CASADI, "iteration_callback": stopper}
+        solver = ca.nlpsol("team", "ipopt", program, settings)
+        solution = solver(x0=self._packed(guess), lbx=lowest, ubx=highest, lbg=lower, ubg=upper)
+        keep(solution["x"])
+        return str(solver.stats()["return_status"])
 
     def contacts(self, motion: Motion, lookout: float | None) -> Contacts:
         """What comes within ``lookout`` [m] of the distance to keep, and when; everything always, for ``None``."""
@@ -287,26 +304,7 @@ class TeamProgram:
         return Motion(states, controls)
 
 
-@contextmanager
-def _ctrl_c_kept() -> Iterator[Event]:
-    """Keep Ctrl-C for the end of the block; the event tells that it came.
-
-    CasADi takes the exception of a Ctrl-C for a function that has no value, and goes on.
-    """
-    came, former = Event(), signal.getsignal(signal.SIGINT)
-    if current_thread() is not main_thread() or not callable(former):
-        yield came
-        return
-    signal.signal(signal.SIGINT, lambda *_: came.set())
-    try:
-        yield came
-    finally:
-        signal.signal(signal.SIGINT, former)
-    if came.is_set():
-        former(signal.SIGINT, None)
-
-
-def _stopper(casadi: Any, sizes: dict[str, int], ends: Callable[[], bool]) -> Any:
+def _stopper(casadi: Any, sizes: dict[str, int], keep: Callable[[Any], None], ends: Callable[[], bool]) -> Any:
     """What IPOPT calls after every iteration of a program of these sizes, and what ends it once ``ends()`` is true."""
 
     class Stopper(casadi.Callback):
@@ -322,7 +320,7 @@ def _stopper(casadi: Any, sizes: dict[str, int], ends: Callable[[], bool]) -> An
             return casadi.Sparsity.dense(size, min(size, 1))
 
         def eval(self, arguments: Any) -> list[int]:
-            del arguments
+            keep(arguments[0])
             return [int(ends())]
 
     return Stopper()

@@ -115,10 +115,12 @@ class Ipopt(Planner):
             candidate = evaluate_controls(search.engine, problem, motion.controls.astype(np.float32))
             if best is None or candidate.rank > best.rank:
                 best = candidate
+            # More constraints do not mend what is infeasible as it is; another start may.
+            if best.solved or note not in FOUND:
+                break
             former, contacts = contacts, _union(contacts, program.contacts(motion, config.lookout))
             standing, docks = docks, _docks(candidate)
-            # More constraints do not mend what is infeasible as it is; another start may.
-            if best.solved or note not in FOUND or (_size(contacts) == _size(former) and (docks == standing).all()):
+            if _size(contacts) == _size(former) and (docks == standing).all():
                 break
             options["mu_init"] = min(NEARLY_SOLVED, config.barrier)
         assert best is not None

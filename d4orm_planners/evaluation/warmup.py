@@ -72,8 +72,9 @@ def _in_another_process(call: str) -> subprocess.Popen[bytes]:
 
 
 def roll_out_once(models: tuple[str, ...]) -> None:
-    """Roll out a plan of the smallest problem of a team of these models on the CPU."""
+    """Drive straight and roll out a plan of the smallest problem of a team of these models on the CPU."""
     problem = _smallest_problem(models)
+    prepare_drives(problem)
     get_engine("cpu").rollout(problem, _no_controls(problem))
 
 
@@ -84,7 +85,6 @@ def sample_once(teams: tuple[tuple[str, ...], ...]) -> None:
         task = SamplingTask(problem, _no_controls(problem))
         rules = SamplingRules(weights=SoftmaxWeights(1.0))
         get_engine("cpu").prepare(task, rules, np.ones(1, np.float32), 2)
-        prepare_drives(problem)
 
 
 def warm_up() -> WarmupReport:
@@ -100,6 +100,8 @@ def warm_up() -> WarmupReport:
     sample_once((TEAMS[0], TEAMS[-1]))
     other.wait()
     sample_once(TEAMS)
+    for models in TEAMS:
+        roll_out_once(models)
     _plan()
     _step_environments()
     seconds = time.perf_counter() - begin

@@ -8,6 +8,7 @@ scales that resolve it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -142,23 +143,23 @@ class Features:
         return features
 
 
-def _scales(gap: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _scales(gap: Any) -> tuple[FloatArray, FloatArray]:
     """Two functions of a distance [m], one that resolves metres and one that resolves centimetres."""
     return 1 / (1 + gap), np.exp(-4 * gap)
 
 
-def _dot(one: FloatArray, two: FloatArray) -> FloatArray:
+def _dot(one: Any, two: Any) -> FloatArray:
     """``(..., 1)`` products of ``(..., d)``; several times quicker than a sum over the short last axis."""
     products: FloatArray = np.einsum("...i,...i->...", one, two)[..., None]
     return products
 
 
-def _norm(vectors: FloatArray) -> FloatArray:
+def _norm(vectors: Any) -> FloatArray:
     """``(..., 1)`` lengths of ``(..., d)``."""
     return np.sqrt(_dot(vectors, vectors))
 
 
-def _unit(vectors: FloatArray) -> FloatArray:
+def _unit(vectors: Any) -> FloatArray:
     """``(..., d)`` of length one; zero stays zero."""
     units: FloatArray = vectors / np.maximum(_norm(vectors), 1e-6)
     return units
