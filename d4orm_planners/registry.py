@@ -194,7 +194,10 @@ def _planner_class(name: Any) -> type[Planner]:
         if kind is not name:
             raise ValueError(f"planner {name!r} is {shown(kind)}; it must be a subclass of d4orm_planners.Planner")
         if isinstance(name, str) and name in POLICIES:
-            raise ValueError(f"{name!r} is no planner but a policy, which acts step by step; use make_policy({name!r})")
+            raise ValueError(
+                f"{name!r} is no planner but a policy, which acts step by step; use make_policy({name!r}), or "
+                f"d4orm run --policy {name}"
+            )
         raise ValueError(f"planner {shown(name)} is unknown; choose one of {', '.join(PLANNERS)}")
     if inspect.isabstract(kind):
         raise ValueError(f"planner {_called(name)!r} lacks iterate; define it in the class")

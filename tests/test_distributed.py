@@ -36,7 +36,7 @@ from d4orm_planners.distributed.events import Event
 from d4orm_planners.distributed.inbox import Inbox
 from d4orm_planners.distributed.judge import Judge, Stopped
 from d4orm_planners.distributed.messages import KINDS, MAGIC, Message, MessageError, decode, encode
-from d4orm_planners.distributed.node import Node, Selection, Task, node_seed
+from d4orm_planners.distributed.node import Node, Task, node_seed
 from d4orm_planners.distributed.selection import choose, diverse, k_means, merge, shares, top_k
 from d4orm_planners.distributed.transport import WAITING, LocalNetwork
 from d4orm_planners.planner import Iteration, Planner
@@ -358,7 +358,7 @@ def test_what_a_process_has_made_is_judged_once() -> None:
 
 def alone(planner: Planner, judge: Judge | None = None) -> Node:
     """A network's only node."""
-    task = Task(1, 0, None, Selection("max", 1))
+    task = Task(1, 0, None, "max", 1)
     return Node(0, task, planner, LocalNetwork().join(), judge or Judge(get_engine("cpu"), PROBLEM))
 
 
@@ -633,7 +633,7 @@ def test_an_observer_is_told_what_a_node_does() -> None:
     planner = D4orm(D4ormConfig(engine="cpu", num_samples=64, num_steps=5))
     events: list[Event] = []
     controls = np.zeros((problem.horizon, 2, 2), np.float32)
-    task, judge = Task(2, 0, controls, Selection("max", 1)), Judge(get_engine("cpu"), problem)
+    task, judge = Task(2, 0, controls, "max", 1), Judge(get_engine("cpu"), problem)
     nodes = [
         Node(i, task, planner, network.join(), judge, observer=observer)
         for i, observer in enumerate((events.append, None))
@@ -655,7 +655,7 @@ def test_an_observer_is_told_what_a_node_does() -> None:
 
 def test_settling_says_whether_all_others_have_a_solution_as_good() -> None:
     problem, network = hop_problem(2), LocalNetwork()
-    task = Task(2, 0, distributed().solve(problem).controls, Selection("max", 1))
+    task = Task(2, 0, distributed().solve(problem).controls, "max", 1)
     judge = Judge(get_engine("cpu"), problem)
     first, second = (Node(i, task, cheap_planner("d4orm"), network.join(), judge) for i in range(2))
     assert not first.settle(0), "nobody has told it anything"

@@ -8,7 +8,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.base import Engine
 from d4orm_env.joint_state import JointState
 from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
@@ -40,7 +40,8 @@ class Guide:
         problem: The problem of the episode.
         config: The settings.
         seed: Of the episode.
-        background: Where refinements are made.
+        refiner: What refinements roll out and sample with.
+        background: Where they are made, if not between control loops.
 
     Attributes:
         guidance: What is followed at present.
@@ -52,8 +53,11 @@ class Guide:
     index: int
     anew: BoolArray
 
-    def __init__(self, problem: Problem, config: D4ormC2FConfig, seed: int, background: Background[Guidance]) -> None:
-        self._problem, self._config, self._seed, self._background = problem, config, seed, background
+    def __init__(
+        self, problem: Problem, config: D4ormC2FConfig, seed: int, refiner: Engine, background: Background[Guidance]
+    ) -> None:
+        self._problem, self._config, self._seed = problem, config, seed
+        self._refiner, self._background = refiner, background
         self._planner = D4ormD(
             D4ormDConfig(
                 engine=config.engine,
@@ -63,8 +67,6 @@ class Guide:
                 improve=True,
             )
         )
-        # On one thread the refinement leaves the other cores, and their threads, to the control loop.
-        self._refiner = get_engine(config.engine, 1 if config.refine == "background" else None)
 
     def begin(self, joint: JointState) -> None:
         """Plan for the episode."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.seeds import Stream, derived_seed, generator
+from d4orm_env.engine.base import get_engine
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.guide import Guide
@@ -61,6 +62,9 @@ class D4ormC2F(StatePolicy):
 
     def __init__(self, config: D4ormC2FConfig | None = None) -> None:
         self.config = config or D4ormC2FConfig()
+        self._engine = get_engine(self.config.engine)
+        # On one thread the refinement leaves the other cores, and their threads, to the control loop.
+        self._refiner = get_engine(self.config.engine, 1 if self.config.refine == "background" else None)
         self._refinement: Background[Guidance] = Background(yielding=True)
         self._control: Background[Prediction] = Background()
 
@@ -81,11 +85,11 @@ class D4ormC2F(StatePolicy):
         self._control.forget()
         self.loops: list[LoopRecord] = []
         joint = split_state(self.problem, env.state())
-        self._window = Window(self.problem, self.config, docks=not env.unwrapped.lifelong)
+        self._window = Window(self.problem, self.config, self._engine, docks=not env.unwrapped.lifelong)
         self._window.prepare(joint)
         self._plan, self._next = self._window.no_controls(), 0
         begin = time.perf_counter()
-        self._guide = Guide(self.problem, self.config, seed, self._refinement)
+        self._guide = Guide(self.problem, self.config, seed, self._refiner, self._refinement)
         self._guide.begin(joint)
         self.coarse_time = time.perf_counter() - begin
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.base import SamplingRules, SamplingTask, get_engine
+from d4orm_env.engine.base import Engine, SamplingRules, SamplingTask
 from d4orm_env.joint_state import JointState
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.steering import track_velocities
@@ -38,12 +38,12 @@ class Window:
     Args:
         problem: The problem of the episode.
         config: The settings.
+        engine: What rolls out and samples.
         docks: Whether robots dock at their goals, rather than drive through them to others.
     """
 
-    def __init__(self, problem: Problem, config: D4ormC2FConfig, docks: bool) -> None:
-        self._problem, self._config, self._docks = problem, config, docks
-        self._engine = get_engine(config.engine)
+    def __init__(self, problem: Problem, config: D4ormC2FConfig, engine: Engine, docks: bool) -> None:
+        self._problem, self._config, self._engine, self._docks = problem, config, engine, docks
         self._rules = SamplingRules(config.weights)
         self._noise_scale = config.noise_scale(config.num_steps)
         limits = problem.team.limits

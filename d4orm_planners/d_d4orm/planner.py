@@ -15,7 +15,7 @@ from d4orm_planners.distributed.crew import AsyncCrew, Crew, SyncCrew
 from d4orm_planners.distributed.inbox import Inbox
 from d4orm_planners.distributed.judge import Judge
 from d4orm_planners.distributed.network import NetworkCrew
-from d4orm_planners.distributed.node import Node, Selection, Task, node_seed
+from d4orm_planners.distributed.node import Node, Task, node_seed
 from d4orm_planners.distributed.ray_connection import RayConnection, import_ray
 from d4orm_planners.distributed.ray_planner import ray_planners
 from d4orm_planners.distributed.transport import LocalNetwork
@@ -65,7 +65,7 @@ class DD4orm(Planner):
         """See :meth:`Planner.init`: the nodes, ready to begin."""
         with ExitStack() as opened:
             number = self.config.nodes or search.problem.num_robots
-            task = Task(number, search.seed, search.current.planned, Selection(self.config.selection, self.config.k))
+            task = Task(number, search.seed, search.current.planned, self.config.selection, self.config.k)
             zenoh = self.config.zenoh
             crew = self._local_crew(search, task, opened) if zenoh is None else self._network_crew(search, task, zenoh)
             return NodesAtWork(crew, opened.pop_all())

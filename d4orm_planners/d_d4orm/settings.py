@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Annotated, Any, Self
 
-from pydantic import Field, SkipValidation
+from pydantic import Field, InstanceOf, SkipValidation
 
 from d4orm_env.core.arrays import shown
 from d4orm_planners.d4orm import D4orm, D4ormConfig
@@ -53,7 +53,7 @@ class DD4ormConfig(PlannerConfig):
             mapping of them; over a network only.
     """
 
-    refinement: Annotated[D4ormConfig, SkipValidation] = field(default_factory=D4ormConfig)
+    refinement: InstanceOf[D4ormConfig] = field(default_factory=D4ormConfig)
     nodes: Annotated[Count, Field(le=MOST_NODES)] | None = 2
     selection: Annotated[str, one_of(SELECTIONS)] = "top-k"
     k: Count = 4

@@ -25,14 +25,6 @@ RETELL = 0.2
 """Seconds after which a candidate is told again, as messages may get lost."""
 
 
-@dataclass(frozen=True)
-class Selection:
-    """How a node chooses what to go on from; see :func:`~d4orm_planners.distributed.selection.choose`."""
-
-    rule: str
-    k: int
-
-
 def node_seed(seed: int, node: int) -> int:
     """The seed of a node; the first one's is the solve's own, so that a single node is the planner that it runs."""
     return seed if node == 0 else derived_seed(seed, Stream.NODE, node)
@@ -46,13 +38,15 @@ class Task:
         num_nodes: How many nodes there are.
         seed: That of the whole solve.
         controls: ``(H, K, m)`` to start from; ``None`` for zeros.
-        selection: How a node chooses what to go on from.
+        selection: How a node chooses what to go on from; see :func:`~d4orm_planners.distributed.selection.choose`.
+        k: How many candidates it draws from.
     """
 
     num_nodes: int
     seed: int
     controls: FloatArray | None
-    selection: Selection
+    selection: str
+    k: int
 
 
 class Node:
@@ -95,7 +89,7 @@ class Node:
         self.transport = Meter(transport)
         self.inbox = Inbox(judge, self.transport, task.num_nodes, number)
         self.excluded = 0
-        self._selection = task.selection
+        self._task = task
         self._told = self._began = told
         self._observer = observer
         self._others = set(range(task.num_nodes)) - {number}
@@ -216,10 +210,10 @@ class Node:
         nodes = sorted(received)
         candidates = [received[node][1] for node in nodes]
         chosen = choose(
-            self._selection.rule,
+            self._task.selection,
             [candidate.trajectory.rewards.mean() for candidate in candidates],
             np.stack([candidate.controls for candidate in candidates]),
-            self._selection.k,
+            self._task.k,
             np.random.default_rng(self.search.iteration_seed(Stream.CHOICE)),
         )
         self.search.current = candidates[chosen]

@@ -13,7 +13,7 @@ from d4orm_env.engine.base import Engine
 from d4orm_planners.candidate import Candidate
 from d4orm_planners.distributed.events import Event
 from d4orm_planners.distributed.judge import Judge
-from d4orm_planners.distributed.node import Node, Selection, Task
+from d4orm_planners.distributed.node import Node, Task
 from d4orm_planners.distributed.transport import Transport
 from onboard.course import Course, digest
 from onboard.mission import Mission
@@ -96,7 +96,7 @@ class Round:
         agenda, planning = self.agenda, self._mission.planning()
         nodes, own = len(agenda.members), agenda.members.index(robot)
         seed = derived_seed(self._mission.seed, Stream.TAKEOVER, agenda.takeover)
-        task = Task(nodes, seed, agenda.guess, Selection(planning.selection, planning.k))
+        task = Task(nodes, seed, agenda.guess, planning.selection, planning.k)
         planner, judge = planning.node_planners(nodes)[own], Judge(self._engine, agenda.problem)
         return Node(own, task, planner, self._team, judge, told=TOLD * agenda.number, observer=self._observe)
 
