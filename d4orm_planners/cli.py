@@ -281,7 +281,8 @@ def planners(
     from d4orm_planners.registry import default_settings, describe_planner, describe_policy
 
     if name is not None:
-        _print_table(name, [(setting, str(value)) for setting, value in default_settings(name).items()])
+        settings = default_settings(name).items()
+        _print_table(name, [(setting, str(value)) for setting, value in settings] or [("no settings", "")])
         return
     for title, table, describe in (("Planners", PLANNERS, describe_planner), ("Policies", POLICIES, describe_policy)):
         _print_table(title, [(name, _or_error(describe, name)) for name in table])

@@ -148,13 +148,16 @@ def setting_names(policy: object, given: Mapping[str, object] = NOTHING) -> tupl
 
 
 def default_settings(policy: str) -> dict[str, object]:
-    """Settings of a planner's or policy's configuration class, with their defaults.
+    """Settings of a planner or policy with their defaults; ``"required"`` where there is none.
 
     Raises:
         ValueError: If there is no such planner or policy.
     """
-    config_class = getattr(find_policy(policy), "config_class", None)
-    return {} if config_class is None else config_class().keywords()
+    kind = find_policy(policy)
+    if (config_class := getattr(kind, "config_class", None)) is not None:
+        return dict(config_class().keywords())
+    parameters = inspect.signature(kind).parameters if makes_policy(kind) else {}
+    return {name: "required" if own.default is own.empty else own.default for name, own in parameters.items()}
 
 
 def policy_settings(name: object, **config: Any) -> dict[str, object]:

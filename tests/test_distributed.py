@@ -708,6 +708,18 @@ def test_a_bad_setting_is_refused_by_name(settings: dict[str, Any], text: str) -
         make_planner("d-d4orm", **settings)
 
 
+def test_nodes_take_the_settings_of_the_planner_that_they_run() -> None:
+    with pytest.raises(TypeError, match=r"'repair_steps' is no setting of planner 'd-d4orm'; it takes .*late_samples"):
+        make_planner("d-d4orm", repair_steps=7)
+    planner = make_planner("d-d4orm", planner="d4orm-d", repair_steps=7, nodes=3, num_samples=100, improve=True)
+    config: Any = planner.config
+    assert {one.config.repair_steps for one in config.node_planners(3)} == {7}
+    assert [one.config.num_samples for one in config.node_planners(3)] == [34, 33, 33]
+    assert make_planner("d-d4orm", **config.keywords()).config == config
+    with pytest.raises(ValueError, match="refinement: "):
+        replace(config, refinement={"repair_steps": 7})
+
+
 def test_the_paper_preset_is_algorithm_5_with_a_node_per_robot() -> None:
     config = make_planner("d-d4orm", preset="paper").config
     inner = config.refinement
