@@ -95,16 +95,20 @@ def test_lists(d4orm, command: str) -> None:
     assert {"scenarios": "amswarm_5", "planners": "d4orm"}[command] in outcome.out
 
 
-@pytest.mark.parametrize("name", ["cem", "d-d4orm", "d4orm-c2f", "goal"])
-def test_the_settings_of_one_are_listed(d4orm, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "listed", "missing"),
+    [
+        ("cem", {"sigma", "elite_fraction"}, "temperature"),
+        ("d-d4orm", {"planner", "nodes", "late_samples"}, "repair_steps"),
+        ("d4orm-c2f", {"weight_cutoff", "deadline"}, "nodes"),
+        ("goal", {"no settings"}, "sigma"),
+    ],
+)
+def test_the_settings_of_one_are_listed(d4orm, name: str, listed: set[str], missing: str) -> None:
     outcome = d4orm("planners", name)
     assert outcome.status == 0
-    listed = {"cem": {"sigma", "elite_fraction"}, "d-d4orm": {"planner", "nodes", "late_samples"}}
-    assert all(
-        setting in outcome.out
-        for setting in listed.get(name, {"weight_cutoff" if name == "d4orm-c2f" else "no settings"})
-    )
-    assert "temperature" not in outcome.out or name != "cem"
+    assert all(setting in outcome.out for setting in listed)
+    assert missing not in outcome.out
 
 
 BAD = [
