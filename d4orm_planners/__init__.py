@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from d4orm_planners.episode import Episode, run_episode
-    from d4orm_planners.evaluation.harness import evaluate
+    from d4orm_planners.evaluation.evaluate import evaluate
     from d4orm_planners.names import register_planner, register_policy
     from d4orm_planners.plan import IterationRecord, Plan
     from d4orm_planners.planner import Iteration, Planner, PlannerConfig
@@ -37,7 +37,7 @@ __all__ = [
 
 _HOMES = {
     "episode": ("Episode", "run_episode"),
-    "evaluation.harness": ("evaluate",),
+    "evaluation.evaluate": ("evaluate",),
     "names": ("register_planner", "register_policy"),
     "plan": ("IterationRecord", "Plan"),
     "planner": ("Iteration", "Planner", "PlannerConfig"),

@@ -15,18 +15,25 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from d4orm_planners.commands.evaluate import evaluate, leaderboard
-from d4orm_planners.commands.inputs import (
-    MOST_SEEDS,
-    check_target,
-    find_here,
-    make_folder,
-    names,
-    numbers,
-    parse_settings,
-    refuse_options,
-)
+from d4orm_planners.commands.bench import bench
+from d4orm_planners.commands.evaluate import evaluate
+from d4orm_planners.commands.inputs import check_target, find_here, make_folder, parse_settings, refuse_options
+from d4orm_planners.commands.leaderboard import leaderboard
 from d4orm_planners.commands.node import node
+from d4orm_planners.commands.options import (
+    Engine,
+    MaxIterations,
+    Model,
+    Obstacles,
+    PlannerName,
+    Preset,
+    Quiet,
+    Robots,
+    Scenario,
+    Seed,
+    Settings,
+    TimeLimit,
+)
 from d4orm_planners.commands.reproduce import reproduce
 from d4orm_planners.commands.robustness import robustness
 from d4orm_planners.commands.train import train
@@ -45,7 +52,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-for command in (evaluate, leaderboard, node, reproduce, robustness, train):
+for command in (bench, evaluate, leaderboard, node, reproduce, robustness, train):
     app.command()(command)
 
 
@@ -65,27 +72,6 @@ def options(
     """Plan and run teams of robots that cross each other's way without touching."""
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
-
-
-Scenario = Annotated[
-    str,
-    typer.Option(
-        "--scenario", "-s", help="Scenario name (see `d4orm scenarios`), a YAML file or package.module:function."
-    ),
-]
-Robots = Annotated[int | None, typer.Option("--robots", "-k", help="Number of robots; the scenario's own by default.")]
-Model = Annotated[str | None, typer.Option("--model", "-m", help="Robot model; the scenario's own by default.")]
-Obstacles = Annotated[int | None, typer.Option("--obstacles", help="Random obstacles to add.")]
-Seed = Annotated[int, typer.Option("--seed", help="Seed of the scenario and of the planner.")]
-PlannerName = Annotated[
-    str, typer.Option("--planner", "-p", help="Planner (see `d4orm planners`), or package.module:Name.")
-]
-Preset = Annotated[str | None, typer.Option("--preset", help="`paper` for the paper's parameters.")]
-Settings = Annotated[list[str] | None, typer.Option("--set", help="A planner setting, as num_samples=512; repeatable.")]
-Engine = Annotated[str, typer.Option("--engine", help="auto, cpu or jax.")]
-TimeLimit = Annotated[float | None, typer.Option("--time-limit", help="Seconds for planning.")]
-MaxIterations = Annotated[int | None, typer.Option("--max-iterations", help="Iterations for planning.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no tables.")]
 
 
 @app.command()
@@ -204,48 +190,9 @@ def run(
 
 
 @app.command()
-def bench(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write bench.json and bench.md to.")] = Path(
-        "bench"
-    ),
-    quick: Annotated[bool, typer.Option("--quick", help="Small sizes and few repetitions, about a minute.")] = False,
-    robots: Annotated[str | None, typer.Option("--robots", "-k", help="Team sizes, as 4,8,16.")] = None,
-    models: Annotated[str | None, typer.Option("--models", help="Robot models, separated by commas.")] = None,
-    engines: Annotated[str | None, typer.Option("--engines", help="Of cpu, jax and plain, with commas.")] = None,
-    seeds: Annotated[
-        int | None, typer.Option("--seeds", max=MOST_SEEDS, help="Seeds for the first feasible plan.")
-    ] = None,
-    quiet: Quiet = False,
-) -> None:
-    """Measure the engines, the environments and the planner on this machine."""
-    from datetime import UTC, datetime
-
-    from d4orm_planners.evaluation.benchmark import QUICK, BenchmarkSettings, parts, run_parts
-    from d4orm_planners.evaluation.live import PartsProgress
-    from d4orm_planners.evaluation.report import write_report
-    from d4orm_planners.evaluation.timing import describe_machine
-
-    given: dict[str, Any] = {
-        "robots": numbers("--robots", robots),
-        "models": names(models),
-        "engines": names(engines),
-    }
-    chosen = {name: value for name, value in {**given, "seeds": seeds}.items() if value is not None}
-    settings = BenchmarkSettings(**{**(QUICK if quick else {}), **chosen})
-    make_folder(out)
-    machine, date = describe_machine(), datetime.now(UTC).isoformat(timespec="seconds")
-    with PartsProgress(enabled=not quiet) as progress:
-        results = run_parts(list(parts(settings)), progress.update)
-    command = " ".join(["d4orm", *sys.argv[1:]])
-    for path in write_report(out, settings, machine, command, date, results):
-        if not quiet:
-            typer.echo(f"wrote {path}")
-
-
-@app.command()
 def warmup(quiet: Quiet = False) -> None:
     """Compile ahead what planning and the environments need, so that the next start is quick."""
-    from d4orm_planners.evaluation.warmup import warm_up
+    from d4orm_planners.commands.warmup import warm_up
 
     report = warm_up()
     if not quiet:
@@ -319,18 +266,16 @@ def _solve(
     quiet: bool,
 ) -> Plan:
     from d4orm_env.engine.base import get_engine
-    from d4orm_planners.evaluation.warmup import compile_for_planning
-    from d4orm_planners.progress import SolveProgress
+    from d4orm_planners.commands.progress import solve_progress
+    from d4orm_planners.commands.warmup import compile_for_planning
     from d4orm_planners.registry import make_planner
 
     chosen = make_planner(planner, **settings)
     if get_engine(chosen.config.engine).name == "cpu":
         compile_for_planning(problem.team.models, lambda: typer.echo("compiling, once per installation ...", err=True))
     limit = max_iterations if max_iterations is not None else chosen.config.max_iterations
-    with SolveProgress(planner, problem.num_robots, limit, enabled=not quiet) as progress:
-        return chosen.solve(
-            problem, seed=seed, time_limit=time_limit, max_iterations=max_iterations, callback=progress.update
-        )
+    with solve_progress(planner, problem.num_robots, limit, enabled=not quiet) as progress:
+        return chosen.solve(problem, seed=seed, time_limit=time_limit, max_iterations=max_iterations, callback=progress)
 
 
 def _execute(plan: Plan, seed: int) -> Any:

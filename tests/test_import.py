@@ -8,7 +8,7 @@ import sys
 import pytest
 
 HEAVY = ("torch", "ray", "casadi", "plotly", "matplotlib", "jax", "stable_baselines3", "supersuit", "zenoh", "pyrvo",
-         "pandas", "pyarrow")  # fmt: skip
+         "pandas", "pyarrow", "scipy.stats")  # fmt: skip
 CONTRACT = (
     "navigation_v0",
     "make_problem",
@@ -59,6 +59,10 @@ def test_the_cpu_engine_does_without_jax() -> None:
 
 def test_the_environment_does_without_jax_and_matplotlib() -> None:
     assert loaded_by("from d4orm_env import navigation_v0\nnavigation_v0.parallel_env(num_robots=2)") == set()
+
+
+def test_comparing_policies_loads_nothing_heavy_before_there_is_something_to_report() -> None:
+    assert loaded_by("from d4orm_planners import evaluate") == set()
 
 
 @pytest.mark.parametrize("name", CONTRACT)

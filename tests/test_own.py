@@ -33,7 +33,6 @@ from d4orm_planners import (
     register_policy,
     run_episode,
 )
-from d4orm_planners.evaluation.robustness import robustness
 from d4orm_planners.evaluation.store import STORE, TrialStore
 from d4orm_planners.names import PLANNERS, POLICIES
 from d4orm_planners.registry import describe_policy
@@ -286,7 +285,7 @@ def test_a_comparison_takes_a_mixture(tmp_path: Path) -> None:
 def test_policies_without_labels_have_their_own_names(tmp_path: Path) -> None:
     rows = compare([Push, push, Duck(), "goal"], tmp_path)
     assert [row.label for row in rows] == ["Push", "push", "Duck", "goal"]
-    assert [row.label for row in robustness(push_one, tmp_path, noise=[0], trials=1, workers=1)] == ["push_one"]
+    assert [row.label for row in compare(push_one, tmp_path)] == ["push_one"]
     with pytest.raises(ValueError, match="two policies are called 'Push'; give a mapping"):
         compare([Push(), Push(2.0)], tmp_path)
     with pytest.raises(ValueError, match=r"policies\['goal'\] has the name of another policy"):

@@ -5,14 +5,11 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
-
-if TYPE_CHECKING:
-    from d4orm_planners.evaluation.summary import SuccessRate
 
 MOST_SEEDS = 1_000_000
 """Trials of one policy at most: a slip of the finger must not fill the memory."""
@@ -61,14 +58,6 @@ def refuse_options(context: typer.Context, options: Iterable[str], reason: str) 
         source = context.get_parameter_source(parameter.name or "")
         if parameter.name in options and source is not None and source.name == "COMMANDLINE":
             raise ValueError(f"{parameter.opts[0]} {reason}")
-
-
-def require_trials(rates: Sequence[SuccessRate]) -> None:
-    """Say so, and end with status 1, if every trial ended with an error."""
-    if all(rate.errors == rate.trials for rate in rates):
-        trials = sum(rate.trials for rate in rates)
-        typer.echo(f"every trial ({trials}) ended with an error; the first: {rates[0].error}", err=True)
-        raise typer.Exit(1)
 
 
 def names(text: str | None) -> tuple[str, ...] | None:

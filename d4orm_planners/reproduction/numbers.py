@@ -9,9 +9,9 @@ from types import MappingProxyType
 
 import numpy as np
 
-from d4orm_planners.evaluation.reproduction import Figure, Group
-from d4orm_planners.evaluation.statistics import wilson_interval
 from d4orm_planners.evaluation.store import Trial
+from d4orm_planners.evaluation.summary import wilson_interval
+from d4orm_planners.reproduction.figure import Figure, Group
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,8 +104,6 @@ def measured(group: Group) -> Measured:
     trials, first = group.trials, group.trials[0]
     solved = [(trial, seconds) for trial in trials if (seconds := first_solution(trial)) is not None]
     lower, upper = wilson_interval(len(solved), len(trials))
-    times = [seconds for _, seconds in solved]
-    quartiles = [float(value) for value in np.percentile(times, (25, 50, 75))] if times else [None] * 3
     rewards = [history[-1][2] for trial in trials if (history := json.loads(trial.history))]
     errors = [trial.error for trial in trials if trial.error]
 
@@ -126,11 +124,7 @@ def measured(group: Group) -> Measured:
         lower=lower,
         upper=upper,
         errors=len(errors),
-        runtime=quartiles[1],
-        runtime_lower=quartiles[0],
-        runtime_upper=quartiles[2],
-        runtime_mean=float(np.mean(times)) if times else None,
-        runtime_deviation=float(np.std(times, ddof=min(len(times) - 1, 1))) if times else None,
+        **_runtimes([seconds for _, seconds in solved]),
         iterations=mean("iterations"),
         reward=float(np.mean(rewards)) if rewards else None,
         travel_time=mean("travel_time"),
@@ -143,6 +137,15 @@ def measured(group: Group) -> Measured:
         step_time=_step_time([trial for trial, _ in solved]),
         error=errors[0] if errors else "",
     )
+
+
+def _runtimes(seconds: Sequence[float]) -> dict[str, float | None]:
+    """Median, quartiles, mean and standard deviation; ``None`` each where nothing was solved."""
+    names = ("runtime_lower", "runtime", "runtime_upper", "runtime_mean", "runtime_deviation")
+    if not seconds:
+        return dict.fromkeys(names)
+    deviation = np.std(seconds, ddof=min(len(seconds) - 1, 1))
+    return dict(zip(names, map(float, (*np.percentile(seconds, (25, 50, 75)), np.mean(seconds), deviation))))
 
 
 def _step_time(trials: Sequence[Trial]) -> float | None:

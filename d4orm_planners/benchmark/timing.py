@@ -1,19 +1,13 @@
-"""Repeated wall-clock measurements, and the machine they were made on."""
+"""Repeated wall-clock measurements."""
 
 from __future__ import annotations
 
-import importlib.metadata
-import os
-import platform
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-
-LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "gymnasium", "pettingzoo")
 
 
 @dataclass(frozen=True)
@@ -56,14 +50,7 @@ class Spread:
         """
         if not factor > 0:
             raise ValueError(f"factor is {factor:g}; it must be positive")
-        return Spread(
-            median=self.median * factor,
-            lower_quartile=self.lower_quartile * factor,
-            upper_quartile=self.upper_quartile * factor,
-            smallest=self.smallest * factor,
-            largest=self.largest * factor,
-            count=self.count,
-        )
+        return replace(self, **{name: value * factor for name, value in vars(self).items() if name != "count"})
 
 
 def measure(work: Callable[[], Any], repetitions: int, time_limit: float) -> Spread:
@@ -81,35 +68,3 @@ def measure(work: Callable[[], Any], repetitions: int, time_limit: float) -> Spr
         work()
         seconds.append(time.perf_counter() - begin)
     return Spread.of(seconds)
-
-
-def describe_machine() -> dict[str, Any]:
-    """Processor, cores, system, load at this moment and the versions of the libraries that matter."""
-    from d4orm_env.engine.threads import available_cores
-
-    return {
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "cores_used": available_cores(),
-        "system": platform.platform(),
-        "load_average": list(os.getloadavg()) if hasattr(os, "getloadavg") else None,
-        "python": platform.python_version(),
-        "libraries": {name: _version(name) for name in LIBRARIES},
-    }
-
-
-def _version(name: str) -> str | None:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return None
-
-
-def _processor() -> str:
-    """The model name, which :func:`platform.processor` does not tell on Linux."""
-    listing = Path("/proc/cpuinfo")
-    if listing.is_file():
-        for line in listing.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()

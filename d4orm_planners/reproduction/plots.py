@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_planners.evaluation.reproduction import Figure, Group
-from d4orm_planners.evaluation.reproduction_numbers import Measured, column
 from d4orm_planners.evaluation.store import Trial
+from d4orm_planners.reproduction.figure import Figure, Group
+from d4orm_planners.reproduction.numbers import Measured, column
 
 NUMERIC: Mapping[str, str] = MappingProxyType(
     {"robots": "robots", "nodes": "nodes", "noise": "standard deviation of the noise"}

@@ -1,18 +1,17 @@
-"""The paper's evaluation, figure by figure: what each compares, and running it through the one harness."""
+"""A figure or table of the paper: what it compares, as studies, and running them."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
 
 from d4orm_env.core.arrays import whole_number
-from d4orm_planners.evaluation.cells import configurations
-from d4orm_planners.evaluation.harness import Progress, gather
+from d4orm_planners.evaluation.evaluate import Progress, run_study
 from d4orm_planners.evaluation.store import Trial
+from d4orm_planners.evaluation.study import Study
 
 PaperNumbers = Mapping[tuple[str, str, str], Mapping[str, str]]
 """By section, label and metric: what the paper says, by column."""
@@ -40,7 +39,7 @@ class Section:
 
     Attributes:
         title: The paper's name of it.
-        policies: Settings by label, see :func:`~d4orm_planners.evaluation.harness.evaluate`.
+        policies: Settings by label, see :func:`~d4orm_planners.evaluation.evaluate.evaluate`.
         scenarios: Scenario names.
         robots: Team sizes; ``None`` is the scenario's own.
         quick_robots: Those of the quick version.
@@ -60,12 +59,19 @@ class Section:
     noise: tuple[float, ...] = (0.0,)
     time_limit: float | None = None
 
-    def variants(self) -> list[Mapping[str, Mapping[str, Any]]]:
-        """The policies, with every number of nodes."""
-        if not self.nodes:
-            return [self.policies]
+    def studies(self, seeds: int) -> list[Study]:
+        """One study with the policies, or one for every number of nodes."""
         return [
-            {label: {**settings, "nodes": nodes} for label, settings in self.policies.items()} for nodes in self.nodes
+            Study(
+                policies={label: {**settings, **nodes} for label, settings in self.policies.items()},
+                scenarios=self.scenarios,
+                seeds=range(seeds),
+                control_noise_std=self.noise,
+                num_robots=self.robots,
+                model=self.model,
+                time_limit=self.time_limit,
+            )
+            for nodes in ([{"nodes": number} for number in self.nodes] or [{}])
         ]
 
     def quick(self) -> Section:
@@ -95,8 +101,8 @@ class Figure:
         source: Where it stands in the paper.
         sections: Its panels.
         across: What varies from left to right.
-        metrics: What is tabulated, see :data:`~d4orm_planners.evaluation.reproduction_report.METRICS`.
-        plots: What is drawn, see :data:`~d4orm_planners.evaluation.reproduction_plots.PLOTS`.
+        metrics: What is tabulated, see :data:`~d4orm_planners.reproduction.numbers.METRICS`.
+        plots: What is drawn, see :data:`~d4orm_planners.reproduction.plots.PLOTS`.
         seeds: Trials per policy, problem and level of noise; the paper's number.
         deadlines: Seconds for planning, for tables of success within them.
         paper: The numbers that the paper gives.
@@ -186,23 +192,11 @@ def reproduce(
         OSError: If the folder or the store cannot be used, or workers do not start.
     """
     count = whole_number(figure.seeds if seeds is None else seeds, "seeds", 1)
-    for section in figure.sections:  # before the first of them runs for hours
-        for policies in section.variants():
-            configurations(policies, section.time_limit)
-    groups = []
-    for section in figure.sections:
-        for policies in section.variants():
-            for label, trials in gather(
-                policies,
-                section.scenarios,
-                out=Path(out),
-                seeds=range(count),
-                control_noise_std=section.noise,
-                num_robots=section.robots,
-                model=section.model,
-                time_limit=section.time_limit,
-                workers=workers,
-                progress=progress,
-            ):
-                groups.append(Group(section.title, label, trials))
-    return groups
+    studies = [(section.title, study) for section in figure.sections for study in section.studies(count)]
+    for _, study in studies:  # before the first of them runs for hours
+        study.configurations()
+    return [
+        Group(title, label, trials)
+        for title, study in studies
+        for label, trials in run_study(study, out, workers=workers, progress=progress)
+    ]

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import csv
 import os
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from d4orm_planners.evaluation.exports import target, write_csv
 from d4orm_planners.evaluation.leaderboard import origin
-from d4orm_planners.evaluation.report import table
-from d4orm_planners.evaluation.reproduction import Figure, Group
-from d4orm_planners.evaluation.reproduction_numbers import METRICS, Measured, column, measured
-from d4orm_planners.evaluation.reproduction_plots import draw
+from d4orm_planners.evaluation.report import deadline_table, errors, table, target, write_csv
 from d4orm_planners.evaluation.summary import success_by
-from d4orm_planners.evaluation.tables import deadline_table
+from d4orm_planners.reproduction.figure import Figure, Group
+from d4orm_planners.reproduction.numbers import METRICS, Measured, column, measured
+from d4orm_planners.reproduction.plots import draw
 
 INTRODUCTION = """\
 Success with its 95% interval (Wilson); runtime to the first solution, median and quartiles, or mean ± standard
@@ -35,8 +31,7 @@ def markdown(figure: Figure, groups: Sequence[Group]) -> str:
     blocks += [draw_table(figure, title, [row for row in rows if row.section == title]) for title in sections]
     if figure.deadlines:
         blocks += _deadlines(figure, groups)
-    if found := dict.fromkeys(f"- `{row.label}`: {row.error}" for row in rows if row.error):
-        blocks.append("\n".join(["### Errors", "", *found]))
+    blocks += errors((row.label, row.error) for row in rows)
     return "\n\n".join([*blocks, origin([trial for group in groups for trial in group.trials])]) + "\n"
 
 
@@ -95,7 +90,7 @@ def write_reproduction(folder: str | os.PathLike[str], figure: Figure, groups: S
     Args:
         folder: Where to.
         figure: The figure.
-        groups: What :func:`~d4orm_planners.evaluation.reproduction.reproduce` returned for it.
+        groups: What :func:`~d4orm_planners.reproduction.figure.reproduce` returned for it.
 
     Returns:
         The paths.
@@ -105,16 +100,11 @@ def write_reproduction(folder: str | os.PathLike[str], figure: Figure, groups: S
     """
     rows = [measured(group) for group in groups]
     paths = [Path(folder, name) for name in (*(f"{figure.name}.{kind}" for kind in ("csv", "md", "png")), "trials.csv")]
-    names = [f"paper_{metric}" for metric in figure.metrics]
-    with target(paths[0]) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [*asdict(rows[0]), *names])
-        writer.writeheader()
-        for row in rows:
-            said = {f"paper_{metric}": _said(figure, row, metric) for metric in figure.metrics}
-            writer.writerow({**asdict(row), **said})
+    said = [{f"paper_{metric}": _said(figure, row, metric) for metric in figure.metrics} for row in rows]
+    write_csv(paths[0], [{**vars(row), **beside} for row, beside in zip(rows, said)])
     with target(paths[1]) as temporary:
         temporary.write_text(markdown(figure, groups), encoding="utf-8")
     with target(paths[2]) as temporary:
         draw(temporary, figure, groups, rows)
-    write_csv(paths[3], [trial for group in groups for trial in group.trials])
+    write_csv(paths[3], [vars(trial) for group in groups for trial in group.trials])
     return paths

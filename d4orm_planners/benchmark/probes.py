@@ -10,14 +10,14 @@ import tempfile
 import time
 from typing import Any
 
-from d4orm_planners.evaluation.timing import Spread
+from d4orm_planners.benchmark.timing import Spread
 
 _FIRST_PLAN = """
 import json, sys, time
 begin = time.perf_counter()
 from d4orm_env import make_problem
 from d4orm_planners import make_planner
-from d4orm_planners.evaluation.warmup import compile_for_planning
+from d4orm_planners.commands.warmup import compile_for_planning
 imported = time.perf_counter()
 problem = make_problem("circle", num_robots=int(sys.argv[1]))
 compile_for_planning(problem.team.models)  # as the command line does

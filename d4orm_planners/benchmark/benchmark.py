@@ -14,8 +14,8 @@ from d4orm_env.core.dynamics import get_model
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.base import SamplingTask, get_engine
 from d4orm_env.scenarios import make_problem
-from d4orm_planners.evaluation.probes import measure_memory, measure_startup
-from d4orm_planners.evaluation.timing import Spread, measure
+from d4orm_planners.benchmark.probes import measure_memory, measure_startup
+from d4orm_planners.benchmark.timing import Spread, measure
 from d4orm_planners.registry import make_planner
 from d4orm_planners.settings import CheckedSettings, Count, Positive, Samples, Steps, Whole
 
@@ -34,7 +34,7 @@ class BenchmarkSettings(CheckedSettings):
     Attributes:
         robots: Team sizes.
         models: Robot models.
-        engines: Of :data:`ENGINES`; ``"plain"`` is :mod:`d4orm_planners.evaluation.plain`.
+        engines: Of :data:`ENGINES`; ``"plain"`` is :mod:`d4orm_planners.benchmark.plain`.
         num_samples: ``M``.
         horizon: ``H``.
         num_steps: Denoising steps in an iteration.
@@ -187,7 +187,7 @@ def _engine_run(problem: Problem, settings: BenchmarkSettings, name: str, preset
 
 
 def _plain_run(problem: Problem, settings: BenchmarkSettings) -> Callable[..., Any]:
-    from d4orm_planners.evaluation import plain
+    from d4orm_planners.benchmark import plain
 
     planner: Any = make_planner("d4orm", preset="paper")
     temperature = float(planner.config.temperature)

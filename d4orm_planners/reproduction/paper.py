@@ -3,26 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
-from d4orm_planners.evaluation import figures_distributed
-from d4orm_planners.evaluation.reproduction import Figure, Section
+from d4orm_planners.distributed.selection import SELECTIONS
+from d4orm_planners.reproduction.figure import Figure, Section
 
 PAPER: dict[str, Any] = {"preset": "paper"}
 C2F: dict[str, Any] = {"policy": "d4orm-c2f", "refine": "sync"}
 """Refinement in the background would make the result depend on how busy the machine is."""
 SIZES = (4, 8, 12, 16)
-ENVIRONMENTS: tuple[tuple[str, str, str | None], ...] = (
-    ("Differential Drive", "circle", "differential_drive"),
-    ("2D Holonomic", "circle", None),
-    ("Heterogeneous", "heterogeneous", None),
-    ("3D Holonomic", "circle", "holonomic3d"),
-    ("2D Holo 4 Obs", "four_obstacles", None),
-)
-"""The paper's environments in its order: title, scenario, model."""
+Environment = tuple[str, str, str | None]
+"""Title, scenario, model."""
+DRIVES: Environment = ("Differential Drive", "circle", "differential_drive")
+PLANE: Environment = ("2D Holonomic", "circle", None)
+SPACE: Environment = ("3D Holonomic", "circle", "holonomic3d")
+OBSTACLES: Environment = ("2D Holo 4 Obs", "four_obstacles", None)
+ENVIRONMENTS = (DRIVES, PLANE, ("Heterogeneous", "heterogeneous", None), SPACE, OBSTACLES)
+"""The paper's, in its order."""
 D4ORM_SECONDS = {"4": "0.12", "8": "0.13", "12": "0.30", "16": "1.25"}
 """Table II, means."""
+
+
+def _sections(
+    policies: Mapping[str, Mapping[str, Any]], *environments: Environment, **settings: Any
+) -> tuple[Section, ...]:
+    """The same policies in environments, of which the settings say more."""
+    return tuple(
+        Section(title=title, policies=policies, scenarios=(scenario,), model=model, **settings)
+        for title, scenario, model in environments
+    )
 
 
 def _team_size() -> Figure:
@@ -40,11 +51,7 @@ def _team_size() -> Figure:
         name="team-size",
         title="D4orm, MPPI, i-MBD, CEM and MBD against team size",
         source="section IV-B, figure of the baselines, and appendix B, figure of CEM and MBD",
-        sections=tuple(
-            Section(title=title, policies=policies, scenarios=(scenario,), model=model, robots=SIZES,
-                    quick_robots=(2, 3))
-            for title, scenario, model in ENVIRONMENTS
-        ),
+        sections=_sections(policies, *ENVIRONMENTS, robots=SIZES, quick_robots=(2, 3)),
         across="robots",
         metrics=("success", "runtime", "reward"),
         plots=("runtime", "success", "anytime"),
@@ -60,12 +67,11 @@ def _team_size() -> Figure:
             "last one only.",
             "The anytime reward is drawn against seconds; the paper counts steps.",
         ),
-    )  # fmt: skip
+    )
 
 
 def _ipopt() -> Figure:
     policies = {"ipopt": {}, "d4orm": PAPER, "d4orm, defaults": {"policy": "d4orm"}}
-    section = Section(title="2D Holonomic", policies=policies, scenarios=("circle",), robots=SIZES, time_limit=120.0)
     paper = {
         ("2D Holonomic", "ipopt", "mean_runtime"): {
             "4": "1.12 ± 0.526", "8": "6.33 ± 2.284", "12": "35.32 ± 11.53", "16": "failed",
@@ -78,7 +84,7 @@ def _ipopt() -> Figure:
         name="ipopt",
         title="D4orm and direct collocation with IPOPT",
         source="section IV-B, Table II",
-        sections=(section,),
+        sections=_sections(policies, PLANE, robots=SIZES, time_limit=120.0),
         across="robots",
         metrics=("mean_runtime", "success"),
         plots=("runtime", "success"),
@@ -101,24 +107,14 @@ def _big_teams() -> Figure:
         ("2D Holo Random", "d4orm-d", "runtime"): {"64": "within 2", "100": "within 30"},
         ("2D Holo Random", "d4orm-c2f", "runtime"): {"64": "within 2"},
     }
-    sections = [
-        Section(title=title, policies=policies, scenarios=(scenario,), model=model, robots=SIZES, time_limit=30.0)
-        for title, scenario, model in ENVIRONMENTS
-    ]
+    random: Environment = ("2D Holo Random", "random", None)
     return Figure(
         name="big-teams",
         title="D4orm, D4orm-D and D4orm-C2F",
         source="section VIII-A, figure of the variants",
         sections=(
-            *sections,
-            Section(
-                title="2D Holo Random",
-                policies=policies,
-                scenarios=("random",),
-                robots=(16, 32, 64, 100),
-                quick_robots=(3,),
-                time_limit=60.0,
-            ),
+            *_sections(policies, *ENVIRONMENTS, robots=SIZES, time_limit=30.0),
+            *_sections(policies, random, robots=(16, 32, 64, 100), quick_robots=(3,), time_limit=60.0),
         ),
         across="robots",
         metrics=("success", "runtime", "travel_time", "step_time"),
@@ -141,16 +137,12 @@ def _robustness() -> Figure:
         name="robustness",
         title="Success under noise on the controls",
         source="section VIII-B, figure of perturbations",
-        sections=tuple(
-            Section(title=title, policies=policies, scenarios=("circle",), model=model, robots=(8,), noise=levels,
-                    time_limit=30.0)
-            for title, model in (("2D Holonomic", None), ("Differential Drive", "differential_drive"))
-        ),
+        sections=_sections(policies, PLANE, DRIVES, robots=(8,), noise=levels, time_limit=30.0),
         across="noise",
         metrics=("success", "travel_time"),
         plots=("success", "travel_time"),
         remarks=("The paper gives no numbers in its text; its plots compare the same two methods.",),
-    )  # fmt: skip
+    )
 
 
 def _coarseness() -> Figure:
@@ -162,25 +154,19 @@ def _coarseness() -> Figure:
         (1, 5): ("0.57", "6.31", "7.49"),
         (1, 10): ("0.43", "6.36", "7.58"),
     }
-    title, metrics = "2D Holo 4 Obs", ("runtime", "travel_time", "makespan")
+    metrics = ("runtime", "travel_time", "makespan")
     labels = {(f, o): f"f={f}, o={o}" for f, o in table}
+    policies = {label: {**C2F, "coarse_factor": f, "check_interval": o} for (f, o), label in labels.items()}
     return Figure(
         name="coarseness",
         title="D4orm-C2F and the coarseness of its guidance",
         source="appendix C-B, Table III",
-        sections=(
-            Section(
-                title=title,
-                policies={labels[f, o]: {**C2F, "coarse_factor": f, "check_interval": o} for f, o in table},
-                scenarios=("four_obstacles",),
-                robots=(16,),
-            ),
-        ),
+        sections=_sections(policies, OBSTACLES, robots=(16,)),
         across="policy",
         metrics=(*metrics, "success"),
         plots=metrics,
         paper={
-            (title, labels[key], metric): {labels[key]: value}
+            (OBSTACLES[0], labels[key], metric): {labels[key]: value}
             for key, values in table.items()
             for metric, value in zip(metrics, values)
         },
@@ -198,17 +184,12 @@ def _noise_schedule() -> Figure:
         name="noise-schedule",
         title="D4orm and its noise schedule",
         source="appendix C-A, figure of the schedule",
-        sections=tuple(
-            Section(title=title, policies=policies, scenarios=(scenario,), model=model, robots=(8,),
-                    time_limit=20.0)
-            for title, scenario, model in ENVIRONMENTS
-            if title in ("Differential Drive", "2D Holonomic", "3D Holonomic")
-        ),
+        sections=_sections(policies, DRIVES, PLANE, SPACE, robots=(8,), time_limit=20.0),
         across="policy",
         metrics=("success", "runtime", "iterations", "travel_time"),
         plots=("runtime", "success"),
         remarks=("The paper gives no numbers in its text: it finds little variation, most in differential drive.",),
-    )  # fmt: skip
+    )
 
 
 def _amswarm() -> Figure:
@@ -253,11 +234,55 @@ def _amswarm() -> Figure:
     )  # fmt: skip
 
 
+def _distributed() -> tuple[Figure, Figure]:
+    """D-D4orm: its selections with a node per robot, and more and more nodes that share the same samples."""
+    samples = 2048  # of all nodes together
+    # A budget of iterations, not of seconds, so that what is solved does not depend on how busy the machine is.
+    paper = {**PAPER, "max_iterations": 20}
+    kinds: dict[str, dict[str, Any]] = {"": paper, ", defaults": {"num_samples": samples, "nodes": None}}
+    nodes: dict[str, dict[str, Any]] = {
+        f"{selection}{kind}": {"policy": "d-d4orm", **settings, "selection": selection}
+        for kind, settings in kinds.items()
+        for selection in SELECTIONS
+    }
+    alone = {"d4orm": {**paper, "num_samples": samples}, "d4orm, defaults": {"policy": "d4orm", "num_samples": samples}}
+    environments = (DRIVES, PLANE, ("2D Heterogeneous", "heterogeneous", None), SPACE)
+    selections = Figure(
+        name="selections",
+        title="D-D4orm with a node per robot",
+        source="section VIII-D, figure of D-D4orm, upper row",
+        sections=_sections({**alone, **nodes}, *environments, robots=SIZES, quick_robots=(2, 3)),
+        across="robots",
+        metrics=("success", "iterations", "runtime", "waiting_share", "messages", "message_bytes"),
+        plots=("iterations", "runtime", "success", "waiting_share"),
+        remarks=DISTRIBUTED_REMARKS,
+    )
+    numbers = replace(
+        selections,
+        name="nodes",
+        title="D-D4orm and the number of its nodes, 16 robots",
+        source="section VIII-D, figure of D-D4orm, lower row",
+        sections=_sections(nodes, *environments, robots=(16,), nodes=(1, 2, 4, 8, 16)),
+        across="nodes",
+        remarks=(*DISTRIBUTED_REMARKS, "With one node there is nothing to select: all are the planner without nodes."),
+    )
+    return selections, numbers
+
+
+DISTRIBUTED_REMARKS = (
+    "The paper shows iterations to the first solution, in a plot without numbers in its text. The policies without "
+    "`defaults` have its parameters, and 20 iterations.",
+    "Iterations are a mean over the successes: where trials failed it is too good.",
+    "All nodes are threads of one machine, and share its cores. On machines of their own they would be quicker.",
+    "Messages are those that nodes send; each goes to all others.",
+)
+
+
 FIGURES: Mapping[str, Figure] = MappingProxyType({
     figure.name: figure
     for figure in (
         _team_size(), _ipopt(), _big_teams(), _robustness(), _coarseness(), _noise_schedule(), _amswarm(),
-        figures_distributed.selections(), figures_distributed.nodes(),
+        *_distributed(),
     )
 })  # fmt: skip
 """Every figure by its name."""

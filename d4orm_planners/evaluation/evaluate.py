@@ -1,4 +1,4 @@
-"""Comparing policies: every policy on every scenario, team size, seed and level of noise, stored trial by trial."""
+"""Running a study: its trials are stored one by one, and those that are stored already are not run again."""
 
 from __future__ import annotations
 
@@ -11,22 +11,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from d4orm_env.core.arrays import duration, positive_number, whole_number
-from d4orm_env.core.problem import Problem
+from d4orm_env.core.arrays import duration, whole_number
 from d4orm_env.engine.threads import available_cores
-from d4orm_planners.evaluation.cells import Policies, checked_seeds, configurations, problems, several
-from d4orm_planners.evaluation.cluster import RayCrew
-from d4orm_planners.evaluation.exports import PARQUET_HINT, write_results
-from d4orm_planners.evaluation.schedule import Crew, run_jobs
+from d4orm_planners.evaluation.cluster import RayPool
+from d4orm_planners.evaluation.pool import Pool, ProcessPool, run_here, run_jobs
+from d4orm_planners.evaluation.report import PARQUET_HINT, write_results
 from d4orm_planners.evaluation.store import STORE, Trial, TrialKey, TrialStore
-from d4orm_planners.evaluation.summary import SuccessRate, success_rate
+from d4orm_planners.evaluation.study import Policies, Scenarios, Study
+from d4orm_planners.evaluation.summary import SuccessRate, success_rates
 from d4orm_planners.evaluation.trials import Job
-from d4orm_planners.evaluation.workers import LocalCrew, run_here
 from d4orm_planners.references import check_sendable
 
 Progress = Callable[[str, int, int], Any]
-Scenario = str | os.PathLike[str] | Problem | Callable[..., Problem]
-Scenarios = Scenario | Iterable[Scenario]
 
 
 def evaluate(
@@ -79,97 +75,55 @@ def evaluate(
         ImportError: If a policy, or the cluster, needs a library that is not installed.
         OSError: If the folder or the store cannot be written to, workers do not start, or there is no cluster.
     """
-    rates = measure(
-        policies,
-        scenarios,
-        out=out,
+    study = Study(
+        policies=policies,
+        scenarios=scenarios,
         seeds=seeds,
         control_noise_std=control_noise_std,
         num_robots=num_robots,
         model=model,
         time_limit=time_limit,
-        trial_timeout=trial_timeout,
-        workers=workers,
-        ray=ray,
-        progress=progress,
     )
+    trials = run_study(study, out, trial_timeout=trial_timeout, workers=workers, ray=ray, progress=progress)
+    rates = success_rates(trials)
     if Path(out) / "trials.parquet" not in write_results(out, rates):
         warnings.warn(PARQUET_HINT, stacklevel=2)
     return rates
 
 
-def measure(
-    policies: Policies,
-    scenarios: Scenarios,
-    *,
+def run_study(
+    study: Study,
     out: str | os.PathLike[str],
-    seeds: Iterable[int],
-    control_noise_std: float | Iterable[float],
-    num_robots: int | Iterable[int | None] | None = None,
-    model: str | None = None,
-    time_limit: float | None = None,
-    trial_timeout: float | None = None,
-    workers: int | None = None,
-    ray: str | None = None,
-    progress: Progress | None = None,
-) -> list[SuccessRate]:
-    """What :func:`evaluate` does, but nothing is written apart from the store."""
-    groups = gather(
-        policies,
-        scenarios,
-        out=out,
-        seeds=seeds,
-        control_noise_std=control_noise_std,
-        num_robots=num_robots,
-        model=model,
-        time_limit=time_limit,
-        trial_timeout=trial_timeout,
-        workers=workers,
-        ray=ray,
-        progress=progress,
-    )
-    return [success_rate(trials, label) for label, trials in groups]
-
-
-def gather(
-    policies: Policies,
-    scenarios: Scenarios,
     *,
-    out: str | os.PathLike[str],
-    seeds: Iterable[int],
-    control_noise_std: float | Iterable[float],
-    num_robots: int | Iterable[int | None] | None = None,
-    model: str | None = None,
-    time_limit: float | None = None,
     trial_timeout: float | None = None,
     workers: int | None = None,
     ray: str | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[str, list[Trial]]]:
-    """What :func:`measure` does, but the trials themselves are returned, one per seed, behind the policy's label."""
-    levels = tuple(
-        dict.fromkeys(positive_number(level, "noise", zero_allowed=True) for level in several(control_noise_std))
-    )
-    if not levels:
-        raise ValueError("noise is empty; give at least one level")
+    """Run those trials of a study that are not stored in a folder yet. Nothing is written apart from the store.
+
+    For the arguments and errors see :func:`evaluate`.
+
+    Returns:
+        Trials, one per seed, behind the policy's label, for every scenario, team size, policy and level of noise, in
+        that order.
+    """
     if trial_timeout is not None:
         trial_timeout = duration(trial_timeout, "trial_timeout")
     if workers is not None:
         whole_number(workers, "workers", 1)
-    chosen, numbers = configurations(policies, time_limit), checked_seeds(seeds)
-    cells = problems(scenarios, tuple(dict.fromkeys(several(num_robots))), numbers, model)
+    groups = study.groups()
     Path(out).mkdir(parents=True, exist_ok=True)
     store = TrialStore(Path(out) / STORE)
-    groups = [
-        [Job(choice, problem, seed, levels) for seed, problem in zip(numbers, cell)]
-        for cell in cells
-        for choice in chosen
-    ]
     missing, done, total = _missing([job for group in groups for job in group], store)
     running = _run(missing, workers, ray, trial_timeout)
-    _store(running, store, done, total, progress or _silent)
+    _store(running, store, done, total, progress or (lambda what, done, total: None))
     stored = {trial.key: trial for trial in store.trials()}
-    return [(group[0].policy.label, [stored[job.key(level)] for job in group]) for group in groups for level in levels]
+    return [
+        (group[0].policy.label, [stored[job.key(level)] for job in group])
+        for group in groups
+        for level in group[0].noise
+    ]
 
 
 def _missing(jobs: Sequence[Job], store: TrialStore) -> tuple[list[Job], int, int]:
@@ -190,15 +144,14 @@ def _missing(jobs: Sequence[Job], store: TrialStore) -> tuple[list[Job], int, in
 def _run(
     jobs: Sequence[Job], workers: int | None, ray: str | None, trial_timeout: float | None
 ) -> Generator[list[Trial]]:
-    crew: Crew
     cores = available_cores()
     size = min(workers or cores, max(len(jobs), 1))
     if ray is None and size == 1 and trial_timeout is None:
         return run_here(jobs)
     for policy in {id(job.policy): job.policy for job in jobs}.values():
         check_sendable(policy.source, f"policy {policy.label!r}")
-    crew = LocalCrew(size, threads=cores if size == 1 else 1) if ray is None else RayCrew(ray, workers)
-    return run_jobs(jobs, crew, trial_timeout)
+    pool: Pool = ProcessPool(size, threads=cores if size == 1 else 1) if ray is None else RayPool(ray, workers)
+    return run_jobs(jobs, pool, trial_timeout)
 
 
 def _store(running: Generator[list[Trial]], store: TrialStore, done: int, total: int, progress: Progress) -> None:
@@ -215,7 +168,3 @@ def _store(running: Generator[list[Trial]], store: TrialStore, done: int, total:
             progress(f"{last.label}, {last.scenario}, {last.robots} robots", done, total)
     if written is not None:
         written.result()
-
-
-def _silent(what: str, done: int, total: int) -> None:
-    """Say nothing."""

@@ -20,39 +20,22 @@ from d4orm_env.core.problem import Problem
 
 
 class PlainTeam(NamedTuple):
-    """A problem of one robot model, as arrays.
+    """A problem of one robot model, as arrays; obstacles and bounds as in :class:`~d4orm_env.core.world.World`."""
 
-    Attributes:
-        start: ``(K, n)``.
-        goal: ``(K, d)``.
-        radius: ``(K,)``.
-        max_speed: ``(K,)``.
-        max_acceleration: ``(K,)``.
-        max_turn_rate: ``(K,)``.
-        balls: ``(., d + 1)`` centre and radius of circles or spheres.
-        cylinders: ``(., 3)`` axis and radius of vertical cylinders.
-        boxes: ``(., 2 d)`` lower and upper corner.
-        bounds: ``(2, d)``.
-        dt: ``()``.
-        margin: ``()``.
-        goal_radius: ``()``.
-        goal_speed: ``()``, infinite without a limit.
-    """
-
-    start: Any
-    goal: Any
-    radius: Any
-    max_speed: Any
-    max_acceleration: Any
-    max_turn_rate: Any
-    balls: Any
-    cylinders: Any
-    boxes: Any
-    bounds: Any
+    start: Any  # (K, n)
+    goal: Any  # (K, d)
+    radius: Any  # (K,)
+    max_speed: Any  # (K,)
+    max_acceleration: Any  # (K,)
+    max_turn_rate: Any  # (K,)
+    balls: Any  # (., d + 1) centre and radius of circles or spheres
+    cylinders: Any  # (., 3) axis and radius of vertical cylinders
+    boxes: Any  # (., 2 d) lower and upper corner
+    bounds: Any  # (2, d)
     dt: Any
     margin: Any
     goal_radius: Any
-    goal_speed: Any
+    goal_speed: Any  # infinite without a limit
 
 
 def plain_team(problem: Problem) -> tuple[str, PlainTeam]:
@@ -190,7 +173,6 @@ def softmax_mean(rewards: Any, samples: Any, temperature: float) -> Any:
 def denoise(
     model: str,
     team: PlainTeam,
-    base: Any,
     mean: Any,
     noise_scale: Any,
     key: Any,
@@ -203,8 +185,7 @@ def denoise(
     Args:
         model: Model name.
         team: The problem.
-        base: ``(H, K, m)`` controls that the deformation is added to.
-        mean: ``(H, K, m)`` deformation to sample around at first.
+        mean: ``(H, K, m)`` controls to sample around at first.
         noise_scale: ``(N,)`` standard deviation at every step.
         key: A key of ``jax.random``.
         num_samples: ``M``.
@@ -218,7 +199,7 @@ def denoise(
     def update(mean: Any, xs: Any) -> Any:
         sigma, step_key = xs
         samples = mean[None] + sigma * jax.random.normal(step_key, (num_samples, *mean.shape))
-        rewards = score(model, team, base[None] + samples, collisions).mean(axis=1)
+        rewards = score(model, team, samples, collisions).mean(axis=1)
         return softmax_mean(rewards, samples, temperature), rewards.mean()
 
     return jax.lax.scan(update, mean, (noise_scale, jax.random.split(key, len(noise_scale))))[0]
@@ -245,7 +226,5 @@ def denoise_around_rest(
     """
     model, team = plain_team(problem)
     zero = jnp.zeros((problem.horizon, problem.num_robots, problem.control_size))
-    mean = denoise(
-        model, team, zero, zero, noise_scale, jax.random.key(seed), num_samples, temperature, collisions
-    )  # fmt: skip
-    return np.asarray(mean)
+    key = jax.random.key(seed)
+    return np.asarray(denoise(model, team, zero, noise_scale, key, num_samples, temperature, collisions))
