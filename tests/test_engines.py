@@ -332,6 +332,19 @@ class TestKernelCache:
         assert self.hits(path, "another version") == 0
         assert self.hits(path, "one version") == 1
 
+    def test_what_another_version_kept_and_this_one_cannot_read_is_compiled_anew(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("KERNEL_KEY", "")
+        path = tmp_path / "kernel.py"
+        path.write_text(KERNEL)
+        assert self.hits(path, "one version") == 0
+        (index,) = tmp_path.rglob("*.nbi")
+        # A type that the other version knew, of a module that is gone.
+        index.write_bytes(index.read_bytes().replace(b"numba.core.types", b"numba.gone.types"))
+        assert self.hits(path, "one version") == 0
+        assert self.hits(path, "one version") == 1
+
     def test_fingerprints_follow_the_source(self) -> None:
         assert fingerprint((tiles, threads)) == fingerprint((tiles, threads))
         assert len({fingerprint(modules) for modules in ((tiles,), (threads,), (tiles, threads))}) == 3
