@@ -17,7 +17,7 @@ import typer
 
 from d4orm_planners.commands.bench import bench
 from d4orm_planners.commands.evaluate import evaluate
-from d4orm_planners.commands.inputs import check_target, find_here, make_folder, parse_settings, refuse_options
+from d4orm_planners.commands.inputs import check_target, make_folder, parse_settings, refuse_options
 from d4orm_planners.commands.leaderboard import leaderboard
 from d4orm_planners.commands.node import node
 from d4orm_planners.commands.options import (
@@ -34,6 +34,7 @@ from d4orm_planners.commands.options import (
     Settings,
     TimeLimit,
 )
+from d4orm_planners.commands.outputs import draw, episode_rows, print_plan, print_table, require_solved
 from d4orm_planners.commands.reproduce import reproduce
 from d4orm_planners.commands.robustness import robustness
 from d4orm_planners.commands.train import train
@@ -87,8 +88,8 @@ def demo(
     make_folder(out)
     problem = _problem("circle", robots, None, None, seed)
     plan = _solve(problem, "d4orm", {"engine": engine}, seed, None, None, quiet=False)
-    _print_plan(plan)
-    _require_solved(plan)
+    print_plan(plan)
+    require_solved(plan)
     episode = _execute(plan, seed)
     files = {"plan": out / "plan.npz", "picture": out / "plan.png", "animation": out / "execution.gif"}
     plan.save(files["plan"])
@@ -127,18 +128,17 @@ def plan_command(
     for name in {"engine", "preset", "max_iterations"}.intersection(chosen):
         refuse_options(context, (name,), f"and --set {name} say the same; give one of them")
     chosen = {"engine": engine, "preset": preset, **chosen}
-    find_here([planner])
     problem = _problem(scenario, robots, model, obstacles, seed)
     plan = _solve(problem, planner, chosen, seed, time_limit, max_iterations, quiet)
     if not quiet:
-        _print_plan(plan)
+        print_plan(plan)
     if out is not None:
         plan.save(out)
-    _draw(problem, plan.trajectory, picture, animation)
+    draw(problem, plan.trajectory, picture, animation)
     for path in (out, picture, animation):
         if path is not None and not quiet:
             typer.echo(f"wrote {path}")
-    _require_solved(plan)
+    require_solved(plan)
 
 
 @app.command()
@@ -177,14 +177,13 @@ def run(
         problem: Problem = plan.problem
         actor: Policy = OpenLoop(plan=plan)
     else:
-        find_here([policy])
         problem, actor = _problem(scenario, robots, model, obstacles, seed), make_policy(policy)
     env = navigation_v0.parallel_env(problem=problem, control_noise_std=noise)
     episode = run_episode(env, actor, seed=seed)
     env.close()
-    _draw(problem, episode.trajectory, picture, animation)
+    draw(problem, episode.trajectory, picture, animation)
     if not quiet:
-        _print_table("Execution", _episode_rows(episode.metrics))
+        print_table("Execution", episode_rows(episode.metrics))
     if not episode.metrics["success"]:
         raise typer.Exit(1)
 
@@ -216,17 +215,23 @@ def scenarios() -> None:
         except ValueError as error:  # an installed package offers it and cannot be imported
             return str(error)
 
-    _print_table("Scenarios", [(name, described(name)) for name in list_scenarios()])
+    print_table("Scenarios", [(name, described(name)) for name in list_scenarios()])
 
 
 @app.command()
-def planners() -> None:
-    """List the planners and policies."""
+def planners(
+    name: Annotated[str | None, typer.Argument(help="List the settings of this one, with their defaults.")] = None,
+) -> None:
+    """List the planners and policies, or what --set can set of one."""
     from d4orm_planners.names import PLANNERS, POLICIES
-    from d4orm_planners.registry import describe_planner, describe_policy
+    from d4orm_planners.registry import default_settings, describe_planner, describe_policy
 
+    if name is not None:
+        settings = default_settings(name).items()
+        print_table(name, [(setting, str(value)) for setting, value in settings] or [("no settings", "")])
+        return
     for title, table, describe in (("Planners", PLANNERS, describe_planner), ("Policies", POLICIES, describe_policy)):
-        _print_table(title, [(name, _or_error(describe, name)) for name in table])
+        print_table(title, [(name, _or_error(describe, name)) for name in table])
 
 
 def _or_error(describe: Callable[[str], str], name: str) -> str:
@@ -239,7 +244,7 @@ def _or_error(describe: Callable[[str], str], name: str) -> str:
 
 def _problem(scenario: str, robots: int | None, model: str | None, obstacles: int | None, seed: int) -> Problem:
     from d4orm_env.scenarios import load_problem, make_problem
-    from d4orm_env.scenarios.registry import is_scenario_file
+    from d4orm_env.scenarios.problems import is_scenario_file
 
     if is_scenario_file(scenario):
         given = {"--robots": robots, "--model": model, "--obstacles": obstacles}
@@ -259,7 +264,7 @@ def _solve(
     max_iterations: int | None,
     quiet: bool,
 ) -> Plan:
-    from d4orm_env.engine.base import get_engine
+    from d4orm_env.engine.choice import get_engine
     from d4orm_planners.commands.progress import solve_progress
     from d4orm_planners.commands.warmup import compile_for_planning
     from d4orm_planners.registry import make_planner
@@ -282,65 +287,12 @@ def _execute(plan: Plan, seed: int) -> Any:
     env.close()
     report = verify(plan.problem, plan.controls)
     rows = [
-        *_episode_rows(episode.metrics),
+        *episode_rows(episode.metrics),
         ("verified", "yes" if report.ok else "no: " + "; ".join(str(violation) for violation in report.violations[:3])),
         ("closest approach", f"{report.min_separation * 100:.1f} cm between surfaces"),
     ]
-    _print_table("Executed in the environment", rows)
+    print_table("Executed in the environment", rows)
     return episode
-
-
-def _episode_rows(metrics: dict[str, float]) -> list[tuple[str, str]]:
-    return [
-        ("success", "yes" if metrics["success"] else "no"),
-        ("arrived", f"{metrics['arrived']:.0f}"),
-        ("robots in contact", f"{metrics['collided']:.0f}"),
-        ("travel time", f"{metrics['travel_time']:.2f} s"),
-        ("makespan", f"{metrics['makespan']:.2f} s"),
-    ]
-
-
-def _print_plan(plan: Plan) -> None:
-    metrics = plan.metrics
-    rows = [
-        ("solved", "yes" if plan.solved else f"no ({plan.status})"),
-        ("planning time", f"{plan.wall_time:.2f} s"),
-        ("iterations", f"{plan.iterations}"),
-        ("travel time", f"{metrics['travel_time']:.2f} s"),
-        ("makespan", f"{metrics['makespan']:.2f} s"),
-        ("reward", f"{metrics['reward']:.3f}"),
-    ]
-    if not plan.solved:
-        rows.append(("not arrived", f"{plan.problem.num_robots - metrics['arrived']:.0f}"))
-        rows.append(("too close", f"{metrics['margin_violated']:.0f}"))
-    _print_table(f"Plan by {plan.planner}, {plan.problem.num_robots} robots", rows)
-
-
-def _print_table(title: str, rows: list[tuple[str, str]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=title, title_justify="left", show_header=False)
-    for row in rows:
-        table.add_row(*row)
-    Console().print(table)
-
-
-def _draw(problem: Problem, trajectory: Any, picture: Path | None, animation: Path | None) -> None:
-    from d4orm_env.render import save_animation, save_picture
-
-    if picture is not None:
-        save_picture(problem, trajectory, picture)
-    if animation is not None:
-        save_animation(problem, trajectory, animation)
-
-
-def _require_solved(plan: Plan) -> None:
-    if not plan.solved:
-        typer.echo(f"no solution found ({plan.status.replace('_', ' ')} after {plan.iterations} iterations)", err=True)
-        for robot, reason in plan.failures.items():
-            typer.echo(f"  {robot} {reason}", err=True)
-        raise typer.Exit(1)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from env_support import line_problem
+from registry_support import forgetting
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.errors import UnknownKeywordError
@@ -80,8 +82,8 @@ class Duck:
 class Ahead(Planner):
     """Everyone at full thrust along the first axis."""
 
-    def iterate(self, search: Any) -> Iteration:
-        return Iteration(np.broadcast_to(np.float32([1, 0]), search.current.controls.shape))
+    def iterate(self, search: Any, state: None) -> tuple[None, Iteration]:
+        return state, Iteration(np.broadcast_to(np.float32([1, 0]), search.current.controls.shape))
 
 
 def push(observations: dict[str, Any], state: Any) -> dict[str, Any]:
@@ -156,14 +158,9 @@ def test_unknown_settings_are_refused(policy: Any) -> None:
 
 
 @pytest.fixture
-def tables(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a test registers is forgotten after it, and entry points are looked for anew."""
-    for table in (PLANNERS, POLICIES):
-        monkeypatch.setattr(table, "_registered", dict(table._registered))
-        monkeypatch.delitem(vars(table), "_entry_points", raising=False)
-    yield
-    for table in (PLANNERS, POLICIES):
-        vars(table).pop("_entry_points", None)
+def tables() -> Iterator[None]:
+    with forgetting(PLANNERS, POLICIES):
+        yield
 
 
 @pytest.mark.usefixtures("tables")

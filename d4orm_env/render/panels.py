@@ -7,6 +7,7 @@ and larger teams by a perceptually uniform map. Only matplotlib figures are used
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import product
 from typing import Any
 
@@ -16,7 +17,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.problem import Problem
 
@@ -54,7 +55,7 @@ def picture_palette(num_robots: int, size: int) -> Array:
     return np.resize(np.round(255 * colors), (size, 3)).astype(np.uint8)
 
 
-def view_limits(problem: Problem, points: Any = ()) -> Array:
+def view_limits(problem: Problem, points: ArrayLike = ()) -> Array:
     """``(2, d)`` lower and upper corner of what a picture shows [m].
 
     That is every start, goal, obstacle and further point with some room around them, and the bounds where they are
@@ -136,27 +137,27 @@ class Panel:
             axis.set_pane_color((0.97, 0.97, 0.98, 1.0))
             axis._axinfo["grid"].update(color="#E5E7EB", linewidth=0.6)
 
-    def flatten(self, points: Any) -> Array:
+    def flatten(self, points: Array) -> Array:
         """Points ``(..., d)`` in the coordinates of this panel: ``z`` is dropped in a view from above."""
         return np.asarray(points, np.float64)[..., : len(self.right)]
 
-    def outlines(self, centres: Any, radius: Any, shape: Array = _CIRCLE) -> Array:
+    def outlines(self, centres: Array, radius: Array | float, shape: Array = _CIRCLE) -> Array:
         """``(N, vertices, .)`` copies of a shape of unit size, facing the reader."""
         offsets = shape[:, :1] * self.right + shape[:, 1:] * self.up
         corners: Array = self.flatten(centres)[:, None] + np.broadcast_to(radius, len(centres))[:, None, None] * offsets
         return corners
 
-    def polygons(self, vertices: Any, **style: Any) -> Any:
+    def polygons(self, vertices: Sequence[Array] | Array, **style: Any) -> Any:
         """Draw filled polygons and return the collection."""
         if self.spatial:
             return self.axes.add_collection3d(Poly3DCollection(vertices, **style), autolim=False)
-        return self.axes.add_collection(PolyCollection(vertices, **style), autolim=False)
+        return self.axes.add_collection(PolyCollection(list(vertices), **style), autolim=False)
 
-    def segments(self, paths: Any, **style: Any) -> Any:
+    def segments(self, paths: Sequence[Array] | Array, **style: Any) -> Any:
         """Draw open paths and return the collection."""
         if self.spatial:
             return self.axes.add_collection3d(Line3DCollection(paths, **style), autolim=False)
-        return self.axes.add_collection(LineCollection(paths, **style), autolim=False)
+        return self.axes.add_collection(LineCollection(list(paths), **style), autolim=False)
 
 
 def draw_world(panel: Panel, problem: Problem) -> None:
@@ -187,7 +188,7 @@ def _draw_solids(panel: Panel, problem: Problem) -> None:
     sides: list[Array] = []
     planes = np.stack([np.column_stack([_CIRCLE, 0 * _ANGLES]), np.column_stack([0 * _ANGLES, _CIRCLE])])
     for *centre, radius in problem.world.spheres:
-        faces.extend(panel.outlines([centre], radius))
+        faces.extend(panel.outlines(np.array([centre]), radius))
         rings.extend(np.array(centre) + radius * planes)
     for x, y, radius in problem.world.cylinders:
         ring = np.array([x, y]) + radius * _CIRCLE

@@ -12,7 +12,8 @@ from pydantic import Field
 
 from d4orm_env.core.dynamics import get_model
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.base import SamplingTask, get_engine
+from d4orm_env.engine.base import SamplingTask
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.benchmark.probes import measure_memory, measure_startup
 from d4orm_planners.benchmark.timing import Spread, measure

@@ -13,7 +13,6 @@ from d4orm_planners.commands.dataclass_options import takes
 from d4orm_planners.commands.inputs import (
     MOST_SEEDS,
     decimals,
-    find_here,
     make_folder,
     names,
     numbers,
@@ -137,7 +136,6 @@ def _policies(texts: list[str]) -> dict[str, dict[str, Any]]:
         if "policy" in (values := parse_settings(text.removeprefix(policy + colon).split(","), "--policy")):
             raise ValueError(f"--policy {text!r}: 'policy' is no setting; the name stands before the colon")
         chosen[text] = {"policy": policy, **values}
-    find_here(settings.get("policy", label) for label, settings in chosen.items())
     return chosen
 
 
@@ -146,12 +144,16 @@ def _with_settings(chosen: dict[str, dict[str, Any]], settings: dict[str, Any]) 
     from d4orm_planners.registry import setting_names
 
     policies = {label: given.get("policy", label) for label, given in chosen.items()}
+    known = {
+        label: setting_names(
+            own, {name.removeprefix(f"{own}."): value for name, value in settings.items()} | chosen[label]
+        )
+        for label, own in policies.items()
+    }
     # What is said of one configuration counts most, then what is said of one policy, whichever was given first.
     for name, value in sorted(settings.items(), key=lambda setting: "." not in setting[0]):
         policy, separator, setting = name.rpartition(".")
-        owners = [
-            label for label, own in policies.items() if (own == policy if separator else name in setting_names(own))
-        ]
+        owners = [label for label, own in policies.items() if (own == policy if separator else name in known[label])]
         if not owners:
             listed = ", ".join(policies.values())
             one, several = f"{policy!r} is not among the policies; they are", f"{name!r} is a setting of none of the"

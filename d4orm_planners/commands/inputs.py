@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -35,12 +33,6 @@ def parse_settings(settings: list[str] | None, option: str = "--set") -> dict[st
         except ValueError as error:
             raise ValueError(f"{option} {setting!r}: the value {error}") from None
     return values
-
-
-def find_here(policies: Iterable[str]) -> None:
-    """Let Python find modules in the present folder, behind all others, if a policy is given by import path."""
-    if any(":" in policy for policy in policies) and os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
 
 
 def refuse_options(context: typer.Context, options: Iterable[str], reason: str) -> None:

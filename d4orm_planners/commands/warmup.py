@@ -22,8 +22,9 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.dynamics import COMMON
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
-from d4orm_env.engine.base import SamplingRules, SamplingTask, get_engine
+from d4orm_env.engine.base import SamplingRules, SamplingTask
 from d4orm_env.engine.caching import has_to_be_compiled
+from d4orm_env.engine.choice import get_engine
 from d4orm_planners.sampling.weights import SoftmaxWeights
 from d4orm_planners.steering import prepare_drives
 

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 from d4orm_env.core.arrays import duration, positive_number, shown, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios import load_problem, make_problem
-from d4orm_env.scenarios.registry import is_scenario_file
+from d4orm_env.scenarios.problems import is_scenario_file
 from d4orm_planners.evaluation.store import LARGEST_NUMBER
 from d4orm_planners.evaluation.trials import Configuration, Job
 from d4orm_planners.registry import PolicyLike, is_brought, list_policies, make_policy, origin

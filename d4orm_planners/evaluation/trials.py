@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 
 from d4orm_env import navigation_v0, verify
-from d4orm_env.core.errors import UnknownKeywordError
+from d4orm_env.core.errors import UnknownKeywordError, describe
 from d4orm_env.core.problem import Problem
 from d4orm_planners.episode import run_episode
 from d4orm_planners.evaluation.store import Trial, TrialKey
 from d4orm_planners.machine import describe_machine, versions
 from d4orm_planners.plan import IterationRecord, Plan
 from d4orm_planners.policy import Actions, OpenLoop, Policy
-from d4orm_planners.references import describe
 from d4orm_planners.registry import is_planned, make_policy, policy_settings
 
 LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "pyrvo", "casadi")
