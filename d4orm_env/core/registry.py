@@ -142,10 +142,8 @@ def load_reference(text: str) -> Any:
     place, _, name = text.rpartition(":")
     if not place or not all(part.isidentifier() for part in name.split(".")):
         raise ValueError(f"{text!r} is no import path; give {FORMS}")
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
     try:
-        found: Any = _load_file(Path(place)) if place.endswith(".py") else import_module(place)
+        found: Any = _load_file(Path(place)) if place.endswith(".py") else _import(place)
     except Exception as error:  # whatever foreign code raises when it is imported
         raise ValueError(
             f"{text!r} cannot be imported ({describe(error)}); give {FORMS}, of a module that Python finds and that "
@@ -156,6 +154,16 @@ def load_reference(text: str) -> Any:
             raise ValueError(f"{text!r} names nothing: {place} has no {name!r}; give a name that the module defines")
         found = getattr(found, part)
     return found
+
+
+def _import(name: str) -> ModuleType:
+    try:
+        return import_module(name)
+    except ModuleNotFoundError:
+        if os.getcwd() in sys.path:
+            raise
+        sys.path.append(os.getcwd())
+        return import_module(name)
 
 
 def _load_file(path: Path) -> ModuleType:
