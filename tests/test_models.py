@@ -134,6 +134,8 @@ def test_an_installed_package_offers_a_model(tmp_path: Path, monkeypatch: pytest
         problem = make_problem("circle", num_robots=2, model="boat")
         assert problem.team.robot_models == (BOAT, BOAT)
         assert problem.arrays.model_codes.tolist() == [len(MODEL_CODES) - 1] * 2
+        register_model(BOAT)  # as its module may do too
+        assert get_model("boat") == BOAT
         with pytest.raises(ValueError, match="model 'ship' calls itself 'boat'"):
             make_problem("circle", num_robots=2, model="ship")
 

@@ -77,10 +77,18 @@ class Registry(Mapping[str, T]):
         claims += [f"{entry.module}:{entry.attr}" for entry in self._entry_points.get(name, ())]
         if not claims:
             raise KeyError(name)
-        if len(claims) > 1:
+        if len(claims) > 1 and not self._same(claims):
             owners = " and ".join(claim if isinstance(claim, str) else shown(claim) for claim in claims)
             raise ValueError(f"{self.what} name {name!r} is claimed by {owners}; uninstall one of them")
         return claims[0]
+
+    def _same(self, claims: list[Any]) -> bool:
+        """Whether all are the same thing, such as one that its module registers and its package offers too."""
+        try:
+            first, *others = (self._identity(load_reference(one) if isinstance(one, str) else one) for one in claims)
+        except ValueError:
+            return False
+        return all(other == first for other in others)
 
     def look_up(self, name: object) -> T:
         """What has this name.
