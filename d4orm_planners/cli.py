@@ -219,11 +219,17 @@ def scenarios() -> None:
 
 
 @app.command()
-def planners() -> None:
-    """List the planners and policies."""
+def planners(
+    name: Annotated[str | None, typer.Argument(help="List the settings of this one, with their defaults.")] = None,
+) -> None:
+    """List the planners and policies, or what --set can set of one."""
     from d4orm_planners.names import PLANNERS, POLICIES
-    from d4orm_planners.registry import describe_planner, describe_policy
+    from d4orm_planners.registry import default_settings, describe_planner, describe_policy
 
+    if name is not None:
+        settings = default_settings(name).items()
+        print_table(name, [(setting, str(value)) for setting, value in settings] or [("no settings", "")])
+        return
     for title, table, describe in (("Planners", PLANNERS, describe_planner), ("Policies", POLICIES, describe_policy)):
         print_table(title, [(name, _or_error(describe, name)) for name in table])
 

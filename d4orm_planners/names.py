@@ -6,7 +6,7 @@ from typing import Any
 
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.registry import Registry
-from d4orm_planners.base import Planner
+from d4orm_planners.planner import Planner
 
 
 def is_planner_class(thing: Any) -> bool:
@@ -70,8 +70,8 @@ def _refuse_name_of(other: Registry[Any], name: Any) -> None:
 
 for _name, _path in {
     "d4orm": "d4orm:D4orm",
-    "d4orm-d": "d4orm_d:D4ormD",
-    "d-d4orm": "d_d4orm:DD4orm",
+    "d4orm-d": "d4orm_d.planner:D4ormD",
+    "d-d4orm": "d_d4orm.planner:DD4orm",
     "mppi": "mppi:MPPI",
     "cem": "cem:CEM",
     "mbd": "mbd:MBD",
@@ -81,7 +81,7 @@ for _name, _path in {
     register_planner(_name, f"d4orm_planners.{_path}")
 
 for _name, _path in {
-    "d4orm-c2f": "d4orm_c2f:D4ormC2F",
+    "d4orm-c2f": "d4orm_c2f.policy:D4ormC2F",
     "goal": "policy:DriveToGoal",
     "random": "policy:RandomControls",
     "orca": "orca:Orca",

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
@@ -100,7 +100,7 @@ class Drives:
         )
 
 
-def closing_stretches(problem: Problem, states: FloatArray, controls: FloatArray, switch_times: Any) -> Drives:
+def closing_stretches(problem: Problem, states: FloatArray, controls: FloatArray, switch_times: ArrayLike) -> Drives:
     """Follow the controls up to a time and drive straight to the goal from there.
 
     Args:
@@ -138,7 +138,9 @@ def _standing(problem: Problem) -> tuple[FloatArray, FloatArray]:
     return states, np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
 
 
-def _drive_teams(problem: Problem, states: FloatArray, controls: FloatArray, switch: Any, vias: FloatArray) -> Drives:
+def _drive_teams(
+    problem: Problem, states: FloatArray, controls: FloatArray, switch: IntArray, vias: FloatArray
+) -> Drives:
     """Every robot on each of its ways: as controlled until ``switch`` ``(R, V)``, then by ``vias`` ``(R, V, d)``."""
     # Here, because importing numba takes long.
     from d4orm_env.engine.drives import DriveRules, Ways, drive_kernel

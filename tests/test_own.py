@@ -82,8 +82,8 @@ class Duck:
 class Ahead(Planner):
     """Everyone at full thrust along the first axis."""
 
-    def iterate(self, search: Any) -> Iteration:
-        return Iteration(np.broadcast_to(np.float32([1, 0]), search.current.controls.shape))
+    def iterate(self, search: Any, state: None) -> tuple[None, Iteration]:
+        return state, Iteration(np.broadcast_to(np.float32([1, 0]), search.current.controls.shape))
 
 
 def push(observations: dict[str, Any], state: Any) -> dict[str, Any]:

@@ -315,6 +315,22 @@ def test_a_solution_is_still_one_when_loaded(solved: tuple[Plan, Path]) -> None:
     assert loaded.verified
 
 
+@pytest.mark.parametrize(
+    ("status", "is_solved"), [("solved", False), ("refuted", True), ("abandoned", True), ("abandoned", False)]
+)
+def test_status_and_solved_cannot_contradict(solved: tuple[Plan, Path], status: Any, is_solved: bool) -> None:
+    with pytest.raises(ValueError, match=f"status (is )?'{status}'"):
+        replace(solved[0], status=status, solved=is_solved)
+
+
+def test_a_file_that_was_refuted_in_vain_is_solved_again(solved: tuple[Plan, Path]) -> None:
+    _, path = solved
+    header, arrays = contents(path)
+    rewrite(path, {**header, "status": "refuted", "solved": False}, arrays)
+    loaded = Plan.load(path)
+    assert (loaded.solved, loaded.status) == (True, "solved")
+
+
 @pytest.mark.parametrize("forged", ["beyond limits", "none", "one robot fewer"])
 def test_what_a_file_claims_of_its_controls_is_judged_anew(solved: tuple[Plan, Path], forged: str) -> None:
     plan, path = solved

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
 
 
 SMALLEST, LARGEST = 1e-7, 1e6
@@ -113,7 +114,7 @@ def shown(value: object) -> str:
 
 
 def positive_number(
-    value: SupportsFloat, name: str, *, zero_allowed: bool = False, least: float = 0.0, most: float = LARGEST_NUMBER
+    value: object, name: str, *, zero_allowed: bool = False, least: float = 0.0, most: float = LARGEST_NUMBER
 ) -> float:
     """``value`` as a finite positive float.
 
@@ -131,7 +132,7 @@ def positive_number(
     try:
         if isinstance(value, bool | np.bool_):
             raise TypeError("truth is no number")
-        number = float(value)
+        number = float(value)  # type: ignore[arg-type] # what is none raises
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be a number, not {shown(value)}") from error
     except OverflowError:
@@ -147,7 +148,7 @@ def positive_number(
     return number
 
 
-def duration(value: SupportsFloat, name: str, *, zero_allowed: bool = False) -> float:
+def duration(value: object, name: str, *, zero_allowed: bool = False) -> float:
     """``value`` as a positive number of seconds that every clock can wait: at most :data:`LARGEST`, eleven days.
 
     Raises:

@@ -144,12 +144,16 @@ def _with_settings(chosen: dict[str, dict[str, Any]], settings: dict[str, Any]) 
     from d4orm_planners.registry import setting_names
 
     policies = {label: given.get("policy", label) for label, given in chosen.items()}
+    known = {
+        label: setting_names(
+            own, {name.removeprefix(f"{own}."): value for name, value in settings.items()} | chosen[label]
+        )
+        for label, own in policies.items()
+    }
     # What is said of one configuration counts most, then what is said of one policy, whichever was given first.
     for name, value in sorted(settings.items(), key=lambda setting: "." not in setting[0]):
         policy, separator, setting = name.rpartition(".")
-        owners = [
-            label for label, own in policies.items() if (own == policy if separator else name in setting_names(own))
-        ]
+        owners = [label for label, own in policies.items() if (own == policy if separator else name in known[label])]
         if not owners:
             listed = ", ".join(policies.values())
             one, several = f"{policy!r} is not among the policies; they are", f"{name!r} is a setting of none of the"
