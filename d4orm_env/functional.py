@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
@@ -78,7 +79,7 @@ def reset(problem: Problem, key: jax.Array) -> State:
     return State(jnp.asarray(problem.start), jnp.zeros(num_robots, bool), jnp.int32(0))
 
 
-def step(problem: Problem, state: State, controls: jax.Array) -> tuple[State, Step]:
+def step(problem: Problem, state: State, controls: ArrayLike) -> tuple[State, Step]:
     """One time step, as every engine takes it.
 
     Args:
