@@ -28,8 +28,10 @@ SOURCES = fingerprint((tiles,))
 
 _HALVINGS = 6
 """Of the angle by which a blocked line is turned, and of the length by which a corner is cut."""
-_PUSHES, _SPARE = 3, 1e-3
-"""How often a node is pushed away from an obstacle, and by what share of the reach more than is needed."""
+_PUSHES, _SPARE = 4, 0.03
+"""How often a node is pushed away from an obstacle, and by what share of the reach more than is needed; less in turn, to
+find the middle of narrow gaps.
+"""
 _TOLERANCE = 1e-6
 """Rounding of clearances [m]."""
 _NOBODY = -1
@@ -41,6 +43,7 @@ class Space(NamedTuple):
     Attributes:
         low: ``(3,)`` lowest corner of the index [m].
         cell: Size of its cells [m].
+        scale: One over that [1/m].
         size: ``(3,)`` its cells along each axis.
         rounding: By how much its clearances may be off [m].
         clearance: ``(C,)`` float32.
@@ -55,6 +58,7 @@ class Space(NamedTuple):
 
     low: Any
     cell: float
+    scale: float
     size: Any
     rounding: float
     clearance: Any
@@ -118,6 +122,7 @@ def make_space(problem: Problem) -> Space:
     return Space(
         low=np.append(index.low.astype(np.float64), [-cell / 2] * (3 - d)),
         cell=cell,
+        scale=1 / cell,
         size=np.append(index.size.astype(np.int64), [1] * (3 - d)),
         rounding=max(0.0, float(index.slack) - cell * float(np.sqrt(d)) / 2) + 1e-4 * cell,
         clearance=index.clearance,
@@ -163,13 +168,6 @@ def _triangle_distance(triangles: Any, i: Any, x: Any, y: Any) -> Any:
 
 
 @inlined
-def _steps_along(space: Any, axis: Any, x: Any) -> Any:
-    """Number along one axis of the cell that holds ``x``, of the outermost one beyond the index."""
-    place = (x - space.low[axis]) / space.cell
-    return min(max(np.int64(place), 0), space.size[axis] - 1)
-
-
-@inlined
 def _to_bounds(space: Any, x: Any, y: Any, z: Any) -> Any:
     low, high = space.bounds[0], space.bounds[1]
     room = min(min(x - low[0], high[0] - x), min(y - low[1], high[1] - y))
@@ -177,17 +175,27 @@ def _to_bounds(space: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 @inlined
-def _outside(low: Any, high: Any, x: Any, y: Any, z: Any) -> Any:
-    """Square of the distance to a box."""
+def _to_extent(space: Any, x: Any, y: Any, z: Any) -> Any:
+    low, high = space.extent[0], space.extent[1]
     gx, gy, gz = max(low[0] - x, x - high[0], 0.0), max(low[1] - y, y - high[1], 0.0), max(low[2] - z, z - high[2], 0.0)
-    return gx * gx + gy * gy + gz * gz
+    return np.sqrt(gx * gx + gy * gy + gz * gz)
+
+
+@inlined
+def _cell(space: Any, x: Any, y: Any, z: Any) -> Any:
+    """Number of the cell of a place, of the outermost one beyond the index, and offsets from its centre in cells."""
+    low, scale, size = space.low, space.scale, space.size
+    x, y, z = (x - low[0]) * scale, (y - low[1]) * scale, (z - low[2]) * scale
+    i = min(max(np.int64(x), 0), size[0] - 1)
+    j = min(max(np.int64(y), 0), size[1] - 1)
+    k = min(max(np.int64(z), 0), size[2] - 1)
+    return (i * size[1] + j) * size[2] + k, x - i - 0.5, y - j - 0.5, z - k - 0.5
 
 
 @compiled
-def _clearance(space: Any, x: Any, y: Any, z: Any) -> Any:
-    """Distance to the nearest surface, exact up to ``pad`` and never too large."""
-    i, j, k = _steps_along(space, 0, x), _steps_along(space, 1, y), _steps_along(space, 2, z)
-    cell = (i * space.size[1] + j) * space.size[2] + k
+def _to_obstacles(space: Any, x: Any, y: Any, z: Any) -> Any:
+    """Distance to the nearest obstacle, exact up to ``pad`` and never too large."""
+    cell, dx, dy, dz = _cell(space, x, y, z)
     nearest = np.inf
     for number in range(space.first[cell], space.first[cell + 1]):
         item = space.items[number]
@@ -195,24 +203,21 @@ def _clearance(space: Any, x: Any, y: Any, z: Any) -> Any:
             nearest = min(nearest, _box_distance(space.boxes, item, x, y, z))
         else:
             nearest = min(nearest, _triangle_distance(space.triangles, item - space.boxes.shape[0], x, y))
-    dx = abs(x - space.low[0] - (i + 0.5) * space.cell)
-    dy = abs(y - space.low[1] - (j + 0.5) * space.cell)
-    dz = abs(z - space.low[2] - (k + 0.5) * space.cell)
-    if max(dx, dy, dz) > 0.501 * space.cell:
-        beyond = np.sqrt(_outside(space.extent[0], space.extent[1], x, y, z))
-        nearest = max(min(nearest, space.pad), beyond)
-    return min(nearest, _to_bounds(space, x, y, z))
+    if max(abs(dx), max(abs(dy), abs(dz))) > 0.501:
+        nearest = max(min(nearest, space.pad), _to_extent(space, x, y, z))
+    return nearest
 
 
 @inlined
-def _sure_clearance(space: Any, x: Any, y: Any, z: Any) -> Any:
-    """At most the clearance; quickly found, and less than it by at most two cells near obstacles."""
-    i, j, k = _steps_along(space, 0, x), _steps_along(space, 1, y), _steps_along(space, 2, z)
-    dx = x - space.low[0] - (i + 0.5) * space.cell
-    dy = y - space.low[1] - (j + 0.5) * space.cell
-    dz = z - space.low[2] - (k + 0.5) * space.cell
-    centre = np.float64(space.clearance[(i * space.size[1] + j) * space.size[2] + k])
-    return min(centre - np.sqrt(dx * dx + dy * dy + dz * dz) - space.rounding, _to_bounds(space, x, y, z))
+def _about_to_obstacles(space: Any, x: Any, y: Any, z: Any) -> Any:
+    """The same, found quickly and too small by a cell or two."""
+    cell, dx, dy, dz = _cell(space, x, y, z)
+    return space.clearance[cell] - np.sqrt(dx * dx + dy * dy + dz * dz) * space.cell - space.rounding
+
+
+@inlined
+def _clearance(space: Any, x: Any, y: Any, z: Any) -> Any:
+    return min(_to_obstacles(space, x, y, z), _to_bounds(space, x, y, z))
 
 
 @inlined
@@ -243,9 +248,9 @@ def _sees(space: Any, reach: Any, a: Any, own_a: Any, b: Any, own_b: Any) -> Any
         if s > zone_b:
             need = min(need, need_b)
         shortest = 0.25 * max(need, 0.1 * reach)
-        room = _sure_clearance(space, x, y, z) - need
+        room = _about_to_obstacles(space, x, y, z) - need
         if room < shortest:
-            room = _clearance(space, x, y, z) - need
+            room = _to_obstacles(space, x, y, z) - need
             if room < -_TOLERANCE:
                 return False
         s += max(room, shortest)
@@ -319,7 +324,7 @@ def _settled(space: Any, lattice: Any, reach: Any, place: Any) -> Any:
 
     And whether it does.
     """
-    half, probe, target = lattice.step / 2, lattice.step / 64, reach * (1 + _SPARE)
+    half, probe, spare = lattice.step / 2, lattice.step / 64, reach * _SPARE
     x, y, z = place
     clearance = _clearance(space, x, y, z)
     for _ in range(_PUSHES):
@@ -331,7 +336,8 @@ def _settled(space: Any, lattice: Any, reach: Any, place: Any) -> Any:
         norm = np.sqrt(gx * gx + gy * gy + gz * gz)
         if norm == 0.0:
             break
-        push = (target - clearance) / norm
+        push = (reach + spare - clearance) / norm
+        spare /= 3
         x = min(max(x + push * gx, place[0] - half), place[0] + half)
         y = min(max(y + push * gy, place[1] - half), place[1] + half)
         z = min(max(z + push * gz, place[2] - half), place[2] + half)
@@ -346,7 +352,12 @@ def settle_nodes(space: Any, lattice: Any, reach: Any) -> None:
     for n in range(lattice.free.shape[0]):
         i, j, k = _indices(lattice, n)
         place = (low[0] + i * step, low[1] + j * step, low[2] + k * step)
-        place, lattice.free[n] = _settled(space, lattice, reach, place)
+        if _about_to_obstacles(space, place[0], place[1], place[2]) > reach < _to_bounds(
+            space, place[0], place[1], place[2]
+        ):
+            lattice.free[n] = True
+        else:
+            place, lattice.free[n] = _settled(space, lattice, reach, place)
         lattice.places[n, 0], lattice.places[n, 1], lattice.places[n, 2] = place
 
 
