@@ -7,18 +7,22 @@ from itertools import product
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 
 if TYPE_CHECKING:
     from d4orm_env.engine.wavefront import Front, Lattice, Space
 
+Floats = NDArray[np.float64]
+
 MAX_NODES, MAX_NODES_IN_ALL = 2**21, 2**24
 """Most nodes of a grid, and of the grids of all robots together; coarser ones where there would be more."""
 
-import os
-SHARE = float(os.environ.get("SHARE", "1"))
+STEP = 0.5
+"""Distance of neighbouring nodes, as a share of the robot's radius and margin."""
+REFINEMENTS = 2
+"""How often a robot that seems to have no way is tried again on a grid that is twice as fine."""
 
 
 class _Field(NamedTuple):
@@ -29,7 +33,7 @@ class _Field(NamedTuple):
     reach: float
     front: Front
 
-    def look(self, places: FloatArray) -> tuple[FloatArray, FloatArray, Any]:
+    def look(self, places: Floats) -> tuple[Floats, Floats, Any]:
         """``(Q, d)`` where to go first from places ``(Q, d)``, ``(Q,)`` the length of the way, ``(Q,)`` its anchor."""
         from d4orm_env.engine.wavefront import look
 
@@ -54,22 +58,22 @@ class Ways:
     """
 
     problem: Problem
-    length: FloatArray
+    length: Floats
     _fields: tuple[_Field, ...]
 
-    def distance(self, points: Any) -> FloatArray:
+    def distance(self, points: Any) -> Floats:
         """``(..., K)`` float64 length of the ways from points ``(..., K, d)`` to the goals [m]."""
         return self._look(points)[1]
 
-    def direction(self, points: Any) -> FloatArray:
+    def direction(self, points: Any) -> Floats:
         """``(..., K, d)`` float64 unit vectors along the ways; zero at a goal and where there is no way."""
         places = np.asarray(points, np.float64)
         offset = self._look(places)[0] - places
         norm = np.sqrt((offset * offset).sum(axis=-1, keepdims=True))
-        direction: FloatArray = offset / np.where(norm > 0, norm, 1.0)
+        direction: Floats = offset / np.where(norm > 0, norm, 1.0)
         return direction
 
-    def path(self, robot: int) -> FloatArray:
+    def path(self, robot: int) -> Floats:
         """``(w, d)`` float64 corners of the way of a robot, its start first and its goal last; empty if there is none.
 
         Args:
@@ -90,13 +94,14 @@ class Ways:
         way = np.stack(corners)
         return way[np.append(True, (np.diff(way, axis=0) != 0).any(axis=1))]
 
-    def _look(self, points: Any) -> tuple[FloatArray, FloatArray]:
+    def _look(self, points: Any) -> tuple[Floats, Floats]:
         """Where to go first, and how far it is in all."""
-        places = np.asarray(points, np.float64)
+        places: Floats = np.asarray(points, np.float64)
         goal = self.problem.goal.astype(np.float64)
         if not self._fields:
             offset = goal - places
-            return np.broadcast_to(goal, places.shape), np.sqrt((offset * offset).sum(axis=-1))
+            straight: Floats = np.sqrt((offset * offset).sum(axis=-1))
+            return np.broadcast_to(goal, places.shape), straight
         target, length = np.empty(places.shape), np.empty(places.shape[:-1])
         for robot, field in enumerate(self._fields):
             own = places[..., robot, :]
@@ -121,47 +126,44 @@ def shortest_ways(problem: Problem) -> Ways:
     from d4orm_env.engine.wavefront import Front, make_space, spread
 
     space = make_space(problem)
-    reaches = problem.team.radius.astype(np.float64) + problem.margin
     length, fields = np.full(problem.num_robots, np.inf), []
-    lattices: dict[float, Lattice] = {}
+    lattices: dict[tuple[float, int], Lattice] = {}
     for robot, goal in enumerate(_spatial(problem.goal.astype(np.float64))):
-        reach = float(reaches[robot])
-        if reach not in lattices:
-            lattices[reach] = _lattice(problem, space, reach)
-        lattice = lattices[reach]
-        field = _Field(space, lattice, reach, Front(*spread(space, lattice, reach, goal)))
-        length[robot] = field.look(start[robot : robot + 1])[1][0]
+        reach = float(np.asarray(problem.team.radius)[robot]) + problem.margin
+        for refinement in range(1 + REFINEMENTS):
+            if (reach, refinement) not in lattices:
+                lattices[reach, refinement] = _lattice(problem, space, reach, STEP * reach / 2**refinement)
+            lattice = lattices[reach, refinement]
+            field = _Field(space, lattice, reach, Front(*spread(space, lattice, reach, goal)))
+            length[robot] = field.look(start[robot : robot + 1])[1][0]
+            if np.isfinite(length[robot]):
+                break
         fields.append(field)
+    length.setflags(write=False)
     return Ways(problem, length, tuple(fields))
 
 
-def _lattice(problem: Problem, space: Space, reach: float) -> Lattice:
-    """Nodes over all places and obstacles, so far apart; farther where there would be too many."""
+def _lattice(problem: Problem, space: Space, reach: float, step: float) -> Lattice:
+    """Nodes so far apart wherever ways may lead; farther apart where there would be too many."""
     from d4orm_env.engine.wavefront import Lattice, settle_nodes
 
     d = problem.dimension
-    places = np.concatenate([problem.start[:, :d], problem.goal]).astype(np.float64)
-    obstacles = space.extent[:, :d]
-    obstacles = obstacles[:, :].copy()
-    border = 2 * (float(problem.team.radius.max()) + problem.margin)
-    low, high = places.min(axis=0), places.max(axis=0)
-    ends = np.isfinite(obstacles[0])
-    low[ends] = np.minimum(low, obstacles[0])[ends]
-    high[ends] = np.maximum(high, obstacles[1])[ends]
-    bounds = problem.world.bounds.astype(np.float64)
-    step = reach * SHARE
-    low, high = np.maximum(low - border, bounds[0]), np.minimum(high + border, bounds[1])
+    obstacles, bounds = space.extent[:, :d], problem.world.bounds.astype(np.float64)
+    places = np.concatenate(
+        [problem.start[:, :d], problem.goal, np.where(np.isinf(obstacles), problem.goal[0], obstacles)]
+    )
+    low = np.maximum(places.min(axis=0) - 2 * reach, bounds[0])
+    high = np.minimum(places.max(axis=0) + 2 * reach, bounds[1])
     most = min(MAX_NODES, MAX_NODES_IN_ALL // problem.num_robots)
     while np.floor((high - low) / step + 1).prod() > most:
         step *= 1.05
     size = np.floor((high - low) / step).astype(np.int64) + 1
-    first = (low + high - (size - 1) * step) / 2
-    moves = [move for move in product((-1, 0, 1), repeat=d) if any(move)]
+    flat = [0] * (3 - d)
     lattice = Lattice(
-        low=np.append(first, [0.0] * (3 - d)),
+        low=np.append((low + high - (size - 1) * step) / 2, flat).astype(np.float64),
         step=step,
-        size=np.append(size, [1] * (3 - d)),
-        moves=np.hstack([np.array(moves), np.zeros((len(moves), 3 - d), np.int64)]),
+        size=np.append(size, [1] * (3 - d)).astype(np.int64),
+        moves=np.array([(*move, *flat) for move in product((-1, 0, 1), repeat=d) if any(move)]),
         places=np.empty((size.prod(), 3)),
         free=np.empty(size.prod(), np.bool_),
     )
@@ -169,6 +171,6 @@ def _lattice(problem: Problem, space: Space, reach: float) -> Lattice:
     return lattice
 
 
-def _spatial(places: FloatArray) -> FloatArray:
+def _spatial(places: Floats) -> Floats:
     """Places ``(Q, d)`` in three dimensions."""
     return np.hstack([places, np.zeros((len(places), 3 - places.shape[1]))])

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,9 @@ from d4orm_env.core.dynamics import MODEL_CODES, NUM_BUILT_IN, model_digest
 from d4orm_env.core.robot_model import SPEED, STANDARD_LIMITS, TURN_RATE, Model
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
+
+if TYPE_CHECKING:
+    from d4orm_env.ways import Ways
 
 MAX_HORIZON, MAX_ROBOT_STEPS = 1_000_000, 50_000_000
 """Most steps of a problem, and most robots times steps: a slip of the finger must not fill the memory."""
@@ -293,6 +296,32 @@ class Problem:
         """:attr:`arrays` with an index that finds so many of the nearest obstacles of any place."""
         index = self.world.index(float(self.team.radius.max()) + self.margin, max(num_obstacles, 1))
         return self.arrays._replace(index=index)
+
+    @cached_property
+    def ways(self) -> Ways:
+        """The shortest free way of every robot; see :func:`d4orm_env.ways.shortest_ways`."""
+        # The one road up from here: it is compiled.
+        from d4orm_env.ways import shortest_ways
+
+        return shortest_ways(self)
+
+    def check_reachable(self) -> None:
+        """Whether every robot has a way to its goal that keeps its radius and the margin from obstacles and bounds.
+
+        Other robots do not count. It takes a wavefront for every robot, which is why construction does not ask.
+
+        Raises:
+            ValueError: If one has none; the message names all of those.
+        """
+        robots = np.flatnonzero(np.isinf(self.ways.length))
+        if len(robots):
+            names = ", ".join(f"robot_{robot}" for robot in robots)
+            reach = sorted({f"{radius + self.margin:.4g}" for radius in np.asarray(self.team.radius)[robots]})
+            raise ValueError(
+                f"{names} {'has' if len(robots) == 1 else 'have'} no way from start to goal that is "
+                f"{' or '.join(reach)} m clear of obstacles; move the start or the goal, open the world there, or use "
+                f"a smaller radius or margin"
+            )
 
     @cached_property
     def digest(self) -> str:

@@ -29,9 +29,8 @@ SOURCES = fingerprint((tiles,))
 _HALVINGS = 6
 """Of the angle by which a blocked line is turned, and of the length by which a corner is cut."""
 _PUSHES, _SPARE = 4, 0.03
-"""How often a node is pushed away from an obstacle, and by what share of the reach more than is needed; less in turn, to
-find the middle of narrow gaps.
-"""
+"""How often a node is pushed away from an obstacle, and how much farther than need be, as a share of the reach; a third
+of it each time, so as to end in the middle of narrow gaps."""
 _TOLERANCE = 1e-6
 """Rounding of clearances [m]."""
 _NOBODY = -1
@@ -123,7 +122,7 @@ def make_space(problem: Problem) -> Space:
         low=np.append(index.low.astype(np.float64), [-cell / 2] * (3 - d)),
         cell=cell,
         scale=1 / cell,
-        size=np.append(index.size.astype(np.int64), [1] * (3 - d)),
+        size=np.append(index.size, [1] * (3 - d)).astype(np.int64),
         rounding=max(0.0, float(index.slack) - cell * float(np.sqrt(d)) / 2) + 1e-4 * cell,
         clearance=index.clearance,
         first=index.first,
@@ -352,8 +351,10 @@ def settle_nodes(space: Any, lattice: Any, reach: Any) -> None:
     for n in range(lattice.free.shape[0]):
         i, j, k = _indices(lattice, n)
         place = (low[0] + i * step, low[1] + j * step, low[2] + k * step)
-        if _about_to_obstacles(space, place[0], place[1], place[2]) > reach < _to_bounds(
-            space, place[0], place[1], place[2]
+        if (
+            _about_to_obstacles(space, place[0], place[1], place[2])
+            > reach
+            < _to_bounds(space, place[0], place[1], place[2])
         ):
             lattice.free[n] = True
         else:
@@ -428,9 +429,10 @@ def spread(space: Any, lattice: Any, reach: Any, goal: Any) -> Any:
                         place = _place(lattice.places, p)
                         c, fits = _settled(space, lattice, reach, _between(place, q, 0.5))
                         length = value[p] + _distance(place, c) + _distance(c, q)
-                        if fits and length < best and _sees(space, reach, place, reach, c, reach):
-                            if _sees(space, reach, c, reach, q, reach):
-                                best, through, bend = length, p, c
+                        if not fits or length >= best or not _sees(space, reach, place, reach, c, reach):
+                            continue
+                        if _sees(space, reach, c, reach, q, reach):
+                            best, through, bend = length, p, c
                     if best < np.inf:
                         b, c, a = _place(lattice.places, through), bend, anchor[through]
                 elif via < best:
