@@ -27,8 +27,8 @@ def visible_lengths(world: World, reach: float, source: np.ndarray, places: np.n
             # Ways turn only where an obstacle bulges out.
             corners.append(points[before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0] > 0])
     nodes = np.concatenate(corners)
-    low, high = world.bounds.astype(np.float64) + [[reach], [-reach]]
-    inside = ((nodes >= low - 1e-9) & (nodes <= high + 1e-9)).all(axis=1)
+    low, high = world.bounds.astype(np.float64)
+    inside = ((nodes >= low + reach - 1e-9) & (nodes <= high - reach + 1e-9)).all(axis=1)
     inside[: 1 + len(places)] = True
     nodes = nodes[inside]
     solid_within = blocked.buffer(-1e-6)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import SupportsFloat
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import positive_number, whole_number
 from d4orm_env.core.dynamics import get_model
@@ -50,19 +51,19 @@ class Settings:
     scenario: str
     num_robots: int = 8
     seed: int = 0
-    model: Any = "holonomic2d"
+    model: str | Sequence[str] | None = "holonomic2d"
     num_obstacles: int = 0
     obstacle_radius: float = 0.15
-    radius: Any = 0.15
+    radius: ArrayLike = 0.15
     margin: float = 0.05
     dt: float = 0.1
     horizon: int | None = None
     goal_radius: float = 0.075
     goal_speed: float | None = None
-    max_speed: Any = 1.0
-    max_acceleration: Any = 1.0
-    max_turn_rate: Any = float(np.pi / 2)
-    own_limits: Any = field(default_factory=dict)
+    max_speed: ArrayLike = 1.0
+    max_acceleration: ArrayLike = 1.0
+    max_turn_rate: ArrayLike = float(np.pi / 2)
+    own_limits: Mapping[str, ArrayLike] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, minimum in (("num_robots", 1), ("seed", 0), ("num_obstacles", 0)):
@@ -111,7 +112,7 @@ STARTS_AND_GOALS, OBSTACLES, JITTER = range(3)
 """Purposes of :meth:`Settings.generator`."""
 
 
-def bounded(value: Any, name: str, *, zero_allowed: bool = False) -> float:
+def bounded(value: SupportsFloat, name: str, *, zero_allowed: bool = False) -> float:
     """``value`` as a positive number no larger than scenarios are.
 
     Raises:

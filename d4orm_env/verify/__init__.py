@@ -11,10 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.verify.contact import MAX_NUMBERS, Pairs, Stretch, Watch, surroundings
 from d4orm_env.verify.docking import Docking, find_docking
@@ -36,7 +36,7 @@ LIMIT_TOLERANCE = 1e-5
 """Relative excess over a control limit that float32 rounding may cause."""
 
 
-def verify(problem: Problem, controls: Any) -> VerificationReport:
+def verify(problem: Problem, controls: ArrayLike) -> VerificationReport:
     """Judge a plan: do all robots arrive by the horizon, within their limits, touching nothing at any time?
 
     Contact is judged, not the safety margin: it is a gap of zero or less at any moment, also between steps, known to
@@ -68,9 +68,13 @@ def verify(problem: Problem, controls: Any) -> VerificationReport:
     sub_steps = np.ceil(problem.dt * np.sqrt(motion.bend / (8 * CHORD_ERROR)))
     if sub_steps.max() > MAX_SUB_STEPS:
         return _unjudged(problem, list(_too_violent(sub_steps, motion, problem.dt)))
-    course = _Course(motion, max(MIN_SUB_STEPS, int(sub_steps.max())), np.asarray(problem.start, np.float64))
+    course = _Course(motion, max(MIN_SUB_STEPS, int(sub_steps.max())), problem.start.astype(np.float64))
+    return _judged(problem, motion, course)
+
+
+def _judged(problem: Problem, motion: TeamMotion, course: _Course) -> VerificationReport:
     docking = find_docking(problem, motion, course.ends)
-    radius = np.asarray(problem.team.radius, np.float64)
+    radius = problem.team.radius.astype(np.float64)
     pairs, obstacles = Pairs(docking.robot, radius), surroundings(problem.world, docking.robot, radius)
     watches: list[Watch] = [pairs, *obstacles]
     for stretch in course.stretches(docking, max(len(watch.rows) for watch in watches)):
@@ -122,7 +126,7 @@ class _Course:
             yield Stretch(place[:, None] + way, norm(way).max(axis=1), steps.start * dt, dt)
 
 
-def _checked_controls(problem: Problem, controls: Any) -> Floats:
+def _checked_controls(problem: Problem, controls: ArrayLike) -> Floats:
     try:
         array = np.asarray(controls, np.float64)
     except OverflowError as error:
