@@ -7,8 +7,10 @@ from itertools import product
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 
 if TYPE_CHECKING:
@@ -61,17 +63,22 @@ class Ways:
     length: Floats
     _fields: tuple[_Field, ...]
 
-    def distance(self, points: Any) -> Floats:
+    def distance(self, points: ArrayLike) -> Floats:
         """``(..., K)`` float64 length of the ways from points ``(..., K, d)`` to the goals [m]."""
         return self._look(points)[1]
 
-    def direction(self, points: Any) -> Floats:
+    def direction(self, points: ArrayLike) -> Floats:
         """``(..., K, d)`` float64 unit vectors along the ways; zero at a goal and where there is no way."""
+        return self.ahead(points)[0]
+
+    def ahead(self, points: ArrayLike) -> tuple[Floats, Floats]:
+        """:meth:`direction` and :meth:`distance` at once."""
         places = np.asarray(points, np.float64)
-        offset = self._look(places)[0] - places
+        target, length = self._look(places)
+        offset = target - places
         norm = np.sqrt((offset * offset).sum(axis=-1, keepdims=True))
         direction: Floats = offset / np.where(norm > 0, norm, 1.0)
-        return direction
+        return direction, length
 
     def path(self, robot: int) -> Floats:
         """``(w, d)`` float64 corners of the way of a robot, its start first and its goal last; empty if there is none.
@@ -94,7 +101,7 @@ class Ways:
         way = np.stack(corners)
         return way[np.append(True, (np.diff(way, axis=0) != 0).any(axis=1))]
 
-    def _look(self, points: Any) -> tuple[Floats, Floats]:
+    def _look(self, points: ArrayLike) -> tuple[Floats, Floats]:
         """Where to go first, and how far it is in all."""
         places: Floats = np.asarray(points, np.float64)
         goal = self.problem.goal.astype(np.float64)
@@ -141,6 +148,20 @@ def shortest_ways(problem: Problem) -> Ways:
         fields.append(field)
     length.setflags(write=False)
     return Ways(problem, length, tuple(fields))
+
+
+def observe_ways(observations: FloatArray, layout: ObservationLayout, ways: Ways, places: FloatArray) -> None:
+    """Fill in what robots see of their ways.
+
+    Args:
+        observations: ``(..., K, D)``.
+        layout: What is in them.
+        ways: The ways.
+        places: ``(..., K, d)`` where the robots are [m].
+    """
+    seen, parts = layout.ways(observations), layout.way
+    seen[..., parts.direction], length = ways.ahead(places)
+    seen[..., parts.length] = np.minimum(length, layout.high[-1])[..., None]
 
 
 def _lattice(problem: Problem, space: Space, reach: float, step: float) -> Lattice:
