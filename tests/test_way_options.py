@@ -114,7 +114,7 @@ def test_the_way_is_observed_at_the_end(spatial: bool, closed: bool) -> None:
     )
     np.testing.assert_allclose(layout.ways(seen)[..., d], problem.ways.distance(places[1:]), rtol=1e-6)
     assert layout.obstacles(seen).shape[-2:] == (4, d + 2)
-    assert layout.names[-d - 1 :] == tuple(f"way.direction_{axis}" for axis in "xyz"[:d]) + ("way.length",)
+    assert layout.names[-d - 1 :] == (*(f"way.direction_{axis}" for axis in "xyz"[:d]), "way.length")
     assert layout.names[: -d - 1] == ObservationLayout.for_problem(problem).names
     assert np.isfinite(layout.bounds).all()
     assert (layout.low <= seen).all()
@@ -143,7 +143,7 @@ def drawn(seed: int, num_robots: int) -> Problem:
     random = np.random.default_rng(seed)
     start, goal = np.zeros((2, 4)), np.zeros((2, 2))
     start[:, 0], goal[:, 0], start[:, 1] = -2, 2, [-0.5, 0.5]
-    goal[:, 1] = [-0.5, 0.5] + random.uniform(-0.2, 0.2, 2)
+    goal[:, 1] = start[:, 1] + random.uniform(-0.2, 0.2, 2)
     return Problem(
         Team(("holonomic2d",) * 2), start, goal, World(circles=[[random.uniform(-1, 1), 0, 0.6]]), horizon=20
     )

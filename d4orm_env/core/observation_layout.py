@@ -65,7 +65,7 @@ Parts: TypeAlias = OwnParts | NeighborParts | ObstacleParts | WayParts
 
 @dataclass(frozen=True)
 class ObservationSlices:
-    """Where the parts of an observation lie: the robot's own, each neighbour's, each obstacle's, and its way's if at all.
+    """Where the parts of an observation lie: the robot's own, each neighbour's, each obstacle's, and its way's.
 
     Attributes:
         dimension: ``d``.
