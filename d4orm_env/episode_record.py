@@ -40,10 +40,12 @@ class EpisodeRecord:
         if np.count_nonzero(margin_violated):
             self._collisions += collided
             self._margin_violations += margin_violated
-        if np.count_nonzero(arrived):
-            new = arrived if self._lifelong else arrived & np.isinf(self._arrival_step)
-            self._goals_reached += new
-            self._arrival_step[new] = np.minimum(self._arrival_step[new], self._steps)
+        if self._lifelong:
+            self._goals_reached += arrived
+        elif np.count_nonzero(arrived) or np.count_nonzero(self._goals_reached):
+            # Where arriving is not for ever, a robot may have been moved away again.
+            self._arrival_step = np.where(arrived, np.minimum(self._arrival_step, self._steps), np.inf)
+            self._goals_reached = arrived.astype(np.int64)
 
     def metrics(self) -> dict[str, float]:
         """The episode so far, as plain numbers; see :func:`episode_metrics`."""
@@ -68,7 +70,8 @@ class EpisodeCounts(NamedTuple):
         goals: ``(..., K)`` goals reached by each robot.
         contacts: ``(..., K)`` steps in contact.
         violations: ``(..., K)`` steps within the margin.
-        arrival_step: ``(..., K)`` step of docking, infinite for not yet; ``None`` in lifelong mode.
+        arrival_step: ``(..., K)`` step since which a robot is at its goal, infinite where it is not; ``None`` in
+            lifelong mode.
     """
 
     steps: int | Counts

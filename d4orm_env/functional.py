@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
@@ -79,7 +80,7 @@ def reset(problem: Problem, key: jax.Array) -> State:
     return State(jnp.asarray(problem.start), jnp.zeros(num_robots, bool), jnp.int32(0))
 
 
-def step(problem: Problem, state: State, controls: jax.Array) -> tuple[State, Step]:
+def step(problem: Problem, state: State, controls: ArrayLike) -> tuple[State, Step]:
     """One time step, as every engine takes it.
 
     Args:
@@ -126,7 +127,7 @@ def _arrays(problem: Problem) -> ProblemArrays:
         "inverse_initial_distance": 1 / distance,
         "boxes": _rounded_boxes(world),
         "triangles": _triangles(world),
-        "index": None,
+        "grid": None,
         "bounds": bounds,
         "time_step": jnp.stack([jnp.asarray(dt / part, jnp.float32) for part in (1, 2, 3, 6)]),
         "margin": jnp.asarray(problem.margin, jnp.float32),

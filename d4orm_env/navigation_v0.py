@@ -148,9 +148,8 @@ class parallel_env(EnvironmentShell, ParallelEnv[str, FloatArray, FloatArray]):
         controls = np.zeros((len(self.possible_agents), self._control_size), np.float32)
         controls[robots] = self._collect(actions)
         step = simulation.step(controls)
-        observations, rewards, arrived = step.observations, step.rewards.tolist(), step.arrived.tolist()
-        ends = not simulation.lifelong
-        terminations = {agent: ends and arrived[robot] for agent, robot in zip(acting, robots)}
+        observations, rewards, finished = step.observations, step.rewards.tolist(), simulation.finished.tolist()
+        terminations = {agent: finished[robot] for agent, robot in zip(acting, robots)}
         out_of_time = simulation.out_of_time
         self.agents = [] if out_of_time else [agent for agent in acting if not terminations[agent]]
         self._show()

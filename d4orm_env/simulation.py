@@ -197,7 +197,7 @@ class Simulation:
         """
         self.require_reset()
         shape = self.problem.start.shape
-        self.states = checked_states(self.problem, states, self.arrived, self.state_bounds, shape)
+        self.states = checked_states(self.problem, states, self.arrived & self.problem.docks, self.state_bounds, shape)
         self.collided, margin_violated = self._engine.contacts(self.arrays, self.states)
         self._trail.append(self.states[:, : self._dimension])
         return self._report(np.zeros(len(self.states), np.float32), self.arrived.copy(), margin_violated)
@@ -211,6 +211,13 @@ class Simulation:
         """The episode so far in numbers; see :meth:`d4orm_env.episode_record.EpisodeRecord.metrics`."""
         self.require_reset()
         return self.record.metrics()
+
+    @property
+    def finished(self) -> BoolArray:
+        """``(K,)`` robots that are done: those that have docked or, where nobody docks, all once all are there."""
+        if self.lifelong:
+            return np.zeros_like(self.arrived)
+        return self.arrived if self.problem.docks else self.arrived & self.arrived.all()
 
     def _rewards(self, reward: RewardFunction, result: StepResult, arrived: BoolArray) -> FloatArray:
         """``(K,)`` of the step from the present states to ``result``."""

@@ -90,7 +90,7 @@ class WorldDraws:
     def _drawn(self, random: np.random.Generator) -> Problem:
         """A new instance that differs from the first in places and obstacles only."""
         drawn = self._template.draw_instance(random)
-        differing = self.differing(drawn, set(drawn.arrays._fields) - {*OWN_ARRAYS, *WORLD_ARRAYS, "index"})
+        differing = self.differing(drawn, set(drawn.arrays._fields) - {*OWN_ARRAYS, *WORLD_ARRAYS, "grid"})
         if differing:
             raise ValueError(
                 f"instances of scenario {drawn.name!r} differ in their {', '.join(differing)}, and worlds of a batch "

@@ -51,7 +51,8 @@ def evaluate_controls(engine: Engine, problem: Problem, controls: FloatArray) ->
     reach = PLAN_REACH * problem.team.control_limits
     bounded = np.clip(controls, -reach, reach)
     trajectory = engine.rollout(problem, bounded)
-    planned = np.where(trajectory.arrived[:-1, :, None], np.float32(0), bounded)
+    docked = trajectory.arrived[:-1, :, None] & problem.docks
+    planned = np.where(docked, np.float32(0), bounded)
     failed = failed_robots(trajectory)
     solved = not failed.any() and verify(problem, trajectory.controls).ok
     return Candidate(planned, trajectory.controls, trajectory, solved, failed)

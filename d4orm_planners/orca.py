@@ -97,7 +97,8 @@ class Orca(StatePolicy):
         simulator.set_time_step(problem.dt)
         clearance = problem.margin if config.clearance is None else config.clearance
         radius, max_speed = np.asarray(problem.team.radius), np.asarray(problem.team.max_speed)
-        moving = np.flatnonzero(~joint.arrived)
+        stands = joint.arrived & problem.docks
+        moving = np.flatnonzero(~stands)
         velocities = _velocities(problem, joint)
         for robot in moving:
             simulator.add_agent(
@@ -110,7 +111,7 @@ class Orca(StatePolicy):
                 float(max_speed[robot]),
                 velocities[robot].tolist(),
             )
-        docked = [_disc(joint.states[k, 0], joint.states[k, 1], radius[k]) for k in np.flatnonzero(joint.arrived)]
+        docked = [_disc(joint.states[k, 0], joint.states[k, 1], radius[k]) for k in np.flatnonzero(stands)]
         for corners in [*self._walls, *docked]:
             simulator.add_obstacle(corners.tolist())
         simulator.process_obstacles()
@@ -153,7 +154,7 @@ def _walls(problem: Problem) -> Iterator[FloatArray]:
         forward = any((b - a) % len(corners) == 1 for t in triangles for a, b in zip(t, (*t[1:], t[0]), strict=True))
         yield corners if forward else corners[::-1]
     if problem.world.lower is not None:
-        yield _rectangle(*problem.world.lower, *problem.world.upper)[::-1]
+        yield _rectangle(*problem.world.bounds.ravel())[::-1]
 
 
 def _rectangle(left: float, bottom: float, right: float, top: float) -> FloatArray:

@@ -150,7 +150,7 @@ def _drive_teams(
     x = np.repeat(np.asarray(states, np.float32)[:, :, None], num_ways, axis=2)
     arrived = np.zeros(switch.shape, bool)
     docking = np.array([arrays.squared_goal_radius, arrays.squared_goal_speed])
-    rules = DriveRules(arrays.time_step, docking, NEAR_VIA)
+    rules = DriveRules(arrays.time_step, docking, arrays.docks, NEAR_VIA)
     for model, robots in _by_model(problem):
         # One lane for every robot and way.
         lanes_x, lanes_u = (array[:, robots].reshape(len(array), -1, array.shape[-1]) for array in (x, u))

@@ -10,6 +10,13 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 
 
+def arrival_steps(arrived: BoolArray) -> NDArray[np.intp]:
+    """``(K,)`` first row of ``arrived`` ``(H+1, K)`` from which on a robot is at its goal; the last where it is not."""
+    last_away = len(arrived) - (~arrived[::-1]).argmax(axis=0)
+    since: NDArray[np.intp] = np.where(arrived.all(axis=0), 0, np.minimum(last_away, len(arrived) - 1))
+    return since
+
+
 def arrival_times(arrived: BoolArray, dt: float) -> NDArray[np.float64]:
     """``(K,)`` time from which on each robot is at its goal [s]; infinite for one that is not there at the end.
 
@@ -17,9 +24,7 @@ def arrival_times(arrived: BoolArray, dt: float) -> NDArray[np.float64]:
         arrived: ``(H+1, K)`` bool.
         dt: Time step [s].
     """
-    last_away = len(arrived) - (~arrived[::-1]).argmax(axis=0)
-    since = np.where(arrived.all(axis=0), 0, last_away)
-    times: NDArray[np.float64] = np.where(arrived[-1], since * dt, np.inf)
+    times: NDArray[np.float64] = np.where(arrived[-1], arrival_steps(arrived) * dt, np.inf)
     return times
 
 

@@ -132,7 +132,7 @@ def _find_nearest_robots(k: int, position: FloatArray, nearest: FloatArray) -> N
 def _find_nearest_obstacles(place: FloatArray, arrays: ProblemArrays, nearest: FloatArray) -> None:
     d = place.shape[0]
     nearest[:, 0] = np.inf
-    index, count = arrays.index, arrays.boxes.shape[0] + arrays.triangles.shape[0]
+    index, count = arrays.grid, arrays.boxes.shape[0] + arrays.triangles.shape[0]
     begin, end, cell, listed = 0, count, 0, (count > 0) & (index.nearest >= nearest.shape[0])
     for axis in range(d):
         step = (place[axis] - index.low[axis]) * index.scale
@@ -172,7 +172,7 @@ def _insert_box(place: FloatArray, box: FloatArray, nearest: FloatArray) -> None
             nearest[row, 1 + axis] = (min(max(place[axis], box[axis]), box[d + axis]) - place[axis]) * share
 
 
-def _insert_triangle(place: Any, corners: Any, nearest: Any) -> None:
+def _insert_triangle(place: FloatArray, corners: FloatArray, nearest: FloatArray) -> None:
     inside, nearest_x, nearest_y, least = True, 0.0, 0.0, np.inf
     for edge in range(3):
         after = (edge + 1) % 3

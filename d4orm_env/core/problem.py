@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import (
     LARGEST,
@@ -37,6 +37,16 @@ MAX_HORIZON, MAX_ROBOT_STEPS = 1_000_000, 50_000_000
 """Most steps of a problem, and most robots times steps: a slip of the finger must not fill the memory."""
 MIN_TIME_STEP, MAX_TIME_STEP = 1e-6, 1e3
 """Bounds of ``dt`` [s]."""
+
+
+def check_arrival(value: object) -> None:
+    """Refuse what is no :data:`Arrival`.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    if value not in get_args(Arrival):
+        raise ValueError(f"arrival is {shown(value)}; choose one of {', '.join(get_args(Arrival))}")
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -102,8 +112,7 @@ class Problem:
             raise ValueError(f"the world has dimension {world.dimension} and the team {team.dimension}; match them")
         if goal_speed is not None:
             goal_speed = positive_number(goal_speed, "goal_speed", zero_allowed=True, most=LARGEST)
-        if arrival not in get_args(Arrival):
-            raise ValueError(f"arrival is {shown(arrival)}; choose one of {', '.join(get_args(Arrival))}")
+        check_arrival(arrival)
         restore_frozen(self, {
             "team": team,
             "start": frozen_array(start, "start", (team.num_robots, team.state_size), largest=LARGEST),
@@ -177,7 +186,7 @@ class Problem:
             ),
             boxes=self.world.shapes.boxes,
             triangles=self.world.shapes.triangles,
-            index=self.world.index(float(np.max(self.team.radius)) + self.margin),
+            grid=self.world.index(float(np.max(self.team.radius)) + self.margin),
             bounds=self.world.bounds,
             time_step=np.array([self.dt, self.dt / 2, self.dt / 3, self.dt / 6], np.float32),
             margin=np.float32(self.margin),
@@ -192,8 +201,8 @@ class Problem:
 
     def arrays_to_observe(self, num_obstacles: int) -> ProblemArrays:
         """:attr:`arrays` with an index that finds so many of the nearest obstacles of any place."""
-        index = self.world.index(float(np.max(self.team.radius)) + self.margin, max(num_obstacles, 1))
-        return self.arrays._replace(index=index)
+        grid = self.world.index(float(np.max(self.team.radius)) + self.margin, max(num_obstacles, 1))
+        return self.arrays._replace(grid=grid)
 
     @cached_property
     def ways(self) -> Ways:

@@ -23,7 +23,7 @@ class ProblemArrays(NamedTuple):
         inverse_initial_distance: ``(K,)`` one over the distance from start to goal (at least the goal radius).
         boxes: ``(., 2 d + 1)`` obstacles, see :class:`~d4orm_env.core.shapes.Shapes`.
         triangles: ``(., 6)`` more of them.
-        index: Where they are.
+        grid: Where they are.
         bounds: ``(2, d)``, infinite where open.
         time_step: ``(4,)`` dt, dt/2, dt/3, dt/6.
         margin: ``()``.
@@ -40,7 +40,7 @@ class ProblemArrays(NamedTuple):
     inverse_initial_distance: FloatArray
     boxes: FloatArray
     triangles: FloatArray
-    index: WorldIndex
+    grid: WorldIndex
     bounds: FloatArray
     time_step: FloatArray
     margin: np.float32

@@ -77,10 +77,18 @@ class Registry(Mapping[str, T]):
         claims += [f"{entry.module}:{entry.attr}" for entry in self._entry_points.get(name, ())]
         if not claims:
             raise KeyError(name)
-        if len(claims) > 1:
+        if len(claims) > 1 and not self._same(claims):
             owners = " and ".join(claim if isinstance(claim, str) else shown(claim) for claim in claims)
             raise ValueError(f"{self.what} name {name!r} is claimed by {owners}; uninstall one of them")
         return claims[0]
+
+    def _same(self, claims: list[Any]) -> bool:
+        """Whether all are the same thing, such as one that its module registers and its package offers too."""
+        try:
+            first, *others = (self._identity(load_reference(one) if isinstance(one, str) else one) for one in claims)
+        except ValueError:
+            return False
+        return all(other == first for other in others)
 
     def look_up(self, name: object) -> T:
         """What has this name.
@@ -142,10 +150,8 @@ def load_reference(text: str) -> Any:
     place, _, name = text.rpartition(":")
     if not place or not all(part.isidentifier() for part in name.split(".")):
         raise ValueError(f"{text!r} is no import path; give {FORMS}")
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
     try:
-        found: Any = _load_file(Path(place)) if place.endswith(".py") else import_module(place)
+        found: Any = _load_file(Path(place)) if place.endswith(".py") else _import(place)
     except Exception as error:  # whatever foreign code raises when it is imported
         raise ValueError(
             f"{text!r} cannot be imported ({describe(error)}); give {FORMS}, of a module that Python finds and that "
@@ -156,6 +162,16 @@ def load_reference(text: str) -> Any:
             raise ValueError(f"{text!r} names nothing: {place} has no {name!r}; give a name that the module defines")
         found = getattr(found, part)
     return found
+
+
+def _import(name: str) -> ModuleType:
+    try:
+        return import_module(name)
+    except ModuleNotFoundError:
+        if os.getcwd() in sys.path:
+            raise
+        sys.path.append(os.getcwd())
+        return import_module(name)
 
 
 def _load_file(path: Path) -> ModuleType:

@@ -32,10 +32,10 @@ class _SourceKeyedCache(FunctionCache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """What is kept for arguments of these types, or ``None``."""
-        self.keys()
+        self.kept()
         return super().load_overload(sig, target_context)
 
-    def keys(self) -> tuple[Any, ...]:
+    def kept(self) -> tuple[Any, ...]:
         """Keys of all that is kept; none, from then on, where another version kept what this one cannot read."""
         try:
             return tuple(self._cache_file._load_index())
@@ -69,4 +69,4 @@ def has_to_be_compiled(kernel: Any) -> bool:
     cache = kernel._cache
     if not isinstance(cache, _SourceKeyedCache):
         return False
-    return not any(key[-1] == cache._source_key for key in cache.keys())
+    return not any(key[-1] == cache._source_key for key in cache.kept())

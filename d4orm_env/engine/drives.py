@@ -33,11 +33,13 @@ class DriveRules(NamedTuple):
     Attributes:
         time_step: ``(4,)`` see :class:`~d4orm_env.core.robot_model.TimeStep`.
         docking: ``(2,)`` squares of the goal radius and of the goal speed.
+        docks: Whether who has arrived stands there for ever.
         near2: Square of how near to a point is near [m^2].
     """
 
     time_step: FloatArray
     docking: FloatArray
+    docks: np.bool_
     near2: np.float32
 
 
@@ -62,7 +64,7 @@ def drive_kernel(name: str) -> Any:
     """The compiled drives of robots of the model with this name, each as if nobody else were there.
 
     The kernel carries states ``x`` ``(H+1, B, n)`` and controls ``u`` ``(H, B, m)`` on in place, given up to ``switch``
-    and inside the limits from there on, zero after arrival; ``arrived`` ``(B,)`` is output.
+    and inside the limits from there on, zero once docked; ``arrived`` ``(B,)`` is output.
     """
     robot = MODELS[name]
     move, dock = make_stepper(robot)
@@ -72,27 +74,28 @@ def drive_kernel(name: str) -> Any:
 
     @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
     def drive(rules: DriveRules, ways: Ways, x: FloatArray, u: FloatArray, arrived: BoolArray) -> None:
-        dt, docking = rules.time_step, rules.docking
+        dt, docking = rules.time_step, (rules.docking[0], rules.docking[1], rules.docks)
         h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])
         for b in range(ways.switch.shape[0]):
             own_limits = to_fixed_tuple(ways.limits[b], num_limits)
             goal, via = to_fixed_tuple(ways.goals[b], d), to_fixed_tuple(ways.vias[b], d)
-            first, standing = ways.switch[b], False
+            first, at_goal = ways.switch[b], False
             state = to_fixed_tuple(x[first, b], n)
             if first > 0:
-                state, _, standing = dock(False, state, to_fixed_tuple(u[first - 1, b], m), own_limits, goal, docking)
+                state, _, at_goal = dock(False, state, to_fixed_tuple(u[first - 1, b], m), own_limits, goal, docking)
             for t in range(first, u.shape[0]):
+                standing = transition.stands(at_goal, rules.docks)
                 via = goal if squared_gap(state, via) < rules.near2 else via
                 wanted = track(state, approach(state, via, own_limits, h, OPS), own_limits, h, OPS)
                 control = limit_control(wanted, own_limits, OPS)
                 for i in range(m):
                     u[t, b, i] = ZERO if standing else control[i]
                 control = to_fixed_tuple(u[t, b], m)
-                state, _, standing = dock(
+                state, _, at_goal = dock(
                     standing, move(standing, state, control, own_limits, h), control, own_limits, goal, docking
                 )
                 for i in range(n):
                     x[t + 1, b, i] = state[i]
-            arrived[b] = standing
+            arrived[b] = at_goal
 
     return drive

@@ -115,7 +115,7 @@ def obstacle_contacts(arrays: ProblemArrays, place: Any, extra: Any) -> Any:
     hit = jnp.zeros((place.shape[0], place.shape[2]), bool)
     for axis in range(place.shape[1]):
         hit |= collision.leaves(place[:, axis], reach, arrays.bounds[0, axis], arrays.bounds[1, axis])
-    if len(arrays.boxes) + len(arrays.triangles) > FEW and arrays.index is not None:
+    if len(arrays.boxes) + len(arrays.triangles) > FEW and arrays.grid is not None:
         return hit | _indexed_contacts(arrays, place, reach)
     if len(arrays.boxes):
         box = jnp.moveaxis(arrays.boxes, 1, 0)[..., None, :, None]
@@ -147,7 +147,7 @@ def _touches_triangle(corners: Any, reach: Any, place: Any) -> Any:
 
 def _indexed_contacts(arrays: ProblemArrays, place: Any, reach: Any) -> Any:
     """``(K, S)`` bool: contacts with obstacles, see :mod:`d4orm_env.engine.obstacles`."""
-    index, cell = arrays.index, jnp.int32(0)
+    index, cell = arrays.grid, jnp.int32(0)
     for axis in range(place.shape[1]):
         step = (place[:, axis] - index.low[axis]) * index.scale
         # Asked this way round, what is not a number counts as zero.

@@ -247,7 +247,7 @@ def _observe(
         read_motion(arrays, k, s, w, eyes.velocity[k], eyes.heading[k])
         eyes.arrived[k] = ONE if docked[k] else ZERO
         for axis in range(dimension):
-            if docked[k]:
+            if transition.stands(docked[k], arrays.docks):
                 eyes.velocity[k, axis] = ZERO
     for k in range(num_robots):
         row = out[k]

@@ -61,6 +61,7 @@ def build(settings: Settings, layout: Layout) -> Problem:
         goal_radius=settings.goal_radius,
         goal_speed=settings.goal_speed,
         name=settings.scenario,
+        arrival=settings.arrival,
     )
     require_margin(problem)
     return problem

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from d4orm_env.core.dynamics import get_model
 from d4orm_env.core.portable import arctan2
-from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem import Arrival, Problem
 from d4orm_env.core.robot_model import Model
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
@@ -166,6 +166,7 @@ class ProblemFile(Entry):
     margin: Squared = 0.05
     goal_radius: Squared = 0.075
     goal_speed: Squared | None = None
+    arrival: Arrival = "dock"
     robots: list[RobotEntry] = Field(min_length=1)
     world: WorldEntry = WorldEntry()
 
@@ -186,6 +187,7 @@ class ProblemFile(Entry):
             margin=self.margin,
             goal_radius=self.goal_radius,
             goal_speed=self.goal_speed,
+            arrival=self.arrival,
             name=self.name,
         )
 
@@ -270,6 +272,8 @@ def parse(data: object) -> Problem:
 def describe(problem: Problem) -> dict[str, Any]:
     """The content of a file that means that problem, to the bit: the inverse of :func:`parse`."""
     settings = {name: getattr(problem, name) for name in ("dt", "horizon", "margin", "goal_radius", "goal_speed")}
+    if not problem.docks:
+        settings["arrival"] = problem.arrival
     robots = [_describe_robot(problem, robot) for robot in range(problem.num_robots)]
     return {
         "version": VERSION,
@@ -304,7 +308,8 @@ def _describe_world(problem: Problem) -> dict[str, Any]:
     world, dimension = problem.world, problem.dimension
     content: dict[str, Any] = {}
     if world.lower is not None:
-        content["bounds"] = {"lower": _decimals(world.lower), "upper": _decimals(world.upper)}
+        lower, upper = map(_decimals, world.bounds)
+        content["bounds"] = {"lower": lower, "upper": upper}
     for kind in ("circles", "spheres", "cylinders"):
         rows = [_decimals(row) for row in getattr(world, kind)]
         content[kind] = [{"center": row[:-1], "radius": row[-1]} for row in rows]

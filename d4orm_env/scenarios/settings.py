@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import positive_number, whole_number
 from d4orm_env.core.dynamics import get_model
-from d4orm_env.core.problem import MAX_HORIZON
+from d4orm_env.core.problem import MAX_HORIZON, Arrival, check_arrival
 from d4orm_env.core.team import Team
 
 MAX_COUNT = 10_000
@@ -39,6 +39,7 @@ class Settings:
         horizon: Number of steps; ``None`` follows :func:`~d4orm_env.scenarios.layout.default_horizon`.
         goal_radius: A robot within it has arrived [m].
         goal_speed: Speed at which a robot may still dock [m/s]; ``None`` is no limit.
+        arrival: ``"dock"``: who arrives stands there for ever. ``"stay"``: it may be moved again, to make way.
         max_speed: Speed limit [m/s], one or ``K``.
         max_acceleration: Acceleration limit [m/s^2], one or ``K``.
         max_turn_rate: Turn rate limit [rad/s], one or ``K``.
@@ -60,6 +61,7 @@ class Settings:
     horizon: int | None = None
     goal_radius: float = 0.075
     goal_speed: float | None = None
+    arrival: Arrival = "dock"
     max_speed: ArrayLike = 1.0
     max_acceleration: ArrayLike = 1.0
     max_turn_rate: ArrayLike = float(np.pi / 2)
@@ -76,6 +78,7 @@ class Settings:
         for name in ("dt", "goal_radius", "obstacle_radius"):
             object.__setattr__(self, name, bounded(getattr(self, name), name))
         object.__setattr__(self, "margin", bounded(self.margin, "margin", zero_allowed=True))
+        check_arrival(self.arrival)
         if self.goal_speed is not None:
             object.__setattr__(self, "goal_speed", bounded(self.goal_speed, "goal_speed", zero_allowed=True))
 

@@ -48,6 +48,9 @@ def verify(problem: Problem, controls: ArrayLike) -> VerificationReport:
     to the goal speed, that rounding decides (see :mod:`d4orm_env.verify.docking`), both readings are judged, that it
     docks there and that it drives on, and the plan is fine only if everyone arrives and nobody touches in all of them.
 
+    Where arrival is to stay rather than to dock, nobody stands for ever: a robot must be at its goal, beyond what
+    rounding decides, from some step to the last.
+
     Controls that are not finite define no motion: they are reported, and nothing else is judged. So are robots that
     turn or accelerate so hard that ``MAX_SUB_STEPS`` sub-steps do not follow them through one step.
 

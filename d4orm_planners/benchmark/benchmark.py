@@ -17,6 +17,7 @@ from d4orm_env.engine.choice import get_engine
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.benchmark.probes import measure_memory, measure_startup
 from d4orm_planners.benchmark.timing import Spread, measure
+from d4orm_planners.benchmark.walls import Where, boxed_problem, measure_index, measure_obstacles
 from d4orm_planners.registry import make_planner
 from d4orm_planners.settings import CheckedSettings, Count, Positive, Samples, Steps, Whole
 
@@ -49,6 +50,9 @@ class BenchmarkSettings(CheckedSettings):
         seeds: Seeds ``0, 1, ...`` per team size.
         plan_time_limit: Seconds per plan.
         memory_robots: Team size of the memory measurement.
+        obstacles: How many boxes stand among the ways of 8 robots.
+        far_obstacles: The same of boxes far away; also what environments are stepped among.
+        map_cells: Cells along a side of the maps whose index of obstacles is timed.
 
     Raises:
         ValueError: If a value makes no sense; the message names it.
@@ -70,6 +74,9 @@ class BenchmarkSettings(CheckedSettings):
     seeds: Count = 20
     plan_time_limit: Positive = 20.0
     memory_robots: Robots = 64
+    obstacles: tuple[Count, ...] = (4, 200, 1000, 5000)
+    far_obstacles: tuple[Count, ...] = (200,)
+    map_cells: tuple[Count, ...] = (32, 256)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -94,6 +101,8 @@ QUICK: dict[str, Any] = {
     "seeds": 2,
     "plan_time_limit": 5.0,
     "memory_robots": 16,
+    "obstacles": (4, 200),
+    "map_cells": (32,),
 }
 """What differs in a benchmark of about a minute, for a first look."""
 
@@ -124,8 +133,15 @@ def parts(settings: BenchmarkSettings) -> Iterator[Part]:
                 for preset in PRESETS if engine == "cpu" else ("paper",):
                     label = f"{num_robots} {model} on {engine}"
                     yield "denoising", label, partial(_measure_denoising, settings, engine, preset, num_robots, model)
-    yield "environments", "one environment", partial(_measure_env, settings)
-    yield "environments", f"{settings.num_worlds} worlds", partial(_measure_worlds, settings)
+    for num_boxes in (0, *settings.far_obstacles):
+        among = f" among {num_boxes} boxes" if num_boxes else ""
+        yield "environments", f"one environment{among}", partial(_measure_env, settings, num_boxes)
+        yield "environments", f"{settings.num_worlds} worlds{among}", partial(_measure_worlds, settings, num_boxes)
+    for where, counts in (("near", settings.obstacles), ("far", settings.far_obstacles)):
+        for count in counts:
+            yield "obstacles", f"{count} boxes {where}", partial(_measure_obstacles, settings, count, where)
+    for cells in settings.map_cells:
+        yield "index", f"index of {cells} x {cells} cells", partial(measure_index, cells)
     yield "startup", "first plan of a process", partial(measure_startup, 8, min(settings.repetitions, 5))
     size = settings.memory_robots
     memory = partial(measure_memory, size, settings.num_samples, settings.horizon, diameter(size))
@@ -197,11 +213,22 @@ def _plain_run(problem: Problem, settings: BenchmarkSettings) -> Callable[..., A
     )
 
 
-def _measure_env(settings: BenchmarkSettings) -> dict[str, Any]:
+def _measure_obstacles(settings: BenchmarkSettings, num_boxes: int, where: Where) -> dict[str, Any]:
+    """An iteration of the paper's planner among boxes, beside one in the open."""
+    planner: Any = make_planner("d4orm", preset="paper", num_steps=settings.num_steps)
+    noise_scale = planner.noise_scale()
+
+    def iterate(problem: Problem) -> None:
+        _engine_run(problem, settings, "cpu", "paper")(noise_scale, True)
+
+    return measure_obstacles(iterate, num_boxes, where, settings.repetitions, settings.time_limit)
+
+
+def _measure_env(settings: BenchmarkSettings, num_boxes: int) -> dict[str, Any]:
     """One PettingZoo environment of 8 robots under random controls, resets included."""
     from d4orm_env import navigation_v0
 
-    env = navigation_v0.parallel_env(scenario="circle", num_robots=8)
+    env = navigation_v0.parallel_env(problem=boxed_problem(num_boxes, "near"))
     env.reset(seed=0)
     space = env.action_space(env.possible_agents[0])
     random = np.random.default_rng(0)
@@ -218,16 +245,20 @@ def _measure_env(settings: BenchmarkSettings) -> dict[str, Any]:
 
     spread = measure(steps, settings.repetitions, settings.time_limit)
     env.close()
-    return {"environment": "parallel_env", "num_worlds": 1, "num_robots": 8, **_rate(spread, settings.env_steps)}
+    row = {"environment": "parallel_env", "num_worlds": 1, "num_robots": 8, "obstacles": num_boxes}
+    return {**row, **_rate(spread, settings.env_steps)}
 
 
-def _measure_worlds(settings: BenchmarkSettings) -> dict[str, Any]:
+def _measure_worlds(settings: BenchmarkSettings, num_boxes: int) -> dict[str, Any]:
     """The batched environment of 8 robots per world under random controls, auto-reset included."""
     import gymnasium
 
     size = settings.num_worlds
     env = gymnasium.make_vec(
-        "d4orm/Navigation-v0", num_envs=size, vectorization_mode="vector_entry_point", num_robots=8
+        "d4orm/Navigation-v0",
+        num_envs=size,
+        vectorization_mode="vector_entry_point",
+        problem=boxed_problem(num_boxes, "near"),
     )
     env.reset(seed=0)
     space: Any = env.single_action_space
@@ -242,7 +273,8 @@ def _measure_worlds(settings: BenchmarkSettings) -> dict[str, Any]:
 
     spread = measure(steps, settings.repetitions, settings.time_limit)
     env.close()
-    return {"environment": "make_vec", "num_worlds": size, "num_robots": 8, **_rate(spread, calls * size)}
+    row = {"environment": "make_vec", "num_worlds": size, "num_robots": 8, "obstacles": num_boxes}
+    return {**row, **_rate(spread, calls * size)}
 
 
 def _rate(seconds: Spread, steps: int) -> dict[str, Any]:

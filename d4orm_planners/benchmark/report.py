@@ -104,10 +104,43 @@ def _denoising(rows: list[dict[str, Any]]) -> str:
 
 def _environments(rows: list[dict[str, Any]]) -> str:
     lines = [
-        (row["environment"], str(row["num_worlds"]), str(row["num_robots"]), f"{row['steps_per_second']:,.0f}")
+        (
+            row["environment"],
+            str(row["num_worlds"]),
+            str(row["num_robots"]),
+            str(row["obstacles"]),
+            f"{row['steps_per_second']:,.0f}",
+        )
         for row in rows
     ]
-    return table("Environment steps", ("environment", "worlds", "robots", "env-steps per second"), lines)
+    return table("Environment steps", ("environment", "worlds", "robots", "boxes", "env-steps per second"), lines)
+
+
+def _obstacles(rows: list[dict[str, Any]]) -> str:
+    lines = [
+        (
+            f"{row['obstacles']} {row['where']}",
+            milliseconds(row["iteration"]),
+            f"{row['ratio'].median:.2f}",
+            milliseconds(row["verify"]),
+        )
+        for row in rows
+    ]
+    header = ("boxes", "iteration, ms", "times that in the open", "verify(), ms")
+    return table("Obstacles, 8 robots, preset paper", header, lines)
+
+
+def _index(rows: list[dict[str, Any]]) -> str:
+    lines = [
+        (
+            f"{row['cells']} x {row['cells']}",
+            str(row["obstacles"]),
+            f"{row['seconds']:.2f}",
+            f"{row['bytes'] / 2**20:.1f}",
+        )
+        for row in rows
+    ]
+    return table("Index of a map's obstacles", ("cells", "boxes", "s", "MiB"), lines)
 
 
 def _startup(rows: list[dict[str, Any]]) -> str:
@@ -142,6 +175,8 @@ def _plans(rows: list[dict[str, Any]]) -> str:
 _SECTIONS: dict[str, Callable[[list[dict[str, Any]]], str]] = {
     "denoising": _denoising,
     "environments": _environments,
+    "obstacles": _obstacles,
+    "index": _index,
     "startup": _startup,
     "memory": _memory,
     "plans": _plans,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.core.metrics import arrival_steps
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
 from d4orm_env.core.trajectory import Trajectory
@@ -62,7 +63,7 @@ class _Repair:
         """Repair, and shorten the ways home once nobody is in anybody's way."""
         problem, current = self.problem, self.search.current.trajectory
         robots, credit = self.next_robots()
-        arrival = np.where(self.team.arrived, current.arrived.argmax(axis=0), problem.horizon)
+        arrival = np.where(self.team.arrived, arrival_steps(current.arrived), problem.horizon)
         horizon = min(int(arrival[list(robots)].max()) + RULES.slack, problem.horizon)
         distance = np.linalg.norm(problem.goal - problem.start[:, : problem.dimension], axis=1)
         wider = RULES.noise_factors[self.search.iteration % len(RULES.noise_factors)]
