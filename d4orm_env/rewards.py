@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, shown
 from d4orm_env.core.team import Team
+from d4orm_env.ways import Ways
 
 __all__ = ["RewardFunction", "RewardInput", "TrainingReward"]
 
@@ -111,6 +112,39 @@ class TrainingReward:
             - self.time
         ) * ~step.previously_arrived
         return rewards
+
+
+def paper_reward(step: RewardInput) -> FloatArray:
+    """``(..., K)`` the paper's reward, for where its distances are not those that the engines measure."""
+    return step.paper
+
+
+def along_ways(step: RewardInput, ways: Ways | Sequence[Ways]) -> RewardInput:
+    """The same step with all distances, the paper's reward included, along the shortest free ways.
+
+    A distance stays straight where a robot has got to that no way leads from, as inside an obstacle.
+
+    Args:
+        step: One of ``(K,)`` or ``(B, K)``.
+        ways: From the starts to the goals; one for each of the ``B`` worlds where they differ.
+    """
+    places = np.stack([step.previous_positions, step.positions])
+    if isinstance(ways, Ways):
+        initial, lengths = ways.length, ways.distance(places)
+    else:
+        initial = np.stack([own.length for own in ways])
+        lengths = np.stack([own.distance(places[:, world]) for world, own in enumerate(ways)], axis=1)
+    straight = np.stack([step.previous_distances, step.distances])
+    previous, present = np.where(np.isfinite(lengths), lengths, straight).astype(np.float32)
+    # It is at least the goal radius, as the straight one is.
+    least: FloatArray = np.maximum(initial, step.initial_distances).astype(np.float32)
+    return replace(
+        step,
+        previous_distances=previous,
+        distances=present,
+        initial_distances=least,
+        paper=step.paper + step.distances / step.initial_distances - present / least,
+    )
 
 
 REWARDS: Mapping[str, RewardFunction | None] = MappingProxyType({"paper": None, "training": TrainingReward()})

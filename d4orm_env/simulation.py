@@ -22,8 +22,9 @@ from d4orm_env.episode_record import EpisodeRecord
 from d4orm_env.joint_state import JointState, join_state, state_bounds
 from d4orm_env.lifelong import fresh_goal, goal_region, reached_goals
 from d4orm_env.options import EnvOptions
-from d4orm_env.rewards import RewardFunction, RewardInput, compute_rewards, find_reward
+from d4orm_env.rewards import RewardFunction, RewardInput, along_ways, compute_rewards, find_reward, paper_reward
 from d4orm_env.team_step import TeamStep
+from d4orm_env.ways import observe_ways
 
 _MAX_OBSERVED = 10_000
 _OPEN_WORLD_EXTENT = 1000.0
@@ -52,7 +53,13 @@ class Simulation:
             problem,
             num_neighbors=whole_number(options.observed_robots, "observed_robots", 0, _MAX_OBSERVED),
             num_obstacles=whole_number(options.observed_obstacles, "observed_obstacles", 0, _MAX_OBSERVED),
+            observed_way=options.observed_way,
         )
+        # In an open world the two are the same.
+        self.along_ways = options.progress == "way" and problem.world.num_obstacles > 0
+        if self.along_ways:
+            self.reward = self.reward or paper_reward
+            problem.check_reachable()
         # Here, because importing the compiler takes longer than importing all the rest of the package.
         from d4orm_env.engine.cpu import CpuEngine
 
@@ -114,6 +121,8 @@ class Simulation:
                 f"the instance drawn from scenario {drawn.name!r} has another team or lies outside "
                 f"{places.tolist()} m, where the state space ends; use a scenario whose seed changes places only"
             )
+        if self.along_ways:
+            drawn.check_reachable()
         return drawn
 
     def require_reset(self) -> None:
@@ -228,7 +237,7 @@ class Simulation:
             team=self.problem.team,
             dt=self.problem.dt,
         )
-        return compute_rewards(reward, step)
+        return compute_rewards(reward, along_ways(step, self.problem.ways) if self.along_ways else step)
 
     def _distances(self, states: FloatArray) -> FloatArray:
         """``(K,)`` to the present goals [m]."""
@@ -241,6 +250,8 @@ class Simulation:
         observations = self._engine.observe(
             self.arrays, self.layout, self.states, self.controls, self.arrived, time_left
         )
+        if self.layout.observed_way:
+            observe_ways(observations, self.layout, self.problem.ways, self.states[:, : self._dimension])
         distances = self._distances(self.states)
         self.last = TeamStep(observations, rewards, arrived, self.collided, margin_violated, distances)
         return self.last

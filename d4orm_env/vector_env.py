@@ -18,12 +18,13 @@ from d4orm_env.env_inputs import checked_states, joint_controls
 from d4orm_env.episode_record import EpisodeCounts, episode_metrics
 from d4orm_env.joint_env import joint_spaces
 from d4orm_env.options import EnvOptions
-from d4orm_env.rewards import RewardInput, compute_rewards
+from d4orm_env.rewards import RewardInput, along_ways, compute_rewards
 from d4orm_env.scenarios.problems import ScenarioLike
 from d4orm_env.simulation import Simulation
 from d4orm_env.team_step import Info
 from d4orm_env.vector_infos import final_infos, masked
 from d4orm_env.vector_inputs import checked_autoreset_mode, reset_mask, world_seeds
+from d4orm_env.ways import observe_ways
 from d4orm_env.world_draws import OWN_ARRAYS, WorldDraws
 
 if TYPE_CHECKING:
@@ -120,6 +121,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         start, goal, inverse = (np.repeat(getattr(problem.arrays, name)[None], count, axis=0) for name in OWN_ARRAYS)
         self._worlds = WorldBatch.of(start, goal, inverse, problem.control_size)
         self._arrays: list[ProblemArrays] = [problem.arrays_to_observe(self._template.layout.num_obstacles)] * count
+        self._problems = [problem] * count
         self._apart = False
         self.robot_rewards = np.zeros((count, problem.num_robots), np.float32)
         shape = (count, problem.num_robots, self._template.layout.size)
@@ -284,6 +286,12 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
                 one = slice(world, world + 1)
                 part = type(self._worlds)(*(values[one] for values in self._worlds))
                 advance(arrays, layout, cycles, orders[one], part, out[one])
+        if layout.observed_way:
+            places = self._worlds.state[..., : self.problem.dimension]
+            if not template.redraws:
+                observe_ways(out, layout, self.problem.ways, places)
+            for world, problem in enumerate(self._problems if template.redraws else ()):
+                observe_ways(out[world], layout, problem.ways, places[world])
         return out.reshape(self.num_envs, -1)
 
     def _before(self) -> WorldBatch | None:
@@ -315,6 +323,9 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             team=self.problem.team,
             dt=self.problem.dt,
         )
+        if self._template.along_ways:
+            drawn = [problem.ways for problem in self._problems] if self._template.redraws else None
+            step = along_ways(step, drawn or self.problem.ways)
         self.robot_rewards = np.where(moved[:, None], compute_rewards(reward, step), np.float32(0))
         worlds.reward[:] = self.robot_rewards.mean(axis=1)
         # Where a world was reset both are zero.
@@ -327,6 +338,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         for world in indices:
             problem = self._draws.begin(world)
             if problem is not None:
+                self._problems[world] = problem
                 self._worlds.start[world], self._worlds.goal[world] = problem.start, problem.goal
                 self._worlds.inverse[world] = problem.arrays.inverse_initial_distance
                 self._arrays[world] = problem.arrays_to_observe(self._template.layout.num_obstacles)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, whole_number
-from d4orm_env.core.metrics import mean_squared_jerk
+from d4orm_env.core.metrics import mean_squared_jerk, mean_stretch
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.joint_state import JointState, split_state
@@ -23,6 +24,7 @@ class Episode:
     """What happened.
 
     Attributes:
+        problem: What the environment ran.
         trajectory: The executed motion, ``T`` steps long; ``T`` is at most the horizon.
         metrics: The environment's own, see :meth:`d4orm_env.episode_record.EpisodeRecord.metrics`, and
             ``mean_squared_jerk``, see :func:`d4orm_env.core.metrics.mean_squared_jerk`.
@@ -30,10 +32,19 @@ class Episode:
         infos: Infos likewise.
     """
 
+    problem: Problem
     trajectory: Trajectory
     metrics: dict[str, float]
     observations: tuple[dict[str, FloatArray], ...]
     infos: tuple[dict[str, dict[str, Any]], ...]
+
+    @cached_property
+    def stretch(self) -> float:
+        """Way travelled over the shortest free way, see :func:`d4orm_env.core.metrics.mean_stretch`.
+
+        In lifelong mode, where goals change, it means nothing.
+        """
+        return mean_stretch(self.problem, self.trajectory)
 
 
 def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0) -> Episode:
@@ -68,7 +79,7 @@ def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0) -> Episode:
     trajectory = _trajectory(problem, joints, outcomes)
     jerk = mean_squared_jerk(trajectory.controls, trajectory.arrived, problem.dt)
     metrics = {**env.unwrapped.metrics(), "mean_squared_jerk": jerk}
-    return Episode(trajectory, metrics, tuple(all_observations), tuple(all_infos))
+    return Episode(problem, trajectory, metrics, tuple(all_observations), tuple(all_infos))
 
 
 class _Outcome(NamedTuple):

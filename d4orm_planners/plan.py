@@ -15,7 +15,7 @@ import numpy as np
 from d4orm_env.core.archives import ArrayArchive
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.files import replaced_when_done
-from d4orm_env.core.metrics import trajectory_metrics
+from d4orm_env.core.metrics import mean_stretch, trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.rollout import rollout
@@ -118,6 +118,13 @@ class Plan:
     def verified(self) -> bool:
         """Whether :func:`d4orm_env.verify` finds no fault with the controls; judged when it is first asked for."""
         return verify(self.problem, self.controls).ok
+
+    @cached_property
+    def stretch(self) -> float:
+        """Way travelled over the shortest free way, see :func:`d4orm_env.core.metrics.mean_stretch`; found when it is
+        first asked for, so that solving does not wait for it.
+        """
+        return mean_stretch(self.problem, self.trajectory)
 
     @property
     def failures(self) -> dict[str, str]:

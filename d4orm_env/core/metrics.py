@@ -43,6 +43,30 @@ def mean_squared_jerk(controls: FloatArray, arrived: BoolArray, dt: float) -> fl
     return float((jerk**2).sum(axis=-1)[moving].mean()) if moving.any() else 0.0
 
 
+def stretch(problem: Problem, trajectory: Trajectory) -> np.ndarray:
+    """``(K,)`` the way that each robot travelled over its shortest free way, :attr:`Problem.ways`; 1 is the least.
+
+    The rest of the way, from where the robot docked to the goal itself, counts as travelled. Infinite for a robot that
+    did not arrive, or that has no free way.
+
+    Among obstacles the first call for a problem takes some 20 ms per robot, so that it is no part of
+    :func:`trajectory_metrics`.
+    """
+    positions = np.asarray(trajectory.positions, np.float64)
+    way = np.concatenate([positions, problem.goal[None].astype(np.float64)])
+    travelled = np.linalg.norm(np.diff(way, axis=0), axis=-1).sum(axis=0)
+    shortest = problem.ways.length
+    counts = trajectory.arrived[-1] & np.isfinite(shortest)
+    return np.where(counts, travelled / np.maximum(shortest, problem.goal_radius), np.inf)
+
+
+def mean_stretch(problem: Problem, trajectory: Trajectory) -> float:
+    """Mean :func:`stretch` of the robots that arrived; infinite if none did."""
+    values = stretch(problem, trajectory)
+    arrived = np.isfinite(values)
+    return float(values[arrived].mean()) if arrived.any() else np.inf
+
+
 def trajectory_metrics(problem: Problem, trajectory: Trajectory) -> dict[str, float]:
     """Success, travel time, makespan, reward, jerk and counts of what went wrong.
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate, pairwise
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, whole_number
 from d4orm_env.core.problem import Problem
+
+WINDING = 10
+"""The longest way that an observation tells, over the farthest that anything may be from a robot."""
 
 
 class OwnParts(NamedTuple):
@@ -45,19 +48,36 @@ class ObstacleParts(NamedTuple):
     gap: slice  # between the two surfaces
 
 
+class WayParts(NamedTuple):
+    """What it sees of its shortest free way, from the first component of that on.
+
+    Attributes:
+        direction: ``d`` unit vector along it; zero at the goal.
+        length: [m].
+    """
+
+    direction: slice
+    length: slice
+
+
+Parts: TypeAlias = OwnParts | NeighborParts | ObstacleParts | WayParts
+
+
 @dataclass(frozen=True)
 class ObservationSlices:
-    """Where the parts of an observation lie: the robot's own, then each neighbour's, then each obstacle's.
+    """Where the parts of an observation lie: the robot's own, each neighbour's, each obstacle's, and its way's.
 
     Attributes:
         dimension: ``d``.
         num_neighbors: Neighbours listed, nearest first.
         num_obstacles: Obstacles listed, nearest first; walls of the bounds are among them.
+        observed_way: Whether the way is there.
     """
 
     dimension: int
     num_neighbors: int
     num_obstacles: int
+    observed_way: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
         whole_number(self.num_neighbors, "num_neighbors", 0)
@@ -80,13 +100,22 @@ class ObservationSlices:
         return ObstacleParts(*_slices(1, self.dimension, 1))
 
     @cached_property
+    def way(self) -> WayParts:
+        """Slices of :meth:`ways`."""
+        return WayParts(*_slices(self.dimension, 1))
+
+    @cached_property
     def size(self) -> int:
         """Number of components ``D``."""
-        return self._neighbors_end + self.num_obstacles * self.obstacle[-1].stop
+        return self._obstacles_end + self.observed_way * self.way[-1].stop
 
     @property
     def _neighbors_end(self) -> int:
         return self.own[-1].stop + self.num_neighbors * self.neighbor[-1].stop
+
+    @property
+    def _obstacles_end(self) -> int:
+        return self._neighbors_end + self.num_obstacles * self.obstacle[-1].stop
 
     def neighbors(self, observations: FloatArray) -> FloatArray:
         """``(..., num_neighbors, .)`` the rows of neighbours of observations ``(..., D)``."""
@@ -95,15 +124,20 @@ class ObservationSlices:
 
     def obstacles(self, observations: FloatArray) -> FloatArray:
         """``(..., num_obstacles, .)`` the rows of obstacles of observations ``(..., D)``."""
-        rows = observations[..., self._neighbors_end :]
+        rows = observations[..., self._neighbors_end : self._obstacles_end]
         return rows.reshape(*rows.shape[:-1], self.num_obstacles, self.obstacle[-1].stop)
+
+    def ways(self, observations: FloatArray) -> FloatArray:
+        """``(..., .)`` what observations ``(..., D)`` say of the way; empty where they do not."""
+        return observations[..., self._obstacles_end :]
 
     @property
     def names(self) -> tuple[str, ...]:
         """One name per component, as ``neighbor_0.velocity_y``."""
-        blocks: list[tuple[str, OwnParts | NeighborParts | ObstacleParts]] = [("", self.own)]
+        blocks: list[tuple[str, Parts]] = [("", self.own)]
         blocks += [(f"neighbor_{row}.", self.neighbor) for row in range(self.num_neighbors)]
         blocks += [(f"obstacle_{row}.", self.obstacle) for row in range(self.num_obstacles)]
+        blocks += [("way.", self.way)] * self.observed_way
         return tuple(prefix + name for prefix, parts in blocks for name in _component_names(parts))
 
 
@@ -120,13 +154,15 @@ class ObservationLayout(ObservationSlices):
     high: FloatArray
 
     @classmethod
-    def for_problem(cls, problem: Problem, num_neighbors: int = 4, num_obstacles: int = 4) -> ObservationLayout:
+    def for_problem(
+        cls, problem: Problem, num_neighbors: int = 4, num_obstacles: int = 4, observed_way: bool = False
+    ) -> ObservationLayout:
         """The layout for a problem, with bounds that no motion of its robots can leave.
 
         Raises:
             ValueError: If a number of neighbours or obstacles is negative or not whole.
         """
-        slices = ObservationSlices(problem.dimension, num_neighbors, num_obstacles)
+        slices = ObservationSlices(problem.dimension, num_neighbors, num_obstacles, observed_way=observed_way)
         team, reach = problem.team, _reach(problem)
         radius, speed, acceleration = (
             float(values.max()) for values in (team.radius, team.max_speed, team.max_acceleration)
@@ -138,13 +174,17 @@ class ObservationLayout(ObservationSlices):
         _fill(high, slices.own, own)
         _fill(slices.neighbors(high), slices.neighbor, neighbor)
         _fill(slices.obstacles(high), slices.obstacle, {"present": 1, "position": reach, "gap": reach})
+        if observed_way:
+            _fill(slices.ways(high), slices.way, {"direction": 1, "length": WINDING * reach})
         low = -high
         _fill(low, slices.own, {"time_left": 0, "arrived": 0})
         _fill(slices.neighbors(low), slices.neighbor, {"present": 0})
         _fill(slices.obstacles(low), slices.obstacle, {"present": 0})
+        if observed_way:
+            _fill(slices.ways(low), slices.way, {"length": 0})
         for bound in (low, high):
             bound.setflags(write=False)
-        return cls(problem.dimension, num_neighbors, num_obstacles, low, high)
+        return cls(problem.dimension, num_neighbors, num_obstacles, low, high, observed_way=observed_way)
 
     @cached_property
     def bounds(self) -> FloatArray:
@@ -159,7 +199,7 @@ def _slices(*widths: int) -> Iterator[slice]:
     return (slice(begin, end) for begin, end in pairwise(accumulate(widths, initial=0)))
 
 
-def _component_names(parts: OwnParts | NeighborParts | ObstacleParts) -> Iterator[str]:
+def _component_names(parts: Parts) -> Iterator[str]:
     for name, part in zip(parts._fields, parts, strict=True):
         width = part.stop - part.start
         suffixes = ("_cos", "_sin") if name == "heading" else ("",) if width == 1 else ("_x", "_y", "_z")[:width]

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +26,9 @@ from d4orm_env.core.problem_arrays import ProblemArrays, inverse_initial_distanc
 from d4orm_env.core.problem_checks import check_places, check_resolution, check_states, check_turning
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
+
+if TYPE_CHECKING:
+    from d4orm_env.ways import Ways
 
 Arrival = Literal["dock", "stay"]
 """What it means to arrive."""
@@ -200,6 +203,32 @@ class Problem:
         """:attr:`arrays` with an index that finds so many of the nearest obstacles of any place."""
         grid = self.world.index(float(np.max(self.team.radius)) + self.margin, max(num_obstacles, 1))
         return self.arrays._replace(grid=grid)
+
+    @cached_property
+    def ways(self) -> Ways:
+        """The shortest free way of every robot; see :func:`d4orm_env.ways.shortest_ways`."""
+        # The one road up from here: it is compiled.
+        from d4orm_env.ways import shortest_ways
+
+        return shortest_ways(self)
+
+    def check_reachable(self) -> None:
+        """Whether every robot has a way to its goal that keeps its radius and the margin from obstacles and bounds.
+
+        Other robots do not count. It takes a wavefront for every robot, which is why construction does not ask.
+
+        Raises:
+            ValueError: If one has none; the message names all of those.
+        """
+        robots = np.flatnonzero(np.isinf(self.ways.length))
+        if len(robots):
+            names = ", ".join(f"robot_{robot}" for robot in robots)
+            reach = sorted({f"{radius + self.margin:.4g}" for radius in np.asarray(self.team.radius)[robots]})
+            raise ValueError(
+                f"{names} {'has' if len(robots) == 1 else 'have'} no way from start to goal that is "
+                f"{' or '.join(reach)} m clear of obstacles; move the start or the goal, open the world there, or use "
+                f"a smaller radius or margin"
+            )
 
     @cached_property
     def digest(self) -> str:

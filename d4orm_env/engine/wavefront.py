@@ -1,0 +1,533 @@
+"""Shortest free ways to one place, compiled with numba: a wavefront over a grid, any-angle, in the plane and in space.
+
+As in Lazy Theta* (A. Nash, S. Koenig and C. Tovey, AAAI 2010) a node of the grid is worth the value of its anchor and
+the straight line to it, which is tested when the node's turn comes. Anchors are not tied to the grid: where a line is
+blocked, it is turned about its far end until it just passes, and the place where it then touches is the new anchor. So
+ways are nearly as short as they can be on grids that are no finer than the robot.
+
+Whether a line is free is found by marching along it with steps that the clearance allows. Where there is hardly any
+room, steps are a quarter of the distance to keep: what is convex and comes no nearer than that at both ends of such a
+step comes nearer by at most 1/128 of it in between.
+
+Worlds of the plane are treated as spatial ones without end in z.
+"""
+
+from __future__ import annotations
+
+import heapq
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from d4orm_env.core.problem import Problem
+from d4orm_env.engine import tiles
+from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.tiles import OPTIONS, compiled, inlined
+
+SOURCES = fingerprint((tiles,))
+
+_HALVINGS = 6
+"""Of the angle by which a blocked line is turned, and of the length by which a corner is cut."""
+_PUSHES, _SPARE = 4, 0.03
+"""How often a node is pushed away from an obstacle, and how much farther than need be, as a share of the reach; a third
+of it each time, so as to end in the middle of narrow gaps."""
+_TOLERANCE = 1e-6
+"""Rounding of clearances [m]."""
+_NOBODY = -1
+
+
+class Space(NamedTuple):
+    """A world with obstacles as the wavefront reads it; see :class:`~d4orm_env.core.world_index.WorldIndex`.
+
+    Attributes:
+        low: ``(3,)`` lowest corner of the index [m].
+        cell: Size of its cells [m].
+        scale: One over that [1/m].
+        size: ``(3,)`` its cells along each axis.
+        rounding: By how much its clearances may be off [m].
+        clearance: ``(C,)`` float32.
+        first: ``(C + 1,)`` int32.
+        items: int32.
+        boxes: ``(., 7)``.
+        triangles: ``(., 6)``.
+        bounds: ``(2, 3)`` of the world.
+        extent: ``(2, 3)`` of the obstacles.
+        pad: How far from the obstacles the index reaches at least [m].
+    """
+
+    low: Any
+    cell: float
+    scale: float
+    size: Any
+    rounding: float
+    clearance: Any
+    first: Any
+    items: Any
+    boxes: Any
+    triangles: Any
+    bounds: Any
+    extent: Any
+    pad: float
+
+
+class Lattice(NamedTuple):
+    """The nodes of a wavefront, numbered with the last axis fastest.
+
+    Attributes:
+        low: ``(3,)`` the first node [m].
+        step: Between neighbours along an axis [m].
+        size: ``(3,)`` int64 nodes along each axis.
+        moves: ``(M, 3)`` int64 to the neighbours of a node.
+        places: ``(N, 3)`` where each is [m].
+        free: ``(N,)`` bool.
+    """
+
+    low: Any
+    step: float
+    size: Any
+    moves: Any
+    places: Any
+    free: Any
+
+
+class Front(NamedTuple):
+    """Where a wavefront came from.
+
+    Attributes:
+        anchor: ``(N,)`` int32 the anchor that each node sees; -1 for a node out of reach.
+        points: ``(A, 3)`` the anchors; the first is the goal [m].
+        values: ``(A,)`` length of the way from each to the goal [m].
+        parents: ``(A,)`` int32 the anchor that comes next on that way; -1 for the goal.
+    """
+
+    anchor: Any
+    points: Any
+    values: Any
+    parents: Any
+
+
+def make_space(problem: Problem) -> Space:
+    """The world of a problem; it must have obstacles."""
+    world, d = problem.world, problem.dimension
+    shapes, index = world.shapes, problem.arrays.index
+    cell = 1.0 / float(index.scale)
+    lower, upper = shapes.extent()
+    pad = 0.999 * float((lower - index.low).min())
+    corners = shapes.boxes.astype(np.float64)
+    low, high = corners[:, :d], corners[:, d : 2 * d]
+    for axis in range(d):
+        if np.isinf(low[:, axis]).any():
+            lower[axis], upper[axis] = -np.inf, np.inf
+    return Space(
+        low=np.append(index.low.astype(np.float64), [-cell / 2] * (3 - d)),
+        cell=cell,
+        scale=1 / cell,
+        size=np.append(index.size, [1] * (3 - d)).astype(np.int64),
+        rounding=max(0.0, float(index.slack) - cell * float(np.sqrt(d)) / 2) + 1e-4 * cell,
+        clearance=index.clearance,
+        first=index.first,
+        items=index.items,
+        boxes=np.hstack([*_endless(np.stack([low, high])), corners[:, 2 * d :]]),
+        triangles=shapes.triangles.astype(np.float64),
+        bounds=_endless(world.bounds.astype(np.float64)),
+        extent=_endless(np.stack([lower, upper])),
+        pad=pad,
+    )
+
+
+def _endless(corners: Any) -> Any:
+    """Lower and upper corners ``(2, ..., d)`` in three dimensions."""
+    end = np.full((*corners.shape[1:-1], 3 - corners.shape[-1]), np.inf)
+    return np.stack([np.concatenate([corner, side * end], axis=-1) for side, corner in zip((-1, 1), corners)])
+
+
+@inlined
+def _box_distance(boxes: Any, i: Any, x: Any, y: Any, z: Any) -> Any:
+    gx = max(boxes[i, 0] - x, x - boxes[i, 3])
+    gy = max(boxes[i, 1] - y, y - boxes[i, 4])
+    gz = max(boxes[i, 2] - z, z - boxes[i, 5])
+    deepest = max(gx, max(gy, gz))
+    gx, gy, gz = max(gx, 0.0), max(gy, 0.0), max(gz, 0.0)
+    return np.sqrt(gx * gx + gy * gy + gz * gz) + min(deepest, 0.0) - boxes[i, 6]
+
+
+@compiled
+def _triangle_distance(triangles: Any, i: Any, x: Any, y: Any) -> Any:
+    nearest, inside = np.inf, True
+    for edge in range(3):
+        after = 2 * edge + 2 if edge < 2 else 0
+        bx, by = triangles[i, 2 * edge], triangles[i, 2 * edge + 1]
+        ax, ay = triangles[i, after] - bx, triangles[i, after + 1] - by
+        ox, oy = x - bx, y - by
+        share = min(max((ox * ax + oy * ay) / (ax * ax + ay * ay), 0.0), 1.0)
+        dx, dy = ox - share * ax, oy - share * ay
+        nearest = min(nearest, dx * dx + dy * dy)
+        inside &= ax * oy - ay * ox >= 0.0
+    return -np.sqrt(nearest) if inside else np.sqrt(nearest)
+
+
+@inlined
+def _to_bounds(space: Any, x: Any, y: Any, z: Any) -> Any:
+    low, high = space.bounds[0], space.bounds[1]
+    room = min(min(x - low[0], high[0] - x), min(y - low[1], high[1] - y))
+    return min(room, min(z - low[2], high[2] - z))
+
+
+@inlined
+def _to_extent(space: Any, x: Any, y: Any, z: Any) -> Any:
+    low, high = space.extent[0], space.extent[1]
+    gx, gy, gz = max(low[0] - x, x - high[0], 0.0), max(low[1] - y, y - high[1], 0.0), max(low[2] - z, z - high[2], 0.0)
+    return np.sqrt(gx * gx + gy * gy + gz * gz)
+
+
+@inlined
+def _cell(space: Any, x: Any, y: Any, z: Any) -> Any:
+    """Number of the cell of a place, of the outermost one beyond the index, and offsets from its centre in cells."""
+    low, scale, size = space.low, space.scale, space.size
+    x, y, z = (x - low[0]) * scale, (y - low[1]) * scale, (z - low[2]) * scale
+    i = min(max(np.int64(x), 0), size[0] - 1)
+    j = min(max(np.int64(y), 0), size[1] - 1)
+    k = min(max(np.int64(z), 0), size[2] - 1)
+    return (i * size[1] + j) * size[2] + k, x - i - 0.5, y - j - 0.5, z - k - 0.5
+
+
+@compiled
+def _to_obstacles(space: Any, x: Any, y: Any, z: Any) -> Any:
+    """Distance to the nearest obstacle, exact up to ``pad`` and never too large."""
+    cell, dx, dy, dz = _cell(space, x, y, z)
+    nearest = np.inf
+    for number in range(space.first[cell], space.first[cell + 1]):
+        item = space.items[number]
+        if item < space.boxes.shape[0]:
+            nearest = min(nearest, _box_distance(space.boxes, item, x, y, z))
+        else:
+            nearest = min(nearest, _triangle_distance(space.triangles, item - space.boxes.shape[0], x, y))
+    if max(abs(dx), max(abs(dy), abs(dz))) > 0.501:
+        nearest = max(min(nearest, space.pad), _to_extent(space, x, y, z))
+    return nearest
+
+
+@inlined
+def _about_to_obstacles(space: Any, x: Any, y: Any, z: Any) -> Any:
+    """The same, found quickly and too small by a cell or two."""
+    cell, dx, dy, dz = _cell(space, x, y, z)
+    return space.clearance[cell] - np.sqrt(dx * dx + dy * dy + dz * dz) * space.cell - space.rounding
+
+
+@inlined
+def _clearance(space: Any, x: Any, y: Any, z: Any) -> Any:
+    return min(_to_obstacles(space, x, y, z), _to_bounds(space, x, y, z))
+
+
+@inlined
+def _distance(a: Any, b: Any) -> Any:
+    dx, dy, dz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    return np.sqrt(dx * dx + dy * dy + dz * dz)
+
+
+@compiled
+def _sees(space: Any, reach: Any, a: Any, own_a: Any, b: Any, own_b: Any) -> Any:
+    """Whether a line is free.
+
+    ``own_a`` and ``own_b`` are the clearances at the ends: a place that lies nearer to something than ``reach`` is left
+    on lines that come no nearer than it is.
+    """
+    length = _distance(a, b)
+    if length == 0.0:
+        return True
+    ux, uy, uz = (b[0] - a[0]) / length, (b[1] - a[1]) / length, (b[2] - a[2]) / length
+    need_a, need_b = min(reach, own_a), min(reach, own_b)
+    zone_a, zone_b = 2 * (reach - need_a), length - 2 * (reach - need_b)
+    s = 0.0
+    while s < length:
+        x, y, z = a[0] + s * ux, a[1] + s * uy, a[2] + s * uz
+        need = reach
+        if s < zone_a:
+            need = need_a
+        if s > zone_b:
+            need = min(need, need_b)
+        shortest = 0.25 * max(need, 0.1 * reach)
+        room = _about_to_obstacles(space, x, y, z) - need
+        if room < shortest:
+            room = _to_obstacles(space, x, y, z) - need
+            if room < -_TOLERANCE:
+                return False
+        s += max(room, shortest)
+    return True
+
+
+@inlined
+def _indices(lattice: Any, n: Any) -> Any:
+    """Steps to a node along each axis."""
+    size = lattice.size
+    return n // (size[2] * size[1]), n // size[2] % size[1], n % size[2]
+
+
+@inlined
+def _place(rows: Any, n: Any) -> Any:
+    return (rows[n, 0], rows[n, 1], rows[n, 2])
+
+
+@inlined
+def _corner(lattice: Any, q: Any) -> Any:
+    """Steps along each axis to the node below a place, or to the outermost one."""
+    low, step, size = lattice.low, lattice.step, lattice.size
+    i = min(max(np.int64((q[0] - low[0]) / step), 0), size[0] - 1)
+    j = min(max(np.int64((q[1] - low[1]) / step), 0), size[1] - 1)
+    return i, j, min(max(np.int64((q[2] - low[2]) / step), 0), size[2] - 1)
+
+
+@inlined
+def _neighbour(lattice: Any, move: Any, i: Any, j: Any, k: Any) -> Any:
+    """The number of a neighbour; -1 beyond the lattice."""
+    ni, nj, nk = i + lattice.moves[move, 0], j + lattice.moves[move, 1], k + lattice.moves[move, 2]
+    size = lattice.size
+    if ni < 0 or nj < 0 or nk < 0 or ni >= size[0] or nj >= size[1] or nk >= size[2]:
+        return -1
+    return (ni * size[1] + nj) * size[2] + nk
+
+
+@inlined
+def _between(a: Any, b: Any, share: Any) -> Any:
+    return (a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]), a[2] + share * (b[2] - a[2]))
+
+
+@compiled
+def _turned(space: Any, reach: Any, a: Any, own: Any, p: Any, q: Any) -> Any:
+    """Two places to go round on the way from ``a`` to ``q``, which it does not see and ``p`` beside it does."""
+    low, high = 0.0, 1.0
+    for _ in range(_HALVINGS):
+        share = (low + high) / 2
+        if _sees(space, reach, a, own, _between(q, p, share), reach):
+            high = share
+        else:
+            low = share
+    # The line from ``a`` just passes what it is turned about. Now the corner is cut.
+    x = _between(q, p, high)
+    near, far = _distance(x, a), _distance(x, q)
+    one, other, low, high = x, x, 0.0, min(near, far)
+    if high > 0.0:
+        for _ in range(_HALVINGS):
+            cut = (low + high) / 2
+            b, c = _between(x, a, cut / near), _between(x, q, cut / far)
+            if _sees(space, reach, b, reach, c, reach):
+                low, one, other = cut, b, c
+            else:
+                high = cut
+    return one, other
+
+
+@compiled
+def _settled(space: Any, lattice: Any, reach: Any, place: Any) -> Any:
+    """The place, or if a body of this reach does not fit there one less than half a step away where it does.
+
+    And whether it does.
+    """
+    half, probe, spare = lattice.step / 2, lattice.step / 64, reach * _SPARE
+    x, y, z = place
+    clearance = _clearance(space, x, y, z)
+    for _ in range(_PUSHES):
+        if clearance > reach or clearance < reach - lattice.step:
+            break
+        gx = _clearance(space, x + probe, y, z) - _clearance(space, x - probe, y, z)
+        gy = _clearance(space, x, y + probe, z) - _clearance(space, x, y - probe, z)
+        gz = _clearance(space, x, y, z + probe) - _clearance(space, x, y, z - probe)
+        norm = np.sqrt(gx * gx + gy * gy + gz * gz)
+        if norm == 0.0:
+            break
+        push = (reach + spare - clearance) / norm
+        spare /= 3
+        x = min(max(x + push * gx, place[0] - half), place[0] + half)
+        y = min(max(y + push * gy, place[1] - half), place[1] + half)
+        z = min(max(z + push * gz, place[2] - half), place[2] + half)
+        clearance = _clearance(space, x, y, z)
+    return (x, y, z), clearance > reach
+
+
+@cached_kernel(SOURCES, variant="settle", **OPTIONS)
+def settle_nodes(space: Any, lattice: Any, reach: Any) -> None:
+    """Put the nodes of a lattice where a body of this reach fits, if that is less than half a step away."""
+    low, step = lattice.low, lattice.step
+    for n in range(lattice.free.shape[0]):
+        i, j, k = _indices(lattice, n)
+        place = (low[0] + i * step, low[1] + j * step, low[2] + k * step)
+        if (
+            _about_to_obstacles(space, place[0], place[1], place[2])
+            > reach
+            < _to_bounds(space, place[0], place[1], place[2])
+        ):
+            lattice.free[n] = True
+        else:
+            place, lattice.free[n] = _settled(space, lattice, reach, place)
+        lattice.places[n, 0], lattice.places[n, 1], lattice.places[n, 2] = place
+
+
+@cached_kernel(SOURCES, variant="wave", **OPTIONS)
+def spread(space: Any, lattice: Any, reach: Any, goal: Any) -> Any:
+    """The wavefront of a body of this reach from its goal ``(3,)``, as the parts of a :class:`Front`."""
+    count = lattice.free.shape[0]
+    value, anchor = np.full(count, np.inf), np.full(count, np.int32(_NOBODY))
+    refused = np.full(count, np.int32(_NOBODY))
+    tested, done = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
+    num_moves = lattice.moves.shape[0]
+    tried = np.empty(num_moves, np.int32)
+    points, values, parents = np.empty((256, 3)), np.empty(256), np.empty(256, np.int32)
+    points[0, 0], points[0, 1], points[0, 2] = goal[0], goal[1], goal[2]
+    values[0], parents[0], used = 0.0, _NOBODY, 1
+    target = (goal[0], goal[1], goal[2])
+    own_goal = _clearance(space, goal[0], goal[1], goal[2])
+    heap = [(0.0, np.int64(0)) for _ in range(0)]
+    around = 2 + np.int64(2 * max(0.0, reach - own_goal) / lattice.step)
+    gi, gj, gk = _corner(lattice, target)
+    for i in range(max(0, gi - around), min(lattice.size[0], gi + around + 1)):
+        for j in range(max(0, gj - around), min(lattice.size[1], gj + around + 1)):
+            for k in range(max(0, gk - around), min(lattice.size[2], gk + around + 1)):
+                n = (i * lattice.size[1] + j) * lattice.size[2] + k
+                if lattice.free[n]:
+                    value[n], anchor[n] = _distance(target, _place(lattice.places, n)), 0
+                    heapq.heappush(heap, (value[n], n))
+    while len(heap) > 0:
+        reached, n = heapq.heappop(heap)
+        if done[n] or reached != value[n]:
+            continue
+        q = _place(lattice.places, n)
+        i, j, k = _indices(lattice, n)
+        if not tested[n]:
+            a = anchor[n]
+            tested[n] = True
+            at = _place(points, a)
+            if not _sees(space, reach, at, own_goal if a == 0 else reach, q, reach):
+                # The anchors of its neighbours, and the neighbours themselves.
+                refused[n] = a
+                best, chosen, num_tried = np.inf, _NOBODY, 0
+                via, through = np.inf, np.int64(-1)
+                b, c, bend = q, q, q
+                for move in range(num_moves):
+                    p = _neighbour(lattice, move, i, j, k)
+                    if p < 0 or not done[p]:
+                        continue
+                    other, known = anchor[p], anchor[p] == a
+                    for t in range(num_tried):
+                        known |= tried[t] == other
+                    place = _place(lattice.places, p)
+                    if not known:
+                        tried[num_tried] = other
+                        num_tried += 1
+                        at = _place(points, other)
+                        length = values[other] + _distance(at, q)
+                        if length < best and _sees(space, reach, at, own_goal if other == 0 else reach, q, reach):
+                            best, chosen = length, other
+                    length = value[p] + _distance(place, q)
+                    if length < via and _sees(space, reach, place, reach, q, reach):
+                        via, through = length, p
+                if best == np.inf and via == np.inf:
+                    # In a narrow gap neighbours may see each other by way of a place between them only.
+                    for move in range(num_moves):
+                        p = _neighbour(lattice, move, i, j, k)
+                        if p < 0 or not done[p]:
+                            continue
+                        place = _place(lattice.places, p)
+                        c, fits = _settled(space, lattice, reach, _between(place, q, 0.5))
+                        length = value[p] + _distance(place, c) + _distance(c, q)
+                        if not fits or length >= best or not _sees(space, reach, place, reach, c, reach):
+                            continue
+                        if _sees(space, reach, c, reach, q, reach):
+                            best, through, bend = length, p, c
+                    if best < np.inf:
+                        b, c, a = _place(lattice.places, through), bend, anchor[through]
+                elif via < best:
+                    a, p = anchor[through], _place(lattice.places, through)
+                    b, c = _turned(space, reach, _place(points, a), own_goal if a == 0 else reach, p, q)
+                if min(best, via) < np.inf and (chosen < 0 or via < best):
+                    if used + 2 > len(values):
+                        points = np.concatenate((points, np.empty((used, 3))))
+                        values = np.concatenate((values, np.empty(used)))
+                        parents = np.concatenate((parents, np.empty(used, np.int32)))
+                    points[used, 0], points[used, 1], points[used, 2] = b
+                    points[used + 1, 0], points[used + 1, 1], points[used + 1, 2] = c
+                    values[used], parents[used] = values[a] + _distance(_place(points, a), b), a
+                    values[used + 1], parents[used + 1] = values[used] + _distance(b, c), used
+                    best, chosen, used = values[used + 1] + _distance(c, q), used + 1, used + 2
+                value[n], anchor[n] = best, chosen
+                if chosen < 0:
+                    tested[n] = False
+                    continue
+                if best > reached:
+                    heapq.heappush(heap, (best, n))
+                    continue
+        done[n] = True
+        a = anchor[n]
+        at = _place(points, a)
+        for move in range(num_moves):
+            p = _neighbour(lattice, move, i, j, k)
+            if p < 0 or done[p] or not lattice.free[p]:
+                continue
+            if refused[p] == a and value[p] < np.inf:
+                continue
+            place = _place(lattice.places, p)
+            length = values[a] + _distance(at, place)
+            if length >= value[p]:
+                continue
+            if tested[p] and not _sees(space, reach, at, own_goal if a == 0 else reach, place, reach):
+                refused[p] = a
+                continue
+            value[p], anchor[p] = length, a
+            heapq.heappush(heap, (length, p))
+    for n in range(count):
+        if not done[n]:
+            anchor[n] = _NOBODY
+    return anchor, points[:used].copy(), values[:used].copy(), parents[:used].copy()
+
+
+@cached_kernel(SOURCES, variant="look", **OPTIONS)
+def look(space: Any, lattice: Any, reach: Any, front: Any, places: Any, target: Any, length: Any, anchor: Any) -> None:
+    """The ways from places of a body of this reach.
+
+    Args:
+        space: The world.
+        lattice: The nodes.
+        reach: The distance to keep [m].
+        front: The wavefront from the goal.
+        places: ``(Q, 3)``.
+        target: ``(Q, 3)`` where to go first, output.
+        length: ``(Q,)`` of the whole way; infinite where there is none, output.
+        anchor: ``(Q,)`` int32 the anchor that is the target or comes next, output; -1 where there is none.
+    """
+    points, values = front.points, front.values
+    step, size = lattice.step, lattice.size
+    own_goal = _clearance(space, points[0, 0], points[0, 1], points[0, 2])
+    goal = (points[0, 0], points[0, 1], points[0, 2])
+    for b in range(places.shape[0]):
+        q = (places[b, 0], places[b, 1], places[b, 2])
+        own = _clearance(space, q[0], q[1], q[2])
+        length[b], anchor[b] = np.inf, _NOBODY
+        if _sees(space, reach, goal, own_goal, q, own):
+            length[b], anchor[b] = _distance(goal, q), 0
+            target[b] = points[0]
+            continue
+        i, j, k = _corner(lattice, q)
+        rings = 2 + np.int64(2 * max(0.0, reach - own) / step)
+        ring = 0
+        while ring < rings and anchor[b] < 0:
+            last = np.int32(_NOBODY)
+            for ni in range(max(0, i - ring), min(size[0], i + ring + 2)):
+                for nj in range(max(0, j - ring), min(size[1], j + ring + 2)):
+                    for nk in range(max(0, k - ring), min(size[2], k + ring + 2)):
+                        n = (ni * size[1] + nj) * size[2] + nk
+                        a = front.anchor[n]
+                        if a < 0:
+                            continue
+                        at = _place(points, a)
+                        straight = values[a] + _distance(at, q)
+                        if straight < length[b] and a != last:
+                            last = a
+                            if _sees(space, reach, at, own_goal if a == 0 else reach, q, own):
+                                length[b], anchor[b] = straight, a
+                                target[b] = points[a]
+                                continue
+                        place = _place(lattice.places, n)
+                        bent = values[a] + _distance(at, place) + _distance(place, q)
+                        if bent < length[b] and _sees(space, reach, place, reach, q, own):
+                            length[b], anchor[b] = bent, a
+                            target[b, 0], target[b, 1], target[b, 2] = place
+            ring += 1
