@@ -12,7 +12,7 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
 from d4orm_env.joint_env import register_environments
 from d4orm_env.rollout import rollout
-from d4orm_env.scenarios import list_scenarios, make_problem, register_scenario
+from d4orm_env.scenarios import list_scenarios, load_map, make_problem, register_scenario
 from d4orm_env.verify import VerificationReport, verify
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ __all__ = [
     "World",
     "functional",
     "list_scenarios",
+    "load_map",
     "load_problem",
     "make_problem",
     "navigation_v0",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from d4orm_env.scenarios.maps import load_map
 from d4orm_env.scenarios.registry import describe_scenario, list_scenarios, make_problem, register_scenario
 
 if TYPE_CHECKING:
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
 __all__ = [
     "describe_scenario",
     "list_scenarios",
+    "load_map",
     "load_problem",
     "make_problem",
     "register_scenario",

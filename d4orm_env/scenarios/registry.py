@@ -18,7 +18,7 @@ from d4orm_env.core.arrays import shown, whole_number
 from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.core.plugins import entry_point_names, import_object, load_entry_point
 from d4orm_env.core.problem import Problem
-from d4orm_env.scenarios import generators
+from d4orm_env.scenarios import corridors, forest, generators, maps, maze, rooms, warehouse
 from d4orm_env.scenarios.settings import Settings
 
 ENTRY_POINTS = "d4orm.scenarios"
@@ -194,6 +194,13 @@ for _scenario in (
     BuiltIn(generators.amswarm_3, **_AMSWARM),
     BuiltIn(generators.amswarm_4, **_AMSWARM),
     BuiltIn(generators.amswarm_5, **_AMSWARM),
+    BuiltIn(rooms.rooms),
+    BuiltIn(maze.maze),
+    BuiltIn(warehouse.warehouse),
+    BuiltIn(forest.forest),
+    BuiltIn(corridors.corridor),
+    BuiltIn(corridors.doorway),
+    BuiltIn(maps.map),
 ):
     register_scenario(_scenario.__name__, _scenario)
 

@@ -209,6 +209,8 @@ class ScenarioFile(BaseModel):
         complaint = unknown_argument(scenario, arguments)
         if complaint:
             raise ValueError(complaint)
+        if scenario.name == "map":
+            raise ValueError("scenario 'map' reads another file, as none does; write its problem with save_problem()")
         problem = make_problem(scenario, **arguments)
         return problem if self.name is None else problem.replace(name=self.name)
 

@@ -107,7 +107,7 @@ class Settings:
         return np.random.default_rng([self.seed, purpose])
 
 
-STARTS_AND_GOALS, OBSTACLES, JITTER = range(3)
+STARTS_AND_GOALS, OBSTACLES, JITTER, WALLS = range(4)
 """Purposes of :meth:`Settings.generator`."""
 
 
@@ -121,3 +121,16 @@ def bounded(value: Any, name: str, *, zero_allowed: bool = False) -> float:
     if number > LARGEST:
         raise ValueError(f"{name} is {number:g}; scenarios take at most {LARGEST:g}")
     return number
+
+
+def require_plane(settings: Settings) -> None:
+    """Check that a scenario of the plane is asked for robots of the plane.
+
+    Raises:
+        ValueError: If not.
+    """
+    if settings.team.dimension != 2:
+        raise ValueError(
+            f"scenario {settings.scenario!r} is planar and model {settings.model!r} is not; "
+            f"use model='holonomic2d', or scenario 'forest'"
+        )
