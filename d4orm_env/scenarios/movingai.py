@@ -95,7 +95,7 @@ def _task(line: str, number: int, shape: tuple[int, int]) -> Task:
         start, goal, way = (cells[0], cells[1]), (cells[2], cells[3]), float(line.split()[-1])
     except (ValueError, IndexError):
         raise ValueError(
-            f"has a line {number} that is not bucket, map, width , height, start x, start y, goal x, goal y and length"
+            f"has a line {number} that is not bucket, map, width, height, start x, start y, goal x, goal y and length"
         ) from None
     if (height, width) != shape:
         raise ValueError(
