@@ -37,7 +37,7 @@ def main() -> int:
         problem = make_problem(name, num_robots=arguments.robots, seed=arguments.seed, **settings)
         standing = rollout(problem.replace(horizon=1), np.zeros((1, problem.num_robots, problem.control_size)))
         path = save_picture(
-            problem, standing, arguments.out / f"{name}.png", title=f"{name}, {problem.num_robots} robots"
+            problem, standing, arguments.out / f"scenario_{name}.png", title=f"{name}, {problem.num_robots} robots"
         )
         print(f"wrote {path}")
     return 0

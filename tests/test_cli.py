@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from d4orm_env import make_problem
 from d4orm_planners import cli
 from d4orm_planners.plan import Plan
 

@@ -76,7 +76,7 @@ def _two_rooms(
         raise ValueError(
             f"{bays} bays do not fit along a length of {length:g}; use length={round_up(bays * bay * 1.2)}"
         )
-    step = lattice_step(settings, 2 * room + length, passage)
+    step = lattice_step(settings, [2 * room + length, room], passage)
     middles = length * ((np.arange(bays) + 1) / (bays + 1) - 0.5)
     above = _bank(length, width / 2, depth, room / 2, np.column_stack([middles - bay / 2, middles + bay / 2])[::2])
     below = _bank(length, width / 2, depth, room / 2, np.column_stack([middles - bay / 2, middles + bay / 2])[1::2])

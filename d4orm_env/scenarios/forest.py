@@ -43,4 +43,4 @@ def forest(settings: Settings, *, size: float | None = None, density: float = 0.
     kind = "circles" if dimension == 2 else "cylinders"
     world = World(dimension, **{kind: trees}, lower=-bounds, upper=bounds)
     travel = 1.2 * size * float(np.sqrt(dimension))
-    return populate(settings, world, lattice_step(settings, size), travel, "a larger size or a lower density")
+    return populate(settings, world, lattice_step(settings, 2 * bounds), travel, "a larger size or a lower density")

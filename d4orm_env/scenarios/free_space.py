@@ -12,10 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from d4orm_env.core.portable import root
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.layout import Layout, build
@@ -30,11 +32,14 @@ RESERVE = 1e-3
 MAX_POINTS = 2**23
 """Lattice points of a world at most: what a map of two million cells needs."""
 
-ACROSS = {2: 256, 3: 64}
-"""Lattice points along a side that do where nothing is narrow."""
+ENOUGH_POINTS = 2**18
+"""Lattice points that do where nothing is narrow."""
 
-TRIES, ROUNDS = 20_000, 3
-"""Places looked at in one attempt to find all starts and goals, and attempts."""
+WINDOW = {2: 32, 3: 8}
+"""How many lattice points away a way round a place is looked for at least."""
+
+TRIES, ROUNDS = 200, 3
+"""Places looked at for each start or goal in one attempt to find all of them, and attempts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,18 +103,18 @@ class FreeSpace:
         Returns:
             ``(P, d)`` group by group; fewer than asked for if there is no room.
         """
-        placing = _Placing(self.inside, separation / self.step)
+        placing = _Placing(self.inside, separation / self.step, sum(number for _, number in groups))
         for part, number in groups:
             candidates = np.flatnonzero(self.inside if part is None else self.inside & part)
-            some = random.choice(candidates, min(len(candidates), TRIES), replace=False)
-            wanted = len(placing.places) + number
+            some = random.choice(candidates, min(len(candidates), TRIES * max(number, 100)), replace=False)
+            wanted = placing.count + number
             for index in zip(*np.unravel_index(some, self.inside.shape), strict=True):
-                if len(placing.places) == wanted:
+                if placing.count == wanted:
                     break
                 placing.add(np.array(index))
-            if len(placing.places) < wanted:
+            if placing.count < wanted:
                 break
-        return self.points(np.array(placing.places, np.int64).reshape(-1, self.inside.ndim))
+        return self.points(placing.places[: placing.count])
 
 
 @lru_cache(maxsize=4)
@@ -148,49 +153,55 @@ class _Placing:
     Args:
         inside: The region.
         separation: How far those who pass by stay away from a place, in steps of the lattice.
+        most: How many places there will be.
     """
 
-    def __init__(self, inside: Mask, separation: float) -> None:
+    def __init__(self, inside: Mask, separation: float, most: int) -> None:
         from scipy.ndimage import binary_dilation, label
 
         self._label, self._dilation = label, binary_dilation
-        self.places: list[NDArray[np.int64]] = []
-        reach = int(separation)
-        # Whoever goes round a place finds a way within the window about it, or is held to find none.
-        self._window = 2 * reach + 1
-        self._free = np.pad(inside, self._window)
+        self.places, self.count = np.empty((most, inside.ndim), np.int64), 0
+        # Whoever goes round a place finds a way within the wide window about it, or is held to find none.
+        self._narrow = 2 * int(separation) + 1
+        self._wide = max(self._narrow, WINDOW[inside.ndim])
+        self._free = np.pad(inside, self._wide)
         self._taken = np.zeros(self._free.shape, np.int32)
-        offsets = np.indices((2 * self._window + 1,) * inside.ndim) - self._window
-        self._disc = (offsets * offsets).sum(axis=0) <= separation * separation
+        offsets = np.indices((2 * self._wide + 1,) * inside.ndim) - self._wide
+        self._wide_disc = (offsets * offsets).sum(axis=0) <= separation * separation
+        self._disc = self._wide_disc[self._about(np.zeros(inside.ndim, np.int64), self._narrow)]
 
     def add(self, place: NDArray[np.int64]) -> bool:
         """Take a place if that leaves everybody a way."""
-        free, taken = self._free[self._about(place)], self._taken[self._about(place)]
-        if taken[(self._window,) * place.size] or not self._goes_round(free & (taken == 0)):
+        if self._taken[tuple(place + self._wide)] or not self._goes_round(place):
             return False
+        taken = self._taken[self._about(place, self._narrow)]
         taken += self._disc
-        near = [other for other in self.places if np.abs(other - place).max() <= self._window]
-        if all(self._in_touch(other) for other in (place, *near)):
-            self.places.append(place)
+        self.places[self.count] = place
+        others = self.places[: self.count + 1]
+        if all(self._in_touch(other) for other in others[np.abs(others - place).max(axis=1) <= self._narrow]):
+            self.count += 1
             return True
         taken -= self._disc
         return False
 
-    def _about(self, place: NDArray[np.int64]) -> tuple[slice, ...]:
-        return tuple(slice(index, index + 2 * self._window + 1) for index in place)
+    def _about(self, place: NDArray[np.int64], window: int) -> tuple[slice, ...]:
+        return tuple(slice(index + self._wide - window, index + self._wide + window + 1) for index in place)
 
-    def _goes_round(self, untaken: Mask) -> bool:
+    def _goes_round(self, place: NDArray[np.int64]) -> bool:
         """Whether all that a new disc touches of the untaken region is connected around it."""
-        regions, _ = self._label(untaken & ~self._disc)
-        touched = regions[self._dilation(untaken & self._disc)]
+        about = self._about(place, self._wide)
+        untaken = self._free[about] & (self._taken[about] == 0)
+        regions, _ = self._label(untaken & ~self._wide_disc)
+        touched = regions[self._dilation(untaken & self._wide_disc)]
         return len(np.unique(touched[touched > 0])) == 1
 
     def _in_touch(self, place: NDArray[np.int64]) -> bool:
         """Whether a robot gets from a place to the untaken region through no disc but its own."""
-        free, taken = self._free[self._about(place)], self._taken[self._about(place)]
+        about = self._about(place, self._narrow)
+        free, taken = self._free[about], self._taken[about]
         untaken = free & (taken == 0)
         regions, _ = self._label(untaken | (free & (taken == 1) & self._disc))
-        return bool((regions[untaken] == regions[(self._window,) * place.size]).any())
+        return bool((regions[untaken] == regions[(self._narrow,) * place.size]).any())
 
 
 def reach_of(settings: Settings) -> float:
@@ -198,18 +209,18 @@ def reach_of(settings: Settings) -> float:
     return float(np.max(settings.team.radius)) + settings.margin + RESERVE
 
 
-def lattice_step(settings: Settings, extent: float, passage: tuple[str, float] | None = None) -> float:
+def lattice_step(settings: Settings, sides: Any, passage: tuple[str, float] | None = None) -> float:
     """Step of a lattice that is fine enough for the robots, and for the narrowest passage wherever it is [m].
 
     Args:
         settings: The robots.
-        extent: Longest side of the world [m].
+        sides: ``(d,)`` of the world [m].
         passage: Name and width of the narrowest passage [m].
 
     Raises:
         ValueError: If the passage is too narrow; the message says what would do.
     """
-    step = max(settings.spacing / 4, extent / ACROSS[settings.team.dimension])
+    step = max(settings.spacing / 4, root(float(np.prod(sides)) / ENOUGH_POINTS, len(sides)))
     if passage is None:
         return step
     (name, width), reach = passage, reach_of(settings)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from d4orm_env.core.arrays import positive_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios.free_space import lattice_step, populate, reach_of
@@ -31,7 +33,7 @@ def maze(settings: Settings, *, cells: Any = None, corridor_width: float = 1.2, 
         cells = default_squares((2.5 if is_wide else 12) * settings.num_robots, 6)
     columns, rows = grid_size(cells, "cells")
     share = positive_number(loops, "loops", zero_allowed=True, most=1.0)
-    step = lattice_step(settings, max(columns, rows) * (width + WALL), ("corridor_width", width))
+    step = lattice_step(settings, np.array([columns, rows]) * (width + WALL), ("corridor_width", width))
     random = settings.generator(WALLS)
     openings = draw_openings(random, columns, rows, share)
     world = wall_world(openings, width, width, random)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from d4orm_env.core.arrays import positive_number, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios.free_space import lattice_step, populate
@@ -37,7 +39,7 @@ def rooms(
     share = positive_number(extra_doors, "extra_doors", zero_allowed=True, most=1.0)
     if width > side:
         raise ValueError(f"door_width is {width:g}; it must be at most the room_size, which is {side:g}")
-    step = lattice_step(settings, max(columns, rows) * (side + WALL), ("door_width", width))
+    step = lattice_step(settings, np.array([columns, rows]) * (side + WALL), ("door_width", width))
     random = settings.generator(WALLS)
     openings = draw_openings(random, columns, rows, share)
     world = wall_world(openings, side, width, random)

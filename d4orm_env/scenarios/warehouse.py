@@ -38,7 +38,7 @@ def warehouse(
     size = np.array([bounded(shelf_length, "shelf_length"), bounded(shelf_width, "shelf_width")])
     aisle = bounded(aisle_width, "aisle_width")
     half = (np.array(counts) * (size + aisle) + aisle) / 2
-    step = lattice_step(settings, 2 * float(half.max()), ("aisle_width", aisle))
+    step = lattice_step(settings, 2 * half, ("aisle_width", aisle))
     column, row = np.meshgrid(*(np.arange(count) for count in counts))
     low = np.column_stack([column.ravel(), row.ravel()]) * (size + aisle) + aisle - half
     world = World(2, boxes=np.hstack([low, low + size]), lower=-half, upper=half)
