@@ -189,7 +189,7 @@ BAD = [
     ("forest", {"radius": 5}, "use fewer robots, a larger size or a lower density"),
     ("corridor", {"bays": 9}, "9 bays do not fit along a length of 4; use length="),
     ("corridor", {"bays": -1}, "bays is -1"),
-    ("corridor", {"room_size": 1}, "room_size is 1; a corridor_width of 0.6 and its bays need 1.8"),
+    ("corridor", {"room_size": 1}, "room_size is 1; a corridor_width of 0.6 with its bays needs 1.8"),
     ("doorway", {"door_width": 0.2}, "use door_width=0.45"),
     ("doorway", {"room_size": 1}, "use fewer robots, a larger room_size"),
 ]

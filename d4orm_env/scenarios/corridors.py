@@ -69,8 +69,8 @@ def _two_rooms(
     if room_size is None:
         room_size = max(3.0, 1.25 * float(np.sqrt(settings.num_robots)), 1.1 * least)
     room = bounded(room_size, "room_size")
-    if room < least:
-        raise ValueError(f"room_size is {room:g}; a {name} of {width:g} and its bays need {round_up(least)}")
+    if room <= least:
+        raise ValueError(f"room_size is {room:g}; a {name} of {width:g} with its bays needs {round_up(least)}")
     bay = max(2 * width, 2 * reach_of(settings) + width)
     if bays * bay * 1.2 > length:
         raise ValueError(
@@ -78,21 +78,15 @@ def _two_rooms(
         )
     step = lattice_step(settings, [2 * room + length, room], passage)
     middles = length * ((np.arange(bays) + 1) / (bays + 1) - 0.5)
-    above = _bank(length, width / 2, depth, room / 2, np.column_stack([middles - bay / 2, middles + bay / 2])[::2])
-    below = _bank(length, width / 2, depth, room / 2, np.column_stack([middles - bay / 2, middles + bay / 2])[1::2])
+    pockets = np.column_stack([middles - bay / 2, middles + bay / 2])
+    above, below = (_bank(length, width / 2, depth, room / 2, own) for own in (pockets[::2], pockets[1::2]))
     boxes = np.vstack([above, below[:, [0, 3, 2, 1]] * [1, -1, 1, -1]])
     corner = np.array([length / 2 + room, room / 2])
     world = World(2, boxes=boxes, lower=-corner, upper=corner)
+    clear = length / 2 + reach_of(settings)
     # One half drives through after the other, in a row.
     travel = 2 * (length + 2 * room) + settings.num_robots * settings.spacing
-    return populate(
-        settings,
-        world,
-        step,
-        travel,
-        "a larger room_size",
-        sides=(-length / 2 - reach_of(settings), length / 2 + reach_of(settings)),
-    )
+    return populate(settings, world, step, travel, "a larger room_size", exchange=(-clear, clear))
 
 
 def _bank(length: float, near: float, depth: float, far: float, bays: Points) -> Points:

@@ -72,24 +72,12 @@ class FreeSpace:
     def longest_way(self) -> float:
         """About the longest of all shortest ways within the region [m], to some 10%."""
         inside = np.pad(self.inside, 1)
-        if not inside.any():
-            return 0.0
-        strides = np.array(inside.strides) // inside.itemsize
         steps = np.array(list(product((-1, 0, 1), repeat=inside.ndim)))
-        diagonal = steps @ strides
-        straight = diagonal[np.abs(steps).sum(axis=1) == 1]
-        front, levels = np.flatnonzero(inside)[:1], 0
-        for _ in range(2):  # from anywhere to the place furthest off, and from there to the one furthest off
-            unseen, levels, begin = inside.ravel().copy(), 0, front[-1:]
-            unseen[begin] = False
-            reached = begin
-            while len(reached):
-                # Steps of one kind and of the other in turn go about as far in all directions.
-                front, levels = reached, levels + 1
-                near = (front[:, None] + (diagonal if levels % 2 else straight)).ravel()
-                reached = np.unique(near[unseen[near]])
-                unseen[reached] = False
-        return (levels - 1) * self.step
+        around = steps @ (np.array(inside.strides) // inside.itemsize)
+        # Straight steps and any steps in turn go about as far in all directions.
+        kinds = (around[np.abs(steps).sum(axis=1) == 1], around)
+        end, _ = _last_reached(inside.ravel(), np.flatnonzero(inside)[:1], kinds)
+        return _last_reached(inside.ravel(), end, kinds)[1] * self.step
 
     def draw(self, random: np.random.Generator, groups: Sequence[tuple[Mask | None, int]], separation: float) -> Points:
         """Random places, far enough apart that a robot gets from each to each while robots stand on all others.
@@ -117,6 +105,20 @@ class FreeSpace:
         return self.points(placing.places[: placing.count])
 
 
+def _last_reached(
+    inside: Mask, begin: NDArray[np.int64], kinds: Sequence[NDArray[np.int64]]
+) -> tuple[NDArray[np.int64], int]:
+    """One of the points reached last from another, and after how many steps, of these kinds in turn."""
+    unseen, front, steps = inside.copy(), begin, 0
+    while True:
+        unseen[front] = False
+        near = (front[:, None] + kinds[steps % len(kinds)]).ravel()
+        reached = np.unique(near[unseen[near]])
+        if not len(reached):
+            return front[:1], steps
+        front, steps = reached, steps + 1
+
+
 @lru_cache(maxsize=4)
 def free_space(world: World, reach: float, step: float) -> FreeSpace:
     """The free space of a world with bounds.
@@ -139,10 +141,9 @@ def free_space(world: World, reach: float, step: float) -> FreeSpace:
             f"{step:.2g} m apart to find free places in; use a smaller world or larger robots"
         )
     space = FreeSpace(low, step, np.zeros(shape, np.bool_))
-    # At any point between two neighbours the nearest obstacle is this near to one of them at least.
-    free = world.clearance(space.points(np.moveaxis(np.indices(shape), 0, -1))) > math.sqrt(
-        reach * reach + step * step / 4
-    )
+    # A robot keeps its reach between two neighbours that are further from everything than this.
+    needed = math.sqrt(reach * reach + step * step / 4)
+    free = world.clearance(space.points(np.moveaxis(np.indices(shape), 0, -1))) > needed
     regions, count = label(free)
     return replace(space, inside=regions == 1 + np.argmax(np.bincount(regions.ravel())[1:])) if count else space
 
@@ -238,7 +239,7 @@ def populate(
     step: float,
     travel: float,
     remedy: str,
-    sides: tuple[float, float] | None = None,
+    exchange: tuple[float, float] | None = None,
 ) -> Problem:
     """The problem of a team at random places of a world with walls, all of which are free for all others to pass.
 
@@ -248,14 +249,14 @@ def populate(
         step: Of the lattice that places are drawn from [m].
         travel: The distance the horizon is made for [m].
         remedy: What to change where the robots do not fit.
-        sides: Half of the robots start at an x below the first of them and end above the second [m], the others the
+        exchange: Half of the robots start at an x below the first of them and end above the second [m], the others the
             other way round; everywhere by default.
 
     Raises:
         ValueError: If robots or obstacles do not fit.
     """
     world = with_obstacles(settings, world)
-    starts, goals = draw_team(settings, free_space(world, reach_of(settings), step), remedy, sides)
+    starts, goals = draw_team(settings, free_space(world, reach_of(settings), step), remedy, exchange)
     return build(replace(settings, num_obstacles=0), Layout(starts, goals, world, travel, np.zeros(world.dimension)))
 
 
@@ -267,7 +268,7 @@ def with_obstacles(settings: Settings, world: World, places: Points | None = Non
 
 
 def draw_team(
-    settings: Settings, space: FreeSpace, remedy: str, sides: tuple[float, float] | None = None
+    settings: Settings, space: FreeSpace, remedy: str, exchange: tuple[float, float] | None = None
 ) -> tuple[Points, Points]:
     """``(K, d)`` random starts and goals; see :func:`populate`.
 
@@ -276,15 +277,14 @@ def draw_team(
     """
     random = settings.generator(STARTS_AND_GOALS)
     count = settings.num_robots
-    # A robot may dock anywhere within the goal radius. At any point between two lattice points one of them is nearer
-    # to a robot that stands than this.
+    # A robot may dock anywhere within the goal radius.
     apart = settings.spacing + settings.goal_radius + RESERVE
     separation = math.sqrt(apart * apart + space.step * space.step / 4)
     number = np.arange(2 * count)
     groups: list[tuple[Mask | None, int]] = [(None, 2 * count)]
-    if sides is not None:
+    if exchange is not None:
         x = space.low[0] + space.step * np.arange(len(space.inside))[:, None]
-        groups = [(x < sides[0], count), (x > sides[1], count)]
+        groups = [(x < exchange[0], count), (x > exchange[1], count)]
         # On either side the starts of one half and the goals of the other.
         half = (count + 1) // 2
         number = np.concatenate(

@@ -28,7 +28,7 @@ class Settings:
     Attributes:
         scenario: Name of the scenario.
         num_robots: ``K``.
-        seed: Seeds whatever the scenario draws: random starts and goals, random obstacles, jitter.
+        seed: Seeds whatever the scenario draws: walls, random starts and goals, random obstacles, jitter.
         model: One model name for all robots, or ``K`` names.
         num_obstacles: Random circles (spheres in space) placed inside the scenario.
         obstacle_radius: Radius of circular obstacles [m].
