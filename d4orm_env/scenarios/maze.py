@@ -9,8 +9,7 @@ import numpy as np
 from d4orm_env.core.arrays import positive_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios.free_space import lattice_step, populate, reach_of
-from d4orm_env.scenarios.rooms import grid_size
-from d4orm_env.scenarios.settings import WALLS, Settings, bounded, require_plane
+from d4orm_env.scenarios.settings import WALLS, Settings, bounded, grid_size, require_plane
 from d4orm_env.scenarios.wall_grid import WALL, default_squares, draw_openings, wall_world
 
 
@@ -29,7 +28,7 @@ def maze(settings: Settings, *, cells: Any = None, corridor_width: float = 1.2, 
     width = bounded(corridor_width, "corridor_width")
     if cells is None:
         # Where two robots cannot pass each other, every place takes a dead end.
-        is_wide = width > 2 * reach_of(settings) + settings.spacing + settings.goal_radius
+        is_wide = width > 1.1 * (2 * reach_of(settings) + settings.spacing + settings.goal_radius)
         cells = default_squares((2.5 if is_wide else 12) * settings.num_robots, 6)
     columns, rows = grid_size(cells, "cells")
     share = positive_number(loops, "loops", zero_allowed=True, most=1.0)

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.arrays import positive_number, whole_number
+from d4orm_env.core.arrays import positive_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios.free_space import lattice_step, populate
-from d4orm_env.scenarios.settings import MAX_COUNT, WALLS, Settings, bounded, require_plane
+from d4orm_env.scenarios.settings import WALLS, Settings, bounded, grid_size, require_plane
 from d4orm_env.scenarios.wall_grid import WALL, default_squares, draw_openings, wall_world
 
 
@@ -45,17 +45,3 @@ def rooms(
     world = wall_world(openings, side, width, random)
     travel = (openings.longest + 1) * (side + WALL)
     return populate(settings, world, step, travel, "more rooms or a larger room_size")
-
-
-def grid_size(value: Any, name: str) -> tuple[int, int]:
-    """Columns and rows from what was given for them.
-
-    Raises:
-        ValueError: If it is not two whole numbers, or too many squares.
-    """
-    if not isinstance(value, tuple | list) or len(value) != 2:
-        raise ValueError(f"{name} must be two whole numbers, columns and rows, not {value!r}")
-    columns, rows = (whole_number(count, name, 1, MAX_COUNT) for count in value)
-    if columns * rows > MAX_COUNT:
-        raise ValueError(f"{name} is {columns} x {rows}; scenarios make at most {MAX_COUNT} in all")
-    return columns, rows

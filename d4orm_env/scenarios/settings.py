@@ -134,3 +134,17 @@ def require_plane(settings: Settings) -> None:
             f"scenario {settings.scenario!r} is planar and model {settings.model!r} is not; "
             f"use model='holonomic2d', or scenario 'forest'"
         )
+
+
+def grid_size(value: Any, name: str) -> tuple[int, int]:
+    """Columns and rows from what was given for them.
+
+    Raises:
+        ValueError: If it is not two whole numbers, or too many squares.
+    """
+    if not isinstance(value, tuple | list) or len(value) != 2:
+        raise ValueError(f"{name} must be two whole numbers, columns and rows, not {value!r}")
+    columns, rows = (whole_number(count, name, 1, MAX_COUNT) for count in value)
+    if columns * rows > MAX_COUNT:
+        raise ValueError(f"{name} is {columns} x {rows}; scenarios make at most {MAX_COUNT} in all")
+    return columns, rows
