@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-EXTRAS ?= dev,rl,viz,ipopt
+EXTRAS ?= dev,rl,ipopt
 PYTEST_ARGS ?=
 
 # A stamp is as new as the last install that succeeded, so an install is repeated only when what it reads has changed.

@@ -22,23 +22,10 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
-    "Problem",
-    "Team",
-    "Trajectory",
-    "VerificationReport",
-    "World",
-    "functional",
-    "list_scenarios",
-    "load_map",
-    "load_problem",
-    "make_problem",
-    "navigation_v0",
-    "register_model",
-    "register_scenario",
-    "rollout",
-    "save_problem",
+    "Problem", "Team", "Trajectory", "VerificationReport", "World", "functional", "list_scenarios", "load_map",
+    "load_problem", "make_problem", "navigation_v0", "register_model", "register_scenario", "rollout", "save_problem",
     "verify",
-]
+]  # fmt: skip
 
 register_environments()
 

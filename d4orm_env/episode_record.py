@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
+
+Counts = NDArray[np.int64]
+Floats = NDArray[np.float64]
 
 
 class EpisodeRecord:
@@ -36,38 +40,50 @@ class EpisodeRecord:
         if np.count_nonzero(margin_violated):
             self._collisions += collided
             self._margin_violations += margin_violated
-        if np.count_nonzero(arrived):
-            new = arrived if self._lifelong else arrived & np.isinf(self._arrival_step)
-            self._goals_reached += new
-            self._arrival_step[new] = np.minimum(self._arrival_step[new], self._steps)
+        if self._lifelong:
+            self._goals_reached += arrived
+        elif np.count_nonzero(arrived) or np.count_nonzero(self._goals_reached):
+            # Where arriving is not for ever, a robot may have been moved away again.
+            self._arrival_step = np.where(arrived, np.minimum(self._arrival_step, self._steps), np.inf)
+            self._goals_reached = arrived.astype(np.int64)
 
     def metrics(self) -> dict[str, float]:
         """The episode so far, as plain numbers; see :func:`episode_metrics`."""
-        metrics = episode_metrics(
+        counts = EpisodeCounts(
             self._steps,
-            self._dt,
             self._reward,
             self._goals_reached,
             self._collisions,
             self._margin_violations,
             None if self._lifelong else self._arrival_step,
         )
+        metrics = episode_metrics(counts, self._dt)
         return {name: float(value) for name, value in metrics.items()}
 
 
-def episode_metrics(
-    steps: Any, dt: float, reward: Any, goals: Any, contacts: Any, violations: Any, arrival_step: Any
-) -> dict[str, Any]:
-    """Episodes in numbers, of one world or, with leading axes, of many.
+class EpisodeCounts(NamedTuple):
+    """What is counted of an episode of one world or, with leading axes, of many.
 
-    Args:
+    Attributes:
         steps: ``(...)`` steps taken.
-        dt: Time step [s].
         reward: ``(...)`` sum over steps and robots.
         goals: ``(..., K)`` goals reached by each robot.
         contacts: ``(..., K)`` steps in contact.
         violations: ``(..., K)`` steps within the margin.
-        arrival_step: ``(..., K)`` step of docking, infinite for not yet; ``None`` in lifelong mode.
+        arrival_step: ``(..., K)`` step since which a robot is at its goal, infinite where it is not; ``None`` in
+            lifelong mode.
+    """
+
+    steps: int | Counts
+    reward: float | Floats
+    goals: Counts | BoolArray
+    contacts: Counts
+    violations: Counts
+    arrival_step: Floats | None
+
+
+def episode_metrics(counts: EpisodeCounts, dt: float) -> dict[str, Floats]:
+    """Episodes in numbers; ``dt`` is the time step [s].
 
     Returns:
         ``steps``; ``reward``: mean over steps and robots; ``goals_reached``; ``goals_per_robot_minute``;
@@ -76,26 +92,23 @@ def episode_metrics(
         1.0 when all have docked and none was ever in contact; ``travel_time`` and ``makespan``: mean and latest
         arrival [s], with the time so far for a robot that has not docked. Each ``(...)`` float64.
     """
-    team_size, elapsed = contacts.shape[-1], np.asarray(steps, np.float64) * dt
+    team_size, steps = counts.contacts.shape[-1], np.asarray(counts.steps, np.float64)
     robot_steps = team_size * np.maximum(steps, 1)
-    reached = goals.sum(axis=-1).astype(np.float64)
-    collided = np.count_nonzero(contacts, axis=-1)
+    reached = counts.goals.sum(axis=-1).astype(np.float64)
+    collided = np.count_nonzero(counts.contacts, axis=-1)
     metrics = {
-        "steps": np.asarray(steps, np.float64),
-        "reward": np.asarray(reward / robot_steps),
+        "steps": steps,
+        "reward": np.asarray(counts.reward / robot_steps),
         "goals_reached": reached,
         "goals_per_robot_minute": 60 * reached / (robot_steps * dt),
-        "collisions": contacts.sum(axis=-1).astype(np.float64),
-        "margin_violations": violations.sum(axis=-1).astype(np.float64),
+        "collisions": counts.contacts.sum(axis=-1).astype(np.float64),
+        "margin_violations": counts.violations.sum(axis=-1).astype(np.float64),
         "collided": np.asarray(collided, np.float64),
-        "margin_violated": np.asarray(np.count_nonzero(violations, axis=-1), np.float64),
+        "margin_violated": np.asarray(np.count_nonzero(counts.violations, axis=-1), np.float64),
     }
-    if arrival_step is not None:
-        times = np.minimum(arrival_step * dt, elapsed[..., None])
-        metrics |= {
-            "arrived": reached.copy(),
-            "success": ((reached == team_size) & (np.asarray(collided) == 0)).astype(np.float64),
-            "travel_time": times.mean(axis=-1),
-            "makespan": times.max(axis=-1),
-        }
-    return metrics
+    if counts.arrival_step is None:
+        return metrics
+    times = np.minimum(counts.arrival_step * dt, (steps * dt)[..., None])
+    success = ((reached == team_size) & (np.asarray(collided) == 0)).astype(np.float64)
+    arrivals = {"travel_time": times.mean(axis=-1), "makespan": times.max(axis=-1)}
+    return metrics | {"arrived": reached.copy(), "success": success} | arrivals

@@ -19,12 +19,16 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
-from d4orm_env.core.problem import Problem, ProblemArrays
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.robot_model import STANDARD_LIMITS
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.engine.jax import Worlds, advance_worlds, judge
+
+__all__ = ["State", "Step", "reset", "step"]
 
 
 class State(NamedTuple):
@@ -36,9 +40,9 @@ class State(NamedTuple):
         steps: ``()`` int32, steps taken.
     """
 
-    states: Any
-    arrived: Any
-    steps: Any
+    states: jax.Array
+    arrived: jax.Array
+    steps: jax.Array
 
 
 class Step(NamedTuple):
@@ -53,15 +57,15 @@ class Step(NamedTuple):
         controls: ``(K, m)`` as executed.
     """
 
-    rewards: Any
-    arrived: Any
-    collided: Any
-    margin_violated: Any
-    truncated: Any
-    controls: Any
+    rewards: jax.Array
+    arrived: jax.Array
+    collided: jax.Array
+    margin_violated: jax.Array
+    truncated: jax.Array
+    controls: jax.Array
 
 
-def reset(problem: Problem, key: Any) -> State:
+def reset(problem: Problem, key: jax.Array) -> State:
     """The team at its start.
 
     Args:
@@ -76,7 +80,7 @@ def reset(problem: Problem, key: Any) -> State:
     return State(jnp.asarray(problem.start), jnp.zeros(num_robots, bool), jnp.int32(0))
 
 
-def step(problem: Problem, state: State, controls: Any) -> tuple[State, Step]:
+def step(problem: Problem, state: State, controls: ArrayLike) -> tuple[State, Step]:
     """One time step, as every engine takes it.
 
     Args:
@@ -114,25 +118,27 @@ def _arrays(problem: Problem) -> ProblemArrays:
         bounds = jnp.array([[-jnp.inf] * team.dimension, [jnp.inf] * team.dimension], jnp.float32)
     else:
         bounds = jnp.stack([jnp.asarray(world.lower), jnp.asarray(world.upper)])
-    return ProblemArrays(
-        model_codes=None,
-        limits=_limits(team),
-        radius=jnp.asarray(team.radius),
-        start=problem.start,
-        goal=jnp.asarray(problem.goal),
-        inverse_initial_distance=1 / distance,
-        boxes=_rounded_boxes(world),
-        triangles=_triangles(world),
-        index=None,
-        bounds=bounds,
-        time_step=jnp.stack([jnp.asarray(dt / part, jnp.float32) for part in (1, 2, 3, 6)]),
-        margin=jnp.asarray(problem.margin, jnp.float32),
-        squared_goal_radius=jnp.asarray(problem.goal_radius**2, jnp.float32),
-        squared_goal_speed=jnp.asarray(goal_speed**2, jnp.float32),
-    )
+    arrays: dict[str, Any] = {  # traced, which the engine does not mind
+        "model_codes": None,
+        "limits": _limits(team),
+        "radius": jnp.asarray(team.radius),
+        "start": problem.start,
+        "goal": jnp.asarray(problem.goal),
+        "inverse_initial_distance": 1 / distance,
+        "boxes": _rounded_boxes(world),
+        "triangles": _triangles(world),
+        "grid": None,
+        "bounds": bounds,
+        "time_step": jnp.stack([jnp.asarray(dt / part, jnp.float32) for part in (1, 2, 3, 6)]),
+        "margin": jnp.asarray(problem.margin, jnp.float32),
+        "squared_goal_radius": jnp.asarray(problem.goal_radius**2, jnp.float32),
+        "squared_goal_speed": jnp.asarray(goal_speed**2, jnp.float32),
+        "docks": problem.arrival == "dock",
+    }
+    return ProblemArrays(**arrays)
 
 
-def _rounded_boxes(world: World) -> Any:
+def _rounded_boxes(world: World) -> jax.Array:
     """The boxes of :attr:`World.shapes` of a world whose numbers may be traced."""
     d = world.dimension
     balls, cylinders = jnp.asarray(world.balls), jnp.asarray(world.cylinders)
@@ -144,15 +150,14 @@ def _rounded_boxes(world: World) -> Any:
     return jnp.concatenate(rows)
 
 
-def _triangles(world: World) -> Any:
+def _triangles(world: World) -> jax.Array:
     """The triangles of :attr:`World.shapes` of a world whose numbers may be traced."""
     pairs = zip(world.polygons, world.triangles, strict=True)
-    return jnp.concatenate(
-        [jnp.zeros((0, 6)), *(jnp.asarray(corners)[np.array(own)].reshape(-1, 6) for corners, own in pairs)]
-    )
+    corners = [jnp.asarray(polygon)[np.array(own)].reshape(-1, 6) for polygon, own in pairs]
+    return jnp.concatenate([jnp.zeros((0, 6)), *corners])
 
 
-def _limits(team: Team) -> Any:
+def _limits(team: Team) -> jax.Array:
     """:attr:`Team.limits` of a team whose numbers may be traced."""
     columns = [jnp.asarray(getattr(team, name)) for name in STANDARD_LIMITS]
     models = team.robot_models
@@ -165,19 +170,19 @@ def _limits(team: Team) -> Any:
     return jnp.stack(columns, axis=1)
 
 
-_STATIC = {Problem: ("horizon", "name"), Team: ("models",), World: ("dimension", "triangles")}
+_STATIC = {Problem: ("horizon", "arrival", "name"), Team: ("models",), World: ("dimension", "triangles")}
 
 
 def _register(kind: type) -> None:
     static = _STATIC[kind]
     names = tuple(field.name for field in fields(kind) if field.name not in static)
 
-    def flatten(value: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    def flatten(value: object) -> tuple[tuple[object, ...], tuple[object, ...]]:
         return tuple(getattr(value, name) for name in names), tuple(getattr(value, name) for name in static)
 
-    def unflatten(metadata: tuple[Any, ...], children: tuple[Any, ...]) -> Any:
+    def unflatten(metadata: tuple[object, ...], children: tuple[object, ...]) -> object:
         # Not through __init__: tracers cannot be validated, and the problem they stand for has been.
-        value: Any = object.__new__(kind)
+        value: object = object.__new__(kind)
         for name, part in zip((*names, *static), (*children, *metadata), strict=True):
             object.__setattr__(value, name, part)
         return value

@@ -6,24 +6,23 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import FloatArray, as_float32
-from d4orm_env.core.problem import Problem
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.env_inputs import check_options, joint_controls
 from d4orm_env.options import EnvOptions
-from d4orm_env.simulation import (
-    MAX_ACTION,
-    Simulation,
-    TeamStep,
-    agent_infos,
-    check_options,
-    usable,
-)
-from d4orm_env.viewer import RENDER_MODES, Viewer
+from d4orm_env.scenarios.problems import ScenarioLike
+from d4orm_env.shell import EnvironmentShell
+from d4orm_env.simulation import Simulation
+from d4orm_env.team_step import Info, TeamStep, agent_infos
+from d4orm_env.viewer import RENDER_MODES
+
+__all__ = ["JointNavigationEnv", "register_environments"]
 
 ENV_ID = "d4orm/Navigation-v0"
 
 
-class JointNavigationEnv(gymnasium.Env[FloatArray, FloatArray]):
+class JointNavigationEnv(EnvironmentShell, gymnasium.Env[FloatArray, FloatArray]):
     """The joint environment, ``gymnasium.make("d4orm/Navigation-v0", scenario=..., num_robots=...)``.
 
     The observation ``(K * D,)`` is all robots' local observations one after the other, the action ``(K * m,)`` all
@@ -43,28 +42,13 @@ class JointNavigationEnv(gymnasium.Env[FloatArray, FloatArray]):
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012
 
-    def __init__(self, scenario: Any = None, num_robots: int | None = None, **options: Any) -> None:
-        chosen = EnvOptions.of(scenario=scenario, num_robots=num_robots, **options)
-        self.render_mode = chosen.render_mode
-        self._viewer = Viewer(chosen.render_mode)
-        self._simulation = Simulation(chosen)
-        self.metadata = type(self).metadata | {"render_fps": max(1, round(1 / self.problem.dt))}
+    def __init__(self, scenario: ScenarioLike | None = None, num_robots: int | None = None, **options: Any) -> None:
+        self._begin(EnvOptions.of(scenario=scenario, num_robots=num_robots, **options))
         self._agents = [f"robot_{robot}" for robot in range(self.problem.num_robots)]
         self.observation_space, self.action_space = joint_spaces(self._simulation)
+        self._action_shape = (self.problem.num_robots * self.problem.control_size,)
 
-    @property
-    def problem(self) -> Problem:
-        """The problem being run; where every reset draws a new instance, that of the present episode."""
-        return self._simulation.problem
-
-    @property
-    def lifelong(self) -> bool:
-        """Whether robots that arrive get fresh goals instead of docking."""
-        return self._simulation.lifelong
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[FloatArray, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, object] | None = None) -> tuple[FloatArray, Info]:
         """Begin an episode; there are no ``options``.
 
         Returns:
@@ -76,11 +60,10 @@ class JointNavigationEnv(gymnasium.Env[FloatArray, FloatArray]):
         check_options(options)
         super().reset(seed=seed)
         step = self._simulation.reset(self.np_random)
-        if self.render_mode == "human":
-            self.render()
+        self._show()
         return step.observations.ravel(), self._infos(step)
 
-    def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, Info]:
         """Advance one time step under ``action`` ``(K * m,)``.
 
         Returns:
@@ -95,14 +78,13 @@ class JointNavigationEnv(gymnasium.Env[FloatArray, FloatArray]):
         simulation.require_reset()
         if simulation.out_of_time or simulation.arrived.all():
             raise RuntimeError("the episode is over; call reset() to begin another")
-        step = simulation.step(self._controls(action))
+        step = simulation.step(joint_controls(action, self._action_shape, self.problem.num_robots))
         terminated = bool(simulation.arrived.all())
         truncated = simulation.out_of_time and not terminated
-        if self.render_mode == "human":
-            self.render()
+        self._show()
         return step.observations.ravel(), float(step.rewards.mean()), terminated, truncated, self._infos(step)
 
-    def set_state(self, states: Any) -> tuple[FloatArray, dict[str, Any]]:
+    def set_state(self, states: ArrayLike) -> tuple[FloatArray, Info]:
         """Put the robots elsewhere; see :meth:`d4orm_env.navigation_v0.parallel_env.set_state`.
 
         Args:
@@ -118,49 +100,7 @@ class JointNavigationEnv(gymnasium.Env[FloatArray, FloatArray]):
         step = self._simulation.set_state(states)
         return step.observations.ravel(), self._infos(step)
 
-    def state(self) -> FloatArray:
-        """The joint state; see :mod:`d4orm_env.joint_state`.
-
-        Raises:
-            RuntimeError: Before the first reset.
-        """
-        return self._simulation.state()
-
-    def metrics(self) -> dict[str, float]:
-        """The episode so far in numbers; see :meth:`d4orm_env.episode_record.EpisodeRecord.metrics`.
-
-        Raises:
-            RuntimeError: Before the first reset.
-        """
-        return self._simulation.metrics()
-
-    def render(self) -> Any:
-        """``(height, width, 3)`` uint8 frame in mode ``"rgb_array"``, else ``None``."""
-        return self._viewer.render(self._simulation)
-
-    def close(self) -> None:
-        """Close the window or picture, if there is one."""
-        self._viewer.close()
-
-    def _controls(self, action: FloatArray) -> FloatArray:
-        try:
-            controls = as_float32(action)
-        except ValueError as error:
-            raise ValueError(
-                f"action must be an array of {self.action_space.shape} numbers, not {action!r}: {error}"
-            ) from None
-        if controls.shape != self.action_space.shape:
-            raise ValueError(f"action has shape {controls.shape}; expected (K * m,) = {self.action_space.shape}")
-        controls = controls.reshape(self.problem.num_robots, self.problem.control_size)
-        if not usable(controls).all():
-            robot = int(np.argmin(usable(controls).all(axis=1)))
-            raise ValueError(
-                f"action of robot_{robot} is {controls[robot].tolist()}; every value must be finite and at most "
-                f"{MAX_ACTION:g} in magnitude"
-            )
-        return controls
-
-    def _infos(self, step: TeamStep) -> dict[str, Any]:
+    def _infos(self, step: TeamStep) -> Info:
         metrics = self._simulation.metrics()
         return {
             "agents": agent_infos(self._agents, range(len(self._agents)), step),

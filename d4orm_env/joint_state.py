@@ -17,13 +17,18 @@ Together with the problem that is all there is to know about an episode's presen
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_model import ACCELERATION, SPEED
+
+__all__ = ["JointState", "join_state", "split_state"]
+
+Floats = NDArray[np.float64]
 
 
 class JointState(NamedTuple):
@@ -50,7 +55,7 @@ def join_state(joint: JointState) -> FloatArray:
     return np.concatenate([joint.states.ravel(), joint.goals.ravel(), joint.controls.ravel(), flags_and_steps])
 
 
-def split_state(problem: Problem, state: Any) -> JointState:
+def split_state(problem: Problem, state: ArrayLike) -> JointState:
     """Take the vector that ``env.state()`` returned apart.
 
     Args:
@@ -92,9 +97,23 @@ def state_bounds(problem: Problem, places: FloatArray, max_cycles: int) -> tuple
     Returns:
         Lowest and highest joint state vector.
     """
+    low, high = _robot_bounds(problem, places, max_cycles * problem.dt)
+    limits = problem.team.control_limits
+    controls = np.where(limits > 0, limits, 1.0).ravel()
+    lowest = np.concatenate([low.ravel(), np.tile(places[0], problem.num_robots), -controls])
+    highest = np.concatenate([high.ravel(), np.tile(places[1], problem.num_robots), controls])
+    lowest, highest = lowest - 1e-3 * (1 + np.abs(lowest)), highest + 1e-3 * (1 + np.abs(highest))
+    flags = np.ones(problem.num_robots)
+    return (
+        np.concatenate([lowest, 0 * flags, [0]]).astype(np.float32),
+        np.concatenate([highest, flags, [max_cycles]]).astype(np.float32),
+    )
+
+
+def _robot_bounds(problem: Problem, places: FloatArray, duration: float) -> tuple[Floats, Floats]:
+    """``(K, n)`` lowest and highest states within that time [s]."""
     team, dimension = problem.team, problem.dimension
-    duration = max_cycles * problem.dt
-    limits = np.asarray(team.limits, np.float64)
+    limits = team.limits.astype(np.float64)
     speed, acceleration = limits[:, SPEED], limits[:, ACCELERATION]
     # Within a step a robot may exceed the speed limit, which is applied at its end.
     reach = (speed + acceleration * problem.dt / 2) * duration
@@ -110,14 +129,4 @@ def state_bounds(problem: Problem, places: FloatArray, max_cycles: int) -> tuple
     low = -high
     low[:, :dimension] = places[0] - reach[:, None]
     high[:, :dimension] = places[1] + reach[:, None]
-    controls = np.where(team.control_limits > 0, team.control_limits, 1.0)
-    flags, steps = np.ones(problem.num_robots), [max_cycles]
-    goals = np.broadcast_to(places[:, None], (2, problem.num_robots, dimension))
-    slack = 1e-3 * (1 + np.abs(np.concatenate([low.ravel(), goals[0].ravel(), controls.ravel()])))
-    lowest = np.concatenate([low.ravel(), goals[0].ravel(), -controls.ravel()]) - slack
-    slack = 1e-3 * (1 + np.abs(np.concatenate([high.ravel(), goals[1].ravel(), controls.ravel()])))
-    highest = np.concatenate([high.ravel(), goals[1].ravel(), controls.ravel()]) + slack
-    return (
-        np.concatenate([lowest, 0 * flags, [0]]).astype(np.float32),
-        np.concatenate([highest, flags, steps]).astype(np.float32),
-    )
+    return low, high

@@ -12,22 +12,25 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.utils import seeding
+from numpy.typing import ArrayLike
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import OrderEnforcingWrapper
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
 from d4orm_env.core.arrays import FloatArray, as_float32, whole_number
-from d4orm_env.core.problem import Problem
+from d4orm_env.env_inputs import MAX_ACTION, check_options, checked_cycles, usable
 from d4orm_env.options import EnvOptions
-from d4orm_env.simulation import MAX_ACTION, Simulation, TeamStep, agent_infos, check_options, checked_cycles, usable
-from d4orm_env.viewer import RENDER_MODES, Viewer
+from d4orm_env.scenarios.problems import ScenarioLike
+from d4orm_env.shell import EnvironmentShell
+from d4orm_env.team_step import AgentInfos, TeamStep, agent_infos
+from d4orm_env.viewer import RENDER_MODES
 
 __all__ = ["env", "parallel_env", "raw_env"]
 
 _OPTIONS_OF_CONFORMANCE_TESTS = ("options",)  # PettingZoo's API tests send options={"options": 1}
 
 
-class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
+class parallel_env(EnvironmentShell, ParallelEnv[str, FloatArray, FloatArray]):
     """All robots act at once.
 
     Agents are ``robot_0`` .. ``robot_{K-1}``. An agent that arrives is terminated and leaves ``agents``; its body stays
@@ -51,12 +54,8 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
         "is_parallelizable": True,
     }
 
-    def __init__(self, scenario: Any = None, num_robots: int | None = None, **options: Any) -> None:
-        chosen = EnvOptions.of(scenario=scenario, num_robots=num_robots, **options)
-        self.render_mode = chosen.render_mode
-        self._viewer = Viewer(chosen.render_mode)
-        self._simulation = Simulation(chosen)
-        self.metadata = type(self).metadata | {"render_fps": max(1, round(1 / self.problem.dt))}
+    def __init__(self, scenario: ScenarioLike | None = None, num_robots: int | None = None, **options: Any) -> None:
+        self._begin(EnvOptions.of(scenario=scenario, num_robots=num_robots, **options))
         self.possible_agents = [f"robot_{robot}" for robot in range(self.problem.num_robots)]
         self.agents: list[str] = []
         self._robots = {agent: robot for robot, agent in enumerate(self.possible_agents)}
@@ -72,16 +71,6 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
         self.observation_spaces = {agent: box(layout.low, layout.high) for agent in self.possible_agents}
         self.action_spaces = {agent: box(-limit, limit) for agent in self.possible_agents}
         self.state_space = box(*self._simulation.state_bounds)
-
-    @property
-    def problem(self) -> Problem:
-        """The problem being run; where every reset draws a new instance, that of the present episode."""
-        return self._simulation.problem
-
-    @property
-    def lifelong(self) -> bool:
-        """Whether robots that arrive get fresh goals instead of docking."""
-        return self._simulation.lifelong
 
     @property
     def max_cycles(self) -> int:
@@ -112,8 +101,8 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
         return self.action_spaces[agent]
 
     def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, FloatArray], dict[str, dict[str, Any]]]:
+        self, seed: int | None = None, options: dict[str, object] | None = None
+    ) -> tuple[dict[str, FloatArray], AgentInfos]:
         """Begin an episode.
 
         Args:
@@ -131,13 +120,12 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
             self._np_random = seeding.np_random(whole_number(seed, "seed", 0))[0]
         step = self._simulation.reset(self.np_random)
         self.agents = self.possible_agents[:]
-        if self.render_mode == "human":
-            self.render()
+        self._show()
         return dict(zip(self.agents, step.observations)), agent_infos(self.agents, self._robots.values(), step)
 
     def step(
         self, actions: dict[str, FloatArray]
-    ) -> tuple[dict[str, FloatArray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+    ) -> tuple[dict[str, FloatArray], dict[str, float], dict[str, bool], dict[str, bool], AgentInfos]:
         """Advance one time step.
 
         Args:
@@ -160,13 +148,11 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
         controls = np.zeros((len(self.possible_agents), self._control_size), np.float32)
         controls[robots] = self._collect(actions)
         step = simulation.step(controls)
-        observations, rewards, arrived = step.observations, step.rewards.tolist(), step.arrived.tolist()
-        ends = not simulation.lifelong
-        terminations = {agent: ends and arrived[robot] for agent, robot in zip(acting, robots)}
+        observations, rewards, finished = step.observations, step.rewards.tolist(), simulation.finished.tolist()
+        terminations = {agent: finished[robot] for agent, robot in zip(acting, robots)}
         out_of_time = simulation.out_of_time
         self.agents = [] if out_of_time else [agent for agent in acting if not terminations[agent]]
-        if self.render_mode == "human":
-            self.render()
+        self._show()
         return (
             {agent: observations[robot] for agent, robot in zip(acting, robots)},
             {agent: rewards[robot] for agent, robot in zip(acting, robots)},
@@ -175,7 +161,7 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
             agent_infos(acting, robots, step),
         )
 
-    def set_state(self, states: Any) -> tuple[dict[str, FloatArray], dict[str, dict[str, Any]]]:
+    def set_state(self, states: ArrayLike) -> tuple[dict[str, FloatArray], AgentInfos]:
         """Put the robots elsewhere in the middle of an episode, to push one or to replay a log.
 
         Goals, clock, the controls executed last and the metrics so far are kept. A robot that has arrived stays so
@@ -210,30 +196,6 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
         self._simulation.require_reset()
         return self._simulation.last
 
-    def state(self) -> FloatArray:
-        """The joint state, all a planner needs to go on from here; see :mod:`d4orm_env.joint_state`.
-
-        Raises:
-            RuntimeError: Before the first reset.
-        """
-        return self._simulation.state()
-
-    def metrics(self) -> dict[str, float]:
-        """The episode so far in numbers; see :meth:`d4orm_env.episode_record.EpisodeRecord.metrics`.
-
-        Raises:
-            RuntimeError: Before the first reset.
-        """
-        return self._simulation.metrics()
-
-    def render(self) -> Any:
-        """``(height, width, 3)`` uint8 frame in mode ``"rgb_array"``, else ``None``."""
-        return self._viewer.render(self._simulation)
-
-    def close(self) -> None:
-        """Close the window or picture, if there is one."""
-        self._viewer.close()
-
     def _collect(self, actions: dict[str, FloatArray]) -> FloatArray:
         """``(agents, m)`` the actions of the agents still acting, checked."""
         try:
@@ -247,7 +209,7 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
             raise ValueError(f"actions name unknown agents {', '.join(unknown)}; the agents are env.possible_agents")
         return block
 
-    def _complaint(self, actions: Any) -> str:
+    def _complaint(self, actions: object) -> str:
         if not isinstance(actions, Mapping):
             return f"actions must be a dictionary with an action for every agent in env.agents, not {actions!r}"
         for agent in self.agents:
@@ -258,7 +220,7 @@ class parallel_env(ParallelEnv[str, FloatArray, FloatArray]):
                 return complaint
         raise AssertionError("every action is fine")
 
-    def complaint(self, agent: str, action: Any) -> str:
+    def complaint(self, agent: str, action: ArrayLike) -> str:
         """What is wrong with an action of that agent; the empty string if nothing is."""
         shape = (self._control_size,)
         try:
@@ -279,10 +241,10 @@ class _TurnByTurn(parallel_to_aec_wrapper):
     def __init__(self, environment: parallel_env) -> None:
         super().__init__(environment)
         self._observations: dict[str, FloatArray] = {}
-        self.infos: dict[str, dict[str, Any]] = {}
+        self.infos: AgentInfos = {}
         environment.turn_taker = self
 
-    def tell(self, observations: dict[str, FloatArray], infos: dict[str, dict[str, Any]]) -> None:
+    def tell(self, observations: dict[str, FloatArray], infos: AgentInfos) -> None:
         """Show agents the world as it is now, before all have chosen."""
         self._observations = {**self._observations, **observations}
         self.infos = {**self.infos, **infos}

@@ -7,11 +7,15 @@ from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import Any
 
+from numpy.typing import ArrayLike
+
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.core.problem import Problem
 from d4orm_env.rewards import RewardFunction
-from d4orm_env.scenarios.registry import make_problem, unknown_argument
+from d4orm_env.scenarios.problems import ScenarioLike, find_scenario, make_problem, unknown_argument
+
+__all__ = ["EnvOptions"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,7 +34,7 @@ class EnvOptions:
             ``arrived`` at that step, and ``distance_to_goal`` is to the new goal.
         max_cycles: Steps until truncation; the problem's horizon unless given.
         randomize_instance: Draw a new instance of the scenario at every reset. By default wherever the scenario draws
-            at random, that is, where seeds 0 and 1 give different problems; ``False`` keeps the one of ``seed=``.
+            at random, that is, where another seed gives another problem; ``False`` keeps the one of ``seed=``.
         reward: ``"paper"``, ``"training"`` (:class:`~d4orm_env.rewards.TrainingReward`), or a function from a
             :class:`~d4orm_env.rewards.RewardInput` to the rewards ``(..., K)`` of all robots.
         observed_robots: Nearest robots in an observation; missing ones are marked absent.
@@ -38,11 +42,11 @@ class EnvOptions:
         scenario_settings: Arguments of the scenario, such as ``model`` or ``seed``: all other keyword arguments.
     """
 
-    scenario: Any = None
+    scenario: ScenarioLike | None = None
     num_robots: int | None = None
     problem: Problem | None = None
     render_mode: str | None = None
-    control_noise_std: Any = 0.0
+    control_noise_std: ArrayLike = 0.0
     lifelong: bool = False
     max_cycles: int | None = None
     randomize_instance: bool | None = None
@@ -81,8 +85,13 @@ class EnvOptions:
             raise ValueError(f"problem= excludes the scenario arguments ({', '.join(named)}); give one or the other")
 
     @property
-    def _scenario(self) -> Any:
+    def _scenario(self) -> ScenarioLike:
         return "circle" if self.scenario is None else self.scenario
+
+    @property
+    def vouched(self) -> bool:
+        """Whether the scenario is known to draw instances that differ in places and obstacles only."""
+        return self.problem is None and find_scenario(self._scenario).draws
 
     def instances(self) -> tuple[Problem, Callable[[int], Problem] | None]:
         """The problem to begin with, and ``seed -> Problem`` for drawing others; ``None`` where there is only one.
@@ -98,8 +107,7 @@ class EnvOptions:
         if self.randomize_instance is False:
             return first, None
         draw = partial(_draw, self._scenario, settings)
-        zeroth = draw(0) if self.scenario_settings.get("seed") else first
-        if draw(1) != zeroth:
+        if self.vouched or draw(0 if self.scenario_settings.get("seed") else 1) != first:
             return first, draw
         if self.randomize_instance:
             raise ValueError(
@@ -109,5 +117,5 @@ class EnvOptions:
         return first, None
 
 
-def _draw(scenario: Any, settings: Mapping[str, Any], seed: int) -> Problem:
+def _draw(scenario: ScenarioLike, settings: Mapping[str, Any], seed: int) -> Problem:
     return make_problem(scenario, **(dict(settings) | {"seed": seed}))

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, shown
 from d4orm_env.core.team import Team
+
+__all__ = ["RewardFunction", "RewardInput", "TrainingReward"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -72,7 +74,7 @@ class RewardInput:
         return self.states[..., : self.goals.shape[-1]]
 
 
-RewardFunction = Callable[[RewardInput], Any]
+RewardFunction = Callable[[RewardInput], ArrayLike]
 """``(step) -> (..., K)`` rewards of all robots."""
 
 
@@ -100,7 +102,7 @@ class TrainingReward:
 
     def __call__(self, step: RewardInput) -> FloatArray:
         """``(..., K)``."""
-        longest = np.asarray(step.team.max_speed) * step.dt
+        longest = step.team.max_speed * step.dt
         rewards: FloatArray = (
             self.progress * (step.previous_distances - step.distances) / longest
             + self.arrival * step.arrived
@@ -115,7 +117,7 @@ REWARDS: Mapping[str, RewardFunction | None] = MappingProxyType({"paper": None, 
 """Rewards by name; ``None`` is what the engines compute themselves."""
 
 
-def find_reward(reward: Any) -> RewardFunction | None:
+def find_reward(reward: str | RewardFunction) -> RewardFunction | None:
     """The function behind ``reward=``; ``None`` for the paper's.
 
     Raises:

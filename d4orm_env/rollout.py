@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from numpy.typing import ArrayLike
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
+
+__all__ = ["rollout"]
 
 
-def rollout(problem: Problem, controls: Any, engine: str = "auto") -> Trajectory:
+def rollout(problem: Problem, controls: ArrayLike, engine: str = "auto") -> Trajectory:
     """The motion of the team under ``controls``, clipped to the robots' limits.
 
     Args:

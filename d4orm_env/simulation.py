@@ -8,47 +8,26 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
-from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, as_float32, frozen_array, whole_number
-from d4orm_env.core.observation import ObservationLayout
-from d4orm_env.core.problem import Problem, inverse_initial_distance
-from d4orm_env.engine.base import StepResult
+from d4orm_env.core.arrays import BoolArray, FloatArray, frozen_array, whole_number
+from d4orm_env.core.observation_layout import ObservationLayout
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_arrays import inverse_initial_distance
+from d4orm_env.engine.base import StepResult, WorldEngine
+from d4orm_env.env_inputs import checked_cycles, checked_states, noise_std
 from d4orm_env.episode_record import EpisodeRecord
 from d4orm_env.joint_state import JointState, join_state, state_bounds
 from d4orm_env.lifelong import fresh_goal, goal_region, reached_goals
 from d4orm_env.options import EnvOptions
 from d4orm_env.rewards import RewardFunction, RewardInput, compute_rewards, find_reward
+from d4orm_env.team_step import TeamStep
 
-MAX_ACTION = 1e15
-"""Largest magnitude of an action. float32 still holds the square of more, but no control of a robot is near it: an
-action so far outside its space is refused like one that is not finite, and less is clipped to the robot's limits."""
-MAX_CYCLES = 10**9
-MAX_OBSERVED = 10_000
+_MAX_OBSERVED = 10_000
 _OPEN_WORLD_EXTENT = 1000.0
 _TRAIL_LENGTH = 50
-
-
-class TeamStep(NamedTuple):
-    """What a step or a reset tells about the team; every array is the caller's to keep.
-
-    Attributes:
-        observations: ``(K, D)`` local observations.
-        rewards: ``(K,)``; zero at a reset.
-        arrived: ``(K,)`` bool: docked, or in lifelong mode, reached a goal in this step.
-        collided: ``(K,)`` bool, hard contact.
-        margin_violated: ``(K,)`` bool.
-        distances: ``(K,)`` to the present goals [m].
-    """
-
-    observations: FloatArray
-    rewards: FloatArray
-    arrived: BoolArray
-    collided: BoolArray
-    margin_violated: BoolArray
-    distances: FloatArray
 
 
 class Simulation:
@@ -63,6 +42,7 @@ class Simulation:
 
     def __init__(self, options: EnvOptions) -> None:
         problem, self._redraw = options.instances()
+        self.vouched = options.vouched
         self.problem = problem
         self.max_cycles = checked_cycles(problem.horizon if options.max_cycles is None else options.max_cycles)
         self.noise_std = noise_std(options.control_noise_std, problem.control_size)
@@ -70,13 +50,13 @@ class Simulation:
         self.reward = find_reward(options.reward)
         self.layout = ObservationLayout.for_problem(
             problem,
-            num_neighbors=whole_number(options.observed_robots, "observed_robots", 0, MAX_OBSERVED),
-            num_obstacles=whole_number(options.observed_obstacles, "observed_obstacles", 0, MAX_OBSERVED),
+            num_neighbors=whole_number(options.observed_robots, "observed_robots", 0, _MAX_OBSERVED),
+            num_obstacles=whole_number(options.observed_obstacles, "observed_obstacles", 0, _MAX_OBSERVED),
         )
         # Here, because importing the compiler takes longer than importing all the rest of the package.
         from d4orm_env.engine.cpu import CpuEngine
 
-        self._engine = CpuEngine()
+        self._engine: WorldEngine = CpuEngine()
         self._dimension = problem.dimension
         self._places = goal_region(problem)
         if self.redraws and problem.world.lower is None:
@@ -85,7 +65,7 @@ class Simulation:
             self._places = np.array([[-extent], [extent]], np.float32).repeat(problem.dimension, axis=1)
         self._running = False
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: dict[str, object]) -> None:
         # NumPy unpickles read-only arrays as writable ones, for which the engine would have to compile anew.
         self.__dict__ |= state
         low, high = (frozen_array(bound, "bounds", (None,)) for bound in (self.layout.low, self.layout.high))
@@ -192,7 +172,7 @@ class Simulation:
         self.record.add(rewards, arrived, result.collided, result.margin_violated)
         return self._report(rewards, arrived, result.margin_violated)
 
-    def set_state(self, states: Any) -> TeamStep:
+    def set_state(self, states: ArrayLike) -> TeamStep:
         """Put the robots elsewhere in the middle of an episode; all else stays as it is.
 
         Goals, clock, the controls executed last and the metrics so far are kept. A robot that has docked stays docked
@@ -208,7 +188,7 @@ class Simulation:
         """
         self.require_reset()
         shape = self.problem.start.shape
-        self.states = checked_states(self.problem, states, self.arrived, self.state_bounds, shape)
+        self.states = checked_states(self.problem, states, self.arrived & self.problem.docks, self.state_bounds, shape)
         self.collided, margin_violated = self._engine.contacts(self.arrays, self.states)
         self._trail.append(self.states[:, : self._dimension])
         return self._report(np.zeros(len(self.states), np.float32), self.arrived.copy(), margin_violated)
@@ -223,6 +203,13 @@ class Simulation:
         self.require_reset()
         return self.record.metrics()
 
+    @property
+    def finished(self) -> BoolArray:
+        """``(K,)`` robots that are done: those that have docked or, where nobody docks, all once all are there."""
+        if self.lifelong:
+            return np.zeros_like(self.arrived)
+        return self.arrived if self.problem.docks else self.arrived & self.arrived.all()
+
     def _rewards(self, reward: RewardFunction, result: StepResult, arrived: BoolArray) -> FloatArray:
         """``(K,)`` of the step from the present states to ``result``."""
         step = RewardInput(
@@ -232,7 +219,7 @@ class Simulation:
             goals=self.arrays.goal,
             previous_distances=self._distances(self.states),
             distances=self._distances(result.states),
-            initial_distances=1 / self.arrays.inverse_initial_distance,
+            initial_distances=np.float32(1) / self.arrays.inverse_initial_distance,
             previously_arrived=self.arrived,
             arrived=arrived,
             collided=result.collided,
@@ -258,7 +245,7 @@ class Simulation:
         self.last = TeamStep(observations, rewards, arrived, self.collided, margin_violated, distances)
         return self.last
 
-    def _assign_goals(self, robots: Any) -> None:
+    def _assign_goals(self, robots: NDArray[np.intp]) -> None:
         if not len(robots):
             return
         problem, positions = self.problem, self.states[:, : self._dimension]
@@ -273,100 +260,3 @@ class Simulation:
         goals.setflags(write=False)
         inverse_initial_distance.setflags(write=False)
         self.arrays = self.arrays._replace(goal=goals, inverse_initial_distance=inverse_initial_distance)
-
-
-def checked_cycles(value: Any) -> int:
-    """``max_cycles`` as an int."""
-    return whole_number(value, "max_cycles", 1, MAX_CYCLES)
-
-
-def checked_states(
-    problem: Problem, states: Any, docked: BoolArray, bounds: tuple[FloatArray, FloatArray], shape: tuple[int, ...]
-) -> FloatArray:
-    """``states`` as an array of that shape, ``(..., K, n)``, as robots may be put into.
-
-    Args:
-        problem: The problem.
-        states: What was given.
-        docked: ``(..., K)`` bool.
-        bounds: Lowest and highest joint state; see :func:`d4orm_env.joint_state.state_bounds`.
-        shape: The shape expected.
-
-    Raises:
-        ValueError: If a state is none that a robot may be in; the message names the robot.
-    """
-    array = frozen_array(states, "states", shape, largest=LARGEST)
-    low, high = (bound[: problem.start.size].reshape(problem.start.shape) for bound in bounds)
-    for team, parked in zip(array.reshape(-1, *problem.start.shape), docked.reshape(-1, problem.num_robots)):
-        problem.check_states(team, "state")
-        outside = ((team < low) | (team > high)).any(axis=1)
-        if outside.any():
-            robot = int(np.argmax(outside))
-            raise ValueError(
-                f"state of robot_{robot} is {team[robot].tolist()}, outside the state space; move it inside"
-            )
-        for robot in np.flatnonzero(parked).tolist():
-            if team[robot, list(problem.team.robot_models[robot].speed_indices)].any():
-                raise ValueError(f"state of robot_{robot} is moving, but the robot has docked; set its speed to zero")
-    return array
-
-
-def usable(actions: FloatArray) -> BoolArray:
-    """Where actions are finite, and at most :data:`MAX_ACTION` in magnitude."""
-    within: BoolArray = np.abs(actions) <= MAX_ACTION
-    return within
-
-
-def check_options(options: Any, known: tuple[str, ...] = (), ignored: tuple[str, ...] = ()) -> None:
-    """Refuse what ``reset`` would otherwise ignore.
-
-    Raises:
-        TypeError: If ``options`` is no dictionary.
-        ValueError: For an option that is neither in ``known`` nor in ``ignored``.
-    """
-    if options is None:
-        return
-    if not isinstance(options, dict):
-        raise TypeError(f"options must be a dictionary or None, not {options!r}")
-    for name in options:
-        if name not in known + ignored:
-            raise ValueError(
-                f"reset takes no option {name!r}; it takes {', '.join(known) or 'none'}, and what is to differ between "
-                "environments goes to their constructors"
-            )
-
-
-def noise_std(value: Any, control_size: int) -> FloatArray | None:
-    """``(m,)`` standard deviations from one number or one per component; ``None`` where all are zero.
-
-    Raises:
-        ValueError: If it has another shape, or a value is negative, not finite or above 1e6.
-    """
-    try:
-        std = as_float32(value)
-    except ValueError:
-        raise ValueError(f"control_noise_std must be a number or one per control component, not {value!r}") from None
-    if std.shape not in ((), (control_size,)):
-        raise ValueError(
-            f"control_noise_std has shape {std.shape}; give one number, or {control_size}, one per control component"
-        )
-    if not np.isfinite(std).all() or (std < 0).any():
-        raise ValueError(f"control_noise_std is {std.tolist()}; it must be zero or more and finite")
-    if (std > LARGEST).any():
-        raise ValueError(f"control_noise_std is {std.tolist()}; it must be at most {LARGEST:g}")
-    return np.broadcast_to(std, (control_size,)).copy() if std.any() else None
-
-
-def agent_infos(names: Any, robots: Any, step: TeamStep) -> dict[str, dict[str, Any]]:
-    """Fresh info dictionaries of some robots, in plain Python values."""
-    arrived, collided = step.arrived.tolist(), step.collided.tolist()
-    margin_violated, distances = step.margin_violated.tolist(), step.distances.tolist()
-    return {
-        name: {
-            "arrived": arrived[robot],
-            "collided": collided[robot],
-            "margin_violated": margin_violated[robot],
-            "distance_to_goal": distances[robot],
-        }
-        for name, robot in zip(names, robots)
-    }

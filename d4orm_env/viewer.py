@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, TypeAlias
 
 import gymnasium
+import numpy as np
+from numpy.typing import NDArray
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.simulation import Simulation
+
+if TYPE_CHECKING:
+    from d4orm_env.render.frames import FrameRenderer, WindowRenderer
+
+Frame: TypeAlias = NDArray[np.uint8]
+"""``(height, width, 3)``."""
 
 RENDER_MODES = ("human", "rgb_array")
 
@@ -26,20 +34,20 @@ class Viewer:
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise ValueError(f"render_mode is {render_mode!r}; choose one of {', '.join(RENDER_MODES)}, or None")
         self._mode = render_mode
-        self._renderer: Any = None
+        self._renderer: FrameRenderer | WindowRenderer | None = None
         self._problem: Problem | None = None
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         # Figures and windows are neither copied nor sent to other processes; a copy opens its own.
         return self.__dict__ | {"_renderer": None, "_problem": None}
 
-    def render(self, simulation: Simulation) -> Any:
+    def render(self, simulation: Simulation) -> Frame | None:
         """``(height, width, 3)`` uint8 frame in mode ``"rgb_array"``, else ``None``."""
         if self._mode is None:
             gymnasium.logger.warn("render() was called without a render mode; give render_mode= when making the env.")
             return None
         simulation.require_reset()
-        if self._problem is not simulation.problem:
+        if self._renderer is None or self._problem is not simulation.problem:
             self.close()
             self._renderer, self._problem = self._open(simulation.problem), simulation.problem
         frame = self._renderer.draw(
@@ -57,7 +65,7 @@ class Viewer:
             self._renderer.close()
         self._renderer = self._problem = None
 
-    def _open(self, problem: Problem) -> Any:
+    def _open(self, problem: Problem) -> FrameRenderer | WindowRenderer:
         from d4orm_env.render import frames
 
         return frames.FrameRenderer(problem) if self._mode == "rgb_array" else frames.WindowRenderer(problem)

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pettingzoo import ParallelEnv
 from pettingzoo.utils.wrappers import BaseParallelWrapper
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.seeds import Stream, generator
-from d4orm_env.simulation import noise_std
+from d4orm_env.env_inputs import noise_std
+from d4orm_env.team_step import AgentInfos
+
+__all__ = ["GaussianControlNoise"]
 
 
 class GaussianControlNoise(BaseParallelWrapper[str, FloatArray, FloatArray]):
@@ -29,7 +32,7 @@ class GaussianControlNoise(BaseParallelWrapper[str, FloatArray, FloatArray]):
         ValueError: If ``std`` has another shape, or a value is negative or not finite, or the agents' actions differ.
     """
 
-    def __init__(self, env: ParallelEnv[str, FloatArray, FloatArray], std: Any) -> None:
+    def __init__(self, env: ParallelEnv[str, FloatArray, FloatArray], std: ArrayLike) -> None:
         super().__init__(env)
         shapes = {env.action_space(agent).shape for agent in env.possible_agents}
         shape = shapes.pop()
@@ -40,8 +43,8 @@ class GaussianControlNoise(BaseParallelWrapper[str, FloatArray, FloatArray]):
         self._random = np.random.default_rng()
 
     def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, FloatArray], dict[str, dict[str, Any]]]:
+        self, seed: int | None = None, options: dict[str, object] | None = None
+    ) -> tuple[dict[str, FloatArray], AgentInfos]:
         """Reset the environment, and with a seed the noise too; without one the noise goes on."""
         if seed is not None:
             self._random = generator(seed, Stream.CONTROL_NOISE)
@@ -49,7 +52,7 @@ class GaussianControlNoise(BaseParallelWrapper[str, FloatArray, FloatArray]):
 
     def step(
         self, actions: dict[str, FloatArray]
-    ) -> tuple[dict[str, FloatArray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+    ) -> tuple[dict[str, FloatArray], dict[str, float], dict[str, bool], dict[str, bool], AgentInfos]:
         """Step the environment with disturbed actions."""
         if self._std is None or not isinstance(actions, Mapping):  # what is no dictionary is refused further in
             return super().step(actions)
@@ -61,6 +64,6 @@ class GaussianControlNoise(BaseParallelWrapper[str, FloatArray, FloatArray]):
         }
         return super().step({**actions, **disturbed})
 
-    def _disturb(self, action: Any, noise: FloatArray) -> Any:
+    def _disturb(self, action: FloatArray, noise: FloatArray) -> FloatArray:
         # What is not a control of this shape goes on as it is, for the environment to refuse by name.
         return action + noise if np.shape(action) == self._shape else action

@@ -6,13 +6,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from d4orm_planners.base import Iteration, Planner, PlannerConfig, Search
     from d4orm_planners.episode import Episode, run_episode
-    from d4orm_planners.evaluation.harness import evaluate
+    from d4orm_planners.evaluation.evaluate import evaluate
     from d4orm_planners.names import register_planner, register_policy
-    from d4orm_planners.plan import IterationRecord, Plan
+    from d4orm_planners.plan import IterationRecord, Plan, load_plan
+    from d4orm_planners.planner import Iteration, Planner, PlannerConfig
     from d4orm_planners.policy import OpenLoop, Policy
     from d4orm_planners.registry import list_planners, list_policies, make_planner, make_policy
+    from d4orm_planners.search import Search
 
 __all__ = [
     "Episode",
@@ -27,6 +28,7 @@ __all__ = [
     "evaluate",
     "list_planners",
     "list_policies",
+    "load_plan",
     "make_planner",
     "make_policy",
     "register_planner",
@@ -35,13 +37,14 @@ __all__ = [
 ]
 
 _HOMES = {
-    "base": ("Iteration", "Planner", "PlannerConfig", "Search"),
     "episode": ("Episode", "run_episode"),
-    "evaluation.harness": ("evaluate",),
+    "evaluation.evaluate": ("evaluate",),
     "names": ("register_planner", "register_policy"),
-    "plan": ("IterationRecord", "Plan"),
+    "plan": ("IterationRecord", "Plan", "load_plan"),
+    "planner": ("Iteration", "Planner", "PlannerConfig"),
     "policy": ("OpenLoop", "Policy"),
     "registry": ("list_planners", "list_policies", "make_planner", "make_policy"),
+    "search": ("Search",),
 }
 
 

@@ -8,12 +8,18 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_planners.policy import Actions, Policy
+from d4orm_planners.policy import Actions, Observations, Policy
+
+if TYPE_CHECKING:
+    from pettingzoo import ParallelEnv
+
+__all__ = ["SharedPolicy", "from_rllib", "from_sb3", "from_torchrl"]
 
 
 class SharedPolicy(Policy):
@@ -25,14 +31,14 @@ class SharedPolicy(Policy):
         normalized: Whether actions are in ``[-1, 1]``, which stand for the lowest and the highest of the environment.
     """
 
-    def __init__(self, predict: Callable[[FloatArray], Any], weights: Any, normalized: bool = False) -> None:
+    def __init__(self, predict: Callable[[FloatArray], ArrayLike], weights: Any, normalized: bool = False) -> None:
         self._predict, self._weights, self._normalized = predict, weights, normalized
 
-    def reset(self, env: Any, seed: int = 0) -> None:
+    def reset(self, env: ParallelEnv, seed: int = 0) -> None:
         super().reset(env, seed)
         self._spaces = {agent: env.action_space(agent) for agent in env.possible_agents}
 
-    def act(self, observations: dict[str, Any], state: Any) -> Actions:
+    def act(self, observations: Observations, state: FloatArray) -> Actions:
         if not observations:
             return {}
         stacked = np.stack([np.asarray(observation, np.float32) for observation in observations.values()])
@@ -43,7 +49,7 @@ class SharedPolicy(Policy):
             actions = low + (np.clip(actions, -1, 1) + 1) / 2 * (high - low)
         return dict(zip(observations, actions))
 
-    def identity(self) -> dict[str, Any]:
+    def identity(self) -> dict[str, object]:
         digest = hashlib.sha256()
         for name, tensor in self._weights.state_dict().items():
             digest.update(name.encode())
@@ -82,11 +88,11 @@ def from_rllib(module: Any, normalized: bool = True) -> SharedPolicy:
     return SharedPolicy(partial(_ask_rllib, module), module, normalized)
 
 
-def _ask_sb3(model: Any, deterministic: bool, observations: FloatArray) -> Any:
+def _ask_sb3(model: Any, deterministic: bool, observations: FloatArray) -> ArrayLike:
     return model.predict(observations, deterministic=deterministic)[0]
 
 
-def _ask_torchrl(module: Any, observation_key: Any, action_key: Any, observations: FloatArray) -> Any:
+def _ask_torchrl(module: Any, observation_key: Any, action_key: Any, observations: FloatArray) -> ArrayLike:
     import torch
     from tensordict import TensorDict
     from tensordict.nn import InteractionType, set_interaction_type
@@ -96,7 +102,7 @@ def _ask_torchrl(module: Any, observation_key: Any, action_key: Any, observation
         return module(asked)[action_key].cpu().numpy()
 
 
-def _ask_rllib(module: Any, observations: FloatArray) -> Any:
+def _ask_rllib(module: Any, observations: FloatArray) -> ArrayLike:
     import torch
 
     with torch.no_grad():

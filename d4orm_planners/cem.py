@@ -9,16 +9,17 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.engine.base import SamplingRules
-from d4orm_planners.base import Search
-from d4orm_planners.sampling.optimizer import PAPER, SamplingConfig, SamplingPlanner
+from d4orm_planners.sampling.optimizer import SamplingPlanner
 from d4orm_planners.sampling.schedule import constant
+from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, SamplingConfig
 from d4orm_planners.sampling.weights import EliteWeights
+from d4orm_planners.search import Search
 from d4orm_planners.settings import Positive, Share
 
 
 @dataclass(frozen=True, kw_only=True)
-class CEMConfig(SamplingConfig):
-    """Settings of the cross-entropy method; temperature and betas do not apply.
+class CEMConfig(ContinuationSettings, SamplingConfig):
+    """Settings of the cross-entropy method.
 
     Attributes:
         elite_fraction: Share of samples that are averaged.
@@ -50,7 +51,8 @@ class CEM(SamplingPlanner):
 
     name: ClassVar[str] = "cem"
     config_class = CEMConfig
-    presets: ClassVar[dict[str, dict[str, Any]]] = {"paper": PAPER}
+    presets: ClassVar = {"paper": PAPER}
+    config: CEMConfig
 
     def noise_scale(self) -> FloatArray:
         """See :meth:`SamplingPlanner.noise_scale`."""
@@ -64,5 +66,5 @@ class CEM(SamplingPlanner):
 
     def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
         """See :meth:`SamplingPlanner.initial`."""
-        base = self.base(search)
+        base = self.config.continued(search.current)
         return base, np.zeros_like(base)

@@ -15,18 +15,27 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from d4orm_planners.commands.evaluate import evaluate, leaderboard
-from d4orm_planners.commands.inputs import (
-    MOST_SEEDS,
-    check_target,
-    find_here,
-    make_folder,
-    names,
-    numbers,
-    parse_settings,
-    refuse_options,
-)
+from d4orm_planners.commands.bench import bench
+from d4orm_planners.commands.evaluate import evaluate
+from d4orm_planners.commands.inputs import check_target, make_folder, parse_settings, refuse_options
+from d4orm_planners.commands.leaderboard import leaderboard
 from d4orm_planners.commands.node import node
+from d4orm_planners.commands.options import (
+    Engine,
+    MaxIterations,
+    Model,
+    Obstacles,
+    PlannerName,
+    Preset,
+    Quiet,
+    Robots,
+    Scenario,
+    ScenarioSettings,
+    Seed,
+    Settings,
+    TimeLimit,
+)
+from d4orm_planners.commands.outputs import draw, episode_rows, print_plan, print_table, require_solved
 from d4orm_planners.commands.reproduce import reproduce
 from d4orm_planners.commands.robustness import robustness
 from d4orm_planners.commands.train import train
@@ -45,7 +54,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-for command in (evaluate, leaderboard, node, reproduce, robustness, train):
+for command in (bench, evaluate, leaderboard, node, reproduce, robustness, train):
     app.command()(command)
 
 
@@ -67,31 +76,6 @@ def options(
         typer.echo(context.get_help())
 
 
-Scenario = Annotated[
-    str,
-    typer.Option(
-        "--scenario", "-s", help="Scenario name (see `d4orm scenarios`), a YAML file or package.module:function."
-    ),
-]
-Robots = Annotated[int | None, typer.Option("--robots", "-k", help="Number of robots; the scenario's own by default.")]
-Model = Annotated[str | None, typer.Option("--model", "-m", help="Robot model; the scenario's own by default.")]
-Obstacles = Annotated[int | None, typer.Option("--obstacles", help="Random obstacles to add.")]
-ScenarioSettings = Annotated[
-    list[str] | None,
-    typer.Option("--scenario-set", help="An argument of the scenario, as diameter=8; repeatable."),
-]
-Seed = Annotated[int, typer.Option("--seed", help="Seed of the scenario and of the planner.")]
-PlannerName = Annotated[
-    str, typer.Option("--planner", "-p", help="Planner (see `d4orm planners`), or package.module:Name.")
-]
-Preset = Annotated[str | None, typer.Option("--preset", help="`paper` for the paper's parameters.")]
-Settings = Annotated[list[str] | None, typer.Option("--set", help="A planner setting, as num_samples=512; repeatable.")]
-Engine = Annotated[str, typer.Option("--engine", help="auto, cpu or jax.")]
-TimeLimit = Annotated[float | None, typer.Option("--time-limit", help="Seconds for planning.")]
-MaxIterations = Annotated[int | None, typer.Option("--max-iterations", help="Iterations for planning.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no tables.")]
-
-
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")] = Path("demo"),
@@ -105,8 +89,8 @@ def demo(
     make_folder(out)
     problem = _problem("circle", robots, None, None, None, seed)
     plan = _solve(problem, "d4orm", {"engine": engine}, seed, None, None, quiet=False)
-    _print_plan(plan)
-    _require_solved(plan)
+    print_plan(plan)
+    require_solved(plan)
     episode = _execute(plan, seed)
     files = {"plan": out / "plan.npz", "picture": out / "plan.png", "animation": out / "execution.gif"}
     plan.save(files["plan"])
@@ -146,18 +130,17 @@ def plan_command(
     for name in {"engine", "preset", "max_iterations"}.intersection(chosen):
         refuse_options(context, (name,), f"and --set {name} say the same; give one of them")
     chosen = {"engine": engine, "preset": preset, **chosen}
-    find_here([planner])
     problem = _problem(scenario, robots, model, obstacles, scenario_settings, seed)
     plan = _solve(problem, planner, chosen, seed, time_limit, max_iterations, quiet)
     if not quiet:
-        _print_plan(plan)
+        print_plan(plan)
     if out is not None:
         plan.save(out)
-    _draw(problem, plan.trajectory, picture, animation)
+    draw(problem, plan.trajectory, picture, animation)
     for path in (out, picture, animation):
         if path is not None and not quiet:
             typer.echo(f"wrote {path}")
-    _require_solved(plan)
+    require_solved(plan)
 
 
 @app.command()
@@ -197,61 +180,21 @@ def run(
         problem: Problem = plan.problem
         actor: Policy = OpenLoop(plan=plan)
     else:
-        find_here([policy])
         problem, actor = _problem(scenario, robots, model, obstacles, scenario_settings, seed), make_policy(policy)
     env = navigation_v0.parallel_env(problem=problem, control_noise_std=noise)
     episode = run_episode(env, actor, seed=seed)
     env.close()
-    _draw(problem, episode.trajectory, picture, animation)
+    draw(problem, episode.trajectory, picture, animation)
     if not quiet:
-        _print_table("Execution", _episode_rows(episode.metrics))
+        print_table("Execution", episode_rows(episode.metrics))
     if not episode.metrics["success"]:
         raise typer.Exit(1)
 
 
 @app.command()
-def bench(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write bench.json and bench.md to.")] = Path(
-        "bench"
-    ),
-    quick: Annotated[bool, typer.Option("--quick", help="Small sizes and few repetitions, about a minute.")] = False,
-    robots: Annotated[str | None, typer.Option("--robots", "-k", help="Team sizes, as 4,8,16.")] = None,
-    models: Annotated[str | None, typer.Option("--models", help="Robot models, separated by commas.")] = None,
-    engines: Annotated[str | None, typer.Option("--engines", help="Of cpu, jax and plain, with commas.")] = None,
-    seeds: Annotated[
-        int | None, typer.Option("--seeds", max=MOST_SEEDS, help="Seeds for the first feasible plan.")
-    ] = None,
-    quiet: Quiet = False,
-) -> None:
-    """Measure the engines, the environments and the planner on this machine."""
-    from datetime import UTC, datetime
-
-    from d4orm_planners.evaluation.benchmark import QUICK, BenchmarkSettings, parts, run_parts
-    from d4orm_planners.evaluation.live import PartsProgress
-    from d4orm_planners.evaluation.report import write_report
-    from d4orm_planners.evaluation.timing import describe_machine
-
-    given: dict[str, Any] = {
-        "robots": numbers("--robots", robots),
-        "models": names(models),
-        "engines": names(engines),
-    }
-    chosen = {name: value for name, value in {**given, "seeds": seeds}.items() if value is not None}
-    settings = BenchmarkSettings(**{**(QUICK if quick else {}), **chosen})
-    make_folder(out)
-    machine, date = describe_machine(), datetime.now(UTC).isoformat(timespec="seconds")
-    with PartsProgress(enabled=not quiet) as progress:
-        results = run_parts(list(parts(settings)), progress.update)
-    command = " ".join(["d4orm", *sys.argv[1:]])
-    for path in write_report(out, settings, machine, command, date, results):
-        if not quiet:
-            typer.echo(f"wrote {path}")
-
-
-@app.command()
 def warmup(quiet: Quiet = False) -> None:
     """Compile ahead what planning and the environments need, so that the next start is quick."""
-    from d4orm_planners.evaluation.warmup import warm_up
+    from d4orm_planners.commands.warmup import warm_up
 
     report = warm_up()
     if not quiet:
@@ -275,17 +218,23 @@ def scenarios() -> None:
         except ValueError as error:  # an installed package offers it and cannot be imported
             return str(error)
 
-    _print_table("Scenarios", [(name, described(name)) for name in list_scenarios()])
+    print_table("Scenarios", [(name, described(name)) for name in list_scenarios()])
 
 
 @app.command()
-def planners() -> None:
-    """List the planners and policies."""
+def planners(
+    name: Annotated[str | None, typer.Argument(help="List the settings of this one, with their defaults.")] = None,
+) -> None:
+    """List the planners and policies, or what --set can set of one."""
     from d4orm_planners.names import PLANNERS, POLICIES
-    from d4orm_planners.registry import describe_planner, describe_policy
+    from d4orm_planners.registry import default_settings, describe_planner, describe_policy
 
+    if name is not None:
+        settings = default_settings(name).items()
+        print_table(name, [(setting, str(value)) for setting, value in settings] or [("no settings", "")])
+        return
     for title, table, describe in (("Planners", PLANNERS, describe_planner), ("Policies", POLICIES, describe_policy)):
-        _print_table(title, [(name, _or_error(describe, name)) for name in table])
+        print_table(title, [(name, _or_error(describe, name)) for name in table])
 
 
 def _or_error(describe: Callable[[str], str], name: str) -> str:
@@ -305,7 +254,7 @@ def _problem(
     seed: int,
 ) -> Problem:
     from d4orm_env.scenarios import load_problem, make_problem
-    from d4orm_env.scenarios.registry import is_scenario_file
+    from d4orm_env.scenarios.problems import is_scenario_file
 
     if is_scenario_file(scenario):
         given = {"--robots": robots, "--model": model, "--obstacles": obstacles, "--scenario-set": settings}
@@ -335,19 +284,17 @@ def _solve(
     max_iterations: int | None,
     quiet: bool,
 ) -> Plan:
-    from d4orm_env.engine.base import get_engine
-    from d4orm_planners.evaluation.warmup import compile_for_planning
-    from d4orm_planners.progress import SolveProgress
+    from d4orm_env.engine.choice import get_engine
+    from d4orm_planners.commands.progress import solve_progress
+    from d4orm_planners.commands.warmup import compile_for_planning
     from d4orm_planners.registry import make_planner
 
     chosen = make_planner(planner, **settings)
     if get_engine(chosen.config.engine).name == "cpu":
         compile_for_planning(problem.team.models, lambda: typer.echo("compiling, once per installation ...", err=True))
     limit = max_iterations if max_iterations is not None else chosen.config.max_iterations
-    with SolveProgress(planner, problem.num_robots, limit, enabled=not quiet) as progress:
-        return chosen.solve(
-            problem, seed=seed, time_limit=time_limit, max_iterations=max_iterations, callback=progress.update
-        )
+    with solve_progress(planner, problem.num_robots, limit, enabled=not quiet) as progress:
+        return chosen.solve(problem, seed=seed, time_limit=time_limit, max_iterations=max_iterations, callback=progress)
 
 
 def _execute(plan: Plan, seed: int) -> Any:
@@ -360,65 +307,12 @@ def _execute(plan: Plan, seed: int) -> Any:
     env.close()
     report = verify(plan.problem, plan.controls)
     rows = [
-        *_episode_rows(episode.metrics),
+        *episode_rows(episode.metrics),
         ("verified", "yes" if report.ok else "no: " + "; ".join(str(violation) for violation in report.violations[:3])),
         ("closest approach", f"{report.min_separation * 100:.1f} cm between surfaces"),
     ]
-    _print_table("Executed in the environment", rows)
+    print_table("Executed in the environment", rows)
     return episode
-
-
-def _episode_rows(metrics: dict[str, float]) -> list[tuple[str, str]]:
-    return [
-        ("success", "yes" if metrics["success"] else "no"),
-        ("arrived", f"{metrics['arrived']:.0f}"),
-        ("robots in contact", f"{metrics['collided']:.0f}"),
-        ("travel time", f"{metrics['travel_time']:.2f} s"),
-        ("makespan", f"{metrics['makespan']:.2f} s"),
-    ]
-
-
-def _print_plan(plan: Plan) -> None:
-    metrics = plan.metrics
-    rows = [
-        ("solved", "yes" if plan.solved else f"no ({plan.status})"),
-        ("planning time", f"{plan.wall_time:.2f} s"),
-        ("iterations", f"{plan.iterations}"),
-        ("travel time", f"{metrics['travel_time']:.2f} s"),
-        ("makespan", f"{metrics['makespan']:.2f} s"),
-        ("reward", f"{metrics['reward']:.3f}"),
-    ]
-    if not plan.solved:
-        rows.append(("not arrived", f"{plan.problem.num_robots - metrics['arrived']:.0f}"))
-        rows.append(("too close", f"{metrics['margin_violated']:.0f}"))
-    _print_table(f"Plan by {plan.planner}, {plan.problem.num_robots} robots", rows)
-
-
-def _print_table(title: str, rows: list[tuple[str, str]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=title, title_justify="left", show_header=False)
-    for row in rows:
-        table.add_row(*row)
-    Console().print(table)
-
-
-def _draw(problem: Problem, trajectory: Any, picture: Path | None, animation: Path | None) -> None:
-    from d4orm_env.render import save_animation, save_picture
-
-    if picture is not None:
-        save_picture(problem, trajectory, picture)
-    if animation is not None:
-        save_animation(problem, trajectory, animation)
-
-
-def _require_solved(plan: Plan) -> None:
-    if not plan.solved:
-        typer.echo(f"no solution found ({plan.status.replace('_', ' ')} after {plan.iterations} iterations)", err=True)
-        for robot, reason in plan.failures.items():
-            typer.echo(f"  {robot} {reason}", err=True)
-        raise typer.Exit(1)
 
 
 def main(arguments: list[str] | None = None) -> None:

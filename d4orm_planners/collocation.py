@@ -7,15 +7,17 @@ Programming, 2006.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from d4orm_env.core.arrays import IntArray
 from d4orm_env.core.collision import axis_gap
-from d4orm_env.core.problem import Problem, inverse_initial_distance
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_arrays import inverse_initial_distance
 from d4orm_env.core.robot_model import SPEED, Ops
 from d4orm_env.core.transition import TimeStep
 from d4orm_planners.abandoning import run_or_abandon
@@ -32,6 +34,11 @@ ABANDONED = "Abandoned_At_Time_Limit"
 TINY = 1e-9
 """Added to squared distances, since the square root has no derivative at zero [m^2]."""
 
+IPOPT = {"print_level": 0, "sb": "yes", "constr_viol_tol": FEASIBILITY}
+CASADI = {"print_time": False, "show_eval_warnings": False}
+"""Options of every solve."""
+
+Options = Mapping[str, object]
 Floats = NDArray[np.float64]
 Contacts = dict[tuple[int, int], NDArray[np.int64]]
 """Steps at which robot ``k`` is kept clear of body ``b``: robot ``b``, or from ``K`` on obstacle ``b - K``."""
@@ -83,7 +90,7 @@ class TeamProgram:
         ]
 
     def solve(
-        self, guess: Motion, contacts: Contacts, docks: Any, options: dict[str, Any], should_stop: Callable[[], bool]
+        self, guess: Motion, contacts: Contacts, docks: IntArray, options: Options, should_stop: Callable[[], bool]
     ) -> tuple[Motion, str]:
         """Solve from a guess.
 
@@ -111,30 +118,29 @@ class TeamProgram:
         return motion, ABANDONED if ended is None else ended
 
     def _run_ipopt(
-        self, guess: Motion, contacts: Contacts, docks: Any, options: dict[str, Any], keep: Callable[[Any], None],
+        self,
+        guess: Motion,
+        contacts: Contacts,
+        docks: IntArray,
+        options: Options,
+        keep: Callable[[Any], None],
         ends: Callable[[], bool],
-    ) -> str:  # fmt: skip
+    ) -> str:
         """Hand IPOPT's variables to ``keep`` after every iteration and at the end; return how it ended."""
         ca = self.casadi
         rows = [*self._motion_rows(), *self._goal_rows(docks), *self._contact_rows(contacts, docks)]
-        sizes = [row.numel() for row, _, _ in rows]
         program = {
             "x": ca.vertcat(*map(ca.vec, chain(self.states, self.controls))),
             "f": self._cost(),
             "g": ca.vertcat(*(ca.vec(row) for row, _, _ in rows)),
         }
-        options = {"print_level": 0, "sb": "yes", "constr_viol_tol": FEASIBILITY, **options}
+        sizes = [row.numel() for row, _, _ in rows]
+        lower, upper = (np.repeat([row[bound] for row in rows], sizes) for bound in (1, 2))
         lowest, highest = self._variable_bounds()
         stopper = _stopper(ca, {name: part.numel() for name, part in program.items()}, keep, ends)
-        settings = {"print_time": False, "show_eval_warnings": False, "iteration_callback": stopper}
-        solver = ca.nlpsol("team", "ipopt", program, {"ipopt": options, **settings})
-        solution = solver(
-            x0=self._packed(guess),
-            lbx=lowest,
-            ubx=highest,
-            lbg=np.repeat([lower for _, lower, _ in rows], sizes),
-            ubg=np.repeat([upper for _, _, upper in rows], sizes),
-        )
+        settings = {"ipopt": {**IPOPT, **options}, **CASADI, "iteration_callback": stopper}
+        solver = ca.nlpsol("team", "ipopt", program, settings)
+        solution = solver(x0=self._packed(guess), lbx=lowest, ubx=highest, lbg=lower, ubg=upper)
         keep(solution["x"])
         return str(solver.stats()["return_status"])
 
@@ -187,6 +193,19 @@ class TeamProgram:
             yield lambda p, c=centre, r=radius, n=axes: self._norm(p[:n, :] - ca.repmat(ca.DM(c), 1, p.shape[1])) - r
         for box in world.boxes.astype(float):
             yield lambda p, low=box[:dimension], high=box[dimension:]: self._box_gap(p, low, high)
+        for corners in world.shapes.triangles.astype(float).reshape(-1, 3, 2):
+            yield lambda p, corners=corners: self._triangle_gap(p, corners)
+
+    def _triangle_gap(self, points: Any, corners: Floats) -> Any:
+        ca = self.casadi
+        deepest, nearest = [], []
+        for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            along, offset = end - begin, points - ca.repmat(ca.DM(begin), 1, points.shape[1])
+            share = ca.fmin(ca.fmax((along[0] * offset[0, :] + along[1] * offset[1, :]) / (along @ along), 0.0), 1.0)
+            nearest.append(self._norm(offset - ca.DM(along) @ share))
+            deepest.append((along[1] * offset[0, :] - along[0] * offset[1, :]) / np.hypot(*along))
+        depth = ca.fmax(ca.fmax(*deepest[:2]), deepest[2])
+        return ca.if_else(depth < 0, depth, ca.fmin(ca.fmin(*nearest[:2]), nearest[2]))
 
     def _box_gap(self, points: Any, lower: Floats, upper: Floats) -> Any:
         ca = self.casadi
@@ -240,7 +259,7 @@ class TeamProgram:
             components = [index for index, own in enumerate(model.control_limits) if own == column]
             yield self.controls[robot], components, float(limits[column])
 
-    def _goal_rows(self, docks: Any) -> Iterator[Rows]:
+    def _goal_rows(self, docks: IntArray) -> Iterator[Rows]:
         """At the step at which a robot docks it is within the goal radius, and no faster than docking allows."""
         problem = self.problem
         radius = problem.goal_radius - min(self.clearance, problem.goal_radius / 2)
@@ -253,7 +272,7 @@ class TeamProgram:
                 velocity = self.models[robot].functions.velocity(x, u, limits, self.ops)
                 yield sum(part**2 for part in velocity), -np.inf, problem.goal_speed**2
 
-    def _contact_rows(self, contacts: Contacts, docks: Any) -> Iterator[Rows]:
+    def _contact_rows(self, contacts: Contacts, docks: IntArray) -> Iterator[Rows]:
         for (robot, body), steps in contacts.items():
             pair = [robot] if body >= self.problem.num_robots else [robot, body]
             # Once all have docked nothing changes any more.

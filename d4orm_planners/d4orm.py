@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_planners.base import Search
-from d4orm_planners.sampling.optimizer import PAPER, Credit, SamplingConfig, SamplingPlanner, standard_normal
-from d4orm_planners.sampling.schedule import alpha_bar, annealed
+from d4orm_planners.sampling.optimizer import DenoisingPlanner, standard_normal
+from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, Credit, DenoisingConfig
+from d4orm_planners.search import Search
 from d4orm_planners.settings import Samples, Share, ShareOrNone, Steps
 
 
 @dataclass(frozen=True, kw_only=True)
-class D4ormConfig(SamplingConfig):
+class D4ormConfig(ContinuationSettings, DenoisingConfig):
     """Settings of D4orm. The defaults find a first solution soonest; the preset ``"paper"`` has the paper's.
 
     Attributes:
@@ -40,18 +40,13 @@ class D4ormConfig(SamplingConfig):
     random_start: bool = False
 
 
-class D4orm(SamplingPlanner):
+class D4orm(DenoisingPlanner):
     """Iterative deformation: denoise a change of the team's controls and add it to them, until everyone passes."""
 
     name: ClassVar[str] = "d4orm"
     config_class = D4ormConfig
-    presets: ClassVar[dict[str, dict[str, Any]]] = {
-        "paper": {**PAPER, "credit": "team", "late_samples": 1.0, "random_start": False}
-    }
-
-    def noise_scale(self) -> FloatArray:
-        """See :meth:`SamplingPlanner.noise_scale`."""
-        return annealed(self.config.num_steps, self.config.beta_start, self.config.beta_end)
+    presets: ClassVar = {"paper": {**PAPER, "credit": "team", "late_samples": 1.0, "random_start": False}}
+    config: D4ormConfig
 
     def stages(self, search: Search) -> list[tuple[FloatArray, int]]:
         """See :meth:`SamplingPlanner.stages`."""
@@ -65,7 +60,7 @@ class D4orm(SamplingPlanner):
 
     def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
         """See :meth:`SamplingPlanner.initial`."""
-        base = self.base(search)
+        base = self.config.continued(search.current)
         return base, self.start(search, base)
 
     def start(self, search: Search, base: FloatArray, number: int = 0) -> FloatArray:
@@ -75,5 +70,4 @@ class D4orm(SamplingPlanner):
         """
         if not self.config.random_start:
             return np.zeros_like(base)
-        final = alpha_bar(self.config.num_steps, self.config.beta_start, self.config.beta_end)[-1]
-        return standard_normal(search, base.shape, number) / np.float32(np.sqrt(final))
+        return self.first_mean(standard_normal(search, base.shape, number))

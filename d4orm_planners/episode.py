@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_planners.registry import PolicyLike, make_policy
+
+if TYPE_CHECKING:
+    from pettingzoo import ParallelEnv
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +32,11 @@ class Episode:
 
     trajectory: Trajectory
     metrics: dict[str, float]
-    observations: tuple[dict[str, Any], ...]
+    observations: tuple[dict[str, FloatArray], ...]
     infos: tuple[dict[str, dict[str, Any]], ...]
 
 
-def run_episode(env: Any, policy: PolicyLike, seed: int = 0) -> Episode:
+def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0) -> Episode:
     """Reset ``env``, reset ``policy``, and step until no agent is left.
 
     Args:
@@ -76,7 +79,7 @@ class _Outcome(NamedTuple):
     margin_violated: BoolArray
 
 
-def _outcome(env: Any, rewards: dict[str, float]) -> _Outcome:
+def _outcome(env: ParallelEnv, rewards: dict[str, float]) -> _Outcome:
     """What the last step did to all robots, those that have left and may be run into included."""
     step = env.unwrapped.last_step
     outcome = _Outcome(step.rewards.copy(), step.collided, step.margin_violated)

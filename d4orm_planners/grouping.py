@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
 
 Groups = tuple[tuple[int, ...], ...]
 
 
-def conflicts(positions: FloatArray, radius: Any, margin: float) -> BoolArray:
+def conflicts(positions: FloatArray, radius: ArrayLike, margin: float) -> BoolArray:
     """Which robots come within the margin of each other at any step.
 
     Args:

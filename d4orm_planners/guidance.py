@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 
@@ -57,7 +56,7 @@ def passes_checks(trajectory: Trajectory, interval: int) -> bool:
     return arrives and not trajectory.margin_violated[interval::interval].any()
 
 
-def nearest_indices(path: FloatArray, positions: FloatArray, last: Any, window: int) -> Any:
+def nearest_indices(path: FloatArray, positions: FloatArray, last: IntArray, window: int) -> IntArray:
     """Where on its path every robot is: the index of its nearest waypoint.
 
     Args:
@@ -74,7 +73,7 @@ def nearest_indices(path: FloatArray, positions: FloatArray, last: Any, window: 
     return index[:, 0] + ((ahead - positions[:, None]) ** 2).sum(axis=2).argmin(axis=1)
 
 
-def subgoal_indices(indices: Any, mean: int, offset: int, lag: int, last: int) -> Any:
+def subgoal_indices(indices: IntArray, mean: int, offset: int, lag: int, last: int) -> IntArray:
     """The waypoint that every robot heads for (paper, Algorithm 4, line 7).
 
     The paper's is the same for all robots: the mean of their indices and an offset. A robot that was held up would then
@@ -93,7 +92,7 @@ def subgoal_indices(indices: Any, mean: int, offset: int, lag: int, last: int) -
     return np.minimum(np.minimum(mean, indices + lag) + offset, last)
 
 
-def rest_of(guidance: Guidance, index: int, factor: int) -> tuple[Problem, Any]:
+def rest_of(guidance: Guidance, index: int, factor: int) -> tuple[Problem, FloatArray]:
     """The coarse problem that is left from a waypoint on, and the controls of the coarse plan for it."""
     step = min(-(-index // factor), len(guidance.controls) - 1)
     coarse = guidance.problem

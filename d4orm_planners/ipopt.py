@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field
 
 from d4orm_env.core.seeds import Stream
-from d4orm_planners.base import Candidate, Iteration, Planner, PlannerConfig, Search, evaluate_controls
+from d4orm_planners.candidate import Candidate, evaluate_controls
 from d4orm_planners.collocation import Contacts, Motion, TeamProgram, load_casadi
+from d4orm_planners.planner import Iteration, Planner, PlannerConfig
+from d4orm_planners.search import Search
 from d4orm_planners.settings import Count, NotNegative, Positive
 from d4orm_planners.steering import prepare_drives, straight_drives
 
@@ -57,6 +59,19 @@ class IpoptConfig(PlannerConfig):
     solver_iterations: SolverIterations = 1000
 
 
+@dataclass(frozen=True, eq=False)
+class WarmStart:
+    """The state of a solve, which stays as it is.
+
+    Attributes:
+        program: The problem as IPOPT is given it.
+        motion: What every iteration perturbs.
+    """
+
+    program: TeamProgram
+    motion: Motion
+
+
 class Ipopt(Planner):
     """Direct collocation of the whole team, solved by IPOPT: without collisions first, then, perturbed, with them.
 
@@ -69,24 +84,27 @@ class Ipopt(Planner):
 
     name: ClassVar[str] = "ipopt"
     config_class = IpoptConfig
-    presets: ClassVar[dict[str, dict[str, Any]]] = {"paper": {"lookout": None, "rounds": 1}}
+    presets: ClassVar = {"paper": {"lookout": None, "rounds": 1}}
     config: IpoptConfig
 
     def __init__(self, config: IpoptConfig) -> None:
         super().__init__(config)
         load_casadi()
 
-    def iterate(self, search: Search) -> Iteration:
+    def init(self, search: Search) -> WarmStart:
+        """See :meth:`Planner.init`."""
+        program = TeamProgram(search.problem, self.config.clearance)
+        return WarmStart(program, self._warm_start(search, program))
+
+    def iterate(self, search: Search, state: WarmStart) -> tuple[WarmStart, Iteration]:
         """See :meth:`Planner.iterate`: one perturbed restart."""
-        config, problem = self.config, search.problem
-        if search.iteration == 0:
-            search.memory["program"] = TeamProgram(problem, config.clearance)
-            search.memory["warm_start"] = self._warm_start(search)
-        program: TeamProgram = search.memory["program"]
         if search.should_stop():
-            warm_start: Motion = search.memory["warm_start"]
-            return Iteration(warm_start.controls.astype(np.float32), 0, note=OUT_OF_TIME)
-        motion = self._perturbed(search)
+            return state, Iteration(state.motion.controls.astype(np.float32), note=OUT_OF_TIME)
+        return state, self._restart(search, state)
+
+    def _restart(self, search: Search, state: WarmStart) -> Iteration:
+        config, problem, program = self.config, search.problem, state.program
+        motion = self._perturbed(search, state.motion)
         contacts = program.contacts(motion, config.lookout)
         docks = np.full(problem.num_robots, problem.horizon)
         best, note, options = None, "", self._options()
@@ -106,13 +124,13 @@ class Ipopt(Planner):
                 break
             options["mu_init"] = min(NEARLY_SOLVED, config.barrier)
         assert best is not None
-        return Iteration(best.controls, 0, note=note)
+        return Iteration(best.controls, note=note)
 
-    def _options(self) -> dict[str, Any]:
+    def _options(self) -> dict[str, object]:
         config = self.config
         return {"tol": config.tolerance, "max_iter": config.solver_iterations, "mu_init": config.barrier}
 
-    def _warm_start(self, search: Search) -> Motion:
+    def _warm_start(self, search: Search, program: TeamProgram) -> Motion:
         """The controls that the search was given, or else the solution of the program without collisions."""
         if search.current.controls.any():
             return _motion(search.current)
@@ -121,12 +139,10 @@ class Ipopt(Planner):
             prepare_drives(problem)
         straight = evaluate_controls(search.engine, problem, straight_drives(problem).controls[:, :, 0])
         docks = np.full(problem.num_robots, problem.horizon)
-        program: TeamProgram = search.memory["program"]
         return program.solve(_motion(straight), {}, docks, self._options(), search.should_stop)[0]
 
-    def _perturbed(self, search: Search) -> Motion:
+    def _perturbed(self, search: Search, warm_start: Motion) -> Motion:
         random = np.random.default_rng(search.iteration_seed(Stream.PERTURBATION))
-        warm_start: Motion = search.memory["warm_start"]
         return Motion(*(part + self.config.perturbation * random.standard_normal(part.shape) for part in warm_start))
 
 

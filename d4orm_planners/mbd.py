@@ -3,30 +3,35 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_planners.base import Search
-from d4orm_planners.sampling.optimizer import PAPER, SamplingConfig, SamplingPlanner, standard_normal
-from d4orm_planners.sampling.schedule import alpha_bar, annealed
+from d4orm_planners.sampling.optimizer import DenoisingPlanner, standard_normal
+from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, DenoisingConfig
+from d4orm_planners.search import Search
 from d4orm_planners.settings import Count, Steps
 
 
-class _DirectDenoising(SamplingPlanner):
-    """Denoising of the controls themselves, not of a deformation."""
+@dataclass(frozen=True, kw_only=True)
+class MBDConfig(DenoisingConfig):
+    """Settings of model-based diffusion: one run of many steps."""
 
-    config_class = SamplingConfig
+    num_steps: Steps = 10_000
+    max_iterations: Count = 1
 
-    def noise_scale(self) -> FloatArray:
-        """See :meth:`SamplingPlanner.noise_scale`."""
-        return annealed(self.config.num_steps, self.config.beta_start, self.config.beta_end)
+
+class MBD(DenoisingPlanner):
+    """Model-based diffusion: one denoising run of the controls, from pure noise (paper, Algorithm 1)."""
+
+    name: ClassVar[str] = "mbd"
+    config_class: ClassVar[type[DenoisingConfig]] = MBDConfig
+    presets: ClassVar = {"paper": {**PAPER, "num_steps": 10_000}}
 
     def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
-        """See :meth:`SamplingPlanner.initial`."""
-        final = alpha_bar(self.config.num_steps, self.config.beta_start, self.config.beta_end)[-1]
-        return np.zeros_like(search.current.controls), self.noisy_controls(search) / np.float32(np.sqrt(final))
+        """See :meth:`SamplingPlanner.initial`: the controls themselves are denoised, not a deformation."""
+        return np.zeros_like(search.current.controls), self.first_mean(self.noisy_controls(search))
 
     def noisy_controls(self, search: Search) -> FloatArray:
         """``U_N`` of this iteration, ``(H, K, m)``."""
@@ -34,27 +39,18 @@ class _DirectDenoising(SamplingPlanner):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MBDConfig(SamplingConfig):
-    """Settings of model-based diffusion: one run of many steps."""
-
-    num_steps: Steps = 10_000
-    max_iterations: Count = 1
+class IterativeMBDConfig(ContinuationSettings, DenoisingConfig):
+    """Settings of i-MBD."""
 
 
-class MBD(_DirectDenoising):
-    """Model-based diffusion: one denoising run of the controls, from pure noise (paper, Algorithm 1)."""
-
-    name: ClassVar[str] = "mbd"
-    config_class = MBDConfig
-    presets: ClassVar[dict[str, dict[str, Any]]] = {"paper": {**PAPER, "num_steps": 10_000}}
-
-
-class IterativeMBD(_DirectDenoising):
+class IterativeMBD(MBD):
     """i-MBD: model-based diffusion restarted from its last result as if that were noise (paper, section IV-A)."""
 
     name: ClassVar[str] = "i-mbd"
-    presets: ClassVar[dict[str, dict[str, Any]]] = {"paper": PAPER}
+    config_class = IterativeMBDConfig
+    presets: ClassVar = {"paper": PAPER}
+    config: IterativeMBDConfig
 
     def noisy_controls(self, search: Search) -> FloatArray:
         """The last result, or noise in the first iteration."""
-        return self.base(search) if search.iteration else super().noisy_controls(search)
+        return self.config.continued(search.current) if search.iteration else super().noisy_controls(search)

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.engine.base import SamplingRules
-from d4orm_planners.base import Search
-from d4orm_planners.sampling.optimizer import PAPER, SamplingConfig, SamplingPlanner
+from d4orm_planners.sampling.optimizer import SamplingPlanner
 from d4orm_planners.sampling.schedule import constant
+from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, SamplingConfig, SoftmaxSettings
+from d4orm_planners.search import Search
 from d4orm_planners.settings import Positive, ShareOrNone
 
 
 @dataclass(frozen=True, kw_only=True)
-class MPPIConfig(SamplingConfig):
-    """Settings of MPPI; the betas do not apply.
+class MPPIConfig(SoftmaxSettings, ContinuationSettings, SamplingConfig):
+    """Settings of MPPI.
 
     Attributes:
         sigma: Standard deviation of the samples, the same at every step.
@@ -38,11 +39,12 @@ class MPPI(SamplingPlanner):
 
     name: ClassVar[str] = "mppi"
     config_class = MPPIConfig
-    presets: ClassVar[dict[str, dict[str, Any]]] = {"paper": PAPER}
+    presets: ClassVar = {"paper": PAPER}
+    config: MPPIConfig
 
     def rules(self) -> SamplingRules:
         """See :meth:`SamplingPlanner.rules`."""
-        return super().rules()._replace(importance=self.config.importance)
+        return SamplingRules(self.config.weights, importance=self.config.importance)
 
     def noise_scale(self) -> FloatArray:
         """See :meth:`SamplingPlanner.noise_scale`."""
@@ -50,5 +52,5 @@ class MPPI(SamplingPlanner):
 
     def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
         """See :meth:`SamplingPlanner.initial`."""
-        base = self.base(search)
+        base = self.config.continued(search.current)
         return base, np.zeros_like(base)

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -20,6 +21,9 @@ from d4orm_env.joint_state import JointState
 from d4orm_planners.policy import StatePolicy
 from d4orm_planners.settings import CheckedSettings, NotNegative, Positive, Whole
 from d4orm_planners.steering import preferred_velocities, track_velocities
+
+if TYPE_CHECKING:
+    from pettingzoo import ParallelEnv
 
 CORNERS = 16
 """Of the polygons that stand for round obstacles and docked robots."""
@@ -69,7 +73,7 @@ class Orca(StatePolicy):
         self.config = config or OrcaConfig()
         self._rvo = _load_pyrvo()
 
-    def _begin(self, env: Any, seed: int) -> None:
+    def _begin(self, env: ParallelEnv, seed: int) -> None:
         problem = self.problem
         if problem.dimension != 2:
             raise ValueError(
@@ -93,7 +97,8 @@ class Orca(StatePolicy):
         simulator.set_time_step(problem.dt)
         clearance = problem.margin if config.clearance is None else config.clearance
         radius, max_speed = np.asarray(problem.team.radius), np.asarray(problem.team.max_speed)
-        moving = np.flatnonzero(~joint.arrived)
+        stands = joint.arrived & problem.docks
+        moving = np.flatnonzero(~stands)
         velocities = _velocities(problem, joint)
         for robot in moving:
             simulator.add_agent(
@@ -106,7 +111,7 @@ class Orca(StatePolicy):
                 float(max_speed[robot]),
                 velocities[robot].tolist(),
             )
-        docked = [_disc(joint.states[k, 0], joint.states[k, 1], radius[k]) for k in np.flatnonzero(joint.arrived)]
+        docked = [_disc(joint.states[k, 0], joint.states[k, 1], radius[k]) for k in np.flatnonzero(stands)]
         for corners in [*self._walls, *docked]:
             simulator.add_obstacle(corners.tolist())
         simulator.process_obstacles()
@@ -119,7 +124,7 @@ class Orca(StatePolicy):
         return avoiding
 
 
-def _load_pyrvo() -> Any:
+def _load_pyrvo() -> ModuleType:
     try:
         import pyrvo
     except ImportError as error:
@@ -144,8 +149,12 @@ def _walls(problem: Problem) -> Iterator[FloatArray]:
         yield _disc(*circle)
     for box in problem.world.boxes:
         yield _rectangle(*box)
+    for corners, triangles in zip(problem.world.polygons, problem.world.triangles, strict=True):
+        # The triangles are counter-clockwise, and one that has an edge of the outline shows which way round it goes.
+        forward = any((b - a) % len(corners) == 1 for t in triangles for a, b in zip(t, (*t[1:], t[0]), strict=True))
+        yield corners if forward else corners[::-1]
     if problem.world.lower is not None:
-        yield _rectangle(*problem.world.lower, *problem.world.upper)[::-1]
+        yield _rectangle(*problem.world.bounds.ravel())[::-1]
 
 
 def _rectangle(left: float, bottom: float, right: float, top: float) -> FloatArray:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from d4orm_env.rollout import rollout
 from d4orm_env.scenarios.schema import describe, parse
 from d4orm_env.verify import verify
 from d4orm_planners.grouping import conflicts
+
+Status = Literal["solved", "iteration_limit", "time_limit", "stopped", "interrupted", "refuted"]
+"""How a search ended; see :class:`Plan`."""
 
 FORMAT = "d4orm-plan-1"
 
@@ -76,8 +79,9 @@ class Plan:
         seed: The seed.
         controls: ``(H, K, m)`` inside the limits, zero once docked.
         solved: Whether everyone arrives, the margin is kept at every step, and :func:`d4orm_env.verify` found no fault.
-        status: ``"solved"``, ``"iteration_limit"``, ``"time_limit"``, ``"stopped"`` (by the callback) or
-            ``"interrupted"``; ``"refuted"`` for one from a file that says ``"solved"`` and is not.
+        status: How the search ended. ``"solved"``: with a solution. ``"iteration_limit"`` or ``"time_limit"``: with the
+            budget, so without a solution unless it was to be improved. ``"stopped"`` (by the callback) or
+            ``"interrupted"``: with whatever it had. ``"refuted"``: a file says ``"solved"``, and it is not.
         iterations: Iterations done.
         denoising_steps: Sample-score-update steps done.
         wall_time: Seconds, first-call compilation excluded.
@@ -86,6 +90,9 @@ class Plan:
         metrics: See :func:`d4orm_env.core.metrics.trajectory_metrics`. ``d-d4orm`` adds ``"messages"`` and
             ``"message_bytes"`` that its nodes sent, each to all others, and ``"waiting_share"``, the share of their
             time that they waited for each other.
+
+    Raises:
+        ValueError: If the status is none of these, or ``"solved"`` and the plan is not, or ``"refuted"`` and it is.
     """
 
     planner: str
@@ -93,13 +100,19 @@ class Plan:
     seed: int
     controls: FloatArray
     solved: bool
-    status: str
+    status: Status
     iterations: int
     denoising_steps: int
     wall_time: float
     history: tuple[IterationRecord, ...]
     trajectory: Trajectory
     metrics: dict[str, float]
+
+    def __post_init__(self) -> None:
+        if self.status not in get_args(Status):
+            raise ValueError(f"status {self.status!r} is unknown; it must be one of {', '.join(get_args(Status))}")
+        if self.solved != {"solved": True, "refuted": False}.get(self.status, self.solved):
+            raise ValueError(f"status is {self.status!r} and solved is {self.solved}; one of them must be wrong")
 
     @cached_property
     def verified(self) -> bool:
@@ -180,11 +193,16 @@ class Plan:
         """The plan of a file, with what is true of its controls."""
         actual = rollout(problem, claimed.controls, engine="cpu")
         trajectory = claimed if _agree(claimed, actual) else actual
-        scalars["metrics"] |= trajectory_metrics(problem, trajectory)
-        plan = cls(problem=problem, history=history, trajectory=trajectory, controls=trajectory.controls, **scalars)
-        solved = not failed_robots(trajectory).any() and plan.verified
-        refuted = plan.status == "solved" and not solved
-        return replace(plan, solved=solved, status="refuted" if refuted else plan.status)
+        solved = not failed_robots(trajectory).any() and verify(problem, trajectory.controls).ok
+        if scalars["status"] in ("solved", "refuted"):
+            scalars["status"] = "solved" if solved else "refuted"
+        scalars |= {"solved": solved, "metrics": scalars["metrics"] | trajectory_metrics(problem, trajectory)}
+        return cls(problem=problem, history=history, trajectory=trajectory, controls=trajectory.controls, **scalars)
+
+
+def load_plan(path: str | os.PathLike[str]) -> Plan:
+    """:meth:`Plan.load`, beside :func:`d4orm_env.load_problem`."""
+    return Plan.load(path)
 
 
 def failed_robots(trajectory: Trajectory) -> BoolArray:

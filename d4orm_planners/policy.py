@@ -5,9 +5,8 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import asdict
 from functools import partial
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -15,12 +14,17 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.joint_state import JointState, split_state
-from d4orm_planners.base import Planner
 from d4orm_planners.plan import Plan
+from d4orm_planners.planner import Planner
 from d4orm_planners.settings import CheckedSettings
 from d4orm_planners.steering import drive_to_goal
 
+if TYPE_CHECKING:
+    from pettingzoo import ParallelEnv
+
+Observations = dict[str, FloatArray]
 Actions = dict[str, FloatArray]
+"""By agent."""
 
 
 class Policy(ABC):
@@ -37,7 +41,7 @@ class Policy(ABC):
     config_class: ClassVar[type[CheckedSettings] | None] = None
     problem: Problem
 
-    def reset(self, env: Any, seed: int = 0) -> None:
+    def reset(self, env: ParallelEnv, seed: int = 0) -> None:
         """Get ready for an episode that ``env.reset()`` has begun.
 
         Args:
@@ -47,7 +51,7 @@ class Policy(ABC):
         self.problem = env.unwrapped.problem
 
     @abstractmethod
-    def act(self, observations: dict[str, Any], state: Any) -> Actions:
+    def act(self, observations: Observations, state: FloatArray) -> Actions:
         """Controls for the agents in ``observations``.
 
         Args:
@@ -61,39 +65,39 @@ class Policy(ABC):
             RuntimeError: Before the first reset, if the policy needs one.
         """
 
-    def identity(self) -> dict[str, Any]:
+    def identity(self) -> dict[str, object]:
         """What a store of trials tells this instance from others of its class by, as JSON has it.
 
         By default the settings in ``config``, if it has any, else its attributes that are numbers or text.
         """
         config = getattr(self, "config", None)
-        return asdict(config) if isinstance(config, CheckedSettings) else plain_attributes(self)
+        return config.keywords() if isinstance(config, CheckedSettings) else plain_attributes(self)
 
 
-def plain_attributes(thing: Any) -> dict[str, Any]:
+def plain_attributes(thing: object) -> dict[str, object]:
     """Attributes of an object that are numbers, truth values or text."""
     if isinstance(thing, partial):
         return {str(name): value for name, value in (*enumerate(thing.args), *thing.keywords.items()) if _plain(value)}
     return {name: value for name, value in getattr(thing, "__dict__", {}).items() if _plain(value)}
 
 
-def _plain(value: Any) -> bool:
+def _plain(value: object) -> bool:
     return isinstance(value, bool | int | float | str)
 
 
 class StatePolicy(Policy):
     """A policy that goes by the joint state: a subclass says what the whole team does, by :meth:`_controls`."""
 
-    def reset(self, env: Any, seed: int = 0) -> None:
+    def reset(self, env: ParallelEnv, seed: int = 0) -> None:
         super().reset(env, seed)
         self._begin(env, seed)
 
-    def act(self, observations: dict[str, Any], state: Any) -> Actions:
+    def act(self, observations: Observations, state: FloatArray) -> Actions:
         require_reset(self)
         controls = self._controls(split_state(self.problem, state))
         return {agent: controls[robot] for agent, robot in zip(observations, robot_indices(observations))}
 
-    def _begin(self, env: Any, seed: int) -> None:
+    def _begin(self, env: ParallelEnv, seed: int) -> None:
         """What the policy does at a reset beyond looking at the problem."""
 
     @abstractmethod
@@ -119,20 +123,20 @@ def robot_indices(agents: Iterable[str]) -> list[int]:
 class TeamFunction(Policy):
     """A function ``(observations, state) -> actions`` as a policy."""
 
-    def __init__(self, function: Callable[[dict[str, Any], Any], Actions]) -> None:
+    def __init__(self, function: Callable[[Observations, FloatArray], Actions]) -> None:
         self.function = function
 
-    def act(self, observations: dict[str, Any], state: Any) -> Actions:
+    def act(self, observations: Observations, state: FloatArray) -> Actions:
         return self.function(observations, state)
 
 
 class RobotFunction(Policy):
     """A function ``observation -> action`` as a policy: every robot asks it by itself."""
 
-    def __init__(self, function: Callable[[Any], Any]) -> None:
+    def __init__(self, function: Callable[[FloatArray], FloatArray]) -> None:
         self.function = function
 
-    def act(self, observations: dict[str, Any], state: Any) -> Actions:
+    def act(self, observations: Observations, state: FloatArray) -> Actions:
         return {agent: self.function(observation) for agent, observation in observations.items()}
 
 
@@ -155,7 +159,7 @@ class OpenLoop(StatePolicy):
         self.plan = plan
         self.time_limit = time_limit
 
-    def _begin(self, env: Any, seed: int) -> None:
+    def _begin(self, env: ParallelEnv, seed: int) -> None:
         if self.planner is not None:
             self.plan = self.planner.solve(self.problem, seed=seed, time_limit=self.time_limit)
         elif self.plan is not None and self.plan.problem != self.problem:
@@ -164,9 +168,9 @@ class OpenLoop(StatePolicy):
                 "randomize_instance=False"
             )
 
-    def identity(self) -> dict[str, Any]:
+    def identity(self) -> dict[str, object]:
         if self.planner is not None:
-            config = asdict(self.planner.config)
+            config = self.planner.config.keywords()
             return {"planner": self.planner.name, **config, "time_limit": self.time_limit}
         assert self.plan is not None
         return {"controls": hashlib.sha256(self.plan.controls.tobytes()).hexdigest()}
@@ -183,7 +187,7 @@ class RandomControls(StatePolicy):
 
     name = "random"
 
-    def _begin(self, env: Any, seed: int) -> None:
+    def _begin(self, env: ParallelEnv, seed: int) -> None:
         self._generator = generator(seed, Stream.RANDOM_CONTROLS)
 
     def _controls(self, joint: JointState) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Things by where they are written: import paths, the digest of their source, and whether other processes get them."""
+"""Things by where they are written: the digest of their source, and whether other processes get them."""
 
 from __future__ import annotations
 
@@ -7,53 +7,10 @@ import hashlib
 import inspect
 import pickle
 import sys
-from importlib import import_module
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-FORMS = "package.module:Name or folder/file.py:Name"
-
-
-def load_reference(text: str) -> Any:
-    """What ``"package.module:Name"`` or ``"folder/file.py:Name"`` names.
-
-    Raises:
-        ValueError: If the text has another form, or the module cannot be imported or has no such name.
-    """
-    place, _, name = text.rpartition(":")
-    if not place or not all(part.isidentifier() for part in name.split(".")):
-        raise ValueError(f"{text!r} is no import path; give {FORMS}")
-    try:
-        found: Any = _load_file(Path(place)) if place.endswith(".py") else import_module(place)
-    except Exception as error:  # whatever foreign code raises when it is imported
-        raise ValueError(
-            f"{text!r} cannot be imported ({describe(error)}); give {FORMS}, of a module that Python finds and that "
-            "can be imported by itself"
-        ) from error
-    for part in name.split("."):
-        if not hasattr(found, part):
-            raise ValueError(f"{text!r} names nothing: {place} has no {name!r}; give a name that the module defines")
-        found = getattr(found, part)
-    return found
-
-
-def _load_file(path: Path) -> ModuleType:
-    """A file as a module, executed once in a process."""
-    name = f"d4orm_file_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:16]}"
-    if name not in sys.modules:
-        spec = spec_from_file_location(name, path)
-        assert spec is not None
-        assert spec.loader is not None
-        module = module_from_spec(spec)
-        sys.modules[name] = module  # dataclasses look their module up there while it is executed
-        try:
-            spec.loader.exec_module(module)
-        except BaseException:
-            del sys.modules[name]
-            raise
-    return sys.modules[name]
+from d4orm_env.core.errors import describe
 
 
 def source_digest(thing: Any) -> str:
@@ -95,8 +52,3 @@ def check_sendable(thing: Any, owner: str) -> None:
     main = sys.modules["__main__"]
     if written(thing).__module__ == "__main__" and not Path(getattr(main, "__file__", None) or "<stdin>").is_file():
         raise ValueError(f"{owner} cannot be handed to worker processes (it was typed in); {remedy}")
-
-
-def describe(error: BaseException) -> str:
-    """Kind and message on one line."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"

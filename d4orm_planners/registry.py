@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from typing import Any, TypeAlias
 
 from d4orm_env.core.arrays import duration, shown
 from d4orm_env.core.errors import UnknownKeywordError
-from d4orm_planners.base import Planner
+from d4orm_env.core.registry import load_reference
 from d4orm_planners.names import PLANNERS, POLICIES, is_planner_class
+from d4orm_planners.planner import Planner
 from d4orm_planners.policy import OpenLoop, Policy, RobotFunction, TeamFunction, plain_attributes
-from d4orm_planners.references import load_reference, source_digest, written
+from d4orm_planners.references import source_digest, written
+from d4orm_planners.settings import NOTHING
 
 PolicyLike: TypeAlias = str | Policy | Planner | type[Any] | Callable[..., Any]
 """What :func:`make_policy` takes; other objects with ``reset`` and ``act`` as well."""
@@ -55,8 +56,9 @@ def make_planner(name: str | type[Planner], *, preset: str | None = None, **conf
     if preset is not None and not (isinstance(preset, str) and preset in kind.presets):
         raise ValueError(f"preset {shown(preset)} of {owner} is unknown; choose one of {', '.join(kind.presets)}")
     settings = {} if preset is None else kind.presets[preset]
-    kind.config_class.check_names(config, owner)
-    return kind(kind.config_class(**{**settings, **config}))
+    known = kind.config_class.setting_names({**settings, **config})
+    applying = {name: value for name, value in settings.items() if name in known}
+    return kind(kind.config_class.from_keywords({**applying, **config}, owner))
 
 
 def make_policy(name: PolicyLike, **config: Any) -> Policy:
@@ -83,13 +85,12 @@ def make_policy(name: PolicyLike, **config: Any) -> Policy:
         _refuse_settings(config, owner)
         return _as_policy(kind, owner)
     if (config_class := getattr(kind, "config_class", None)) is not None:
-        config_class.check_names(config, owner)
-        return _as_policy(kind(config_class(**config)), owner)
+        return _as_policy(kind(config_class.from_keywords(config, owner)), owner)
     _check_keywords(kind, config, owner)
     return _as_policy(kind(**config), owner)
 
 
-def find_policy(policy: Any) -> Any:
+def find_policy(policy: object) -> Any:
     """What stands behind a policy's name or import path; anything but text is returned as it is.
 
     Raises:
@@ -111,12 +112,12 @@ def find_policy(policy: Any) -> Any:
     )
 
 
-def is_brought(policy: Any) -> bool:
+def is_brought(policy: object) -> bool:
     """Whether a policy is given itself, rather than by name or import path."""
     return callable(policy) or isinstance(policy, Planner) or _acts(policy)
 
 
-def origin(policy: Any) -> Any:
+def origin(policy: object) -> Any:
     """What :func:`make_policy` takes for a policy in any process, whatever was registered there."""
     for table in (PLANNERS, POLICIES):
         if isinstance(policy, str) and policy in table:
@@ -124,30 +125,43 @@ def origin(policy: Any) -> Any:
     return policy
 
 
-def is_planned(policy: Any) -> bool:
+def is_planned(policy: object) -> bool:
     """Whether a policy is a planner, whose plan is executed open loop."""
     kind = find_policy(policy)
     return is_planner_class(kind) or isinstance(kind, Planner)
 
 
-def makes_policy(kind: Any) -> bool:
+def makes_policy(kind: object) -> bool:
     """Whether something that :func:`find_policy` found takes settings and makes a policy, rather than acts itself."""
     return isinstance(kind, type) or (not _acts(kind) and callable(kind) and _required(kind) == 0)
 
 
-def setting_names(policy: Any) -> tuple[str, ...]:
-    """Settings that :func:`make_policy` takes for a policy."""
+def setting_names(policy: object, given: Mapping[str, object] = NOTHING) -> tuple[str, ...]:
+    """Settings that :func:`make_policy` takes for a policy, where these are given."""
     kind = find_policy(policy)
     if is_planner_class(kind):
-        return (*kind.config_class.setting_names(), "preset", "time_limit")
+        return (*kind.config_class.setting_names(given), "preset", "time_limit")
     if not makes_policy(kind):
         return ()
     if (config_class := getattr(kind, "config_class", None)) is not None:
-        return tuple(config_class.setting_names())
+        return tuple(config_class.setting_names(given))
     return tuple(inspect.signature(kind).parameters)
 
 
-def policy_settings(name: Any, **config: Any) -> dict[str, Any]:
+def default_settings(policy: str) -> dict[str, object]:
+    """Settings of a planner or policy with their defaults; ``"required"`` where there is none.
+
+    Raises:
+        ValueError: If there is no such planner or policy.
+    """
+    kind = find_policy(policy)
+    if (config_class := getattr(kind, "config_class", None)) is not None:
+        return dict(config_class().keywords())
+    parameters = inspect.signature(kind).parameters if makes_policy(kind) else {}
+    return {name: "required" if own.default is own.empty else own.default for name, own in parameters.items()}
+
+
+def policy_settings(name: object, **config: Any) -> dict[str, object]:
     """All that tells ``make_policy(name, **config)`` from other policies of that name.
 
     These are its settings, defaults filled in where a configuration class has them; a preset has become its settings.
@@ -157,18 +171,17 @@ def policy_settings(name: Any, **config: Any) -> dict[str, Any]:
         ValueError, TypeError: As :func:`make_policy`; also if there is no source to be read.
     """
     kind, owner = find_policy(name), f"policy {_called(name)!r}"
-    settings: dict[str, Any]
+    settings: dict[str, object]
     if is_planner_class(kind):
         time_limit = _time_limit(config)
         planner = make_planner(name if isinstance(name, str) else kind, **config)
-        settings = {**asdict(planner.config), "time_limit": time_limit}
+        settings = {**planner.config.keywords(), "time_limit": time_limit}
     elif not makes_policy(kind):
         _refuse_settings(config, owner)
         policy = _as_policy(kind, owner)
         settings = policy.identity() if isinstance(kind, Policy | Planner) else plain_attributes(kind)
     elif (config_class := getattr(kind, "config_class", None)) is not None:
-        config_class.check_names(config, owner)
-        settings = asdict(config_class(**config))
+        settings = config_class.from_keywords(config, owner).keywords()
     else:
         _check_keywords(kind, config, owner)
         settings = dict(config)
@@ -184,13 +197,18 @@ def _planner_class(name: Any) -> type[Planner]:
     if not is_planner_class(kind):
         if kind is not name:
             raise ValueError(f"planner {name!r} is {shown(kind)}; it must be a subclass of d4orm_planners.Planner")
+        if isinstance(name, str) and name in POLICIES:
+            raise ValueError(
+                f"{name!r} is no planner but a policy, which acts step by step; use make_policy({name!r}), or "
+                f"d4orm run --policy {name}"
+            )
         raise ValueError(f"planner {shown(name)} is unknown; choose one of {', '.join(PLANNERS)}")
     if inspect.isabstract(kind):
         raise ValueError(f"planner {_called(name)!r} lacks iterate; define it in the class")
     return kind
 
 
-def _acts(thing: Any) -> bool:
+def _acts(thing: object) -> bool:
     return callable(getattr(thing, "reset", None)) and callable(getattr(thing, "act", None))
 
 
@@ -227,7 +245,7 @@ def _required(function: Any) -> int | None:
     return None if not count and any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters) else count
 
 
-def _check_keywords(kind: Any, config: Mapping[str, Any], owner: str) -> None:
+def _check_keywords(kind: Any, config: Mapping[str, object], owner: str) -> None:
     """Refuse what a function or class that makes a policy does not take, and what it lacks."""
     if inspect.isabstract(kind):
         raise ValueError(f"{owner} lacks {', '.join(sorted(kind.__abstractmethods__))}; define it in the class")
@@ -249,21 +267,21 @@ def _check_keywords(kind: Any, config: Mapping[str, Any], owner: str) -> None:
         raise ValueError(f"{owner} cannot be made: {error}; give it as a setting") from None
 
 
-def _refuse_settings(config: Mapping[str, Any], owner: str) -> None:
+def _refuse_settings(config: Mapping[str, object], owner: str) -> None:
     if config:
         raise UnknownKeywordError(f"{owner} takes no settings, but was given {', '.join(map(shown, config))}")
 
 
-def _time_limit(config: dict[str, Any]) -> float | None:
+def _time_limit(config: dict[str, object]) -> float | None:
     """Take the budget of the solve out of a planner's settings."""
     limit = config.pop("time_limit", None)
     return None if limit is None else duration(limit, "time_limit")
 
 
-def _called(thing: Any) -> str:
+def _called(thing: object) -> str:
     """What to call a policy in messages."""
     return thing if isinstance(thing, str) else getattr(thing, "__name__", type(thing).__name__)
 
 
-def _summary(kind: Any) -> str:
+def _summary(kind: object) -> str:
     return (kind.__doc__ or "").strip().partition("\n")[0]

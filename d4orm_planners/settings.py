@@ -7,25 +7,26 @@ in any spelling that means one, text included, so that equal settings are equal 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, fields
 from functools import cache
-from typing import Annotated, Any, get_type_hints
+from types import MappingProxyType
+from typing import Annotated, Any, Self, get_type_hints
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, create_model
 
 from d4orm_env.core.arrays import LARGEST, LARGEST_NUMBER, LARGEST_WHOLE, shown
 from d4orm_env.core.errors import UnknownKeywordError
-from d4orm_env.engine.base import ENGINES
+from d4orm_env.engine.choice import ENGINES
 
 
-def _truth(value: Any) -> Any:
+def _truth(value: object) -> object:
     """NumPy's truth, which pydantic would take for a number, as Python's."""
     return bool(value) if isinstance(value, np.bool_) else value
 
 
-def _whole(value: Any) -> Any:
+def _whole(value: object) -> object:
     """Text and NumPy's integers as an ``int``; anything else as it is, for pydantic to judge."""
     try:
         return int(value) if isinstance(value, str | np.integer) else _truth(value)
@@ -33,7 +34,7 @@ def _whole(value: Any) -> Any:
         return value
 
 
-def _number(value: Any) -> Any:
+def _number(value: Any) -> object:
     """Whatever means a number as a ``float``; anything else as it is, for pydantic to judge."""
     value = _truth(value)
     try:
@@ -44,7 +45,7 @@ def _number(value: Any) -> Any:
         return value
 
 
-def _path(value: Any) -> Any:
+def _path(value: object) -> object:
     return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
@@ -83,6 +84,9 @@ PathText = Annotated[str, BeforeValidator(_path)]
 EngineName = Annotated[str, one_of(ENGINES)]
 
 
+NOTHING: Mapping[str, object] = MappingProxyType({})
+
+
 @dataclass(frozen=True, kw_only=True)
 class CheckedSettings:
     """What settings have in common; a subclass is a frozen dataclass with fields of the types above.
@@ -97,32 +101,43 @@ class CheckedSettings:
             converted = _schema(kind)(**vars(self))
         except ValidationError as error:
             raise ValueError(_explain(error)) from None
-        for name in self.setting_names():
-            object.__setattr__(self, name, getattr(converted, name))
+        for field in fields(self):
+            object.__setattr__(self, field.name, getattr(converted, field.name))
 
     @classmethod
-    def setting_names(cls) -> tuple[str, ...]:
-        """Names of all settings, in order."""
+    def setting_names(cls, given: Mapping[str, object] = NOTHING) -> tuple[str, ...]:
+        """Names of all settings that there are where these are given, in order."""
+        del given
         return tuple(field.name for field in fields(cls))
 
     @classmethod
-    def check_names(cls, given: Iterable[Any], owner: str) -> None:
-        """Refuse what is no setting.
+    def from_keywords(cls, given: Mapping[str, object], owner: str) -> Self:
+        """Settings as users give them.
 
         Raises:
-            UnknownKeywordError: One line that names it, whose setting it is not, and those that there are.
+            UnknownKeywordError: If one of them is no setting; one line that names it, whose it is not, and those that
+                there are.
         """
-        known = cls.setting_names()
+        known = cls.setting_names(given)
         for name in given:
             if name not in known:
                 raise UnknownKeywordError(f"{name!r} is no setting of {owner}; it takes {', '.join(known)}")
+        return cls._made_of(given)
+
+    @classmethod
+    def _made_of(cls, given: Mapping[str, Any]) -> Self:
+        return cls(**given)
+
+    def keywords(self) -> dict[str, object]:
+        """All settings as :meth:`from_keywords` takes them."""
+        return asdict(self)
 
 
 @cache
 def _schema(kind: Any) -> type[BaseModel]:
     """The types of all settings, as pydantic checks them."""
     types = get_type_hints(kind, include_extras=True)
-    wanted: dict[str, Any] = {name: (types[name], ...) for name in kind.setting_names()}
+    wanted: dict[str, Any] = {field.name: (types[field.name], ...) for field in fields(kind)}
     config = ConfigDict(strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
     return create_model(kind.__name__, __config__=config, **wanted)
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
-from d4orm_env.core.dynamics import MODELS, Model
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.robot_model import Model
 from d4orm_env.core.transition import TimeStep
 
 NEAR_VIA = np.float32(0.25)
@@ -99,7 +100,7 @@ class Drives:
         )
 
 
-def closing_stretches(problem: Problem, states: FloatArray, controls: FloatArray, switch_times: Any) -> Drives:
+def closing_stretches(problem: Problem, states: FloatArray, controls: FloatArray, switch_times: ArrayLike) -> Drives:
     """Follow the controls up to a time and drive straight to the goal from there.
 
     Args:
@@ -137,25 +138,27 @@ def _standing(problem: Problem) -> tuple[FloatArray, FloatArray]:
     return states, np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
 
 
-def _drive_teams(problem: Problem, states: FloatArray, controls: FloatArray, switch: Any, vias: FloatArray) -> Drives:
+def _drive_teams(
+    problem: Problem, states: FloatArray, controls: FloatArray, switch: IntArray, vias: FloatArray
+) -> Drives:
     """Every robot on each of its ways: as controlled until ``switch`` ``(R, V)``, then by ``vias`` ``(R, V, d)``."""
-    from d4orm_env.engine.drives import drive_kernel  # here, because importing numba takes long
+    # Here, because importing numba takes long.
+    from d4orm_env.engine.drives import DriveRules, Ways, drive_kernel
 
     num_ways, arrays = switch.shape[1], problem.arrays
     u = np.repeat(np.asarray(controls, np.float32)[:, :, None], num_ways, axis=2)
     x = np.repeat(np.asarray(states, np.float32)[:, :, None], num_ways, axis=2)
     arrived = np.zeros(switch.shape, bool)
     docking = np.array([arrays.squared_goal_radius, arrays.squared_goal_speed])
+    rules = DriveRules(arrays.time_step, docking, arrays.docks, NEAR_VIA)
     for model, robots in _by_model(problem):
         # One lane for every robot and way.
         lanes_x, lanes_u = (array[:, robots].reshape(len(array), -1, array.shape[-1]) for array in (x, u))
         limits, goals = (np.repeat(rows[robots], num_ways, axis=0) for rows in (arrays.limits, problem.goal))
         targets = np.ascontiguousarray(vias[robots], np.float32).reshape(goals.shape)
         lanes_arrived = np.empty(len(goals), bool)
-        drive_kernel(model.name)(
-            limits, arrays.time_step, docking, NEAR_VIA, goals, targets, switch[robots].ravel(), lanes_x, lanes_u,
-            lanes_arrived,
-        )  # fmt: skip
+        ways = Ways(limits, goals, targets, switch[robots].ravel())
+        drive_kernel(model.name)(rules, ways, lanes_x, lanes_u, lanes_arrived)
         x[:, robots] = lanes_x.reshape(len(x), len(robots), num_ways, -1)
         u[:, robots] = lanes_u.reshape(len(u), len(robots), num_ways, -1)
         arrived[robots] = lanes_arrived.reshape(len(robots), num_ways)

@@ -16,7 +16,8 @@ import numpy as np
 from outputs import COLOURS, argument_parser, count, plt, save_figure, save_table
 
 from d4orm_env import Problem, make_problem
-from d4orm_env.engine.base import SamplingRules, SamplingTask, get_engine
+from d4orm_env.engine.base import SamplingRules, SamplingTask
+from d4orm_env.engine.choice import get_engine
 from d4orm_planners.sampling.schedule import annealed
 from d4orm_planners.sampling.weights import SoftmaxWeights
 

@@ -13,8 +13,8 @@ from outputs import argument_parser, count, require, save_table
 require("orca", "pyrvo")
 require("rl", "stable_baselines3", "tensorboard")
 
-from d4orm_planners.evaluation.robustness import robustness
-from d4orm_planners.evaluation.robustness_report import write_robustness
+from d4orm_planners import evaluate
+from d4orm_planners.evaluation.report import write_robustness
 from d4orm_planners.rl.training import TrainingSettings, train
 
 
@@ -32,7 +32,9 @@ def main() -> None:
     result = train(settings, arguments.out / "ppo", progress=report)
     policies = {"ppo": {"path": str(result.policy_path)}, "d4orm-c2f": {"refine": "sync"}, "orca": {}}
     folder = arguments.out / "comparison"
-    rates = robustness(policies, folder, scenarios=("random",), robots=(settings.robots,), noise=noise, trials=trials)
+    rates = evaluate(
+        policies, "random", out=folder, seeds=range(trials), control_noise_std=noise, num_robots=settings.robots
+    )
     for path in write_robustness(folder, rates):
         print(f"wrote {path}")
     rows = [

@@ -10,8 +10,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from d4orm_env.core.dynamics import Ops
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.robot_model import Ops
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.engine import noise

@@ -9,7 +9,7 @@ from engine_support import engine_noise
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.base import SamplingTask
-from d4orm_planners.evaluation import plain
+from d4orm_planners.benchmark import plain
 
 TEMPERATURE = 0.3
 

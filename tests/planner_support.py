@@ -14,8 +14,8 @@ import numpy as np
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_planners.base import Planner
 from d4orm_planners.plan import IterationRecord
+from d4orm_planners.planner import Planner
 from d4orm_planners.registry import PLANNERS, make_planner
 
 CHEAP = {
@@ -35,7 +35,7 @@ CHEAP = {
 
 def cheap_planner(name: str, **config: Any) -> Planner:
     """A planner with those of the cheap settings that it has."""
-    known = PLANNERS[name].config_class.setting_names()
+    known = PLANNERS[name].config_class.setting_names(config)
     return make_planner(name, **{key: value for key, value in CHEAP.items() if key in known} | config)
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.dynamics import ACCELERATION, SPEED, TURN_RATE
+from d4orm_env.core.robot_model import ACCELERATION, SPEED, TURN_RATE
 from d4orm_env.engine.base import SamplingTask
 
 ROUNDOFF = 2.0**-24

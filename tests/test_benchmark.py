@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from d4orm_planners import cli
-from d4orm_planners.evaluation import benchmark, report, timing
-from d4orm_planners.evaluation.benchmark import BenchmarkSettings, parts, run_parts
-from d4orm_planners.evaluation.probes import measure_startup
-from d4orm_planners.evaluation.timing import Spread, measure
+from d4orm_planners.benchmark import benchmark, report, timing
+from d4orm_planners.benchmark.benchmark import BenchmarkSettings, parts, run_parts
+from d4orm_planners.benchmark.probes import measure_startup
+from d4orm_planners.benchmark.timing import Spread, measure
 
 TINY: dict[str, Any] = {
     "robots": (2, 3),
@@ -110,8 +110,7 @@ def test_whole_iterations_that_would_take_too_long_are_left_out(results: dict[st
 
 def test_report_files(results: dict[str, list[Any]], tmp_path: Path) -> None:
     settings = BenchmarkSettings(**TINY)
-    machine = timing.describe_machine()
-    report.write_report(tmp_path, settings, machine, "d4orm bench", "2026-01-01T00:00:00+00:00", results)
+    report.write_report(tmp_path, settings, report.circumstances("d4orm bench"), results)
     assert {path.name for path in tmp_path.iterdir()} == {"bench.json", "bench.md"}
     document = json.loads((tmp_path / "bench.json").read_text())
     assert document["format"] == report.FORMAT

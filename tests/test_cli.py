@@ -102,6 +102,22 @@ def test_lists(d4orm, command: str) -> None:
     assert {"scenarios": "amswarm_5", "planners": "d4orm"}[command] in outcome.out
 
 
+@pytest.mark.parametrize(
+    ("name", "listed", "missing"),
+    [
+        ("cem", {"sigma", "elite_fraction"}, "temperature"),
+        ("d-d4orm", {"planner", "nodes", "late_samples"}, "repair_steps"),
+        ("d4orm-c2f", {"weight_cutoff", "deadline"}, "nodes"),
+        ("goal", {"no settings"}, "sigma"),
+    ],
+)
+def test_the_settings_of_one_are_listed(d4orm, name: str, listed: set[str], missing: str) -> None:
+    outcome = d4orm("planners", name)
+    assert outcome.status == 0
+    assert all(setting in outcome.out for setting in listed)
+    assert missing not in outcome.out
+
+
 BAD = [
     (("plan", "--robots", "0"), "num_robots is 0"),
     (("plan", "--robots", "three"), "--robots"),
@@ -125,6 +141,9 @@ BAD = [
     (("plan", "--set", "num_samples=1"), "num_samples is 1"),
     (("plan", "--set", "nonsense=1"), "nonsense"),
     (("plan", "--set", "num_samples=64", "--set", "num_samples=65"), "--set gives 'num_samples' twice"),
+    (("plan", "--planner", "cem", "--set", "temperature=1"), "'temperature' is no setting of planner 'cem'; it takes"),
+    (("plan", "--planner", "d4orm-c2f"), "use make_policy('d4orm-c2f'), or d4orm run --policy d4orm-c2f"),
+    (("planners", "d4rom"), "policy 'd4rom' is unknown"),
     (("plan", "--set", "temperature=[1"), "the value is not YAML"),
     (("plan", "--set", "temperature=!!python/name:os.system"), "tags are not supported"),
     (("plan", "--set", "temperature=1e400"), "temperature is inf"),

@@ -16,7 +16,7 @@ from hypothesis.extra import numpy as arrays
 
 from d4orm_env.core.collision import axis_gap, leaves
 from d4orm_env.core.world import World
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 
 RADIUS, MARGIN = 0.25, 0.25
 CONTACT, MARGIN_ONLY, CLEAR = (True, True), (False, True), (False, False)

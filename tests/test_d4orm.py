@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from planner_support import hop_problem, walled_in_problem
 
-from d4orm_env.engine.base import SamplingTask, get_engine
+from d4orm_env.engine.base import SamplingTask
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
-from d4orm_planners.base import Search
+from d4orm_planners.search import Search
 
 BUDGET = 25
 """Five times the iterations that any of some twenty seeds takes: other rounding makes another plan."""

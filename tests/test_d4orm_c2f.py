@@ -13,17 +13,20 @@ import numpy as np
 import pytest
 
 from d4orm_env import navigation_v0
-from d4orm_env.core.dynamics import ACCELERATION
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.robot_model import ACCELERATION
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.joint_state import JointState
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Episode, make_policy, run_episode
-from d4orm_planners.d4orm_c2f import D4ormC2F, _Background
+from d4orm_planners.d4orm_c2f.background import Background
+from d4orm_planners.d4orm_c2f.guide import Guide
+from d4orm_planners.d4orm_c2f.policy import D4ormC2F
+from d4orm_planners.d4orm_c2f.window import Window
 from d4orm_planners.guidance import coarse_problem
 from d4orm_planners.steering import straight_drives
 
@@ -207,14 +210,14 @@ def test_loops_that_miss_their_deadline_are_counted_and_the_last_plan_goes_on() 
 def test_a_loop_that_is_late_goes_on_with_the_last_plan(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = circle(4)
     policy = controller(deadline=1.0)
-    in_time = D4ormC2F._predict
+    in_time = Window.predict
 
-    def predict(self: D4ormC2F, joint: Any, *arguments: Any) -> Any:
+    def predict(self: Window, joint: Any, *arguments: Any) -> Any:
         if joint.steps == 10:
             time.sleep(1.3)
         return in_time(self, joint, *arguments)
 
-    monkeypatch.setattr(D4ormC2F, "_predict", predict)
+    monkeypatch.setattr(Window, "predict", predict)
     executed = episode(policy, problem)
     assert policy.loops[10].missed
     assert np.isnan(policy.loops[10].predicted_margin)
@@ -270,7 +273,7 @@ def test_refined_guidance_is_one_plan_from_beginning_to_end() -> None:
 
 
 def test_a_job_in_the_background_is_one_at_a_time_and_gives_its_result_once() -> None:
-    background, go = _Background(), threading.Event()
+    background, go = Background(), threading.Event()
     assert background.result() == (True, None)
     background.start(lambda: go.wait(60))
     assert background.result() == (False, None)
@@ -299,7 +302,7 @@ def test_refinement_yields_to_the_control_loop_and_takes_no_priority(
     asked: list[int] = []
     monkeypatch.setattr(os, "getpriority", lambda which, who: own)
     monkeypatch.setattr(os, "setpriority", lambda which, who, priority: asked.append(priority))
-    for background in (_Background(), _Background(yielding=True)):
+    for background in (Background(), Background(yielding=True)):
         background.start(lambda: None)
         background.forget()
     assert asked == [refining]
@@ -310,14 +313,14 @@ def replanned(
 ) -> list[tuple[JointState, Any, int, Any, int]]:
     """Where it was replanned, from which controls and with how many iterations, and the guidance until then."""
     calls = []
-    plan = D4ormC2F._coarse_plan
+    plan = Guide.plan
 
-    def coarse_plan(self: D4ormC2F, joint: JointState, initial: Any, iterations: int) -> Any:
+    def coarse_plan(self: Guide, joint: JointState, initial: Any, iterations: int) -> Any:
         if initial is not None:
-            calls.append((joint, initial.copy(), iterations, self.guidance, self._index))
+            calls.append((joint, initial.copy(), iterations, self.guidance, self.index))
         return plan(self, joint, initial, iterations)
 
-    monkeypatch.setattr(D4ormC2F, "_coarse_plan", coarse_plan)
+    monkeypatch.setattr(Guide, "plan", coarse_plan)
     world = navigation_v0.parallel_env(**env)
     observations, _ = world.reset(seed=0)
     policy.reset(world, seed=0)

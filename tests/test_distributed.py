@@ -22,12 +22,12 @@ from network_support import PATIENCE, wait_until
 from planner_support import cheap_planner, hop_problem, walled_in_problem
 
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.threads import Threads
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
-from d4orm_planners.base import Iteration, Search, evaluate_controls
+from d4orm_planners.candidate import evaluate_controls
 from d4orm_planners.d4orm import D4orm, D4ormConfig
 from d4orm_planners.distributed import judge as judge_module
 from d4orm_planners.distributed import messages, node
@@ -36,9 +36,11 @@ from d4orm_planners.distributed.events import Event
 from d4orm_planners.distributed.inbox import Inbox
 from d4orm_planners.distributed.judge import Judge, Stopped
 from d4orm_planners.distributed.messages import KINDS, MAGIC, Message, MessageError, decode, encode
-from d4orm_planners.distributed.node import Node, Selection, node_seed
+from d4orm_planners.distributed.node import Node, Task, node_seed
 from d4orm_planners.distributed.selection import choose, diverse, k_means, merge, shares, top_k
 from d4orm_planners.distributed.transport import WAITING, LocalNetwork
+from d4orm_planners.planner import Iteration, Planner
+from d4orm_planners.search import Search
 
 PROBLEM = hop_problem(2, horizon=4)
 SHAPE = (4, 2, 2)
@@ -261,7 +263,7 @@ def test_collecting_waits_for_a_message_or_the_end() -> None:
 def inbox() -> tuple[Inbox, Any]:
     network = LocalNetwork()
     own, other = network.join(), network.join()
-    return Inbox(PROBLEM, get_engine("cpu"), own, 3, own=0), other
+    return Inbox(Judge(get_engine("cpu"), PROBLEM), own, 3, own=0), other
 
 
 def test_what_is_no_message_is_dropped_counted_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -304,7 +306,7 @@ def test_a_claim_is_false_where_either_of_its_parts_is(share: float, feasible: b
     assert found.solved
     network = LocalNetwork()
     own, other = network.join(), network.join()
-    box = Inbox(near, get_engine("cpu"), own, 2, own=0)
+    box = Inbox(Judge(get_engine("cpu"), near), own, 2, own=0)
     reward = float(found.trajectory.rewards.mean())
     other.publish(encode(message(controls=controls, reward=share * reward, feasible=feasible), near))
     (report,) = box.receive()
@@ -354,16 +356,21 @@ def test_what_a_process_has_made_is_judged_once() -> None:
     assert judge.received(changed).rank != made[2].rank
 
 
+def alone(planner: Planner, judge: Judge | None = None) -> Node:
+    """A network's only node."""
+    task = Task(1, 0, None, "max", 1)
+    return Node(0, task, planner, LocalNetwork().join(), judge or Judge(get_engine("cpu"), PROBLEM))
+
+
 def test_the_word_to_stop_ends_judging_and_denoising() -> None:
     judge = Judge(get_engine("cpu"), PROBLEM, remembered=1)
     judge.stop.set()
     with pytest.raises(Stopped):
         judge.own(message().controls)
-    end, engine = LocalNetwork().join(), get_engine("cpu")
-    node = Node(0, 1, cheap_planner("d4orm"), PROBLEM, 0, None, engine, end, Selection("max", 1), judge)
+    node = alone(cheap_planner("d4orm"), judge)
     with pytest.raises(Stopped):
         node.refine()
-    assert node.search.planner.inner.iterate(node.search).denoising_steps == 0
+    assert node.search.planner.iterate(node.search, None)[1].denoising_steps == 0
 
 
 # The planner.
@@ -373,19 +380,24 @@ def test_a_node_that_closes_lets_its_planner_finish() -> None:
     finished = []
 
     class Finishing(D4orm):
-        def finish(self, search: Search) -> None:
-            finished.append(search)
+        def init(self, search: Search) -> str:
+            return "begun"
 
-    end, engine = LocalNetwork().join(), get_engine("cpu")
-    node = Node(0, 1, Finishing(D4ormConfig()), PROBLEM, 0, None, engine, end, Selection("max", 1))
+        def finish(self, search: Search, state: str) -> None:
+            finished.append((search, state))
+
+    node = alone(Finishing(D4ormConfig(num_samples=2, num_steps=1)))
     node.close()
-    assert finished == [node.search]
+    assert not finished, "it had not begun"
+    node.refine()
+    for _ in range(2):
+        node.close()
+        assert finished == [(node.search, "begun")]
 
 
 def test_a_node_whose_time_is_over_makes_no_other_round() -> None:
-    end, engine = LocalNetwork().join(), get_engine("cpu")
     for limit, again in ((3600.0, True), (1e-9, False)):
-        node = Node(0, 1, cheap_planner("d4orm"), PROBLEM, 0, None, engine, end, Selection("max", 1))
+        node = alone(cheap_planner("d4orm"))
         node.search.time_limit = limit
         assert node.step(threading.Event(), patience=0.0, improve=True) is again
 
@@ -414,10 +426,10 @@ def spoil(monkeypatch: pytest.MonkeyPatch, seed: int, act: Callable[[Search], An
     """Have node 1 of solves with this seed do something before every iteration."""
     iterate = D4orm.iterate
 
-    def spoilt(self: D4orm, search: Search) -> Iteration:
+    def spoilt(self: D4orm, search: Search, state: Any) -> tuple[Any, Iteration]:
         if search.seed == node_seed(seed, 1):
             act(search)
-        return iterate(self, search)
+        return iterate(self, search, state)
 
     monkeypatch.setattr(D4orm, "iterate", spoilt)
 
@@ -449,7 +461,7 @@ def test_nodes_search_by_themselves_and_then_go_on_from_a_common_base(clip: bool
     planner = distributed(nodes=3, selection="max", clip_between_iterations=clip)
     search = Search(planner, walled_in_problem(), 0, None)
     search.advance()
-    nodes = search.memory["crew"].alive
+    nodes = search.state.crew.alive
     made = [one.candidate for one in nodes]
     best = max(made, key=lambda candidate: candidate.trajectory.rewards.mean())
     assert len({candidate.controls.tobytes() for candidate in made}) == 3
@@ -458,7 +470,7 @@ def test_nodes_search_by_themselves_and_then_go_on_from_a_common_base(clip: bool
         np.testing.assert_array_equal(one.search.current.controls, best.controls)
     assert np.abs(best.planned).max() > 1.1  # There is a difference.
     assert [one.search.planner.config.num_samples for one in nodes] == [43, 43, 42]
-    search.planner.finish(search)
+    search.close()
 
 
 @MODE
@@ -491,7 +503,7 @@ def test_a_node_that_fails_does_not_take_the_others_down(
 
 @MODE
 def test_when_all_nodes_have_failed_the_error_says_so(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(self: D4orm, search: Search) -> Iteration:
+    def fail(self: D4orm, search: Search, state: Any) -> Any:
         raise ZeroDivisionError("broken")
 
     monkeypatch.setattr(D4orm, "iterate", fail)
@@ -617,13 +629,13 @@ def test_no_thread_outlives_a_solve() -> None:
 
 
 def test_an_observer_is_told_what_a_node_does() -> None:
-    problem, engine, network = hop_problem(2), get_engine("cpu"), LocalNetwork()
+    problem, network = hop_problem(2), LocalNetwork()
     planner = D4orm(D4ormConfig(engine="cpu", num_samples=64, num_steps=5))
     events: list[Event] = []
     controls = np.zeros((problem.horizon, 2, 2), np.float32)
-    selection = Selection("max", 1)
+    task, judge = Task(2, 0, controls, "max", 1), Judge(get_engine("cpu"), problem)
     nodes = [
-        Node(i, 2, planner, problem, 0, controls, engine, network.join(), selection, observer=observer)
+        Node(i, task, planner, network.join(), judge, observer=observer)
         for i, observer in enumerate((events.append, None))
     ]
     for one in nodes:
@@ -642,12 +654,10 @@ def test_an_observer_is_told_what_a_node_does() -> None:
 
 
 def test_settling_says_whether_all_others_have_a_solution_as_good() -> None:
-    problem, engine, network = hop_problem(2), get_engine("cpu"), LocalNetwork()
-    solution = distributed().solve(problem).controls
-    first, second = (
-        Node(i, 2, cheap_planner("d4orm"), problem, 0, solution, engine, network.join(), Selection("max", 1))
-        for i in range(2)
-    )
+    problem, network = hop_problem(2), LocalNetwork()
+    task = Task(2, 0, distributed().solve(problem).controls, "max", 1)
+    judge = Judge(get_engine("cpu"), problem)
+    first, second = (Node(i, task, cheap_planner("d4orm"), network.join(), judge) for i in range(2))
     assert not first.settle(0), "nobody has told it anything"
     assert second.settle(0)
     assert first.settle(0)
@@ -661,7 +671,7 @@ def test_an_asynchronous_node_waits_once_for_one_that_is_silent(monkeypatch: pyt
     search = Search(planner, walled_in_problem(), 5, None)
     try:
         search.advance()
-        fast, silent = search.memory["crew"].alive
+        fast, silent = search.state.crew.alive
         # Waiting every time, the other node would not get so far in that time.
         while fast.search.iteration <= enough and search.watch.elapsed < enough * patience:
             search.advance()
@@ -669,7 +679,7 @@ def test_an_asynchronous_node_waits_once_for_one_that_is_silent(monkeypatch: pyt
         assert fast.search.iteration > enough
     finally:
         release.set()
-        planner.finish(search)
+        search.close()
 
 
 @pytest.mark.parametrize(
@@ -698,19 +708,32 @@ def test_a_bad_setting_is_refused_by_name(settings: dict[str, Any], text: str) -
         make_planner("d-d4orm", **settings)
 
 
+def test_nodes_take_the_settings_of_the_planner_that_they_run() -> None:
+    with pytest.raises(TypeError, match=r"'repair_steps' is no setting of planner 'd-d4orm'; it takes .*late_samples"):
+        make_planner("d-d4orm", repair_steps=7)
+    planner = make_planner("d-d4orm", planner="d4orm-d", repair_steps=7, nodes=3, num_samples=100, improve=True)
+    config: Any = planner.config
+    assert {one.config.repair_steps for one in config.node_planners(3)} == {7}
+    assert [one.config.num_samples for one in config.node_planners(3)] == [34, 33, 33]
+    assert make_planner("d-d4orm", **config.keywords()).config == config
+    with pytest.raises(ValueError, match="refinement: "):
+        replace(config, refinement={"repair_steps": 7})
+
+
 def test_the_paper_preset_is_algorithm_5_with_a_node_per_robot() -> None:
     config = make_planner("d-d4orm", preset="paper").config
-    assert (config.planner, config.nodes, config.selection, config.k, config.mode) == (
+    inner = config.refinement
+    assert (config.node_planner.name, config.nodes, config.selection, config.k, config.mode) == (
         "d4orm",
         None,
         "top-k",
         4,
         "sync",
     )
-    assert (config.num_samples, config.num_steps, config.credit, config.random_start) == (2048, 100, "team", False)
-    assert config.clip_between_iterations is False
+    assert (inner.num_samples, inner.num_steps, inner.credit, inner.random_start) == (2048, 100, "team", False)
+    assert inner.clip_between_iterations is False
     search = Search(make_planner("d-d4orm", preset="paper", engine="cpu", num_steps=2), hop_problem(3), 0, None)
     search.advance()
-    assert [one.search.planner.config.num_samples for one in search.memory["crew"].alive] == [683, 683, 682]
+    assert [one.search.planner.config.num_samples for one in search.state.crew.alive] == [683, 683, 682]
     with pytest.raises(ValueError, match="num_samples is 5 for 3 nodes together"):
         make_planner("d-d4orm", engine="cpu", nodes=None, num_samples=5).solve(hop_problem(3))

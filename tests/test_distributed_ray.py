@@ -43,7 +43,7 @@ KILL = """
 import json, os, signal, threading
 from d4orm_env import make_problem
 from d4orm_planners import make_planner
-from d4orm_planners.base import Search
+from d4orm_planners.search import Search
 from d4orm_planners.distributed import ray_planner
 from d4orm_planners.distributed.ray_connection import RayConnection
 
@@ -56,17 +56,17 @@ def kill(restarts, mode):
     notes = []
     try:
         notes.append(search.advance().note)
-        crew = search.memory["crew"]
-        before = [node.search.planner.inner.process for node in crew.alive]
+        crew = search.state.crew
+        before = [node.search.planner.process for node in crew.alive]
         # Into an iteration, or nearly.
         timer = threading.Timer(0.1, os.kill, (before[1], signal.SIGKILL))
         timer.start()
         while len(notes) < 8 and not any(notes):
             notes.append(search.advance().note)
         timer.join()
-        after = [node.search.planner.inner.process for node in crew.alive]
+        after = [node.search.planner.process for node in crew.alive]
     finally:
-        planner.finish(search)
+        search.close()
     plan = search.plan("stopped")
     return [before, after, [note for note in notes if note], plan.solved]
 

@@ -12,11 +12,12 @@ from engine_support import ENGINE_NAMES, NUMPY_OPS, PYTHON_OPS
 from hypothesis import given
 from hypothesis import strategies as st
 
-from d4orm_env.core.dynamics import MODEL_CODES, MODELS, Ops, get_model
+from d4orm_env.core.dynamics import MODEL_CODES, MODELS, get_model
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.robot_model import Ops
 from d4orm_env.core.team import Team
 from d4orm_env.core.transition import TimeStep, advance
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 
 JAX_OPS = Ops(jnp.cos, jnp.sin, jnp.sqrt, jnp.minimum, jnp.maximum, jnp.arctan2, jnp.where)
 LIMITS = (2.0, 1.0, 0.5)

@@ -21,8 +21,9 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.transition import TimeStep, advance
 from d4orm_env.engine import threads, tiles
-from d4orm_env.engine.base import ENGINES, StepResult, get_engine
+from d4orm_env.engine.base import StepResult
 from d4orm_env.engine.caching import fingerprint
+from d4orm_env.engine.choice import ENGINES, get_engine
 from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.engine.jax import JaxEngine
 from d4orm_env.engine.threads import Threads, available_cores
@@ -329,6 +330,19 @@ class TestKernelCache:
         assert self.hits(path, "one version") == 0
         assert self.hits(path, "one version") == 1
         assert self.hits(path, "another version") == 0
+        assert self.hits(path, "one version") == 1
+
+    def test_what_another_version_kept_and_this_one_cannot_read_is_compiled_anew(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("KERNEL_KEY", "")
+        path = tmp_path / "kernel.py"
+        path.write_text(KERNEL)
+        assert self.hits(path, "one version") == 0
+        (index,) = tmp_path.rglob("*.nbi")
+        # A type that the other version knew, of a module that is gone.
+        index.write_bytes(index.read_bytes().replace(b"numba.core.types", b"numba.gone.types"))
+        assert self.hits(path, "one version") == 0
         assert self.hits(path, "one version") == 1
 
     def test_fingerprints_follow_the_source(self) -> None:

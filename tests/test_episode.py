@@ -13,7 +13,7 @@ from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.joint_state import JointState
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import Episode, OpenLoop, make_policy, run_episode

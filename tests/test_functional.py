@@ -16,7 +16,7 @@ from d4orm_env import functional
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.scenarios import make_problem
 
 KEY = jax.random.key(0)

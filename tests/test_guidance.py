@@ -9,7 +9,7 @@ import pytest
 from planner_support import hop_problem
 
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 from d4orm_planners.guidance import (
     Guidance,
     coarse_problem,

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 import subprocess
 import sys
 
 import pytest
 
-HEAVY = ("torch", "ray", "casadi", "plotly", "matplotlib", "jax", "stable_baselines3", "supersuit", "zenoh", "pyrvo",
-         "pandas", "pyarrow")  # fmt: skip
+HEAVY = ("torch", "ray", "casadi", "matplotlib", "jax", "stable_baselines3", "supersuit", "zenoh", "pyrvo",
+         "pandas", "pyarrow", "scipy.stats")  # fmt: skip
 CONTRACT = (
     "navigation_v0",
     "make_problem",
@@ -54,12 +55,16 @@ def test_making_and_judging_a_problem_loads_nothing_heavy() -> None:
 
 
 def test_the_cpu_engine_does_without_jax() -> None:
-    code = "from d4orm_env.engine.base import get_engine\nassert get_engine('cpu').name == 'cpu'"
+    code = "from d4orm_env.engine.choice import get_engine\nassert get_engine('cpu').name == 'cpu'"
     assert loaded_by(code) == set()
 
 
 def test_the_environment_does_without_jax_and_matplotlib() -> None:
     assert loaded_by("from d4orm_env import navigation_v0\nnavigation_v0.parallel_env(num_robots=2)") == set()
+
+
+def test_comparing_policies_loads_nothing_heavy_before_there_is_something_to_report() -> None:
+    assert loaded_by("from d4orm_planners import evaluate") == set()
 
 
 @pytest.mark.parametrize("name", CONTRACT)
@@ -79,6 +84,21 @@ def test_the_contracts_import_statement_works_in_a_fresh_process() -> None:
 
 def test_all_names_resolve() -> None:
     assert run_python("from d4orm_env import *\nprint(functional.__name__)") == "d4orm_env.functional"
+
+
+PUBLIC = (
+    "d4orm_env", "d4orm_env.engine.base", "d4orm_env.engine.choice", "d4orm_env.functional", "d4orm_env.joint_state",
+    "d4orm_env.models", "d4orm_env.navigation_v0", "d4orm_env.options", "d4orm_env.render", "d4orm_env.rewards",
+    "d4orm_env.scenarios", "d4orm_env.verify", "d4orm_env.wrappers", "d4orm_planners", "d4orm_planners.adapters",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_public_modules_say_what_is_public(name: str) -> None:
+    module = importlib.import_module(name)
+    assert len(set(module.__all__)) == len(module.__all__)
+    for public in module.__all__:
+        assert getattr(module, public) is not None
 
 
 def test_unknown_names_are_attribute_errors() -> None:

@@ -12,9 +12,9 @@ from d4orm_env.core.arrays import LARGEST, SMALLEST
 from d4orm_env.core.problem import MAX_TIME_STEP, MIN_TIME_STEP, Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
+from d4orm_env.env_inputs import MAX_ACTION
 from d4orm_env.joint_env import JointNavigationEnv
 from d4orm_env.joint_state import split_state
-from d4orm_env.simulation import MAX_ACTION
 from d4orm_env.vector_env import NavigationVectorEnv
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from engine_support import ENGINE_NAMES, PYTHON_OPS, random_controls
+from registry_support import forgetting
 
 from d4orm_env import (
     Problem,
@@ -26,9 +27,9 @@ from d4orm_env import (
     verify,
 )
 from d4orm_env.core.dynamics import MODEL_CODES, MODELS, get_model, model_digest
-from d4orm_env.core.observation import ObservationLayout
+from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.transition import TimeStep, advance
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.worlds import kernels_of_codes, world_kernels
 from d4orm_env.models import OWN_LIMITS, SPEED, Limit, Model, ModelFunctions, clip
 from d4orm_env.verify.integrated import Integrated
@@ -80,9 +81,9 @@ BOAT = Model(
 
 @pytest.fixture
 def boat() -> Iterator[Model]:
-    register_model(BOAT)
-    yield BOAT
-    del MODELS["boat"], MODEL_CODES["boat"]
+    with forgetting(MODELS):
+        register_model(BOAT)
+        yield BOAT
     kernels_of_codes.cache_clear()
 
 
@@ -93,8 +94,8 @@ def with_function(**functions: Any) -> Model:
 @pytest.mark.parametrize(
     ("model", "message"),
     [
-        (replace(BOAT, name="car"), "model 'car' exists already; give yours another name"),
-        (replace(BOAT, name="a boat"), "must be an identifier"),
+        (replace(BOAT, name="car"), "model name 'car' is taken; register yours under another"),
+        (replace(BOAT, name="a-boat"), "must be an identifier"),
         (replace(BOAT, dimension=4), "dimension is 4; it must be 2 or 3"),
         (replace(BOAT, control_names=("vx",), control_limits=(0,)), "control_names has 1 names; it must have 2 or 3"),
         (replace(BOAT, control_limits=(0,)), "control_limits has 1 columns; expected 2"),
@@ -118,8 +119,25 @@ def test_a_model_that_does_not_fit_is_refused(model: Any, message: str) -> None:
 
 def test_a_model_may_be_registered_twice_but_not_two(boat: Model) -> None:
     register_model(replace(boat))
-    with pytest.raises(ValueError, match="exists already"):
+    with pytest.raises(ValueError, match="is taken"):
         register_model(with_function(rest=lambda x, zero: (x[0] + zero, x[1])))
+
+
+def test_an_installed_package_offers_a_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    info = tmp_path / "theirs-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[d4orm.models]\nboat = test_models:BOAT\nship = test_models:BOAT\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with forgetting(MODELS):
+        assert {"boat", "ship"} < set(MODELS)
+        problem = make_problem("circle", num_robots=2, model="boat")
+        assert problem.team.robot_models == (BOAT, BOAT)
+        assert problem.arrays.model_codes.tolist() == [len(MODEL_CODES) - 1] * 2
+        register_model(BOAT)  # as its module may do too
+        assert get_model("boat") == BOAT
+        with pytest.raises(ValueError, match="model 'ship' calls itself 'boat'"):
+            make_problem("circle", num_robots=2, model="ship")
 
 
 def test_the_digest_of_a_model_knows_the_numbers_that_its_functions_hold() -> None:
@@ -157,14 +175,14 @@ def test_a_registered_model_is_planned_and_verified(boat: Model) -> None:
 def test_the_digest_of_a_problem_does_not_know_the_order_of_registration(boat: Model) -> None:
     problem = make_problem("circle", num_robots=2, model="boat")
     codes = problem.arrays.model_codes.tolist()
-    other = replace(boat, name="raft")
-    del MODELS["boat"], MODEL_CODES["boat"]
-    register_model(other)
-    register_model(boat)
-    again = make_problem("circle", num_robots=2, model="boat")
-    del MODELS["raft"], MODEL_CODES["raft"]
-    assert codes != again.arrays.model_codes.tolist()
-    assert problem == again
+    with forgetting(MODELS):
+        MODELS._registered.pop("boat")
+        MODEL_CODES.pop("boat")
+        register_model(replace(boat, name="raft"))
+        register_model(boat)
+        again = make_problem("circle", num_robots=2, model="boat")
+        assert codes != again.arrays.model_codes.tolist()
+        assert problem == again
 
 
 @pytest.mark.parametrize("engine", ENGINE_NAMES)

@@ -21,7 +21,7 @@ from pettingzoo.utils import aec_to_parallel
 from d4orm_env import navigation_v0
 from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.world import World
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.joint_env import JointNavigationEnv
 from d4orm_env.joint_state import split_state
 from d4orm_env.scenarios import make_problem

@@ -25,13 +25,14 @@ from planner_support import hop_problem, walled_in_problem
 from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
-from d4orm_planners import Plan, d_d4orm, make_planner
-from d4orm_planners.base import Callback, Iteration, Search
+from d4orm_planners import Plan, make_planner
 from d4orm_planners.d4orm import D4orm
 from d4orm_planners.distributed import messages as message_module
 from d4orm_planners.distributed.messages import KINDS, Message, encode
 from d4orm_planners.distributed.node import node_seed
 from d4orm_planners.distributed.zenoh_transport import ZenohSettings, ZenohTransport
+from d4orm_planners.planner import Callback, Iteration
+from d4orm_planners.search import Search
 
 pytestmark = pytest.mark.slow
 
@@ -162,8 +163,7 @@ def test_a_node_that_was_started_again_is_heard_again() -> None:
 def test_messages_that_are_lost_doubled_and_late_do_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
     seeds = iter(range(10))
     monkeypatch.setattr(
-        d_d4orm,
-        "ZenohTransport",
+        "d4orm_planners.d_d4orm.planner.ZenohTransport",
         lambda settings: FaultyTransport(ZenohTransport(settings), next(seeds), loss=0.2, duplicates=0.2, delay=1.0),
     )
     endpoint = free_endpoint()
@@ -187,7 +187,7 @@ def ends(monkeypatch: pytest.MonkeyPatch) -> list[ZenohTransport]:
         opened.append(ZenohTransport(settings))
         return opened[-1]
 
-    monkeypatch.setattr(d_d4orm, "ZenohTransport", open_end)
+    monkeypatch.setattr("d4orm_planners.d_d4orm.planner.ZenohTransport", open_end)
     return opened
 
 
@@ -195,10 +195,10 @@ def hold(monkeypatch: pytest.MonkeyPatch, node: int) -> threading.Event:
     """A node begins no iteration before this event."""
     iterate, go = D4orm.iterate, threading.Event()
 
-    def held(self: D4orm, search: Search) -> Iteration:
+    def held(self: D4orm, search: Search, state: Any) -> tuple[Any, Iteration]:
         if search.seed == node_seed(SEED, node):
             go.wait()
-        return iterate(self, search)
+        return iterate(self, search, state)
 
     monkeypatch.setattr(D4orm, "iterate", held)
     return go
@@ -260,9 +260,9 @@ def test_what_arrives_while_a_node_hangs_is_not_lost(monkeypatch: pytest.MonkeyP
 def test_what_has_arrived_is_not_lost_with_the_planner_here(heard: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     iterate, go = D4orm.iterate, threading.Event()
 
-    def broken(self: D4orm, search: Search) -> Iteration:
+    def broken(self: D4orm, search: Search, state: Any) -> tuple[Any, Iteration]:
         if search.seed != node_seed(SEED, 1):
-            return iterate(self, search)
+            return iterate(self, search, state)
         go.wait()
         raise ArithmeticError("out of order")
 

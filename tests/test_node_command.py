@@ -174,7 +174,7 @@ def test_a_file_means_a_node(tmp_path: Path) -> None:
     task = load_node(write(tmp_path, seed=7, settings=settings, zenoh=zenoh))
     config = task.planner.config
     assert (config.node, config.nodes, config.transport, config.mode) == (1, 2, "zenoh", "async")
-    assert (config.planner, config.selection, config.num_samples) == ("d4orm-d", "max", 512)
+    assert (config.node_planner.name, config.selection, config.refinement.num_samples) == ("d4orm-d", "max", 512)
     assert config.zenoh is not None
     assert config.zenoh.namespace == "team/1"
     assert config.zenoh.config_file == str(tmp_path / "zenoh.json5")

@@ -10,7 +10,8 @@ from engine_support import ENGINE_NAMES, NUMPY_BITS, SameWeights, engine_noise, 
 from scipy import stats
 
 from d4orm_env.engine import noise
-from d4orm_env.engine.base import SamplingRules, SamplingTask, get_engine
+from d4orm_env.engine.base import SamplingRules, SamplingTask
+from d4orm_env.engine.choice import get_engine
 
 NUM_DRAWS = 1_000_000
 

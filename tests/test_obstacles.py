@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import pickle
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+import shapely.ops
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from d4orm_env import load_problem, navigation_v0, rollout, save_problem, verify
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.core.world_index import MAX_BYTES, build_index
 from d4orm_env.engine.base import get_engine
+from d4orm_env.verify.geometry import polygon_approach
+from d4orm_planners import make_planner
+from d4orm_planners.steering import straight_drives
 
 ENGINES = pytest.mark.parametrize("engine", ["cpu", "jax"])
 
@@ -137,6 +144,69 @@ def test_polygons_are_those_of_shapely(seed: int, corners: int) -> None:
     outside = expected > 0
     np.testing.assert_allclose(clearance[outside], expected[outside], atol=1e-9)
     assert (clearance[~outside] <= 0).all()
+
+
+@given(seed=st.integers(0, 10**6), corners=st.integers(3, 12))
+@settings(max_examples=50, deadline=None)
+def test_verify_sees_how_near_a_way_comes_to_a_polygon(seed: int, corners: int) -> None:
+    random = np.random.default_rng(seed)
+    outline = star(random, corners, 2.0).astype(np.float32).astype(float)
+    polygon = shapely.Polygon(outline)
+    assume(polygon.is_valid)
+    start, end = random.uniform(-3, 3, (2, 40, 2))
+    distance, fraction = polygon_approach(start, end, outline)
+    expected = [shapely.LineString(pair).distance(polygon) for pair in zip(start, end, strict=True)]
+    np.testing.assert_allclose(np.maximum(distance, 0), expected, atol=1e-9)
+    places = start + fraction[:, None] * (end - start)
+    apart = shapely.distance(polygon, shapely.points(places))
+    np.testing.assert_allclose(apart, expected, atol=1e-9)
+
+
+def wall_problem(model: str = "holonomic2d") -> Problem:
+    """One robot, and across its straight way a slanted wall that leaves a gap at one side."""
+    wall = [(-0.3, -2.0), (0.2, -2.1), (0.1, 0.4), (-0.2, 0.3)]
+    start = np.zeros((1, 4), np.float32)
+    start[0, 0] = -1.5
+    return Problem(Team((model,)), start, [(1.5, 0.0)], World(polygons=[wall]))
+
+
+def test_a_polygon_is_in_the_way_of_everyone_alike() -> None:
+    problem = wall_problem()
+    controls = straight_drives(problem).controls[:, :, 0]
+    report, trajectory = verify(problem, controls), rollout(problem, controls)
+    assert trajectory.collided.any()
+    (contact,) = [violation for violation in report.violations if violation.kind == "obstacle contact"]
+    assert "polygons[0]" in contact.detail
+    first = float(np.flatnonzero(trajectory.collided[:, 0])[0] * problem.dt)
+    assert first - problem.dt <= contact.time <= first
+
+
+@pytest.mark.parametrize("name", ["d4orm", "d4orm-d", "ipopt"])
+def test_planners_go_round_a_polygon(name: str) -> None:
+    plan = make_planner(name, **({} if name == "ipopt" else {"engine": "cpu"})).solve(wall_problem(), seed=0)
+    assert plan.solved
+    assert verify(plan.problem, plan.controls).ok
+    assert np.abs(plan.trajectory.positions[:, 0, 1]).max() > 0.4
+
+
+def test_polygons_come_back_from_a_file(tmp_path: Path) -> None:
+    random = np.random.default_rng(5)
+    polygons = [np.add((4 * i, 3), star(random, 7, 1.0)) for i in range(3)]
+    problem = wall_problem().replace(world=World(polygons=polygons, circles=[(0, -4, 1)]))
+    save_problem(problem, tmp_path / "walls.yaml")
+    again = load_problem(tmp_path / "walls.yaml")
+    assert again == problem
+    assert pickle.loads(pickle.dumps(problem)) == problem
+    assert problem != problem.replace(world=World(polygons=polygons[:2], circles=[(0, -4, 1)]))
+
+
+def test_a_robot_sees_the_nearest_edge_of_a_polygon() -> None:
+    env = navigation_v0.parallel_env(problem=wall_problem(), observed_obstacles=2)
+    seen, _ = env.reset(seed=0)
+    present, x, y, gap = seen["robot_0"][-8:-4]
+    nearest = shapely.ops.nearest_points(shapely.Polygon(wall_problem().world.polygons[0]), shapely.Point(-1.5, 0))[0]
+    distance = np.hypot(nearest.x + 1.5, nearest.y)
+    np.testing.assert_allclose([present, x, y, gap], [1, nearest.x + 1.5, nearest.y, distance - 0.15], atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -23,9 +23,9 @@ from PIL import Image
 from test_examples import EXAMPLES, PNG, ROOT, run, table
 
 from d4orm_env import Problem, Team, World
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.joint_state import JointState
-from d4orm_planners.base import evaluate_controls
+from d4orm_planners.candidate import evaluate_controls
 from d4orm_planners.steering import straight_drives
 
 

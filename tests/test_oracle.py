@@ -13,8 +13,9 @@ from reference import judge, position_error
 from d4orm_env import make_problem
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
-from d4orm_env.engine.base import SamplingRules, SamplingTask, get_engine
-from d4orm_planners.evaluation import plain
+from d4orm_env.engine.base import SamplingRules, SamplingTask
+from d4orm_env.engine.choice import get_engine
+from d4orm_planners.benchmark import plain
 from d4orm_planners.sampling.weights import SoftmaxWeights
 
 RULES = SamplingRules(SoftmaxWeights(oracle.TEMPERATURE))

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from env_support import line_problem
+from registry_support import forgetting
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.errors import UnknownKeywordError
@@ -33,7 +35,6 @@ from d4orm_planners import (
     register_policy,
     run_episode,
 )
-from d4orm_planners.evaluation.robustness import robustness
 from d4orm_planners.evaluation.store import STORE, TrialStore
 from d4orm_planners.names import PLANNERS, POLICIES
 from d4orm_planners.registry import describe_policy
@@ -81,8 +82,8 @@ class Duck:
 class Ahead(Planner):
     """Everyone at full thrust along the first axis."""
 
-    def iterate(self, search: Any) -> Iteration:
-        return Iteration(np.broadcast_to(np.float32([1, 0]), search.current.controls.shape))
+    def iterate(self, search: Any, state: None) -> tuple[None, Iteration]:
+        return state, Iteration(np.broadcast_to(np.float32([1, 0]), search.current.controls.shape))
 
 
 def push(observations: dict[str, Any], state: Any) -> dict[str, Any]:
@@ -157,14 +158,9 @@ def test_unknown_settings_are_refused(policy: Any) -> None:
 
 
 @pytest.fixture
-def tables(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a test registers is forgotten after it, and entry points are looked for anew."""
-    for table in (PLANNERS, POLICIES):
-        monkeypatch.setattr(table, "_registered", dict(table._registered))
-        monkeypatch.delitem(vars(table), "_entry_points", raising=False)
-    yield
-    for table in (PLANNERS, POLICIES):
-        vars(table).pop("_entry_points", None)
+def tables() -> Iterator[None]:
+    with forgetting(PLANNERS, POLICIES):
+        yield
 
 
 @pytest.mark.usefixtures("tables")
@@ -286,7 +282,7 @@ def test_a_comparison_takes_a_mixture(tmp_path: Path) -> None:
 def test_policies_without_labels_have_their_own_names(tmp_path: Path) -> None:
     rows = compare([Push, push, Duck(), "goal"], tmp_path)
     assert [row.label for row in rows] == ["Push", "push", "Duck", "goal"]
-    assert [row.label for row in robustness(push_one, tmp_path, noise=[0], trials=1, workers=1)] == ["push_one"]
+    assert [row.label for row in compare(push_one, tmp_path)] == ["push_one"]
     with pytest.raises(ValueError, match="two policies are called 'Push'; give a mapping"):
         compare([Push(), Push(2.0)], tmp_path)
     with pytest.raises(ValueError, match=r"policies\['goal'\] has the name of another policy"):

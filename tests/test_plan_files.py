@@ -19,7 +19,7 @@ from planner_support import cheap_planner, hop_problem
 
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.scenarios import make_problem
-from d4orm_planners import Plan
+from d4orm_planners import Plan, load_plan
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def assert_equal(a: Plan, b: Plan) -> None:
 def test_a_plan_comes_back_to_the_bit(case: dict[str, Any], tmp_path: Path) -> None:
     plan = cheap_planner("d4orm").solve(make_problem(**case), seed=1)
     plan.save(tmp_path / "plan.npz")
-    loaded = Plan.load(str(tmp_path / "plan.npz"))
+    loaded = load_plan(str(tmp_path / "plan.npz"))
     assert_equal(plan, loaded)
     assert loaded.problem.name == plan.problem.name
 
@@ -313,6 +313,22 @@ def test_a_solution_is_still_one_when_loaded(solved: tuple[Plan, Path]) -> None:
     loaded = Plan.load(path)
     assert_equal(plan, loaded)
     assert loaded.verified
+
+
+@pytest.mark.parametrize(
+    ("status", "is_solved"), [("solved", False), ("refuted", True), ("abandoned", True), ("abandoned", False)]
+)
+def test_status_and_solved_cannot_contradict(solved: tuple[Plan, Path], status: Any, is_solved: bool) -> None:
+    with pytest.raises(ValueError, match=f"status (is )?'{status}'"):
+        replace(solved[0], status=status, solved=is_solved)
+
+
+def test_a_file_that_was_refuted_in_vain_is_solved_again(solved: tuple[Plan, Path]) -> None:
+    _, path = solved
+    header, arrays = contents(path)
+    rewrite(path, {**header, "status": "refuted", "solved": False}, arrays)
+    loaded = Plan.load(path)
+    assert (loaded.solved, loaded.status) == (True, "solved")
 
 
 @pytest.mark.parametrize("forged", ["beyond limits", "none", "one robot fewer"])

@@ -21,15 +21,15 @@ from planner_support import (
 from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import IterationRecord, Plan, list_planners, make_planner
-from d4orm_planners.base import Search
 from d4orm_planners.registry import PLANNERS, describe_planner
 from d4orm_planners.sampling.optimizer import SamplingPlanner, standard_normal
 from d4orm_planners.sampling.schedule import alpha_bar, annealed
+from d4orm_planners.search import Search
 
 ALL = pytest.mark.parametrize("name", list_planners())
 SAMPLING = tuple(name for name in list_planners() if issubclass(PLANNERS[name], SamplingPlanner))
@@ -161,7 +161,7 @@ def test_every_iteration_draws_its_own_numbers(name: str) -> None:
     search = Search(cheap_planner(name), hop_problem(), 0, None)
     seeds = {search.iteration_seed(stream) for stream in Stream}
     search.advance()
-    search.planner.finish(search)
+    search.close()
     seeds |= {search.iteration_seed(stream) for stream in Stream}
     assert len(seeds) == 2 * len(Stream)
 
@@ -227,10 +227,10 @@ def test_an_interrupt_within_an_iteration_returns_the_best_plan_too(name: str, m
     planner = cheap_planner(name)
     iterate = planner.iterate
 
-    def interrupted(search: Search) -> Any:
+    def interrupted(search: Search, state: Any) -> Any:
         if search.iteration == 1:
             raise KeyboardInterrupt
-        return iterate(search)
+        return iterate(search, state)
 
     monkeypatch.setattr(planner, "iterate", interrupted)
     plan = planner.solve(walled_in_problem(), max_iterations=5)
@@ -425,6 +425,12 @@ def test_an_unknown_preset_is_refused(name: str) -> None:
         make_planner(name, preset="papers")
 
 
+@pytest.mark.parametrize("name", ["d4orm-c2f", "goal", "ppo"])
+def test_a_policy_that_is_no_planner_is_pointed_to(name: str) -> None:
+    with pytest.raises(ValueError, match=rf"'{name}' is no planner but a policy.*use make_policy\('{name}'\)"):
+        make_planner(name)
+
+
 @pytest.mark.parametrize("name", ["d4rom", "", "D4ORM", None, 4])
 def test_an_unknown_planner_is_refused(name: Any) -> None:
     with pytest.raises(ValueError, match="is unknown; choose one of d4orm, d4orm-d, d-d4orm, mppi"):
@@ -455,14 +461,31 @@ def test_the_methods_of_the_paper_are_there() -> None:
 
 @pytest.mark.parametrize("name", SAMPLING)
 def test_the_paper_preset_has_the_papers_parameters(name: str) -> None:
-    config = make_planner(name, preset="paper").config
-    assert config.num_samples == 1024
-    assert config.num_steps == (10_000 if name == "mbd" else 100)
-    assert config.temperature == 0.3
-    assert (config.beta_start, config.beta_end) == (1e-4, 2e-2)
-    assert config.credit == "team"
-    assert config.weight_cutoff == 0
-    assert config.clip_between_iterations is (name == "d4orm-d")
+    parameters = {
+        "num_samples": 1024,
+        "num_steps": 10_000 if name == "mbd" else 100,
+        "temperature": 0.3,
+        "beta_start": 1e-4,
+        "beta_end": 2e-2,
+        "credit": "team",
+        "weight_cutoff": 0,
+        "clip_between_iterations": name == "d4orm-d",
+    }
+    without = {
+        "mppi": {"beta_start", "beta_end"},
+        "cem": {"temperature", "weight_cutoff", "beta_start", "beta_end"},
+        "mbd": {"clip_between_iterations"},
+    }
+    config = make_planner(name, preset="paper").config.keywords()
+    assert parameters.keys() - config.keys() == without.get(name, set())
+    assert {name: config[name] for name in parameters if name in config}.items() <= parameters.items()
+
+
+@ALL
+def test_a_preset_says_nothing_of_what_no_planner_has(name: str) -> None:
+    known = {setting for kind in PLANNERS.values() for setting in kind.config_class.setting_names()}
+    known |= set(PLANNERS["d-d4orm"].config_class.setting_names({"planner": "d4orm-d"}))
+    assert all(preset.keys() <= known for preset in PLANNERS[name].presets.values())
 
 
 def test_the_paper_presets_of_the_methods_own_parameters() -> None:
@@ -492,8 +515,12 @@ def tiny_problem(num_robots: int) -> Problem:
 
 
 def method(name: str, **config: Any) -> Any:
-    shared = {"engine": "cpu", "num_samples": SAMPLES, "num_steps": STEPS, "temperature": TEMPERATURE}
-    return make_planner(name, weight_cutoff=0.0, beta_start=BETAS[0], beta_end=BETAS[1], **shared, **config)
+    shared = {
+        "engine": "cpu", "num_samples": SAMPLES, "num_steps": STEPS, "temperature": TEMPERATURE, "weight_cutoff": 0.0,
+        "beta_start": BETAS[0], "beta_end": BETAS[1],
+    }  # fmt: skip
+    known = PLANNERS[name].config_class.setting_names()
+    return make_planner(name, **{key: value for key, value in shared.items() if key in known}, **config)
 
 
 def start_of(name: str, problem: Problem, **config: Any) -> Search:
@@ -519,7 +546,7 @@ def draws_of(search: Search) -> Any:
 
 
 def assert_controls(search: Search, expected: np.ndarray) -> None:
-    got = search.planner.iterate(search)
+    _, got = search.planner.iterate(search, None)
     assert got.denoising_steps == STEPS
     # Chance hides nothing here: the planned change is a thousand times larger than what is tolerated.
     assert np.abs(expected - search.current.controls).max() > 0.05
@@ -575,7 +602,7 @@ def test_late_steps_go_on_with_fewer_samples(late: Any, parts: Any, monkeypatch:
     monkeypatch.setattr(CpuEngine, "denoise", recorded)
     planner = make_planner("d4orm", num_samples=40, num_steps=10, **late)
     search = Search(planner, walled_in_problem(), 0, None)
-    iteration = planner.iterate(search)
+    _, iteration = planner.iterate(search, None)
     assert [(len(scale), num_samples) for _, scale, num_samples, _, _ in calls] == parts
     np.testing.assert_array_equal(np.concatenate([call[1] for call in calls]), planner.noise_scale())
     assert len({call[3] for call in calls}) == len(calls)
@@ -633,7 +660,7 @@ def test_an_iteration_starts_from_the_controls_as_planned_or_as_executed(name: s
     search = Search(planner, hop_problem(2), 0, given)
     search.iteration = 1
     assert search.current.trajectory.arrived[docks, 0]
-    got = planner.iterate(search).controls[:, :, 0]
+    got = planner.iterate(search, None)[1].controls[:, :, 0]
     start = limit if clip or (clip is None and name == "d4orm") else wanted
     np.testing.assert_allclose(got[:10, 0], start, atol=1e-3)
     np.testing.assert_allclose(got[docks:, 0], 0, atol=1e-3)

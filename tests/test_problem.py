@@ -291,7 +291,8 @@ def test_control_limits_are_zero_on_padding(monkeypatch: pytest.MonkeyPatch) -> 
     from d4orm_env.core import dynamics
 
     cart = dataclasses.replace(dynamics.MODELS["velocity2d"], name="cart", control_names=("v",), control_limits=(0,))
-    monkeypatch.setitem(dynamics.MODELS, "cart", cart)
+    for table in (dynamics.MODELS._registered, dynamics.MODELS._admitted):
+        monkeypatch.setitem(table, "cart", cart)
     team = Team(("cart", "holonomic2d"), max_speed=2, max_acceleration=3)
     assert team.control_limits.tolist() == [[2, 0], [3, 3]]
 

@@ -12,14 +12,13 @@ import numpy as np
 import pytest
 
 from d4orm_planners import cli, list_planners
-from d4orm_planners.evaluation import harness
-from d4orm_planners.evaluation.cells import configurations
-from d4orm_planners.evaluation.figures import FIGURES, find_figure
-from d4orm_planners.evaluation.reproduction import Figure, Group, Section, reproduce
-from d4orm_planners.evaluation.reproduction_numbers import METRICS, first_solution, measured
-from d4orm_planners.evaluation.reproduction_plots import PLOTS, best_reward
-from d4orm_planners.evaluation.reproduction_report import markdown
+from d4orm_planners.evaluation import evaluate
 from d4orm_planners.evaluation.store import Trial, TrialStore
+from d4orm_planners.reproduction.figure import Figure, Group, Section, reproduce
+from d4orm_planners.reproduction.numbers import METRICS, first_solution, measured
+from d4orm_planners.reproduction.paper import FIGURES, find_figure
+from d4orm_planners.reproduction.plots import PLOTS, best_reward
+from d4orm_planners.reproduction.report import markdown
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -108,14 +107,15 @@ def test_what_a_figure_names_exists(name: str) -> None:
         assert metric in chosen.metrics
     if available(chosen):
         for section in (*chosen.sections, *chosen.quick().sections):
-            assert len(configurations(section.policies, section.time_limit)) == len(section.policies)
+            for study in section.studies(1):
+                assert len(study.configurations()) == len(section.policies)
 
 
 def test_a_call_that_was_broken_off_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     few = {"num_samples": 64, "num_steps": 5, "max_iterations": 1}
     section = Section(title="Circle", policies={"d4orm": few, "mppi": few}, scenarios=("circle",), robots=(2,))
     chosen = figure(sections=(section, replace(section, title="Others", robots=(3,))))
-    run_here, ran = harness.run_here, []
+    run_here, ran = evaluate.run_here, []
 
     def stopping(jobs: Any) -> Any:
         for job, trials in zip(jobs, run_here(jobs)):
@@ -124,7 +124,7 @@ def test_a_call_that_was_broken_off_goes_on(tmp_path: Path, monkeypatch: pytest.
             if len(ran) == 3:
                 raise KeyboardInterrupt
 
-    monkeypatch.setattr(harness, "run_here", stopping)
+    monkeypatch.setattr(evaluate, "run_here", stopping)
     with pytest.raises(KeyboardInterrupt):
         reproduce(chosen, tmp_path, seeds=1)
     groups = reproduce(chosen, tmp_path, seeds=1)
@@ -132,6 +132,37 @@ def test_a_call_that_was_broken_off_goes_on(tmp_path: Path, monkeypatch: pytest.
     assert [(group.section, group.label) for group in groups] == [
         ("Circle", "d4orm"), ("Circle", "mppi"), ("Others", "d4orm"), ("Others", "mppi"),
     ]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_d4orm_solves_no_less_than_mppi_and_cem_with_as_many_samples(tmp_path: Path) -> None:
+    # 200 steps of 1024 samples; those of the defaults have 256 and, for the last 70 of every 100, 128.
+    spent = {"preset": "paper", "max_iterations": 2}
+    policies = {"d4orm": {"max_iterations": 12}, "mppi": spent, "cem": spent}
+    section = Section(title="Circle", policies=policies, scenarios=("circle",), robots=(8,))
+    rows = [measured(group) for group in reproduce(figure(sections=(section,)), tmp_path, seeds=2)]
+    solved = {row.label: row.successes for row in rows}
+    # Two seeds and 200 steps are too few for medians, and only the defaults are sure to solve both within them.
+    assert solved["d4orm"] == 2 >= max(solved.values())
+
+
+@pytest.mark.slow
+def test_coarser_guidance_and_other_schedules_solve_as_well(tmp_path: Path) -> None:
+    coarse = {
+        f"{factor}, {refine}": {"policy": "d4orm-c2f", "coarse_factor": factor, "refine": refine}
+        for factor in (1, 4)
+        for refine in ("off", "background")
+    }
+    schedules = {f"{last}": {"policy": "d4orm", "beta_start": 1e-4, "beta_end": last} for last in (0.01, 0.05)}
+    circle = Section(title="Circle", policies=schedules, scenarios=("circle",), robots=(4,))
+    sections = (
+        Section(title="Obstacles", policies=coarse, scenarios=("four_obstacles",), robots=(4,)),
+        circle,
+        replace(circle, title="Drives", model="differential_drive"),
+    )
+    rows = [measured(group) for group in reproduce(figure(sections=sections), tmp_path, seeds=1)]
+    assert [row.successes for row in rows] == [1] * (4 + 2 + 2)
+    assert all(4.5 < row.travel_time <= row.makespan < 10 for row in rows)  # type: ignore[operator]
 
 
 # What counts as solved, and when.

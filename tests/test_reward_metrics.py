@@ -9,12 +9,13 @@ import pytest
 from engine_support import ENGINE_NAMES, open_problem, stand
 
 from d4orm_env.core.metrics import arrival_times, mean_squared_jerk, trajectory_metrics
-from d4orm_env.core.problem import Problem, inverse_initial_distance
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_arrays import inverse_initial_distance
 from d4orm_env.core.reward import step_reward
 from d4orm_env.core.team import Team
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 
 
 def test_step_reward() -> None:
@@ -26,7 +27,9 @@ def test_step_reward() -> None:
 
 def test_start_distance_counts_from_the_goal_radius() -> None:
     places, goals = [[0, 0], [1, 1], [1, 1]], [[3, 4], [1, 1], [1, 1.05]]
-    np.testing.assert_allclose(inverse_initial_distance(places, goals, 0.1), [0.2, 10, 10], rtol=1e-6)
+    np.testing.assert_allclose(
+        inverse_initial_distance(np.float32(places), np.float32(goals), 0.1), [0.2, 10, 10], rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize("engine", ENGINE_NAMES)
@@ -95,7 +98,7 @@ def test_robots_and_obstacles_cost_one_each_however_many(engine: str) -> None:
 
 
 def test_arrival_times() -> None:
-    arrived = [[False, False, True], [False, False, True], [True, False, True], [True, False, True]]
+    arrived = np.array([[0, 0, 1], [0, 0, 1], [1, 0, 1], [1, 0, 1]], bool)
     assert arrival_times(arrived, 0.5).tolist() == [1.0, np.inf, 0.0]
 
 

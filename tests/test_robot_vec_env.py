@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from d4orm_env import make_problem, navigation_v0
-from d4orm_env.core.observation import ObservationLayout
+from d4orm_env.core.observation_layout import ObservationLayout, ObservationSlices
 from d4orm_planners.rl.features import Features
 
 MODELS = ("holonomic2d", "velocity2d", "differential_drive", "holonomic3d")
@@ -25,7 +25,7 @@ def observations_of(model: str, num_robots: int = 5, seed: int = 0, **kwargs: ob
 def test_sizes_are_those_of_the_observations(model: str) -> None:
     features, observations = observations_of(model)
     encoded, frames = features.encode(observations)
-    assert observations.shape == (5, features.observation_size)
+    assert observations.shape == (5, features.slices.size)
     assert encoded.shape == (5, features.size)
     assert encoded.dtype == np.float32
     assert frames.shape == (5, 2)
@@ -36,7 +36,7 @@ def test_literal_features_of_a_robot_and_one_neighbor() -> None:
     # At rest, goal 3 m up the y axis; a neighbour 1 m away in that direction comes down at 0.5 m/s.
     own = [0, 0, 0, 0, 0, 0, 3, 0.25, 0, 0.15, 1, 2]
     neighbor = [1, 0, 1, 0, -0.5, 0.15]
-    features, frames = Features(2, 1, 0, turned=True).encode(np.array([own + neighbor], np.float32))
+    features, frames = Features(ObservationSlices(2, 1, 0), turned=True).encode(np.array([own + neighbor], np.float32))
     gap = 0.7
     expected = [0, 0, 0, 0, 1, 0, 1 / 4, np.exp(-12), 0.25, 0.15, 2]
     expected += [1, 1, 0, 1 / (1 + gap), np.exp(-4 * gap), -0.25, 0, 2 / 5, 1]
@@ -53,7 +53,7 @@ def test_literal_features_of_a_robot_on_its_way_past_a_neighbor_and_an_obstacle(
     # 1 m to its right, nearest in one second, and by its left an obstacle 0.4 m off.
     neighbor, obstacle = [1, 1, 0, -0.5, 0.5, 0.2], [1, -4, 3, 0.4]
     observation = np.array([own + neighbor + obstacle], np.float32)
-    features, frames = Features(2, 1, 1, turned=True).encode(observation)
+    features, frames = Features(ObservationSlices(2, 1, 1), turned=True).encode(observation)
     gap, miss = 0.65, np.sqrt(0.5) - 0.35
     expected = [0.5, 0, 1, 0, 1, 0, 1 / 4, np.exp(-12), 0.25, 0.15, 1.5]
     expected += [1, 0, -1, 1 / (1 + gap), np.exp(-4 * gap), 0.125, 0.125, 1 / 5, np.exp(-4 * miss)]
@@ -62,14 +62,16 @@ def test_literal_features_of_a_robot_on_its_way_past_a_neighbor_and_an_obstacle(
     np.testing.assert_allclose(features[0], expected, atol=1e-6)
     # What is not there is all zeros, whatever stands in its place.
     observation[0, [12, 18]] = 0
-    np.testing.assert_allclose(Features(2, 1, 1, turned=True).encode(observation)[0][0, 11:], 0, atol=1e-6)
+    np.testing.assert_allclose(
+        Features(ObservationSlices(2, 1, 1), turned=True).encode(observation)[0][0, 11:], 0, atol=1e-6
+    )
 
 
 @given(angle=st.floats(-3.1, 3.1), seed=st.integers(0, 50))
 def test_a_turned_world_looks_the_same_and_is_answered_by_turned_controls(angle: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    features = Features(2, 2, 1, turned=True)
-    observation = rng.normal(size=(1, features.observation_size)).astype(np.float32)
+    features = Features(ObservationSlices(2, 2, 1), turned=True)
+    observation = rng.normal(size=(1, features.slices.size)).astype(np.float32)
     observation[0, [10, 11]] = 1
     observation[0, [12, 18, 24]] = 1
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])

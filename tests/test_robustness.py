@@ -22,18 +22,25 @@ from typing import Any
 import pytest
 
 from d4orm_planners import cli, make_policy
-from d4orm_planners.evaluation import robustness as robustness_module
+from d4orm_planners.evaluation import evaluate as evaluate_module
+from d4orm_planners.evaluation import pool as pool_module
 from d4orm_planners.evaluation import store as store_module
 from d4orm_planners.evaluation import trials as trials_module
-from d4orm_planners.evaluation import workers as workers_module
-from d4orm_planners.evaluation.robustness import robustness
-from d4orm_planners.evaluation.robustness_report import markdown, write_robustness
-from d4orm_planners.evaluation.statistics import wilson_interval
+from d4orm_planners.evaluation.evaluate import run_study
+from d4orm_planners.evaluation.report import robustness_markdown, write_robustness
 from d4orm_planners.evaluation.store import APPLICATION_ID, STORE, Trial, TrialStore
-from d4orm_planners.evaluation.summary import success_rate
+from d4orm_planners.evaluation.study import Study
+from d4orm_planners.evaluation.summary import SuccessRate, success_rate, success_rates, wilson_interval
 from d4orm_planners.policy import DriveToGoal
 
-TINY: dict[str, Any] = {"robots": [2], "noise": [0.0, 0.3], "trials": 2, "workers": 1}
+TINY: dict[str, Any] = {"num_robots": [2], "control_noise_std": [0.0, 0.3], "seeds": range(2), "workers": 1}
+
+
+def rates_of(
+    policies: Any, out: Path, *, workers: int = 1, progress: Callable[..., Any] | None = None, **study: Any
+) -> list[SuccessRate]:
+    """Run what is missing, and sum up."""
+    return success_rates(run_study(Study(policies=policies, **study), out, workers=workers, progress=progress))
 
 
 def trial(seed: int = 0, **changes: Any) -> Trial:
@@ -68,16 +75,15 @@ def d4orm(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytes
         (5, 10, 0.236593, 0.763407),
         (1, 50, 0.003539, 0.104954),
         (45, 50, 0.786398, 0.956524),
-        (0, 0, 0.0, 1.0),
     ],
 )
 def test_wilson_interval(successes: int, count: int, lower: float, upper: float) -> None:
     assert wilson_interval(successes, count) == pytest.approx((lower, upper), abs=1e-6)
 
 
-@pytest.mark.parametrize(("successes", "count"), [(-1, 5), (6, 5), (1, 0)])
+@pytest.mark.parametrize(("successes", "count"), [(-1, 5), (6, 5), (1, 0), (0, 0)])
 def test_impossible_counts_are_refused(successes: int, count: int) -> None:
-    with pytest.raises(ValueError, match=f"successes is {successes}"):
+    with pytest.raises(ValueError, match="must"):
         wilson_interval(successes, count)
 
 
@@ -121,6 +127,25 @@ def test_a_finished_trial_stays_and_a_failed_one_is_replaced(tmp_path: Path) -> 
     assert store.add(trial(1, error="boom"))
     assert store.add(trial(1))
     assert store.trials() == [trial(), trial(1)]
+
+
+def test_the_table_is_that_of_the_files_that_are_out_there(tmp_path: Path) -> None:
+    TrialStore(tmp_path / "new.sqlite")
+    with closing(sqlite3.connect(tmp_path / "new.sqlite")) as connection:
+        (made,) = connection.execute("SELECT sql FROM sqlite_schema WHERE name = 'trials'").fetchone()
+    assert made.split() == FIRST_SCHEMA.split()
+
+
+FIRST_SCHEMA = """
+CREATE TABLE trials (policy TEXT NOT NULL, config TEXT NOT NULL, problem TEXT NOT NULL, noise REAL NOT NULL,
+seed INTEGER NOT NULL, label TEXT NOT NULL, scenario TEXT NOT NULL, robots INTEGER NOT NULL, model TEXT NOT NULL,
+dt REAL NOT NULL, versions TEXT NOT NULL, machine TEXT NOT NULL, date TEXT NOT NULL, success INTEGER NOT NULL,
+verified INTEGER, violation TEXT NOT NULL, collided INTEGER NOT NULL, arrived INTEGER NOT NULL, travel_time REAL,
+makespan REAL, reward REAL, mean_squared_jerk REAL, steps INTEGER NOT NULL, iterations INTEGER, status TEXT NOT NULL,
+wall_time REAL, preparation REAL, elapsed REAL, history TEXT NOT NULL, messages INTEGER, message_bytes INTEGER,
+waiting_share REAL, error TEXT NOT NULL, PRIMARY KEY (policy, config, problem, noise, seed)) WITHOUT ROWID
+"""
+"""Of version 4, which the files that are out there have."""
 
 
 def test_a_seed_that_the_store_has_no_room_for_is_refused(tmp_path: Path) -> None:
@@ -279,7 +304,7 @@ def test_a_file_that_is_not_ours_is_refused_and_left_alone(d4orm, tmp_path: Path
 
 
 def test_success_and_failure_are_counted(tmp_path: Path) -> None:
-    rates = robustness(["goal", "orca"], tmp_path, **TINY)
+    rates = rates_of(["goal", "orca"], tmp_path, **TINY)
     assert [(row.policy, row.noise, row.trials, row.successes, row.contacts) for row in rates] == [
         ("goal", 0.0, 2, 0, 2),
         ("goal", 0.3, 2, 0, 2),
@@ -293,7 +318,7 @@ def test_success_and_failure_are_counted(tmp_path: Path) -> None:
 
 
 def test_random_problems_differ_by_seed_and_noise_too(tmp_path: Path) -> None:
-    robustness(["goal"], tmp_path, scenarios=["random"], **TINY)
+    rates_of(["goal"], tmp_path, scenarios=["random"], **TINY)
     stored = TrialStore(tmp_path / STORE).trials()
     assert len({row.problem for row in stored}) == 2
     assert len({row.travel_time for row in stored}) == 4
@@ -309,7 +334,7 @@ def test_a_plan_is_made_once_for_all_levels_of_noise(tmp_path: Path, monkeypatch
 
     monkeypatch.setattr("d4orm_planners.d4orm.D4orm.solve", counted)
     settings = {"engine": "cpu", "num_samples": 64, "num_steps": 5, "max_iterations": 1}
-    rates = robustness({"d4orm": settings}, tmp_path, **TINY)
+    rates = rates_of({"d4orm": settings}, tmp_path, **TINY)
     assert made == [0, 1]
     assert all(row.errors == 0 for row in rates)
     times = {(row.seed, row.wall_time) for row in TrialStore(tmp_path / STORE).trials()}
@@ -317,25 +342,25 @@ def test_a_plan_is_made_once_for_all_levels_of_noise(tmp_path: Path, monkeypatch
 
 
 def test_resuming_runs_only_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    robustness(["goal"], tmp_path, **TINY)
+    rates_of(["goal"], tmp_path, **TINY)
     ran: list[tuple[int, tuple[float, ...]]] = []
-    run_job = workers_module.run_job
-    monkeypatch.setattr(workers_module, "run_job", lambda job: (ran.append((job.seed, job.noise)), run_job(job))[1])
-    before = robustness(["goal"], tmp_path, **TINY)
+    run_job = pool_module.run_job
+    monkeypatch.setattr(pool_module, "run_job", lambda job: (ran.append((job.seed, job.noise)), run_job(job))[1])
+    before = rates_of(["goal"], tmp_path, **TINY)
     assert ran == []
     counts: list[tuple[int, int]] = []
-    more = {**TINY, "noise": [0.0, 0.3, 0.5], "trials": 3}
-    rates = robustness(["goal"], tmp_path, **more, progress=lambda what, done, total: counts.append((done, total)))
+    more = {**TINY, "control_noise_std": [0.0, 0.3, 0.5], "seeds": range(3)}
+    rates = rates_of(["goal"], tmp_path, **more, progress=lambda what, done, total: counts.append((done, total)))
     assert ran == [(0, (0.5,)), (1, (0.5,)), (2, (0.0, 0.3, 0.5))]
     assert counts == [(4, 9), (5, 9), (6, 9), (7, 9), (8, 9), (9, 9)]
     assert [row.trials for row in rates] == [3, 3, 3]
     # Trials beyond those asked for are in the store and not in the rates.
-    again = robustness(["goal"], tmp_path, **TINY)
+    again = rates_of(["goal"], tmp_path, **TINY)
     assert again == before
     # Other settings are other trials.
     ran.clear()
-    robustness({"orca": {"time_horizon": 2.0}}, tmp_path, **TINY)
-    robustness({"orca": {"time_horizon": 3.0}}, tmp_path, **TINY)
+    rates_of({"orca": {"time_horizon": 2.0}}, tmp_path, **TINY)
+    rates_of({"orca": {"time_horizon": 3.0}}, tmp_path, **TINY)
     assert len(ran) == 4
 
 
@@ -349,23 +374,23 @@ class Unlucky(DriveToGoal):
 
 def test_an_error_is_a_row_and_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trials_module, "make_policy", lambda name, **settings: Unlucky())
-    rates = robustness(["goal"], tmp_path, **TINY)
+    rates = rates_of(["goal"], tmp_path, **TINY)
     assert [(row.trials, row.errors, row.error) for row in rates] == [(2, 1, "RuntimeError: out of luck")] * 2
-    assert "- `goal`: RuntimeError: out of luck" in markdown(rates)
+    assert "- `goal`: RuntimeError: out of luck" in robustness_markdown(rates)
     monkeypatch.undo()
-    rates = robustness(["goal"], tmp_path, **TINY)
+    rates = rates_of(["goal"], tmp_path, **TINY)
     assert [(row.trials, row.errors) for row in rates] == [(2, 0)] * 2
 
 
 def test_ctrl_c_keeps_what_was_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, d4orm) -> None:
-    run_job = workers_module.run_job
+    run_job = pool_module.run_job
 
     def interrupted(job: Any) -> Any:
         if job.seed == 1:
             raise KeyboardInterrupt
         return run_job(job)
 
-    monkeypatch.setattr(workers_module, "run_job", interrupted)
+    monkeypatch.setattr(pool_module, "run_job", interrupted)
     arguments = ("--policies", "goal", "--robots", "2", "--trials", "3", "--noise", "0,0.3", "--workers", "1")
     status, _, err = d4orm(*arguments)
     assert status == 130
@@ -376,7 +401,7 @@ def test_ctrl_c_keeps_what_was_done(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 @pytest.mark.slow
 def test_the_number_of_workers_makes_no_difference(tmp_path: Path) -> None:
     alone, together = (
-        robustness(["goal", "orca"], tmp_path / str(workers), **{**TINY, "workers": workers}) for workers in (1, 2)
+        rates_of(["goal", "orca"], tmp_path / str(workers), **{**TINY, "workers": workers}) for workers in (1, 2)
     )
     untimed: dict[str, Any] = {"wall_time": None, "compute": None, "compute_lower": None, "compute_upper": None}
     assert [replace(row, **untimed) for row in alone] == [replace(row, **untimed) for row in together]
@@ -412,6 +437,16 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, workers: int) -> None
     assert all(kept[row.key] == row for row in first)
 
 
+@pytest.mark.slow
+def test_closed_loop_survives_noise_that_open_loop_does_not(tmp_path: Path) -> None:
+    policies = {"d4orm-c2f": {"refine": "sync"}, "d4orm-d": {}, "goal": {}}
+    rates = rates_of(policies, tmp_path, **{**TINY, "num_robots": 4, "control_noise_std": (0.0, 0.5)})
+    rows = {(row.policy, row.noise): row for row in rates}
+    assert rows["d4orm-d", 0.0].successes == rows["d4orm-c2f", 0.5].successes == 2
+    assert rows["d4orm-d", 0.5].successes == 0
+    assert rows["goal", 0.0].contacts == 2
+
+
 # What is written.
 
 
@@ -434,7 +469,7 @@ def test_the_files(d4orm, tmp_path: Path) -> None:
 
 def test_the_table_row_by_row(tmp_path: Path) -> None:
     rates = [success_rate([trial(0, wall_time=0.25), trial(1, success=False, collided=2)])]
-    assert markdown(rates).splitlines() == [
+    assert robustness_markdown(rates).splitlines() == [
         "### circle, 2 robots, holonomic2d",
         "",
         "| policy | noise | success | 95% interval | contact | not in time | errors | travel time, s | planning, s |",
@@ -448,17 +483,33 @@ def test_the_table_row_by_row(tmp_path: Path) -> None:
 def test_settings_reach_the_policies_that_have_them(d4orm, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: dict[str, Any] = {}
 
-    def measure(policies: Any, out: Any, **rest: Any) -> Any:
-        seen.update(policies)
+    def run(study: Study, out: Any, **rest: Any) -> Any:
+        seen.update((choice.label, choice.settings) for choice in study.configurations())
         raise ValueError("enough")
 
-    monkeypatch.setattr(robustness_module, "robustness", measure)
+    monkeypatch.setattr(evaluate_module, "run_study", run)
     settings = ("--set", "cem.num_samples=32", "--set", "num_samples=64", "--set", "orca.time_horizon=2")
     d4orm("--policies", "d4orm,cem,orca", *settings, "--set", "preset=paper")
     assert seen == {
         "d4orm": {"num_samples": 64, "preset": "paper"},
         "cem": {"num_samples": 32, "preset": "paper"},
         "orca": {"time_horizon": 2},
+    }
+    seen.clear()
+    d4orm(
+        "--policy",
+        "d4orm:num_samples=32",
+        "--policy",
+        "d4orm,mppi",
+        "--set",
+        "num_samples=64",
+        "--set",
+        "d4orm.credit=team",
+    )
+    assert seen == {
+        "d4orm:num_samples=32": {"num_samples": 32, "credit": "team"},
+        "d4orm": {"num_samples": 64, "credit": "team"},
+        "mppi": {"num_samples": 64},
     }
 
 
@@ -506,8 +557,10 @@ def test_a_library_that_is_missing_is_named_before_anything_runs(d4orm, monkeypa
     assert err == "d4orm: policy 'orca' needs pyrvo; install it with pip install \"d4orm-env[orca]\"\n"
 
 
-@pytest.mark.parametrize("changes", [{"policies": []}, {"noise": []}, {"scenarios": []}, {"robots": []}])
-def test_nothing_to_do_is_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
-    arguments = {"policies": ["goal"], **TINY, **changes}
-    with pytest.raises(ValueError, match=f"{next(iter(changes))}.* empty"):
-        robustness(arguments.pop("policies"), tmp_path, **arguments)
+@pytest.mark.parametrize(
+    "options", [("--policies", ""), ("--scenario", ""), ("--robots", ""), ("--noise", "")], ids=lambda given: given[0]
+)
+def test_nothing_to_do_is_refused(d4orm, tmp_path: Path, options: tuple[str, str]) -> None:
+    status, _, err = d4orm("--policies", "goal", *options)
+    assert (status, err.count("\n")) == (2, 1)
+    assert not list(tmp_path.rglob("*.sqlite"))

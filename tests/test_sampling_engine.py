@@ -17,7 +17,8 @@ from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.engine.base import MovingObstacles, SamplingResult, SamplingRules, SamplingTask, get_engine
+from d4orm_env.engine.base import MovingObstacles, SamplingResult, SamplingRules, SamplingTask
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.engine.jax import JaxEngine
 from d4orm_env.engine.sampling import score_kernel

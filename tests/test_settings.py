@@ -14,7 +14,7 @@ import pytest
 
 from d4orm_env.core.arrays import positive_number, whole_number
 from d4orm_planners import list_policies, make_planner, make_policy
-from d4orm_planners.registry import PLANNERS, POLICIES, policy_settings
+from d4orm_planners.registry import PLANNERS, POLICIES, policy_settings, setting_names
 from d4orm_planners.settings import CheckedSettings, UnknownKeywordError
 
 KINDS: dict[str, type[CheckedSettings]] = {
@@ -102,6 +102,13 @@ def test_what_is_no_text_or_truth_is_refused_by_name(kind: type[CheckedSettings]
             with pytest.raises(ValueError, match=f"^{setting} ") as caught:
                 kind(**{setting: value})
             assert "\n" not in str(caught.value)
+
+
+def test_which_settings_there_are_may_depend_on_others() -> None:
+    assert "repair_steps" not in setting_names("d-d4orm")
+    assert "repair_steps" in setting_names("d-d4orm", {"planner": "d4orm-d"})
+    assert "repair_steps" in policy_settings("d-d4orm", planner="d4orm-d", preset="paper")
+    assert "repair_steps" not in policy_settings("d-d4orm", preset="paper")
 
 
 @pytest.mark.parametrize("name", list_policies())

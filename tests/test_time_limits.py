@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 from planner_support import cheap_planner, hop_problem, walled_in_problem
 
-from d4orm_env.engine.base import SamplingRules, SamplingTask, get_engine
+from d4orm_env.engine.base import SamplingRules, SamplingTask
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import Plan, list_planners, make_planner
-from d4orm_planners.base import Search, Stopwatch
 from d4orm_planners.collocation import ABANDONED
 from d4orm_planners.ipopt import OUT_OF_TIME
 from d4orm_planners.registry import PLANNERS
 from d4orm_planners.sampling.weights import SoftmaxWeights
+from d4orm_planners.search import Search
+from d4orm_planners.stopwatch import Stopwatch
 
 ALL = pytest.mark.parametrize("name", list_planners())
 LOOKS = 40
@@ -38,12 +40,12 @@ class Clock(Stopwatch):
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("d4orm_planners.base.Stopwatch", Clock)
+    monkeypatch.setattr("d4orm_planners.search.Stopwatch", Clock)
 
 
 def long_winded(name: str, **settings: Any) -> Any:
     """A planner whose iterations are far too long."""
-    known = PLANNERS[name].config_class.setting_names()
+    known = PLANNERS[name].config_class.setting_names(settings)
     long = {"num_steps": STEPS, "repair_steps": STEPS, "solver_iterations": STEPS, "tolerance": 1e-12}
     return cheap_planner(name, **{key: value for key, value in long.items() if key in known} | settings)
 

@@ -15,7 +15,8 @@ from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.transition import TimeStep, advance, arrives
-from d4orm_env.engine.base import StepResult, get_engine
+from d4orm_env.engine.base import StepResult
+from d4orm_env.engine.choice import get_engine
 
 DIFFERENTIAL_DRIVE = MODELS["differential_drive"].functions
 HOLONOMIC = MODELS["holonomic2d"].functions

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
 
 
 SMALLEST, LARGEST = 1e-7, 1e6
@@ -16,7 +17,7 @@ SMALLEST, LARGEST = 1e-7, 1e6
 over a whole horizon."""
 
 
-def as_float32(value: Any) -> FloatArray:
+def as_float32(value: ArrayLike) -> FloatArray:
     """A new float32 array of ``value``; what is too large for float32 becomes infinite.
 
     Raises:
@@ -31,7 +32,9 @@ def as_float32(value: Any) -> FloatArray:
         raise ValueError("it does not hold numbers only, in rows of one length") from None
 
 
-def frozen_array(value: Any, name: str, shape: tuple[int | None, ...], *, largest: float = float("inf")) -> FloatArray:
+def frozen_array(
+    value: ArrayLike, name: str, shape: tuple[int | None, ...], *, largest: float = float("inf")
+) -> FloatArray:
     """``value`` as a read-only, finite float32 array.
 
     Args:
@@ -63,7 +66,7 @@ def frozen_array(value: Any, name: str, shape: tuple[int | None, ...], *, larges
     return array
 
 
-def frozen_per_robot(value: Any, name: str, num_robots: int) -> FloatArray:
+def frozen_per_robot(value: ArrayLike, name: str, num_robots: int) -> FloatArray:
     """``value`` as ``(num_robots,)`` positive numbers; a single number is given to every robot.
 
     Raises:
@@ -71,7 +74,7 @@ def frozen_per_robot(value: Any, name: str, num_robots: int) -> FloatArray:
             :data:`LARGEST`; the message names the robot.
     """
     if np.ndim(value) == 0:
-        value = [value] * num_robots
+        value = np.repeat(value, num_robots)
     array = frozen_array(value, name, (num_robots,))
     if (array <= 0).any():
         robot = int(np.argmax(array <= 0))
@@ -83,7 +86,7 @@ def frozen_per_robot(value: Any, name: str, num_robots: int) -> FloatArray:
     return array
 
 
-def restore_frozen(instance: Any, state: dict[str, Any]) -> None:
+def restore_frozen(instance: object, state: Mapping[str, object]) -> None:
     """Set the attributes of a frozen dataclass from a pickle; NumPy brings its read-only arrays back writable."""
     for name, value in state.items():
         if isinstance(value, np.ndarray):
@@ -98,7 +101,7 @@ LARGEST_WHOLE = 2**63 - 1
 """Whole numbers must stay below it: every library holds them."""
 
 
-def shown(value: Any) -> str:
+def shown(value: object) -> str:
     """``value`` as it stands in an error: on one line and not too long, whatever it is."""
     if isinstance(value, int) and abs(value) > LARGEST_WHOLE:
         return f"about {'-' if value < 0 else ''}1e{int(value.bit_length() * np.log10(2))}"
@@ -110,7 +113,7 @@ def shown(value: Any) -> str:
 
 
 def positive_number(
-    value: Any, name: str, *, zero_allowed: bool = False, least: float = 0.0, most: float = LARGEST_NUMBER
+    value: object, name: str, *, zero_allowed: bool = False, least: float = 0.0, most: float = LARGEST_NUMBER
 ) -> float:
     """``value`` as a finite positive float.
 
@@ -128,11 +131,11 @@ def positive_number(
     try:
         if isinstance(value, bool | np.bool_):
             raise TypeError("truth is no number")
-        number = float(value)
+        number = float(value)  # type: ignore[arg-type] # what is none raises
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be a number, not {shown(value)}") from error
     except OverflowError:
-        number = np.inf if value > 0 else -np.inf
+        number = np.inf if value > 0 else -np.inf  # type: ignore[operator] # a whole number
     if not np.isfinite(number) or number < 0 or (number == 0 and not zero_allowed):
         raise ValueError(
             f"{name} is {number:g}; it must be {'zero or more' if zero_allowed else 'positive'} and finite"
@@ -144,7 +147,7 @@ def positive_number(
     return number
 
 
-def duration(value: Any, name: str, *, zero_allowed: bool = False) -> float:
+def duration(value: object, name: str, *, zero_allowed: bool = False) -> float:
     """``value`` as a positive number of seconds that every clock can wait: at most :data:`LARGEST`, eleven days.
 
     Raises:
@@ -153,7 +156,7 @@ def duration(value: Any, name: str, *, zero_allowed: bool = False) -> float:
     return positive_number(value, name, zero_allowed=zero_allowed, most=LARGEST)
 
 
-def whole_number(value: Any, name: str, minimum: int, maximum: int | None = None) -> int:
+def whole_number(value: object, name: str, minimum: int, maximum: int | None = None) -> int:
     """``value`` as an int of at least ``minimum``, and at most ``maximum`` where there is one.
 
     Raises:

@@ -5,21 +5,12 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable
 from functools import cache
-from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.robot_model import (
-    ACCELERATION,
-    OWN_LIMITS,
-    PYTHON_OPS,
-    SPEED,
-    TURN_RATE,
-    Model,
-    ModelFunctions,
-    Ops,
-    RungeKutta,
-)
+from d4orm_env.core.arrays import shown
+from d4orm_env.core.registry import Registry
+from d4orm_env.core.robot_model import OWN_LIMITS, PYTHON_OPS, Model, RungeKutta
 from d4orm_env.core.source import pieces
 from d4orm_env.core.transition import TimeStep
 from d4orm_env.models.car import CAR
@@ -29,29 +20,10 @@ from d4orm_env.models.holonomic3d import HOLONOMIC3D
 from d4orm_env.models.unicycle import UNICYCLE
 from d4orm_env.models.velocity2d import VELOCITY2D
 
-__all__ = [
-    "ACCELERATION",
-    "COMMON",
-    "MODELS",
-    "MODEL_CODES",
-    "NUM_BUILT_IN",
-    "SPEED",
-    "TURN_RATE",
-    "Model",
-    "ModelFunctions",
-    "Ops",
-    "get_model",
-    "model_digest",
-    "names_of_codes",
-    "register_model",
-]
-
 _BUILT_IN = (HOLONOMIC2D, HOLONOMIC3D, VELOCITY2D, DIFFERENTIAL_DRIVE, UNICYCLE, CAR)
 
-MODELS: dict[str, Model] = {model.name: model for model in _BUILT_IN}
-"""All robot models by name, in the order of their codes; :func:`register_model` adds to them."""
-
-MODEL_CODES: dict[str, int] = {name: code for code, name in enumerate(MODELS)}
+MODEL_CODES: dict[str, int] = {model.name: code for code, model in enumerate(_BUILT_IN)}
+"""What the engines call models by; a model gets its code when it is registered, or loaded from another package."""
 
 NUM_BUILT_IN = len(_BUILT_IN)
 """Codes from this one on go to models in the order in which this process registers them."""
@@ -63,15 +35,12 @@ so that nobody waits for the compiler because of a model that they do not use.
 
 
 def get_model(name: str) -> Model:
-    """Look a model up by name.
+    """Look a model up by name: those registered, and those that installed packages offer.
 
     Raises:
-        ValueError: If there is no such model; the message lists those there are.
+        ValueError: If there is no such model, or it cannot be loaded; the message lists those there are.
     """
-    try:
-        return MODELS[name]
-    except KeyError:
-        raise ValueError(f"model {name!r} is unknown; choose one of {', '.join(MODELS)}") from None
+    return MODELS.look_up(name)
 
 
 def names_of_codes(codes: Iterable[int]) -> tuple[str, ...]:
@@ -80,7 +49,7 @@ def names_of_codes(codes: Iterable[int]) -> tuple[str, ...]:
     Raises:
         ValueError: If a code is no model's.
     """
-    names = tuple(MODELS)
+    names = tuple(MODEL_CODES)
     for code in codes:
         if not 0 <= code < len(names):
             raise ValueError(f"model code {code} is unknown; there are codes 0 to {len(names) - 1}: register the model")
@@ -101,26 +70,32 @@ def register_model(model: Model) -> None:
     """Add a robot model, which is then known by its name everywhere, to this process.
 
     Processes that are started to work on problems with it have to register it too: do it where the module that defines
-    it is imported.
+    it is imported. A package that offers it as an entry point of the group ``d4orm.models`` need not.
 
     Args:
         model: The model.
 
     Raises:
-        ValueError: If another model has its name, a size or an index does not fit, or a function fails on Python's
+        ValueError: If the name is taken or none, a size or an index does not fit, or a function fails on Python's
             numbers, returns a wrong number of them or names a constant that is a float.
     """
     if not isinstance(model, Model):
-        raise ValueError(f"register_model takes a Model, not {model!r}; see docs/own_robot.md")
-    known = MODELS.get(model.name)
-    if known is not None:
-        if model_digest(known) == model_digest(model):
-            return
-        raise ValueError(f"model {model.name!r} exists already; give yours another name")
+        raise ValueError(f"register_model takes a Model, not {shown(model)}; see docs/own_robot.md")
+    MODELS.add(model.name, model)
+
+
+def _admit(name: str, model: object) -> Model:
+    """A model with its code, checked if it does not come with this package."""
+    if model in _BUILT_IN:
+        return model
+    if not isinstance(model, Model):
+        raise ValueError(f"model {name!r} is {shown(model)}; it must be a Model, see docs/own_robot.md")
+    if model.name != name:
+        raise ValueError(f"model {name!r} calls itself {model.name!r}; offer it under that name")
     _check_attributes(model)
     _check_functions(model)
-    MODEL_CODES[model.name] = len(MODELS)
-    MODELS[model.name] = model
+    MODEL_CODES.setdefault(name, len(MODEL_CODES))
+    return model
 
 
 def _check_attributes(model: Model) -> None:
@@ -152,7 +127,7 @@ def _check_functions(model: Model) -> None:
     x, u = (0.5,) * n, (0.25,) * m
     limits = (1.0,) * OWN_LIMITS + tuple(limit.default for limit in model.own_limits)
     h = TimeStep(0.1, 0.1 / 2, 0.1 / 3, 0.1 / 6)
-    calls: dict[str, tuple[int, tuple[Any, ...]]] = {
+    calls: dict[str, tuple[int, tuple[object, ...]]] = {
         "derivative": (n, (x, u, limits, PYTHON_OPS)),
         "limit_control": (m, (u, limits, PYTHON_OPS)),
         "limit_state": (n, (x, limits, PYTHON_OPS)),
@@ -180,3 +155,10 @@ def _check_functions(model: Model) -> None:
                     f"model {model.name!r}: {name} uses the float {floats[0]:g}, which would change an engine's "
                     f"precision; make it one of own_limits"
                 )
+
+
+MODELS = Registry("model", "d4orm.models", _admit, model_digest)
+"""All robot models by name; :func:`register_model` adds to them."""
+
+for _model in _BUILT_IN:
+    register_model(_model)

@@ -5,3 +5,8 @@ from __future__ import annotations
 
 class UnknownKeywordError(TypeError, ValueError):
     """A keyword or setting that does not exist: a TypeError, as Python raises, and bad input like any other."""
+
+
+def describe(error: BaseException) -> str:
+    """Kind and message on one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"

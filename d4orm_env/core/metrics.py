@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import NDArray
 
+from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 
 
-def arrival_times(arrived: Any, dt: float) -> np.ndarray:
-    """``(K,)`` time at which each robot docked [s]; infinite for one that never did.
+def arrival_steps(arrived: BoolArray) -> NDArray[np.intp]:
+    """``(K,)`` first row of ``arrived`` ``(H+1, K)`` from which on a robot is at its goal; the last where it is not."""
+    last_away = len(arrived) - (~arrived[::-1]).argmax(axis=0)
+    since: NDArray[np.intp] = np.where(arrived.all(axis=0), 0, np.minimum(last_away, len(arrived) - 1))
+    return since
+
+
+def arrival_times(arrived: BoolArray, dt: float) -> NDArray[np.float64]:
+    """``(K,)`` time from which on each robot is at its goal [s]; infinite for one that is not there at the end.
 
     Args:
         arrived: ``(H+1, K)`` bool.
         dt: Time step [s].
     """
-    arrived = np.asarray(arrived)
-    return np.where(arrived.any(axis=0), arrived.argmax(axis=0) * dt, np.inf)
+    times: NDArray[np.float64] = np.where(arrived[-1], arrival_steps(arrived) * dt, np.inf)
+    return times
 
 
-def mean_squared_jerk(controls: Any, arrived: Any, dt: float) -> float:
+def mean_squared_jerk(controls: FloatArray, arrived: BoolArray, dt: float) -> float:
     """Mean squared norm of the jerk [m^2/s^6] over robots and over steps before arrival (paper, section VIII-C).
 
     The jerk is the finite difference of the executed accelerations; for models driven otherwise, of their controls.
@@ -31,8 +38,8 @@ def mean_squared_jerk(controls: Any, arrived: Any, dt: float) -> float:
         arrived: ``(H+1, K)`` bool.
         dt: Time step [s].
     """
-    jerk = np.diff(np.asarray(controls, np.float64), axis=0) / dt
-    moving = ~np.asarray(arrived)[1:-1]
+    jerk = np.diff(controls.astype(np.float64), axis=0) / dt
+    moving = ~arrived[1:-1]
     return float((jerk**2).sum(axis=-1)[moving].mean()) if moving.any() else 0.0
 
 

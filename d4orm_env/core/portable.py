@@ -19,11 +19,13 @@ from functools import cache, wraps
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.robot_model import Ops
 
 Floats = NDArray[np.float64]
+Function = Callable[..., Any]
+"""Of arrays or numbers; it gives float32 or float64, arrays or numbers, as it is given them."""
 
 _TWO_OVER_PI = 6.36619772367581382433e-01
 _HALF_PI = (
@@ -105,11 +107,11 @@ _ARC_LOW = np.array(
 _ARC_SHIFT = np.array([[1, 0, 0, 1], [2, -1, 1, 2], [1, -1, 1, 1], [1, -1.5, 1.5, 1], [0, -1, 1, 0]]).T
 
 
-def _in_float64(function: Callable[..., Any]) -> Callable[..., Any]:
+def _in_float64(function: Function) -> Function:
     """Compute in float64, in silence, and round to float32 what came in float32."""
 
     @wraps(function)
-    def wrapper(*arguments: Any) -> Any:
+    def wrapper(*arguments: ArrayLike) -> Any:
         arrays = [np.asarray(argument) for argument in arguments]
         single = all(array.dtype == np.float32 for array in arrays)
         with np.errstate(all="ignore"):
@@ -121,18 +123,18 @@ def _in_float64(function: Callable[..., Any]) -> Callable[..., Any]:
     return wrapper
 
 
-def sin(x: Any) -> Any:
+def sin(x: ArrayLike) -> Any:
     """Sine of ``x`` [rad]."""
     return sin_cos(x)[0]
 
 
-def cos(x: Any) -> Any:
+def cos(x: ArrayLike) -> Any:
     """Cosine of ``x`` [rad]."""
     return sin_cos(x)[1]
 
 
 @_in_float64
-def sin_cos(x: Any) -> Any:
+def sin_cos(x: Floats) -> tuple[Floats, Floats]:
     """Sine and cosine of ``x`` [rad], for little more than the price of one."""
     quadrant, high, low = _reduced(x)
     sine, cosine = _sine(high, low), _cosine(high, low)
@@ -143,7 +145,7 @@ def sin_cos(x: Any) -> Any:
 
 
 @_in_float64
-def arctan2(y: Any, x: Any) -> Any:
+def arctan2(y: Floats, x: Floats) -> Floats:
     """Angle of the point ``(x, y)`` [rad], from minus pi to pi."""
     tall, wide = np.abs(y), np.abs(x)
     alike = ((tall == 0) & (wide == 0)) | (np.isinf(tall) & np.isinf(wide))  # where the quotient has no value
@@ -154,7 +156,7 @@ def arctan2(y: Any, x: Any) -> Any:
 
 
 @_in_float64
-def exp(x: Any) -> Any:
+def exp(x: Floats) -> Floats:
     """The exponential of ``x``."""
     x = np.minimum(np.maximum(x, -800.0), 800.0)  # beyond, the result is zero or infinite anyway; NaN stays
     exponent = np.rint(x * _ONE_OVER_LN2)
@@ -166,7 +168,7 @@ def exp(x: Any) -> Any:
 
 
 @_in_float64
-def log(x: Any) -> Any:
+def log(x: Floats) -> Floats:
     """The natural logarithm of ``x``; minus infinity at zero, NaN below."""
     mantissa, power = np.frexp(x)
     small = mantissa < _SQRT_HALF
@@ -196,15 +198,15 @@ NUMPY_OPS = Ops(cos, sin, np.sqrt, np.minimum, np.maximum, arctan2, np.where)
 """What the robot models need, over NumPy arrays."""
 
 
-def _polynomial(x: Any, coefficients: tuple[float, ...]) -> Any:
+def _polynomial(x: Floats, coefficients: tuple[float, ...]) -> Floats:
     """``coefficients[0] + coefficients[1] * x + ...``, by Horner's rule."""
-    total: Any = coefficients[-1]
-    for coefficient in coefficients[-2::-1]:
+    total = coefficients[-2] + x * coefficients[-1]
+    for coefficient in coefficients[-3::-1]:
         total = coefficient + x * total
     return total
 
 
-def _sine(high: Any, low: Any) -> Any:
+def _sine(high: Floats, low: Floats) -> Floats:
     """Sine of ``high + low`` within a quarter of pi of zero."""
     square = high * high
     cube = square * high
@@ -212,7 +214,7 @@ def _sine(high: Any, low: Any) -> Any:
     return high - ((square * (0.5 * low - cube * rest) - low) - cube * _SINE[0])
 
 
-def _cosine(high: Any, low: Any) -> Any:
+def _cosine(high: Floats, low: Floats) -> Floats:
     """Cosine of ``high + low`` within a quarter of pi of zero."""
     square = high * high
     half = 0.5 * square
@@ -220,7 +222,7 @@ def _cosine(high: Any, low: Any) -> Any:
     return head + (((1.0 - head) - half) + (square * (square * _polynomial(square, _COSINE)) - high * low))
 
 
-def _arc_tangent(q: Any) -> Any:
+def _arc_tangent(q: Floats) -> Floats:
     """Arc tangent of ``q >= 0``."""
     q = np.minimum(q, 1e300)  # keeps zero times infinity out of the shift
     index = sum((q >= limit).astype(np.intp) for limit in _ARC_LIMITS)
@@ -230,7 +232,7 @@ def _arc_tangent(q: Any) -> Any:
     return _ARC_HIGH[index] - ((x * (square * _polynomial(square, _ARC_TANGENT)) - _ARC_LOW[index]) - x)
 
 
-def _reduced(x: Any) -> tuple[Any, Any, Any]:
+def _reduced(x: Floats) -> tuple[NDArray[np.int64], Floats, Floats]:
     """Nearest multiple of pi/2 as a number of quadrants from 0 to 3, and what is left over, high and low part."""
     huge = ~(np.abs(x) < _REDUCED_EXACTLY)  # NaN too
     some_huge = huge.any()
@@ -250,7 +252,7 @@ def _reduced(x: Any) -> tuple[Any, Any, Any]:
     return quadrant, high, low
 
 
-def _difference(a: Any, b: Any) -> tuple[Any, Any]:
+def _difference(a: Floats, b: Floats) -> tuple[Floats, Floats]:
     """``a - b`` rounded, and what rounding lost (Knuth)."""
     result = a - b
     part = result - a

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from d4orm_env.core.robot_model import Number
 
 
 def step_reward(
-    distance: Any, inverse_initial_distance: Any, pair_violation: Any, obstacle_violation: Any, one: Any
-) -> Any:
+    distance: Number, inverse_initial_distance: Number, pair_violation: Number, obstacle_violation: Number, one: Number
+) -> Number:
     """``1 - distance / initial distance``, minus one for any robot and minus one for any obstacle within the margin.
 
     The violations are 0 or 1 and ``one`` is 1, all in the caller's precision.

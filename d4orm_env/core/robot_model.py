@@ -12,7 +12,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, TypeAlias
+
+from d4orm_env.core.arrays import FloatArray
 
 SPEED, ACCELERATION, TURN_RATE = range(3)
 """First columns of every robot's limits: speed [m/s], acceleration [m/s^2], turn rate [rad/s]."""
@@ -22,21 +24,58 @@ OWN_LIMITS = len(STANDARD_LIMITS)
 """Column of the first limit that a model has for itself."""
 
 
+class Truth(Protocol):
+    """What comparing two :class:`Number` gives."""
+
+    def __and__(self, other: Any, /) -> Truth: ...
+    def __or__(self, other: Any, /) -> Truth: ...
+
+
+class Number(Protocol):
+    """What the physics computes with: a number of Python or numba, an array of NumPy or JAX, a symbol of CasADi."""
+
+    def __neg__(self) -> Number: ...
+    def __add__(self, other: Any, /) -> Number: ...
+    def __sub__(self, other: Any, /) -> Number: ...
+    def __mul__(self, other: Any, /) -> Number: ...
+    def __truediv__(self, other: Any, /) -> Number: ...
+    def __gt__(self, other: Any, /) -> Truth: ...
+    def __ge__(self, other: Any, /) -> Truth: ...
+    def __le__(self, other: Any, /) -> Truth: ...
+
+
+Vector: TypeAlias = tuple[Number, ...]
+"""A state, a control, limits, a place or a velocity."""
+
+
+class TimeStep(NamedTuple):
+    """``dt`` and the fractions of it that Runge-Kutta needs, in the caller's precision."""
+
+    full: Number
+    half: Number
+    third: Number
+    sixth: Number
+
+
 class Ops(NamedTuple):
     """The mathematical functions a model may call, from whichever library compiles it."""
 
-    cos: Callable[..., Any]
-    sin: Callable[..., Any]
-    sqrt: Callable[..., Any]
-    minimum: Callable[..., Any]
-    maximum: Callable[..., Any]
-    arctan2: Callable[..., Any]
-    where: Callable[..., Any]
+    cos: Callable[..., Number]
+    sin: Callable[..., Number]
+    sqrt: Callable[..., Number]
+    minimum: Callable[..., Number]
+    maximum: Callable[..., Number]
+    arctan2: Callable[..., Number]
+    where: Callable[..., Number]
     """``(condition, a, b) -> a`` where the condition holds, ``b`` elsewhere."""
 
 
 PYTHON_OPS = Ops(math.cos, math.sin, math.sqrt, min, max, math.atan2, lambda condition, a, b: a if condition else b)
 """Over Python's numbers."""
+
+
+ModelFunction: TypeAlias = Callable[..., Any]
+"""It returns what it is given numbers of."""
 
 
 class ModelFunctions(NamedTuple):
@@ -46,25 +85,25 @@ class ModelFunctions(NamedTuple):
     and then those of :attr:`Model.own_limits`.
     """
 
-    derivative: Callable[..., Any]
+    derivative: ModelFunction
     """``(x, u, limits, ops) -> dx/dt``."""
-    limit_control: Callable[..., Any]
+    limit_control: ModelFunction
     """``(u, limits, ops) -> u`` inside the robot's limits."""
-    limit_state: Callable[..., Any]
+    limit_state: ModelFunction
     """``(x, limits, ops) -> x`` at no more than the speed limit."""
-    velocity: Callable[..., Any]
+    velocity: ModelFunction
     """``(x, u, limits, ops) -> `` velocity vector in the world frame [m/s]."""
-    rest: Callable[..., Any]
+    rest: ModelFunction
     """``(x, zero) -> x`` standing still at the same place and heading."""
-    approach: Callable[..., Any]
+    approach: ModelFunction
     """``(x, goal, limits, h, ops) -> `` fastest velocity straight to the goal from which it can stop there [m/s]."""
-    track: Callable[..., Any]
+    track: ModelFunction
     """``(x, velocity, limits, h, ops) -> u`` that would bring it to a velocity within a step; it may exceed the limits.
     """
     integrate: Any = None
-    """``(x, u, limits, h, ops) -> x`` after a :class:`~d4orm_env.core.transition.TimeStep`: what classical
-    Runge-Kutta makes of the derivative with the control held constant, written out without the terms that cancel. A
-    model that leaves it out is integrated by :class:`RungeKutta`.
+    """``(x, u, limits, h, ops) -> x`` after a :class:`TimeStep`: what classical Runge-Kutta makes of the derivative
+    with the control held constant, written out without the terms that cancel. A model that leaves it out is integrated
+    by :class:`RungeKutta`.
     """
 
 
@@ -85,30 +124,32 @@ class Limit(NamedTuple):
 # ``x + h * k`` for states of two to six components, written out for the compiler.
 
 
-def _moved2(x: Any, h: Any, k: Any) -> Any:
+def _moved2(x: Vector, h: Number, k: Vector) -> Vector:
     return (x[0] + h * k[0], x[1] + h * k[1])
 
 
-def _moved3(x: Any, h: Any, k: Any) -> Any:
+def _moved3(x: Vector, h: Number, k: Vector) -> Vector:
     return (x[0] + h * k[0], x[1] + h * k[1], x[2] + h * k[2])
 
 
-def _moved4(x: Any, h: Any, k: Any) -> Any:
+def _moved4(x: Vector, h: Number, k: Vector) -> Vector:
     return (x[0] + h * k[0], x[1] + h * k[1], x[2] + h * k[2], x[3] + h * k[3])
 
 
-def _moved5(x: Any, h: Any, k: Any) -> Any:
+def _moved5(x: Vector, h: Number, k: Vector) -> Vector:
     return (x[0] + h * k[0], x[1] + h * k[1], x[2] + h * k[2], x[3] + h * k[3], x[4] + h * k[4])
 
 
-def _moved6(x: Any, h: Any, k: Any) -> Any:
+def _moved6(x: Vector, h: Number, k: Vector) -> Vector:
     return (x[0] + h * k[0], x[1] + h * k[1], x[2] + h * k[2], x[3] + h * k[3], x[4] + h * k[4], x[5] + h * k[5])
 
 
-MOVED: dict[int, Callable[..., Any]] = {2: _moved2, 3: _moved3, 4: _moved4, 5: _moved5, 6: _moved6}
+MOVED: dict[int, ModelFunction] = {2: _moved2, 3: _moved3, 4: _moved4, 5: _moved5, 6: _moved6}
 
 
-def runge_kutta(derivative: Any, moved: Any, x: Any, u: Any, limits: Any, h: Any, ops: Ops) -> Any:
+def runge_kutta(
+    derivative: ModelFunction, moved: ModelFunction, x: Vector, u: Vector, limits: Vector, h: TimeStep, ops: Ops
+) -> Vector:
     """One step of the classical Runge-Kutta method, the control held constant; ``moved`` is one of :data:`MOVED`."""
     k1 = derivative(x, u, limits, ops)
     k2 = derivative(moved(x, h.half, k1), u, limits, ops)
@@ -121,10 +162,10 @@ def runge_kutta(derivative: Any, moved: Any, x: Any, u: Any, limits: Any, h: Any
 class RungeKutta:
     """:attr:`ModelFunctions.integrate` of a model that has none of its own."""
 
-    derivative: Callable[..., Any]
+    derivative: ModelFunction
     state_size: int
 
-    def __call__(self, x: Any, u: Any, limits: Any, h: Any, ops: Ops) -> Any:
+    def __call__(self, x: Vector, u: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
         return runge_kutta(self.derivative, MOVED[self.state_size], x, u, limits, h, ops)
 
 
@@ -176,39 +217,39 @@ class Model:
         """The columns of the robot's limits."""
         return (*STANDARD_LIMITS, *(limit.name for limit in self.own_limits))
 
-    def turn_rate(self, limits: Any) -> float:
+    def turn_rate(self, limits: FloatArray) -> float:
         """Fastest turn of the heading that these limits allow [rad/s], zero without a heading.
 
         Sought among the states and controls at their limits, which is where models turn fastest.
         """
         if self.heading_index is None:
             return 0.0
-        limits = [float(limit) for limit in limits]
+        most = limits.tolist()
         bounds = dict(self.state_limits) | dict.fromkeys(self.speed_indices, SPEED)
-        ends = [(-limits[bounds[i]], limits[bounds[i]]) if i in bounds else (0.0,) for i in range(self.state_size)]
-        controls = list(product(*((-limits[column], limits[column]) for column in self.control_limits)))
+        ends = [(-most[bounds[i]], most[bounds[i]]) if i in bounds else (0.0,) for i in range(self.state_size)]
+        controls = list(product(*((-most[column], most[column]) for column in self.control_limits)))
         return max(
-            abs(self.functions.derivative(x, u, limits, PYTHON_OPS)[self.heading_index])
+            abs(self.functions.derivative(x, u, most, PYTHON_OPS)[self.heading_index])
             for x in product(*ends)
             for u in controls
         )
 
 
-def norm_scale(square: Any, limit: Any, ops: Ops) -> Any:
+def norm_scale(square: Number, limit: Number, ops: Ops) -> Number:
     """Factor that brings a vector of this squared length to at most ``limit``; exactly one for a shorter vector."""
     return limit / ops.sqrt(ops.maximum(square, limit * limit))
 
 
-def control_scale(square: Any, limit: Any, ops: Ops) -> Any:
+def control_scale(square: Number, limit: Number, ops: Ops) -> Number:
     """As :func:`norm_scale`; NaN where the square has overflowed, lest the control pass for none at all."""
     return norm_scale(square, limit, ops) + (square - square)
 
 
-def clip(value: Any, limit: Any, ops: Ops) -> Any:
+def clip(value: Number, limit: Number, ops: Ops) -> Number:
     return ops.maximum(-limit, ops.minimum(limit, value))
 
 
-def stopping_speed(distance: Any, limits: Any, h: Any, ops: Ops) -> Any:
+def stopping_speed(distance: Number, limits: Vector, h: TimeStep, ops: Ops) -> Number:
     """Fastest speed from which a robot with a limited acceleration stops within a distance."""
     acceleration = limits[ACCELERATION]
     # Braking begins with the next step.
@@ -216,12 +257,12 @@ def stopping_speed(distance: Any, limits: Any, h: Any, ops: Ops) -> Any:
     return ops.minimum(limits[SPEED], ops.sqrt((acceleration + acceleration) * distance + lost * lost) - lost)
 
 
-def share(part: Any, whole: Any, other: Any, ops: Ops) -> Any:
+def share(part: Number, whole: Number, other: Number, ops: Ops) -> Number:
     """``part / whole``, and no division by zero where both are: ``other`` is any number but zero."""
     return part / ops.where(whole > 0, whole, other)
 
 
-def planar_approach(x: Any, goal: Any, limits: Any, h: Any, ops: Ops) -> Any:
+def planar_approach(x: Vector, goal: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
     """:attr:`ModelFunctions.approach` of a planar model with a limited acceleration."""
     gap_x, gap_y = goal[0] - x[0], goal[1] - x[1]
     distance = ops.sqrt(gap_x * gap_x + gap_y * gap_y)
@@ -229,7 +270,7 @@ def planar_approach(x: Any, goal: Any, limits: Any, h: Any, ops: Ops) -> Any:
     return (gap_x * pace, gap_y * pace)
 
 
-def first_order_approach(x: Any, goal: Any, limits: Any, h: Any, ops: Ops) -> Any:
+def first_order_approach(x: Vector, goal: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
     """:attr:`ModelFunctions.approach` of a planar model that takes a new speed at once."""
     gap_x, gap_y = goal[0] - x[0], goal[1] - x[1]
     distance = ops.sqrt(gap_x * gap_x + gap_y * gap_y)
@@ -238,7 +279,7 @@ def first_order_approach(x: Any, goal: Any, limits: Any, h: Any, ops: Ops) -> An
     return (gap_x * pace, gap_y * pace)
 
 
-def turn_towards(heading: Any, velocity: Any, ops: Ops) -> Any:
+def turn_towards(heading: Number, velocity: Vector, ops: Ops) -> tuple[Number, Number]:
     """The wanted velocity's part along the heading [m/s], and the turn that brings the heading to it [rad]."""
     facing_x, facing_y = ops.cos(heading), ops.sin(heading)
     along = facing_x * velocity[0] + facing_y * velocity[1]

@@ -8,7 +8,7 @@ from types import CodeType, FunctionType
 from typing import Any
 
 
-def pieces(function: Any, seen: frozenset[Any] = frozenset()) -> Iterator[Any]:
+def pieces(function: Any, seen: frozenset[FunctionType] = frozenset()) -> Iterator[object]:
     """Source text or bytecode, and the numbers that the code holds or names, through all functions that it calls."""
     code = function.__code__
     yield _text(function)
@@ -30,5 +30,5 @@ def _text(function: FunctionType) -> str:
         return f"{function.__code__.co_code.hex()} {function.__code__.co_names}"
 
 
-def _numbers(code: CodeType) -> Iterator[Any]:
+def _numbers(code: CodeType) -> Iterator[object]:
     return (value for value in code.co_consts if isinstance(value, float | int | tuple))

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, fields
+from functools import cached_property
+from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray, frozen_per_robot, restore_frozen, shown
 from d4orm_env.core.dynamics import get_model
 from d4orm_env.core.robot_model import STANDARD_LIMITS, Limit, Model
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Team:
     """The robots, in order. Teams may mix models; all must move in the same number of dimensions.
 
@@ -35,26 +37,34 @@ class Team:
     """
 
     models: tuple[str, ...]
-    radius: FloatArray | float = 0.15
-    max_speed: FloatArray | float = 1.0
-    max_acceleration: FloatArray | float = 1.0
-    max_turn_rate: FloatArray | float = float(np.pi / 2)
-    own_limits: Mapping[str, Any] = field(default_factory=dict)
+    radius: FloatArray
+    max_speed: FloatArray
+    max_acceleration: FloatArray
+    max_turn_rate: FloatArray
+    own_limits: Mapping[str, FloatArray]
 
-    def __post_init__(self) -> None:
-        if isinstance(self.models, str) or not isinstance(self.models, Sequence):
-            raise ValueError(f"models must be a sequence of model names, not {self.models!r}")
-        object.__setattr__(self, "models", tuple(self.models))
-        if not self.models:
+    def __init__(
+        self,
+        models: Sequence[str],
+        radius: ArrayLike = 0.15,
+        max_speed: ArrayLike = 1.0,
+        max_acceleration: ArrayLike = 1.0,
+        max_turn_rate: ArrayLike = float(np.pi / 2),
+        own_limits: Mapping[str, ArrayLike] = MappingProxyType({}),
+    ) -> None:
+        if isinstance(models, str) or not isinstance(models, Sequence):
+            raise ValueError(f"models must be a sequence of model names, not {models!r}")
+        if not models:
             raise ValueError("a team needs at least one robot; models is empty")
-        dimensions = {get_model(name).dimension for name in self.models}
-        if len(dimensions) > 1:
-            raise ValueError(f"models {sorted(set(self.models))} mix 2D and 3D robots; a team moves in one dimension")
-        for name in ("radius", "max_speed", "max_acceleration", "max_turn_rate"):
-            object.__setattr__(self, name, frozen_per_robot(getattr(self, name), name, len(self.models)))
-        object.__setattr__(self, "own_limits", self._complete_own_limits(self.own_limits))
+        if len({get_model(name).dimension for name in models}) > 1:
+            raise ValueError(f"models {sorted(set(models))} mix 2D and 3D robots; a team moves in one dimension")
+        restore_frozen(self, {"models": tuple(models)})
+        for name, value in zip(STANDARD_LIMITS, (max_speed, max_acceleration, max_turn_rate), strict=True):
+            restore_frozen(self, {name: frozen_per_robot(value, name, len(models))})
+        own = self._complete_own_limits(own_limits)
+        restore_frozen(self, {"radius": frozen_per_robot(radius, "radius", len(models)), "own_limits": own})
 
-    def _complete_own_limits(self, given: Any) -> dict[str, FloatArray]:
+    def _complete_own_limits(self, given: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
         if not isinstance(given, Mapping):
             raise ValueError(f"own_limits must be a mapping such as {{'wheelbase': 0.3}}, not {shown(given)}")
         known = [{limit.name: limit for limit in model.own_limits} for model in self.robot_models]
@@ -67,17 +77,21 @@ class Team:
                 )
         return {name: _per_robot(name, given.get(name), [limits.get(name) for limits in known]) for name in names}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __getstate__(self) -> dict[str, object]:
+        # What is cached is looked up anew in a copy.
+        return {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
         restore_frozen(self, state)
         for array in self.own_limits.values():
-            np.asarray(array).setflags(write=False)
+            array.setflags(write=False)
 
     @property
     def num_robots(self) -> int:
         """``K``."""
         return len(self.models)
 
-    @property
+    @cached_property
     def robot_models(self) -> tuple[Model, ...]:
         """The ``K`` models themselves."""
         return tuple(get_model(name) for name in self.models)
@@ -106,7 +120,7 @@ class Team:
             limits[:, column] = getattr(self, name)
         for robot, model in enumerate(models):
             for column, limit in enumerate(model.own_limits, len(STANDARD_LIMITS)):
-                limits[robot, column] = np.asarray(self.own_limits[limit.name])[robot]
+                limits[robot, column] = self.own_limits[limit.name][robot]
         return limits
 
     @property
@@ -122,20 +136,20 @@ class Team:
         index = list(robots)
         return Team(
             tuple(self.models[robot] for robot in index),
-            np.asarray(self.radius)[index],
-            np.asarray(self.max_speed)[index],
-            np.asarray(self.max_acceleration)[index],
-            np.asarray(self.max_turn_rate)[index],
+            self.radius[index],
+            self.max_speed[index],
+            self.max_acceleration[index],
+            self.max_turn_rate[index],
             self._own_limits_of(index),
         )
 
     def _own_limits_of(self, robots: list[int]) -> dict[str, FloatArray]:
         models = self.robot_models
         names = {limit.name for robot in robots for limit in models[robot].own_limits}
-        return {name: np.asarray(values)[robots] for name, values in self.own_limits.items() if name in names}
+        return {name: values[robots] for name, values in self.own_limits.items() if name in names}
 
 
-def _per_robot(name: str, value: Any, limits: list[Limit | None]) -> FloatArray:
+def _per_robot(name: str, value: ArrayLike | None, limits: list[Limit | None]) -> FloatArray:
     """``(K,)`` values of a limit, given or default, of robots that have it or ``None``."""
     if value is None:
         value = [1.0 if limit is None else limit.default for limit in limits]

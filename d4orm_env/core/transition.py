@@ -2,30 +2,31 @@
 
 The order is the definition of a step for every engine: the control is clipped to the limits, RK4 integrates the model
 over ``dt``, the speed limit is applied, and a robot within its goal radius at no more than the goal speed has arrived.
-From then on it stands where it docked (paper, section III; docking as in the paper's reference code).
+From then on it stands where it docked (paper, section III; docking as in the paper's reference code), unless the
+problem says that who has arrived may be moved again: then it has arrived for as long as it is there.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
-from d4orm_env.core.robot_model import ModelFunctions, Ops
+from d4orm_env.core.robot_model import ModelFunctions, Number, Ops, TimeStep, Vector
 
-
-class TimeStep(NamedTuple):
-    """``dt`` and the fractions of it that Runge-Kutta needs, in the caller's precision."""
-
-    full: Any
-    half: Any
-    third: Any
-    sixth: Any
+__all__ = ["TimeStep", "advance", "arrives"]
 
 
-def advance(model: ModelFunctions, x: Any, u: Any, limits: Any, h: TimeStep, ops: Ops) -> Any:
+def advance(model: ModelFunctions, x: Vector, u: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
     """The state after one step under a control that :meth:`ModelFunctions.limit_control` has clipped."""
     return model.limit_state(model.integrate(x, u, limits, h, ops), limits, ops)
 
 
-def arrives(squared_distance: Any, squared_speed: Any, squared_goal_radius: Any, squared_goal_speed: Any) -> Any:
+def arrives(
+    squared_distance: Number, squared_speed: Number, squared_goal_radius: Number, squared_goal_speed: Number
+) -> Any:
     """Whether a robot at this distance from its goal, at this speed, docks there."""
     return (squared_distance <= squared_goal_radius) & (squared_speed <= squared_goal_speed)
+
+
+def stands(arrived: Any, docks: Any) -> Any:
+    """Whether a robot that has arrived stays where it is, whatever its control; ``docks`` says whether any does."""
+    return arrived & docks

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import LARGEST, FloatArray, frozen_array, restore_frozen
 from d4orm_env.core.polygon import check_polygon, triangulate
@@ -15,7 +17,7 @@ from d4orm_env.core.shapes import Shapes
 from d4orm_env.core.world_index import WorldIndex, build_index, nearest_distance
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class World:
     """Obstacles and bounds of a planar or spatial world; all numbers are at most 1e6 in magnitude.
 
@@ -33,21 +35,51 @@ class World:
         ValueError: For a shape, radius, corner or bound that makes no sense; the message names it.
     """
 
-    dimension: int = 2
-    circles: Any = ()
-    spheres: Any = ()
-    cylinders: Any = ()
-    boxes: Any = ()
-    polygons: Any = ()
-    lower: Any = None
-    upper: Any = None
+    dimension: int
+    circles: FloatArray
+    spheres: FloatArray
+    cylinders: FloatArray
+    boxes: FloatArray
+    polygons: tuple[FloatArray, ...]
+    lower: FloatArray | None
+    upper: FloatArray | None
 
-    def __post_init__(self) -> None:
-        if self.dimension not in (2, 3):
-            raise ValueError(f"dimension of the world is {self.dimension!r}; it must be 2 or 3")
-        for name, width in (("circles", 3), ("spheres", 4), ("cylinders", 3), ("boxes", 2 * self.dimension)):
-            rows = frozen_array(getattr(self, name), name, (None, width), largest=LARGEST)
-            object.__setattr__(self, name, rows)
+    def __init__(
+        self,
+        dimension: int = 2,
+        circles: ArrayLike = (),
+        spheres: ArrayLike = (),
+        cylinders: ArrayLike = (),
+        boxes: ArrayLike = (),
+        polygons: Sequence[ArrayLike] = (),
+        lower: ArrayLike | None = None,
+        upper: ArrayLike | None = None,
+    ) -> None:
+        if dimension not in (2, 3):
+            raise ValueError(f"dimension of the world is {dimension!r}; it must be 2 or 3")
+        if (lower is None) != (upper is None):
+            raise ValueError("bounds need both lower and upper; give both, or neither for an open world")
+        rows = {
+            "circles": (circles, 3),
+            "spheres": (spheres, 4),
+            "cylinders": (cylinders, 3),
+            "boxes": (boxes, 2 * dimension),
+        }
+        tables = {
+            name: frozen_array(given, name, (None, width), largest=LARGEST) for name, (given, width) in rows.items()
+        }
+        bounds = {
+            f"{name}": None if given is None else frozen_array(given, f"bounds {name}", (dimension,), largest=LARGEST)
+            for name, given in (("lower", lower), ("upper", upper))
+        }
+        corners = tuple(
+            frozen_array(given, f"polygons[{index}]", (None, 2), largest=LARGEST)
+            for index, given in enumerate(polygons)
+        )
+        restore_frozen(self, {"dimension": dimension, **tables, "polygons": corners, **bounds})
+        self._check()
+
+    def _check(self) -> None:
         for name, dimension in (("circles", 2), ("spheres", 3), ("cylinders", 3)):
             round_obstacles = getattr(self, name)
             if len(round_obstacles) and self.dimension != dimension:
@@ -60,19 +92,10 @@ class World:
                 raise ValueError(f"boxes[{index}] is {box.tolist()}; its lower corner must lie below its upper corner")
         if len(self.polygons) and self.dimension != 2:
             raise ValueError(f"polygons need a world of dimension 2, and this one has {self.dimension}")
-        polygons = []
         for index, corners in enumerate(self.polygons):
-            polygons.append(frozen_array(corners, f"polygons[{index}]", (None, 2), largest=LARGEST))
-            check_polygon(polygons[-1], f"polygons[{index}]")
-        object.__setattr__(self, "polygons", tuple(polygons))
-        if (self.lower is None) != (self.upper is None):
-            raise ValueError("bounds need both lower and upper; give both, or neither for an open world")
-        if self.lower is not None:
-            for name in ("lower", "upper"):
-                bound = frozen_array(getattr(self, name), f"bounds {name}", (self.dimension,), largest=LARGEST)
-                object.__setattr__(self, name, bound)
-            if (self.lower >= self.upper).any():
-                raise ValueError(f"bounds lower {self.lower.tolist()} must lie below upper {self.upper.tolist()}")
+            check_polygon(corners, f"polygons[{index}]")
+        if self.lower is not None and self.upper is not None and (self.lower >= self.upper).any():
+            raise ValueError(f"bounds lower {self.lower.tolist()} must lie below upper {self.upper.tolist()}")
 
     def __getstate__(self) -> dict[str, Any]:
         # What is cached is made anew in a copy.
@@ -97,7 +120,7 @@ class World:
     @property
     def bounds(self) -> FloatArray:
         """``(2, dimension)`` lower and upper bounds; infinite in an open world."""
-        if self.lower is None:
+        if self.lower is None or self.upper is None:
             return np.array([[-np.inf] * self.dimension, [np.inf] * self.dimension], np.float32)
         return np.stack([self.lower, self.upper])
 

@@ -11,7 +11,7 @@ for cells of the size asked for gets larger ones, which cost time and no exactne
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import product
+from itertools import pairwise, product
 from typing import NamedTuple
 
 import numpy as np
@@ -87,7 +87,9 @@ def build_index(shapes: Shapes, cell: float, reach: float, nearest: int = 1) -> 
         nearest: How many of the nearest obstacles of any point a cell's list is sure to hold.
     """
     if not shapes.count:
-        return _frozen(np.zeros(shapes.dimension), 1.0, np.zeros(shapes.dimension), 0.0, *np.zeros((3, 0)), nearest)
+        nothing = np.zeros(0)
+        corner = np.zeros(shapes.dimension)
+        return _frozen(corner, 1.0, corner, 0.0, nothing, nothing, nothing, nearest)
     while True:
         low, size, cell = _layout(shapes, cell, reach)
         index = _filled(shapes, low, size, cell, nearest)
@@ -100,7 +102,7 @@ def nearest_distance(shapes: Shapes, index: WorldIndex, points: Floats) -> Float
     """``(N,)`` signed distance from points ``(N, d)`` to the nearest of the obstacles [m]; there must be some."""
     distance = np.empty(len(points))
     place = (points - index.low) * index.scale
-    inside = ((place > 0) & (place < index.size)).all(axis=1)
+    inside: NDArray[np.bool_] = np.all((place > 0) & (place < index.size), axis=1)
     cell = np.zeros(len(points), np.int64)
     cell[inside] = np.ravel_multi_index(tuple(place[inside].astype(np.int64).T), tuple(index.size))
     # Beyond the grid every obstacle may be the nearest.
@@ -193,7 +195,7 @@ def _halved(cells: _Cells) -> Iterator[_Cells]:
     """The cells, in parts small enough to be split."""
     parts = -(-(len(cells.item) << cells.place.shape[1]) // _PAIRS_AT_ONCE)
     ends = np.searchsorted(cells.cell, np.linspace(0, len(cells.place), min(parts, len(cells.place)) + 1).astype(int))
-    for begin, end in zip(ends[:-1], ends[1:], strict=True):
+    for begin, end in pairwise(ends):
         if begin < end:
             first, last = cells.cell[begin], cells.cell[end - 1]
             yield _Cells(cells.place[first : last + 1], cells.cell[begin:end] - first, cells.item[begin:end])
@@ -204,7 +206,7 @@ def _split(cells: _Cells, size: Floats) -> _Cells:
     places, owners, items, count = [], [], [], 0
     for corner in product((0, 1), repeat=len(size)):
         place = 2 * cells.place + corner
-        inside = (place < size).all(axis=1)
+        inside: NDArray[np.bool_] = np.all(place < size, axis=1)
         kept = inside[cells.cell]
         places.append(place[inside])
         owners.append(count + (np.cumsum(inside) - 1)[cells.cell[kept]])

@@ -57,7 +57,7 @@ def parse_yaml(text: str) -> Any:
     return documents[0]
 
 
-def _node(events: Iterator[yaml.Event], event: Any, depth: int) -> Any:
+def _node(events: Iterator[yaml.Event], event: Any, depth: int) -> object:
     """The value that begins with ``event``; takes the rest of it from ``events``."""
     line = _line(event.start_mark)
     if depth > MAX_DEPTH:
@@ -69,13 +69,13 @@ def _node(events: Iterator[yaml.Event], event: Any, depth: int) -> Any:
     if isinstance(event, yaml.ScalarEvent):
         return _scalar(event.value) if event.implicit[0] else event.value
     if isinstance(event, yaml.SequenceStartEvent):
-        items: list[Any] = []
+        items: list[object] = []
         for item in _until(events, yaml.SequenceEndEvent):
             if len(items) == MAX_ITEMS:
                 raise ValueError(f"has a list of more than {MAX_ITEMS} entries{line}; give fewer")
             items.append(_node(events, item, depth + 1))
         return items
-    mapping: dict[str, Any] = {}
+    mapping: dict[str, object] = {}
     for item in _until(events, yaml.MappingEndEvent):
         key = item.value if isinstance(item, yaml.ScalarEvent) and item.tag is None else None
         if key is None:
@@ -100,7 +100,7 @@ def _until(events: Iterator[yaml.Event], end: type[yaml.Event]) -> Iterator[yaml
         yield event
 
 
-def _scalar(text: str) -> Any:
+def _scalar(text: str) -> object:
     """A plain scalar by the rules of YAML 1.2: ``1e-3`` is a number, ``on`` is text, nothing is octal or base 60."""
     if text in _WORDS:
         return _WORDS[text]

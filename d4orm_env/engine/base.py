@@ -1,20 +1,27 @@
-"""What an engine is, and how to get one."""
+"""What an engine is: what it is asked for, and what it answers."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.util import find_spec
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import LARGEST_NUMBER, BoolArray, FloatArray, as_float32
-from d4orm_env.core.problem import Problem, ProblemArrays
+from d4orm_env.core.observation_layout import ObservationLayout
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
 
-ENGINES = ("auto", "cpu", "jax")
+if TYPE_CHECKING:
+    from d4orm_env.engine.worlds import WorldBatch
+
+__all__ = [
+    "Engine", "MovingObstacles", "SamplingResult", "SamplingRules", "SamplingTask", "StepResult", "WorldEngine",
+    "checked_controls",
+]  # fmt: skip
 
 
 class StepResult(NamedTuple):
@@ -132,7 +139,7 @@ class Engine(Protocol):
         """
         ...
 
-    def rollout(self, problem: Problem, controls: FloatArray) -> Trajectory:
+    def rollout(self, problem: Problem, controls: ArrayLike) -> Trajectory:
         """Roll ``controls`` ``(H, K, m)`` out from the problem's start."""
         ...
 
@@ -160,40 +167,60 @@ class Engine(Protocol):
         ...
 
 
-def get_engine(name: str = "auto", num_threads: int | None = None) -> Engine:
-    """The engine of that name.
+class WorldEngine(Engine, Protocol):
+    """An engine with what environments need as well."""
 
-    Args:
-        name: ``"auto"`` is JAX where JAX sees an accelerator, and the CPU engine elsewhere.
-        num_threads: Of the CPU engine; as many as there are cores by default.
+    def contacts(self, arrays: ProblemArrays, states: FloatArray) -> tuple[BoolArray, BoolArray]:
+        """``(collided (K,), margin_violated (K,))`` of a team standing at ``states`` ``(K, n)``."""
+        ...
 
-    Raises:
-        ValueError: If there is no such engine.
-    """
-    if name not in ENGINES:
-        raise ValueError(f"engine {name!r} is unknown; choose one of {', '.join(ENGINES)}")
-    if name == "auto":
-        name = "jax" if _accelerator_visible() else "cpu"
-    if name == "jax":
-        from d4orm_env.engine.jax import JaxEngine
+    def observe(
+        self,
+        arrays: ProblemArrays,
+        layout: ObservationLayout,
+        states: FloatArray,
+        controls: FloatArray,
+        arrived: BoolArray,
+        time_left: float,
+    ) -> FloatArray:
+        """What every robot sees.
 
-        return JaxEngine()
-    from d4orm_env.engine.cpu import CpuEngine
+        Args:
+            arrays: The problem.
+            layout: Which components there are, and their bounds.
+            states: ``(K, n)``.
+            controls: ``(K, m)`` executed last.
+            arrived: ``(K,)`` bool.
+            time_left: Share of the time left, 1 to 0.
 
-    return CpuEngine(num_threads)
+        Returns:
+            ``(K, D)`` observations inside the layout's bounds.
+        """
+        ...
+
+    def advance(
+        self,
+        arrays: ProblemArrays,
+        layout: ObservationLayout,
+        max_cycles: int,
+        orders: NDArray[np.int64],
+        batch: WorldBatch,
+        out: FloatArray,
+    ) -> None:
+        """Step, reset and observe the worlds of a batch in place, each as it is ordered to.
+
+        Args:
+            arrays: The problem that the worlds share; each has its own starts and goals.
+            layout: Which components an observation has, and their bounds.
+            max_cycles: Steps in an episode.
+            orders: ``(B,)`` one of :data:`~d4orm_env.engine.worlds.STEP` and its like for every world.
+            batch: The worlds; ``batch.control`` holds what to do.
+            out: ``(B, K, D)`` observations, output; those of skipped worlds are not written.
+        """
+        ...
 
 
-def _accelerator_visible() -> bool:
-    # JAX sees accelerators through plugin packages. Where none is installed there is no need to import JAX to ask it,
-    # which would take longer than planning.
-    if "jax" not in sys.modules and not any(find_spec(plugin) for plugin in ("jax_plugins", "libtpu")):
-        return False
-    import jax
-
-    return jax.default_backend() != "cpu"
-
-
-def checked_controls(problem: Problem, controls: Any) -> FloatArray:
+def checked_controls(problem: Problem, controls: ArrayLike) -> FloatArray:
     """``controls`` as a contiguous ``(H, K, m)`` float32 array.
 
     Raises:

@@ -30,6 +30,19 @@ class _SourceKeyedCache(FunctionCache):
     def _index_key(self, sig: Any, codegen: Any) -> Any:
         return sig, codegen.magic_tuple(), self._source_key
 
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """What is kept for arguments of these types, or ``None``."""
+        self.kept()
+        return super().load_overload(sig, target_context)
+
+    def kept(self) -> tuple[Any, ...]:
+        """Keys of all that is kept; none, from then on, where another version kept what this one cannot read."""
+        try:
+            return tuple(self._cache_file._load_index())
+        except (ImportError, AttributeError):
+            self.flush()
+            return ()
+
 
 def cached_kernel(key: str, variant: str = "", **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Decorator: compile with numba on first call, and keep the result on disk under ``key``.
@@ -56,4 +69,4 @@ def has_to_be_compiled(kernel: Any) -> bool:
     cache = kernel._cache
     if not isinstance(cache, _SourceKeyedCache):
         return False
-    return not any(key[-1] == cache._source_key for key in cache._cache_file._load_index())
+    return not any(key[-1] == cache._source_key for key in cache.kept())

@@ -6,10 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
-from d4orm_env.core.observation import ObservationLayout
-from d4orm_env.core.problem import Problem, ProblemArrays
+from d4orm_env.core.observation_layout import ObservationLayout
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine import noise, sampling
 from d4orm_env.engine.base import SamplingResult, SamplingRules, SamplingTask, StepResult, checked_controls
@@ -40,7 +42,7 @@ class CpuEngine:
         return StepResult(state[0], control[0], docked[0], collided[0], violated[0], rewards[0])
 
     def contacts(self, arrays: ProblemArrays, states: FloatArray) -> tuple[BoolArray, BoolArray]:
-        """``(collided (K,), margin_violated (K,))`` of a team standing at ``states`` ``(K, n)``."""
+        """See :meth:`d4orm_env.engine.base.WorldEngine.contacts`."""
         state = np.array(states, np.float32)[None]
         control = np.zeros((1, len(states), 1), np.float32)
         docked = np.zeros((1, len(states)), bool)
@@ -58,19 +60,7 @@ class CpuEngine:
         arrived: BoolArray,
         time_left: float,
     ) -> FloatArray:
-        """What every robot sees.
-
-        Args:
-            arrays: The problem.
-            layout: Which components there are, and their bounds.
-            states: ``(K, n)``.
-            controls: ``(K, m)`` executed last.
-            arrived: ``(K,)`` bool.
-            time_left: Share of the time left, 1 to 0.
-
-        Returns:
-            ``(K, D)`` observations inside the layout's bounds.
-        """
+        """See :meth:`d4orm_env.engine.base.WorldEngine.observe`."""
         out: FloatArray = np.empty((1, len(states), layout.size), np.float32)
         arrays = _typed(arrays)
         _kernels(arrays).observe_world(
@@ -93,20 +83,11 @@ class CpuEngine:
         arrays: ProblemArrays,
         layout: ObservationLayout,
         max_cycles: int,
-        orders: Any,
+        orders: NDArray[np.int64],
         batch: WorldBatch,
         out: FloatArray,
     ) -> None:
-        """Step, reset and observe the worlds of a batch in place, each as it is ordered to.
-
-        Args:
-            arrays: The problem that the worlds share; each has its own starts and goals.
-            layout: Which components an observation has, and their bounds.
-            max_cycles: Steps in an episode.
-            orders: ``(B,)`` uint8, one of :data:`~d4orm_env.engine.worlds.STEP` and its like for every world.
-            batch: The worlds; ``batch.control`` holds what to do.
-            out: ``(B, K, D)`` observations, output; those of skipped worlds are not written.
-        """
+        """See :meth:`d4orm_env.engine.base.WorldEngine.advance`."""
         arrays = _typed(arrays)
         advance_worlds = _kernels(arrays).advance_worlds
         self._threads.over(
@@ -116,7 +97,7 @@ class CpuEngine:
             ),
         )
 
-    def rollout(self, problem: Problem, controls: FloatArray) -> Trajectory:
+    def rollout(self, problem: Problem, controls: ArrayLike) -> Trajectory:
         """See :meth:`d4orm_env.engine.base.Engine.rollout`.
 
         Raises:

@@ -14,11 +14,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from d4orm_env.core import collision, reward, transition
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.dynamics import MODELS, names_of_codes
-from d4orm_env.core.problem import Problem, ProblemArrays
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.robot_model import Ops
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine import noise
@@ -77,14 +79,15 @@ def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: World
         limits = tuple(arrays.limits[robots, i][:, None] for i in range(len(model.limit_names)))
         x = tuple(worlds.state[robots, i] for i in range(model.state_size))
         u = functions.limit_control(tuple(control[robots, i] for i in range(model.control_size)), limits, OPS)
-        y = transition.advance(functions, x, u, limits, h, OPS)
+        y: tuple[Any, ...] = transition.advance(functions, x, u, limits, h, OPS)
         gap2 = sum((y[i] - arrays.goal[robots, i][:, None]) ** 2 for i in range(model.dimension))
         speed2 = sum(v * v for v in functions.velocity(y, u, limits, OPS))
         arrives = transition.arrives(gap2, speed2, arrays.squared_goal_radius, arrays.squared_goal_speed)
-        standing = worlds.docked[robots]
+        standing = transition.stands(worlds.docked[robots], arrays.docks)
+        docks = transition.stands(arrives, arrays.docks)
         zero = jnp.zeros_like(gap2)
         for i, (old, rest, new) in enumerate(zip(x, functions.rest(y, zero), y, strict=True)):
-            state = state.at[robots, i].set(jnp.where(standing, old, jnp.where(arrives, rest, new)))
+            state = state.at[robots, i].set(jnp.where(standing, old, jnp.where(docks, rest, new)))
         for i, component in enumerate(u):
             executed = executed.at[robots, i].set(jnp.where(standing, zero, component))
         docked = docked.at[robots].set(standing | arrives)
@@ -112,7 +115,7 @@ def obstacle_contacts(arrays: ProblemArrays, place: Any, extra: Any) -> Any:
     hit = jnp.zeros((place.shape[0], place.shape[2]), bool)
     for axis in range(place.shape[1]):
         hit |= collision.leaves(place[:, axis], reach, arrays.bounds[0, axis], arrays.bounds[1, axis])
-    if len(arrays.boxes) + len(arrays.triangles) > FEW and arrays.index is not None:
+    if len(arrays.boxes) + len(arrays.triangles) > FEW and arrays.grid is not None:
         return hit | _indexed_contacts(arrays, place, reach)
     if len(arrays.boxes):
         box = jnp.moveaxis(arrays.boxes, 1, 0)[..., None, :, None]
@@ -144,7 +147,7 @@ def _touches_triangle(corners: Any, reach: Any, place: Any) -> Any:
 
 def _indexed_contacts(arrays: ProblemArrays, place: Any, reach: Any) -> Any:
     """``(K, S)`` bool: contacts with obstacles, see :mod:`d4orm_env.engine.obstacles`."""
-    index, cell = arrays.index, jnp.int32(0)
+    index, cell = arrays.grid, jnp.int32(0)
     for axis in range(place.shape[1]):
         step = (place[:, axis] - index.low[axis]) * index.scale
         # Asked this way round, what is not a number counts as zero.
@@ -339,20 +342,20 @@ class JaxEngine:
         state, docked, control = (np.asarray(value)[..., 0] for value in worlds)
         return StepResult(state, control, docked, collided, margin_violated, rewards)
 
-    def rollout(self, problem: Problem, controls: FloatArray) -> Trajectory:
+    def rollout(self, problem: Problem, controls: ArrayLike) -> Trajectory:
         """See :meth:`d4orm_env.engine.base.Engine.rollout`.
 
         Raises:
             ValueError: If the controls have another shape than ``(H, K, m)`` or are not finite.
         """
-        controls = checked_controls(problem, controls)
+        wanted = checked_controls(problem, controls)
         num_robots = problem.num_robots
         worlds = Worlds(
             problem.start[..., None],
             np.zeros((num_robots, 1), bool),
             np.zeros((num_robots, problem.control_size, 1), np.float32),
         )
-        first, (worlds, verdicts) = _rollout(problem.team.models, problem.arrays, worlds, controls[..., None])
+        first, (worlds, verdicts) = _rollout(problem.team.models, problem.arrays, worlds, wanted[..., None])
         states = np.concatenate([problem.start[None], np.asarray(worlds.state)[..., 0]])
         collided, margin_violated = (
             np.concatenate([np.asarray(first[i])[None, :, 0], np.asarray(verdicts[i])[..., 0]]) for i in range(2)

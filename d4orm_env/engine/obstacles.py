@@ -91,8 +91,8 @@ def near_obstacles(arrays: Any, reach: Any, places: Any, spare: Any) -> Any:
     ``spare`` is a row to overwrite.
     """
     mask = NOWHERE
-    if arrays.index.clearance.shape[0] > 0:
-        mask = _near_indexed(arrays.index, arrays.boxes, arrays.triangles, reach, places, spare)
+    if arrays.grid.clearance.shape[0] > 0:
+        mask = _near_indexed(arrays.grid, arrays.boxes, arrays.triangles, reach, places, spare)
     for axis in range(arrays.goal.shape[1]):
         lower, upper = arrays.bounds[0, axis], arrays.bounds[1, axis]
         if lower > -np.inf or upper < np.inf:

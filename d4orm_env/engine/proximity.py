@@ -231,10 +231,10 @@ def near_static(arrays: Any, k: Any, bounds: Any, boxes: Any) -> Any:
     :func:`bound_boxes`.
     """
     dimension, limits, touch = arrays.goal.shape[1], bounds.reshape(-1), False
-    if arrays.index.clearance.shape[0] > 0:
+    if arrays.grid.clearance.shape[0] > 0:
         # The boxes are wider than the places by the radius and half of the margin.
         reach, half = arrays.radius[k] + arrays.margin, arrays.radius[k] + _HALF * arrays.margin + SLACK
-        touch = may_touch(arrays.index, reach, half, boxes, box_of(k, dimension) + 2 * TILE, BOX)
+        touch = may_touch(arrays.grid, reach, half, boxes, box_of(k, dimension) + 2 * TILE, BOX)
     for bound in range(bounds.shape[0]):
         touch |= _meets(k, bound, dimension, boxes, limits)
     return touch

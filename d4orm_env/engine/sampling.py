@@ -237,11 +237,11 @@ def _runner(name: str) -> Any:
         for i in range(count):
             u = controls[i * CONTROL_ROWS * TILE : (i + 1) * CONTROL_ROWS * TILE]
             for s in range(TILE):
-                standing = w[DOCKED * TILE + s] > ZERO
+                standing = transition.stands(w[DOCKED * TILE + s] > ZERO, docking[2])
                 x = move(standing, read_x(w, STATE * TILE, s), read_u(u, 0, s), limits, h)
                 write_x(w, STATE * TILE, s, x)
             for s in range(TILE):
-                standing = w[DOCKED * TILE + s] > ZERO
+                standing = transition.stands(w[DOCKED * TILE + s] > ZERO, docking[2])
                 x, gap2, docked = dock(standing, read_x(w, STATE * TILE, s), read_u(u, 0, s), limits, goal, docking)
                 write_x(w, STATE * TILE, s, x)
                 w[DOCKED * TILE + s] = ONE if docked else ZERO
@@ -302,7 +302,8 @@ def _score_tile(
     # Taken out of the tuple once: every access counts a reference, which costs as much as several samples.
     codes, all_limits, goals, inverse = arrays.model_codes, arrays.limits, arrays.goal, arrays.inverse_initial_distance
     h = transition.TimeStep(arrays.time_step[0], arrays.time_step[1], arrays.time_step[2], arrays.time_step[3])
-    docking, dimension = (arrays.squared_goal_radius, arrays.squared_goal_speed), goals.shape[1]
+    docks, dimension = arrays.docks, goals.shape[1]
+    docking = (arrays.squared_goal_radius, arrays.squared_goal_speed, docks)
     radius, margin = arrays.radius, arrays.margin
     standing[:] = False
     _begin_tile(arrays, docked, w)
@@ -328,7 +329,7 @@ def _score_tile(
             # Once a robot stands in every sample nothing about it changes any more: neither its place nor its flags
             # towards static obstacles.
             rest = 0
-            if _all_docked(robot):
+            if docks and _all_docked(robot):
                 standing[k] = True
                 rest = num_steps - (first + count)
                 _add_standing(goals[k], inverse[k], np.float32(rest), robot)

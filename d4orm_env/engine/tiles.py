@@ -66,6 +66,7 @@ for _function in (
     robot_model.runge_kutta,
     transition.advance,
     transition.arrives,
+    transition.stands,
     collision.axis_gap,
     collision.leaves,
     collision.meets_edge,
@@ -314,7 +315,8 @@ def make_stepper(model: Model) -> tuple[Any, Any]:
         gap2 = squared_gap(x, goal)
         speed2 = squared_norm(functions.velocity(x, u, limits, OPS))
         arrives = transition.arrives(gap2, speed2, docking[0], docking[1])
-        return pick_x(arrives, functions.rest(x, ZERO), x), gap2, standing | arrives
+        docks = transition.stands(arrives, docking[2])
+        return pick_x(docks, functions.rest(x, ZERO), x), gap2, standing | arrives
 
     return move, dock
 
@@ -336,15 +338,15 @@ def _mover(model: Model) -> Any:
         use_wide_registers()
         limits = to_fixed_tuple(all_limits, num_limits)
         for s in range(TILE):
-            standing = w[DOCKED * TILE + s] > ZERO
+            standing = transition.stands(w[DOCKED * TILE + s] > ZERO, docking[2])
             u = limit_control(read_u(w, CONTROL * TILE, s), limits, OPS)
             write_u(w, CONTROL * TILE, s, pick_u(standing, no_control, u))
         for s in range(TILE):
-            standing = w[DOCKED * TILE + s] > ZERO
+            standing = transition.stands(w[DOCKED * TILE + s] > ZERO, docking[2])
             u = read_u(w, CONTROL * TILE, s)
             write_x(w, STATE * TILE, s, move(standing, read_x(w, STATE * TILE, s), u, limits, h))
         for s in range(TILE):
-            standing = w[DOCKED * TILE + s] > ZERO
+            standing = transition.stands(w[DOCKED * TILE + s] > ZERO, docking[2])
             x, u = read_x(w, STATE * TILE, s), read_u(w, CONTROL * TILE, s)
             x, gap2, docked = dock(standing, x, u, limits, read_goal(w, GOAL * TILE, s), docking)
             write_x(w, STATE * TILE, s, x)
@@ -393,7 +395,7 @@ def robot_mover(names: tuple[str, ...]) -> Any:
     @inlined
     def move_robot(arrays: Any, k: Any, w: Any) -> None:
         h = transition.TimeStep(arrays.time_step[0], arrays.time_step[1], arrays.time_step[2], arrays.time_step[3])
-        docking = (arrays.squared_goal_radius, arrays.squared_goal_speed)
+        docking = (arrays.squared_goal_radius, arrays.squared_goal_speed, arrays.docks)
         move(arrays.model_codes[k], arrays.limits[k], h, docking, w[k * STRIDE : (k + 1) * STRIDE])
 
     return move_robot

@@ -44,6 +44,9 @@ SOURCES = fingerprint((robot_model, transition, collision, reward, observation, 
 
 for _function in (
     observation.observe_robot,
+    observation._see_itself,
+    observation._see_robots,
+    observation._see_obstacles,
     observation.insert_nearest,
     observation._find_nearest_robots,
     observation._find_nearest_obstacles,
@@ -222,20 +225,9 @@ def judge_worlds(
     _judge_all(arrays, goal, inverse, state, control, docked, collided, violated, rewards, w, near)
 
 
-class Eyes(NamedTuple):
-    """Scratch for the observations of one world: what robots see of each other, and the nearest things so far."""
-
-    position: Any
-    velocity: Any
-    heading: Any
-    arrived: Any
-    nearest_robots: Any
-    nearest_obstacles: Any
-
-
 @numba.njit(nogil=True, **OPTIONS)
 def _open_eyes(num_robots: Any, dimension: Any, num_neighbors: Any, num_obstacles: Any) -> Any:
-    return Eyes(
+    return observation.Eyes(
         np.empty((num_robots, dimension), np.float32), np.empty((num_robots, dimension), np.float32),
         np.empty((num_robots, 2), np.float32), np.empty(num_robots, np.float32),
         np.empty((num_neighbors, 2), np.float32), np.empty((num_obstacles, 1 + dimension), np.float32),
@@ -255,14 +247,11 @@ def _observe(
         read_motion(arrays, k, s, w, eyes.velocity[k], eyes.heading[k])
         eyes.arrived[k] = ONE if docked[k] else ZERO
         for axis in range(dimension):
-            if docked[k]:
+            if transition.stands(docked[k], arrays.docks):
                 eyes.velocity[k, axis] = ZERO
     for k in range(num_robots):
         row = out[k]
-        observation.observe_robot(
-            k, arrays, goal, eyes.position, eyes.velocity, eyes.heading, eyes.arrived, time_left, eyes.nearest_robots,
-            eyes.nearest_obstacles, row,
-        )  # fmt: skip
+        observation.observe_robot(k, arrays, goal, eyes, time_left, row)
         for i in range(row.shape[0]):
             value = row[i]
             value = value if value > bounds[0, i] else bounds[0, i]
@@ -311,7 +300,7 @@ class WorldBatch(NamedTuple):
         terminated: ``(B,)`` bool: all have docked.
         truncated: ``(B,)`` bool: out of time before that.
         total_reward: ``(B,)`` float64 sum over robots and steps of the episode.
-        arrival: ``(B, K)`` int64 step of docking, 0 for not yet.
+        arrival: ``(B, K)`` int64 step since which a robot is at its goal, 0 for not there.
         contacts: ``(B, K)`` int64 steps in contact.
         violations: ``(B, K)`` int64 steps within the margin.
     """
@@ -386,7 +375,9 @@ def _tally(batch: Any, max_cycles: Any, b: Any) -> None:
         total += batch.rewards[b, k]
         batch.contacts[b, k] += batch.collided[b, k]
         batch.violations[b, k] += batch.violated[b, k]
-        if batch.docked[b, k] and batch.arrival[b, k] == 0:
+        if not batch.docked[b, k]:
+            batch.arrival[b, k] = 0
+        elif batch.arrival[b, k] == 0:
             batch.arrival[b, k] = batch.steps[b]
         everybody &= batch.docked[b, k]
     batch.reward[b] = total / num_robots

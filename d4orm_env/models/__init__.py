@@ -20,20 +20,6 @@ from d4orm_env.core.robot_model import (
 )
 
 __all__ = [
-    "ACCELERATION",
-    "OWN_LIMITS",
-    "SPEED",
-    "TURN_RATE",
-    "Limit",
-    "Model",
-    "ModelFunctions",
-    "Ops",
-    "clip",
-    "control_scale",
-    "first_order_approach",
-    "norm_scale",
-    "planar_approach",
-    "share",
-    "stopping_speed",
-    "turn_towards",
-]
+    "ACCELERATION", "OWN_LIMITS", "SPEED", "TURN_RATE", "Limit", "Model", "ModelFunctions", "Ops", "clip",
+    "control_scale", "first_order_approach", "norm_scale", "planar_approach", "share", "stopping_speed", "turn_towards",
+]  # fmt: skip

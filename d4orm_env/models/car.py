@@ -7,8 +7,6 @@ steering angle as states.
 
 from __future__ import annotations
 
-from typing import Any
-
 from d4orm_env.core.robot_model import (
     ACCELERATION,
     OWN_LIMITS,
@@ -16,7 +14,10 @@ from d4orm_env.core.robot_model import (
     Limit,
     Model,
     ModelFunctions,
+    Number,
     Ops,
+    TimeStep,
+    Vector,
     clip,
     planar_approach,
     turn_towards,
@@ -25,28 +26,28 @@ from d4orm_env.core.robot_model import (
 MAX_STEERING, MAX_STEERING_RATE, WHEELBASE = range(OWN_LIMITS, OWN_LIMITS + 3)
 
 
-def _derivative(x: Any, u: Any, limits: Any, ops: Ops) -> Any:
+def _derivative(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
     turn_rate = x[3] * ops.sin(x[4]) / (ops.cos(x[4]) * limits[WHEELBASE])
     return (x[3] * ops.cos(x[2]), x[3] * ops.sin(x[2]), turn_rate, u[0], u[1])
 
 
-def _limit_control(u: Any, limits: Any, ops: Ops) -> Any:
+def _limit_control(u: Vector, limits: Vector, ops: Ops) -> Vector:
     return (clip(u[0], limits[ACCELERATION], ops), clip(u[1], limits[MAX_STEERING_RATE], ops))
 
 
-def _limit_state(x: Any, limits: Any, ops: Ops) -> Any:
+def _limit_state(x: Vector, limits: Vector, ops: Ops) -> Vector:
     return (x[0], x[1], x[2], clip(x[3], limits[SPEED], ops), clip(x[4], limits[MAX_STEERING], ops))
 
 
-def _velocity(x: Any, u: Any, limits: Any, ops: Ops) -> Any:
+def _velocity(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
     return (x[3] * ops.cos(x[2]), x[3] * ops.sin(x[2]))
 
 
-def _rest(x: Any, zero: Any) -> Any:
+def _rest(x: Vector, zero: Number) -> Vector:
     return (x[0], x[1], x[2], zero, x[4])
 
 
-def _track(x: Any, velocity: Any, limits: Any, h: Any, ops: Ops) -> Any:
+def _track(x: Vector, velocity: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
     """Turn the front to the wanted direction, forwards where that lies ahead and in reverse where it lies behind.
 
     It drives as fast as wanted wherever it faces, because it turns only as it drives.
@@ -66,15 +67,7 @@ CAR = Model(
     control_limits=(ACCELERATION, MAX_STEERING_RATE),
     heading_index=2,
     speed_indices=(3,),
-    functions=ModelFunctions(
-        derivative=_derivative,
-        limit_control=_limit_control,
-        limit_state=_limit_state,
-        velocity=_velocity,
-        rest=_rest,
-        approach=planar_approach,
-        track=_track,
-    ),
+    functions=ModelFunctions(_derivative, _limit_control, _limit_state, _velocity, _rest, planar_approach, _track),
     own_limits=(
         Limit("max_steering", 0.6, most=1.5),
         Limit("max_steering_rate", 1.0),

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from d4orm_env.core.robot_model import (
     ACCELERATION,
     SPEED,
     TURN_RATE,
     Model,
     ModelFunctions,
+    Number,
     Ops,
+    TimeStep,
+    Vector,
     clip,
     planar_approach,
     turn_towards,
 )
 
 
-def _derivative(x: Any, u: Any, limits: Any, ops: Ops) -> Any:
+def _derivative(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
     return (x[3] * ops.cos(x[2]), x[3] * ops.sin(x[2]), u[0], u[1])
 
 
-def _integrate(x: Any, u: Any, limits: Any, h: Any, ops: Ops) -> Any:
+def _integrate(x: Vector, u: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
     # The heading turns evenly, so that two of the four stages are the same, and what remains is Simpson's rule. The
     # headings half-way and at the end come from the first one, turned twice by the same angle.
     turn = h.half * u[0]
@@ -39,23 +40,23 @@ def _integrate(x: Any, u: Any, limits: Any, h: Any, ops: Ops) -> Any:
     )
 
 
-def _limit_control(u: Any, limits: Any, ops: Ops) -> Any:
+def _limit_control(u: Vector, limits: Vector, ops: Ops) -> Vector:
     return (clip(u[0], limits[TURN_RATE], ops), clip(u[1], limits[ACCELERATION], ops))
 
 
-def _limit_state(x: Any, limits: Any, ops: Ops) -> Any:
+def _limit_state(x: Vector, limits: Vector, ops: Ops) -> Vector:
     return (x[0], x[1], x[2], clip(x[3], limits[SPEED], ops))
 
 
-def _velocity(x: Any, u: Any, limits: Any, ops: Ops) -> Any:
+def _velocity(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
     return (x[3] * ops.cos(x[2]), x[3] * ops.sin(x[2]))
 
 
-def _rest(x: Any, zero: Any) -> Any:
+def _rest(x: Vector, zero: Number) -> Vector:
     return (x[0], x[1], x[2], zero)
 
 
-def _track(x: Any, velocity: Any, limits: Any, h: Any, ops: Ops) -> Any:
+def _track(x: Vector, velocity: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
     """Turn to the wanted direction, and drive as fast as it faces that way."""
     along, turn = turn_towards(x[2], velocity, ops)
     return (clip(turn / h.full, limits[TURN_RATE], ops), (ops.maximum(along, along - along) - x[3]) / h.full)
@@ -70,13 +71,6 @@ DIFFERENTIAL_DRIVE = Model(
     heading_index=2,
     speed_indices=(3,),
     functions=ModelFunctions(
-        derivative=_derivative,
-        limit_control=_limit_control,
-        limit_state=_limit_state,
-        velocity=_velocity,
-        rest=_rest,
-        integrate=_integrate,
-        approach=planar_approach,
-        track=_track,
+        _derivative, _limit_control, _limit_state, _velocity, _rest, planar_approach, _track, _integrate
     ),
 )

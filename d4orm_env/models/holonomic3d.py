@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from d4orm_env.core.robot_model import (
     ACCELERATION,
     SPEED,
     Model,
     ModelFunctions,
+    Number,
     Ops,
+    TimeStep,
+    Vector,
     control_scale,
     norm_scale,
     share,
@@ -17,11 +18,11 @@ from d4orm_env.core.robot_model import (
 )
 
 
-def _derivative(x: Any, u: Any, limits: Any, ops: Ops) -> Any:
+def _derivative(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
     return (x[3], x[4], x[5], u[0], u[1], u[2])
 
 
-def _integrate(x: Any, u: Any, limits: Any, h: Any, ops: Ops) -> Any:
+def _integrate(x: Vector, u: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
     return (
         x[0] + h.full * (x[3] + h.half * u[0]),
         x[1] + h.full * (x[4] + h.half * u[1]),
@@ -32,32 +33,32 @@ def _integrate(x: Any, u: Any, limits: Any, h: Any, ops: Ops) -> Any:
     )
 
 
-def _limit_control(u: Any, limits: Any, ops: Ops) -> Any:
+def _limit_control(u: Vector, limits: Vector, ops: Ops) -> Vector:
     scale = control_scale(u[0] * u[0] + u[1] * u[1] + u[2] * u[2], limits[ACCELERATION], ops)
     return (u[0] * scale, u[1] * scale, u[2] * scale)
 
 
-def _limit_state(x: Any, limits: Any, ops: Ops) -> Any:
+def _limit_state(x: Vector, limits: Vector, ops: Ops) -> Vector:
     scale = norm_scale(x[3] * x[3] + x[4] * x[4] + x[5] * x[5], limits[SPEED], ops)
     return (x[0], x[1], x[2], x[3] * scale, x[4] * scale, x[5] * scale)
 
 
-def _velocity(x: Any, u: Any, limits: Any, ops: Ops) -> Any:
+def _velocity(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
     return (x[3], x[4], x[5])
 
 
-def _rest(x: Any, zero: Any) -> Any:
+def _rest(x: Vector, zero: Number) -> Vector:
     return (x[0], x[1], x[2], zero, zero, zero)
 
 
-def _approach(x: Any, goal: Any, limits: Any, h: Any, ops: Ops) -> Any:
+def _approach(x: Vector, goal: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
     gap_x, gap_y, gap_z = goal[0] - x[0], goal[1] - x[1], goal[2] - x[2]
     distance = ops.sqrt(gap_x * gap_x + gap_y * gap_y + gap_z * gap_z)
     pace = share(stopping_speed(distance, limits, h, ops), distance, h.full, ops)
     return (gap_x * pace, gap_y * pace, gap_z * pace)
 
 
-def _track(x: Any, velocity: Any, limits: Any, h: Any, ops: Ops) -> Any:
+def _track(x: Vector, velocity: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
     return ((velocity[0] - x[3]) / h.full, (velocity[1] - x[4]) / h.full, (velocity[2] - x[5]) / h.full)
 
 
@@ -70,13 +71,6 @@ HOLONOMIC3D = Model(
     heading_index=None,
     speed_indices=(3, 4, 5),
     functions=ModelFunctions(
-        derivative=_derivative,
-        limit_control=_limit_control,
-        limit_state=_limit_state,
-        velocity=_velocity,
-        rest=_rest,
-        integrate=_integrate,
-        approach=_approach,
-        track=_track,
+        _derivative, _limit_control, _limit_state, _velocity, _rest, _approach, _track, _integrate
     ),
 )

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from d4orm_env.core.robot_model import (
     SPEED,
     TURN_RATE,
     Model,
     ModelFunctions,
+    Number,
     Ops,
+    TimeStep,
+    Vector,
     clip,
     first_order_approach,
     turn_towards,
 )
 
 
-def _derivative(x: Any, u: Any, limits: Any, ops: Ops) -> Any:
+def _derivative(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
     return (u[0] * ops.cos(x[2]), u[0] * ops.sin(x[2]), u[1])
 
 
-def _integrate(x: Any, u: Any, limits: Any, h: Any, ops: Ops) -> Any:
+def _integrate(x: Vector, u: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
     # Two of the four stages of Runge-Kutta are the same: what remains is Simpson's rule.
     middle, end = x[2] + h.half * u[1], x[2] + h.full * u[1]
     along, twice = h.sixth * u[0], h.third * (u[0] + u[0])
@@ -31,23 +32,23 @@ def _integrate(x: Any, u: Any, limits: Any, h: Any, ops: Ops) -> Any:
     )
 
 
-def _limit_control(u: Any, limits: Any, ops: Ops) -> Any:
+def _limit_control(u: Vector, limits: Vector, ops: Ops) -> Vector:
     return (clip(u[0], limits[SPEED], ops), clip(u[1], limits[TURN_RATE], ops))
 
 
-def _limit_state(x: Any, limits: Any, ops: Ops) -> Any:
+def _limit_state(x: Vector, limits: Vector, ops: Ops) -> Vector:
     return x
 
 
-def _velocity(x: Any, u: Any, limits: Any, ops: Ops) -> Any:
+def _velocity(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
     return (u[0] * ops.cos(x[2]), u[0] * ops.sin(x[2]))
 
 
-def _rest(x: Any, zero: Any) -> Any:
+def _rest(x: Vector, zero: Number) -> Vector:
     return x
 
 
-def _track(x: Any, velocity: Any, limits: Any, h: Any, ops: Ops) -> Any:
+def _track(x: Vector, velocity: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
     """Turn to the wanted direction, and drive as fast as it faces that way."""
     along, turn = turn_towards(x[2], velocity, ops)
     return (ops.maximum(along, along - along), clip(turn / h.full, limits[TURN_RATE], ops))
@@ -62,13 +63,6 @@ UNICYCLE = Model(
     heading_index=2,
     speed_indices=(),
     functions=ModelFunctions(
-        derivative=_derivative,
-        integrate=_integrate,
-        limit_control=_limit_control,
-        limit_state=_limit_state,
-        velocity=_velocity,
-        rest=_rest,
-        approach=first_order_approach,
-        track=_track,
+        _derivative, _limit_control, _limit_state, _velocity, _rest, first_order_approach, _track, _integrate
     ),
 )

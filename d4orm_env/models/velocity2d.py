@@ -2,44 +2,45 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from d4orm_env.core.robot_model import (
     SPEED,
     Model,
     ModelFunctions,
+    Number,
     Ops,
+    TimeStep,
+    Vector,
     control_scale,
     first_order_approach,
 )
 
 
-def _derivative(x: Any, u: Any, limits: Any, ops: Ops) -> Any:
+def _derivative(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
     return (u[0], u[1])
 
 
-def _integrate(x: Any, u: Any, limits: Any, h: Any, ops: Ops) -> Any:
+def _integrate(x: Vector, u: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
     return (x[0] + h.full * u[0], x[1] + h.full * u[1])
 
 
-def _limit_control(u: Any, limits: Any, ops: Ops) -> Any:
+def _limit_control(u: Vector, limits: Vector, ops: Ops) -> Vector:
     scale = control_scale(u[0] * u[0] + u[1] * u[1], limits[SPEED], ops)
     return (u[0] * scale, u[1] * scale)
 
 
-def _limit_state(x: Any, limits: Any, ops: Ops) -> Any:
+def _limit_state(x: Vector, limits: Vector, ops: Ops) -> Vector:
     return x
 
 
-def _velocity(x: Any, u: Any, limits: Any, ops: Ops) -> Any:
+def _velocity(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
     return (u[0], u[1])
 
 
-def _rest(x: Any, zero: Any) -> Any:
+def _rest(x: Vector, zero: Number) -> Vector:
     return x
 
 
-def _track(x: Any, velocity: Any, limits: Any, h: Any, ops: Ops) -> Any:
+def _track(x: Vector, velocity: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
     return velocity
 
 
@@ -52,13 +53,6 @@ VELOCITY2D = Model(
     heading_index=None,
     speed_indices=(),
     functions=ModelFunctions(
-        derivative=_derivative,
-        limit_control=_limit_control,
-        limit_state=_limit_state,
-        velocity=_velocity,
-        rest=_rest,
-        integrate=_integrate,
-        approach=first_order_approach,
-        track=_track,
+        _derivative, _limit_control, _limit_state, _velocity, _rest, first_order_approach, _track, _integrate
     ),
 )

@@ -41,9 +41,7 @@ def save_animation(
     speed: float = 1.0,
     max_frames: int = 400,
 ) -> Path:
-    """Write a trajectory as a moving picture with trails, headings, goals, obstacles, contacts and the time.
-
-    It ends half a second after the last robot has arrived, or at the end of the trajectory.
+    """Write a trajectory as a moving picture, up to half a second after the last robot has arrived, or to its end.
 
     Args:
         problem: The problem that the trajectory belongs to.
@@ -57,18 +55,16 @@ def save_animation(
         The path.
 
     Raises:
-        ValueError: For another suffix, ``.mp4`` without ffmpeg, a number out of range, or a trajectory that does not
-            fit the problem or is not finite.
+        ValueError: For another suffix, ``.mp4`` without ffmpeg, or a number or trajectory that does not fit.
         OSError: If the folder does not exist or cannot be written to, or ffmpeg fails.
     """
-    path = Path(path)
     checked_trajectory(problem, trajectory)
-    with replaced_when_done(path, ANIMATION_SUFFIXES) as temporary:
+    with replaced_when_done(path := Path(path), ANIMATION_SUFFIXES) as temporary:
         kind = path.suffix.lower()
         if kind == ".mp4" and shutil.which("ffmpeg") is None:
             raise ValueError(f"{path} needs ffmpeg, which is not on the PATH; install it, or write a .gif instead")
-        rate = _frame_rate(problem, fps, speed, _MOST_FRAMES_PER_SECOND[kind])
-        steps, rate = frame_steps(problem, trajectory, rate, speed, max_frames)
+        most = _MOST_FRAMES_PER_SECOND[kind]
+        steps, rate = frame_steps(problem, trajectory, _frame_rate(problem, fps, speed, most), speed, max_frames)
         renderer = FrameRenderer(problem, frame_size(problem, trajectory), trajectory.positions)
         try:
             write = _write_gif if kind == ".gif" else _write_mp4

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.registry import backend_registry
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.render.panels import INK, Array, Panel, TeamLayer, view_limits
@@ -33,7 +33,7 @@ class FrameRenderer:
         ValueError: If the size is below 64 x 64.
     """
 
-    def __init__(self, problem: Problem, size: tuple[int, int] = (480, 480), points: Any = ()) -> None:
+    def __init__(self, problem: Problem, size: tuple[int, int] = (480, 480), points: ArrayLike = ()) -> None:
         self.problem, self.size = problem, (int(size[0]), int(size[1]))
         if min(self.size) < 64:
             raise ValueError(f"size is {size}; a frame needs at least 64 x 64 pixels")
@@ -71,13 +71,13 @@ class FrameRenderer:
 
     def draw(
         self,
-        states: Any,
-        arrived: Any,
-        collided: Any,
-        goals: Any = None,
-        trail: Any = None,
+        states: ArrayLike,
+        arrived: ArrayLike,
+        collided: ArrayLike,
+        goals: ArrayLike | None = None,
+        trail: ArrayLike | None = None,
         *,
-        contacts: Any = (),
+        contacts: ArrayLike = (),
         caption: str | None = None,
     ) -> NDArray[np.uint8]:
         """Draw one moment.
@@ -98,21 +98,24 @@ class FrameRenderer:
             ValueError: If the states have another shape or are not finite.
             RuntimeError: After :meth:`close`.
         """
+        team, d = self._checked(np.asarray(states)), self.problem.dimension
+        docked = np.asarray(arrived, bool)
+        places = self.problem.goal if goals is None else np.asarray(goals)
+        way = np.empty((0, len(team), d)) if trail is None else np.asarray(trail)
+        stars = np.concatenate([np.reshape(contacts, (-1, d)), team[np.asarray(collided, bool), :d]])
+        self._keep_in_view(np.concatenate([team[:, :d], places]))
+        for layer in self._layers:
+            layer.update(team, docked, places, way, stars)
+        self._caption.set_text(f"arrived {docked.sum()} of {len(docked)}" if caption is None else caption)
+        return self._paint()
+
+    def _checked(self, states: Array) -> Array:
         if self._closed:
             raise RuntimeError("this renderer is closed; make a new one to draw again")
-        states, d = np.asarray(states), self.problem.dimension
-        arrived, collided = np.asarray(arrived, bool), np.asarray(collided, bool)
         expected = (self.problem.num_robots, self.problem.state_size)
         if states.shape != expected or not np.isfinite(states).all():
             raise ValueError(f"states must be finite and of shape (K, n) = {expected}; these have {states.shape}")
-        goals = self.problem.goal if goals is None else np.asarray(goals)
-        trail = np.empty((0, len(states), d)) if trail is None else np.asarray(trail)
-        contacts = np.concatenate([np.reshape(contacts, (-1, d)), states[collided, :d]])
-        self._keep_in_view(np.concatenate([states[:, :d], goals]))
-        for layer in self._layers:
-            layer.update(states, arrived, goals, trail, contacts)
-        self._caption.set_text(f"arrived {arrived.sum()} of {len(arrived)}" if caption is None else caption)
-        return self._paint()
+        return states
 
     def _keep_in_view(self, places: Array) -> None:
         reach = np.max(self.problem.team.radius)
@@ -182,14 +185,12 @@ class WindowRenderer:
         self._manager.canvas.mpl_connect("close_event", self._forget_window)
         self._manager.show()
 
-    def _forget_window(self, event: Any) -> None:
+    def _forget_window(self, event: object) -> None:
         self._manager = None
 
-    def draw(
-        self, states: Any, arrived: Any, collided: Any, goals: Any = None, trail: Any = None, **marks: Any
-    ) -> NDArray[np.uint8]:
+    def draw(self, *moment: ArrayLike, **marks: Any) -> NDArray[np.uint8]:
         """Draw one moment as :meth:`FrameRenderer.draw` does, show it, and wait until it is time for the next."""
-        frame = self._frames.draw(states, arrived, collided, goals, trail, **marks)
+        frame = self._frames.draw(*moment, **marks)
         if self._manager is not None:
             canvas = self._manager.canvas
             self._image.set_data(frame)

@@ -7,6 +7,7 @@ and larger teams by a perceptually uniform map. Only matplotlib figures are used
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import product
 from typing import Any
 
@@ -16,7 +17,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.problem import Problem
 
@@ -54,7 +55,7 @@ def picture_palette(num_robots: int, size: int) -> Array:
     return np.resize(np.round(255 * colors), (size, 3)).astype(np.uint8)
 
 
-def view_limits(problem: Problem, points: Any = ()) -> Array:
+def view_limits(problem: Problem, points: ArrayLike = ()) -> Array:
     """``(2, d)`` lower and upper corner of what a picture shows [m].
 
     That is every start, goal, obstacle and further point with some room around them, and the bounds where they are
@@ -76,6 +77,9 @@ def view_limits(problem: Problem, points: Any = ()) -> Array:
     for box in world.boxes:
         lows.append(box[:d])
         highs.append(box[d:])
+    for corners in world.polygons:
+        lows.append(corners.min(axis=0))
+        highs.append(corners.max(axis=0))
     lower, upper = np.min(lows, axis=0), np.max(highs, axis=0)
     span = float(np.max(upper - lower))
     room = max(1.5 * reach, 0.05 * span)
@@ -133,27 +137,27 @@ class Panel:
             axis.set_pane_color((0.97, 0.97, 0.98, 1.0))
             axis._axinfo["grid"].update(color="#E5E7EB", linewidth=0.6)
 
-    def flatten(self, points: Any) -> Array:
+    def flatten(self, points: Array) -> Array:
         """Points ``(..., d)`` in the coordinates of this panel: ``z`` is dropped in a view from above."""
         return np.asarray(points, np.float64)[..., : len(self.right)]
 
-    def outlines(self, centres: Any, radius: Any, shape: Array = _CIRCLE) -> Array:
+    def outlines(self, centres: Array, radius: Array | float, shape: Array = _CIRCLE) -> Array:
         """``(N, vertices, .)`` copies of a shape of unit size, facing the reader."""
         offsets = shape[:, :1] * self.right + shape[:, 1:] * self.up
         corners: Array = self.flatten(centres)[:, None] + np.broadcast_to(radius, len(centres))[:, None, None] * offsets
         return corners
 
-    def polygons(self, vertices: Any, **style: Any) -> Any:
+    def polygons(self, vertices: Sequence[Array] | Array, **style: Any) -> Any:
         """Draw filled polygons and return the collection."""
         if self.spatial:
             return self.axes.add_collection3d(Poly3DCollection(vertices, **style), autolim=False)
-        return self.axes.add_collection(PolyCollection(vertices, **style), autolim=False)
+        return self.axes.add_collection(PolyCollection(list(vertices), **style), autolim=False)
 
-    def segments(self, paths: Any, **style: Any) -> Any:
+    def segments(self, paths: Sequence[Array] | Array, **style: Any) -> Any:
         """Draw open paths and return the collection."""
         if self.spatial:
             return self.axes.add_collection3d(Line3DCollection(paths, **style), autolim=False)
-        return self.axes.add_collection(LineCollection(paths, **style), autolim=False)
+        return self.axes.add_collection(LineCollection(list(paths), **style), autolim=False)
 
 
 def draw_world(panel: Panel, problem: Problem) -> None:
@@ -167,7 +171,7 @@ def draw_world(panel: Panel, problem: Problem) -> None:
             panel.polygons(panel.outlines(discs[:, :2], discs[:, -1]), **solid)
         corners = [(0, 1), (2, 1), (2, 3), (0, 3)]
         flat = world.boxes[:, [0, 1, problem.dimension, problem.dimension + 1]]
-        panel.polygons([box[np.array(corner)] for box in flat for corner in [corners]], **solid)
+        panel.polygons([*(box[np.array(corners)] for box in flat), *world.polygons], **solid)
     if world.lower is not None:
         x, y = world.bounds[:, :2].T
         rectangle = np.array([(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1]), (x[0], y[0])])
@@ -179,20 +183,24 @@ def draw_world(panel: Panel, problem: Problem) -> None:
 def _draw_solids(panel: Panel, problem: Problem) -> None:
     """The obstacles of a view of space, translucent: nothing may hide behind them."""
     style = {"facecolors": (*to_rgb(OBSTACLE), 0.4), "edgecolors": (*to_rgb(OBSTACLE_EDGE), 0.6), "zorder": 1}
+    faces: list[Array] = []
+    rings: list[Array] = []
+    sides: list[Array] = []
+    planes = np.stack([np.column_stack([_CIRCLE, 0 * _ANGLES]), np.column_stack([0 * _ANGLES, _CIRCLE])])
     for *centre, radius in problem.world.spheres:
-        panel.polygons(panel.outlines([centre], radius), linewidths=0.8, **style)
-        rings = np.stack([np.column_stack([_CIRCLE, 0 * _ANGLES]), np.column_stack([0 * _ANGLES, _CIRCLE])])
-        panel.polygons(np.array(centre) + radius * rings, **(style | {"facecolors": "none", "linewidths": 0.4}))
+        faces.extend(panel.outlines(np.array([centre]), radius))
+        rings.extend(np.array(centre) + radius * planes)
     for x, y, radius in problem.world.cylinders:
         ring = np.array([x, y]) + radius * _CIRCLE
         low, high = (np.column_stack([ring, np.full(len(ring), z)]) for z in panel.limits[:, 2])
-        sides = np.stack([low, np.roll(low, 1, axis=0), np.roll(high, 1, axis=0), high], axis=1)
-        panel.polygons(sides, **(style | {"edgecolors": "none"}))
-        panel.polygons([low, high], linewidths=0.8, **style)
+        sides.extend(np.stack([low, np.roll(low, 1, axis=0), np.roll(high, 1, axis=0), high], axis=1))
+        faces += [low, high]
+    corners = [(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5)]
     for box in problem.world.boxes:
-        corners = np.array(list(product(*box.reshape(2, 3).T)))
-        faces = [(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5)]
-        panel.polygons(corners[np.array(faces)], linewidths=0.8, **style)
+        faces.extend(np.array(list(product(*box.reshape(2, 3).T)))[np.array(corners)])
+    panel.polygons(sides, **(style | {"edgecolors": "none"}))
+    panel.polygons(faces, linewidths=0.8, **style)
+    panel.polygons(rings, **(style | {"facecolors": "none", "linewidths": 0.4}))
 
 
 class TeamLayer:

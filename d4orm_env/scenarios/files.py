@@ -72,12 +72,12 @@ def _format(content: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _flow(value: Any) -> str:
+def _flow(value: object) -> str:
     if isinstance(value, str):
         return _dump(value, default_style='"')
     return _dump(value, default_flow_style=True)
 
 
-def _dump(value: Any, **style: Any) -> str:
+def _dump(value: object, **style: Any) -> str:
     text: str = yaml.safe_dump(value, width=2**31 - 1, sort_keys=False, explicit_end=False, **style)
     return text.removesuffix("...\n").strip()

@@ -40,7 +40,7 @@ def forest(settings: Settings, *, size: float | None = None, density: float = 0.
     trunks = settings.generator(WALLS).uniform(-size / 2, size / 2, (number, 2))
     trees = np.column_stack([trunks, np.full(number, settings.obstacle_radius)])
     bounds = np.full(dimension, size / 2)
-    kind = "circles" if dimension == 2 else "cylinders"
-    world = World(dimension, **{kind: trees}, lower=-bounds, upper=bounds)
+    circles, cylinders = (trees, ()) if dimension == 2 else ((), trees)
+    world = World(dimension, circles=circles, cylinders=cylinders, lower=-bounds, upper=bounds)
     travel = 1.2 * size * float(np.sqrt(dimension))
     return populate(settings, world, lattice_step(settings, 2 * bounds), travel, "a larger size or a lower density")

@@ -90,7 +90,7 @@ def four_obstacles(settings: Settings, *, diameter: float = 5.0, obstacle_distan
     centres = distance * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
     obstacles = np.hstack([centres, np.full((4, 1), settings.obstacle_radius)])
     dimension = settings.team.dimension
-    world = World(dimension=dimension, **{"circles" if dimension == 2 else "cylinders": obstacles})
+    world = World(circles=obstacles) if dimension == 2 else World(3, cylinders=obstacles)
     return build(settings, replace(layout, world=world))
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from d4orm_env.core.portable import arctan2
 from d4orm_env.core.problem import MAX_HORIZON, Problem
@@ -61,6 +61,7 @@ def build(settings: Settings, layout: Layout) -> Problem:
         goal_radius=settings.goal_radius,
         goal_speed=settings.goal_speed,
         name=settings.scenario,
+        arrival=settings.arrival,
     )
     require_margin(problem)
     return problem
@@ -105,7 +106,7 @@ def start_states(team: Team, starts: Points, goals: Points) -> Points:
     return states
 
 
-def in_space(points: Any, dimension: int) -> Points:
+def in_space(points: ArrayLike, dimension: int) -> Points:
     """``(., 2)`` points of the plane as ``(., dimension)``: in space, at z = 0."""
     planar: Points = np.asarray(points, np.float64).reshape(-1, 2)
     return planar if dimension == 2 else np.hstack([planar, np.zeros((len(planar), 1))])

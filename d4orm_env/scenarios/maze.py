@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -13,7 +13,9 @@ from d4orm_env.scenarios.settings import WALLS, Settings, bounded, grid_size, re
 from d4orm_env.scenarios.wall_grid import WALL, default_squares, draw_openings, wall_world
 
 
-def maze(settings: Settings, *, cells: Any = None, corridor_width: float = 1.2, loops: float = 0.1) -> Problem:
+def maze(
+    settings: Settings, *, cells: Sequence[int] | None = None, corridor_width: float = 1.2, loops: float = 0.1
+) -> Problem:
     """A maze of corridors; starts and goals anywhere where others get by, which is in dead ends if it is narrow.
 
     Walls, starts and goals are set by the seed.

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,16 +103,17 @@ def with_random_obstacles(
     for index in range(settings.num_obstacles):
         ball = _first(random, half_extent, is_free, centre)
         if ball is None:
-            raise ValueError(
-                f"scenario {settings.scenario!r}: only {index} of {settings.num_obstacles} obstacles of radius "
-                f"{size:g} m fit between the robots; use num_obstacles={index}, a smaller obstacle_radius or a larger "
-                f"scenario"
-            )
+            raise _too_many(settings, index, size)
         balls = np.vstack([balls, ball])
-    kind = "circles" if world.dimension == 2 else "spheres"
-    rows = np.hstack([balls, np.full((len(balls), 1), size)])
-    obstacles: dict[str, Any] = {kind: np.vstack([world.balls, rows])}
-    return replace(world, **obstacles)
+    rows = np.vstack([world.balls, np.hstack([balls, np.full((len(balls), 1), size)])])
+    return replace(world, circles=rows) if world.dimension == 2 else replace(world, spheres=rows)
+
+
+def _too_many(settings: Settings, fitting: int, size: float) -> ValueError:
+    return ValueError(
+        f"scenario {settings.scenario!r}: only {fitting} of {settings.num_obstacles} obstacles of radius {size:g} m "
+        f"fit between the robots; use num_obstacles={fitting}, a smaller obstacle_radius or a larger scenario"
+    )
 
 
 def round_up(value: float) -> str:
@@ -138,7 +139,10 @@ def _with_another(
 
 
 def _first(
-    random: np.random.Generator, half_extent: Points, is_free: Any, centre: Points | float = 0.0
+    random: np.random.Generator,
+    half_extent: Points,
+    is_free: Callable[[Points], NDArray[np.bool_]],
+    centre: Points | float = 0.0,
 ) -> Points | None:
     """The first uniform random point that is free, or ``None`` if none of many was."""
     for attempt in range(ROUNDS):
@@ -152,7 +156,7 @@ def _first(
     return None
 
 
-def _gaps(candidates: Points, points: Points, reach: Any) -> Points:
+def _gaps(candidates: Points, points: Points, reach: Points | float) -> Points:
     """``(C,)`` how far each candidate is from all points, less their reach; infinite where there are none [m]."""
     if not len(points):
         return np.full(len(candidates), np.inf)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from d4orm_env.scenarios.wall_grid import WALL, default_squares, draw_openings, 
 def rooms(
     settings: Settings,
     *,
-    rooms: Any = None,
+    rooms: Sequence[int] | None = None,
     room_size: float = 2.5,
     door_width: float = 0.8,
     extra_doors: float = 0.3,

@@ -5,17 +5,19 @@ The public description is the documented example ``examples/scenarios/mixed_team
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from d4orm_env.core.dynamics import Model, get_model
+from d4orm_env.core.dynamics import get_model
 from d4orm_env.core.portable import arctan2
-from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem import Arrival, Problem
+from d4orm_env.core.robot_model import Model
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.registry import get_scenario, make_problem, unknown_argument
+from d4orm_env.scenarios.registry import SCENARIOS
 
 FLOAT32_MAX = float(str(np.finfo(np.float32).max))
 VERSION = 1
@@ -129,6 +131,12 @@ class BoxEntry(Entry):
         return [*self.lower, *self.upper]
 
 
+class PolygonEntry(Entry):
+    """A simple polygon: its corners x, y in order, either way round [m]."""
+
+    corners: list[PlanarPlace] = Field(min_length=3)
+
+
 class WorldEntry(Entry):
     """Obstacles and bounds; an open world without bounds."""
 
@@ -137,13 +145,15 @@ class WorldEntry(Entry):
     spheres: list[SphereEntry] = []
     cylinders: list[RoundEntry] = []
     boxes: list[BoxEntry] = []
+    polygons: list[PolygonEntry] = []
 
     def build(self, dimension: int) -> World:
         rows = {
             kind: [entry.row for entry in getattr(self, kind)] for kind in ("circles", "spheres", "cylinders", "boxes")
         }
         lower, upper = (self.bounds.lower, self.bounds.upper) if self.bounds else (None, None)
-        return World(dimension, **rows, lower=lower, upper=upper)
+        polygons = [entry.corners for entry in self.polygons]
+        return World(dimension, **rows, polygons=polygons, lower=lower, upper=upper)
 
 
 class ProblemFile(Entry):
@@ -156,12 +166,13 @@ class ProblemFile(Entry):
     margin: Squared = 0.05
     goal_radius: Squared = 0.075
     goal_speed: Squared | None = None
+    arrival: Arrival = "dock"
     robots: list[RobotEntry] = Field(min_length=1)
     world: WorldEntry = WorldEntry()
 
     def build(self) -> Problem:
         limits = ("radius", "max_speed", "max_acceleration", "max_turn_rate")
-        columns: dict[str, Any] = {name: [getattr(robot, name) for robot in self.robots] for name in limits}
+        columns: dict[str, list[float]] = {name: [getattr(robot, name) for robot in self.robots] for name in limits}
         models = tuple(robot.model for robot in self.robots)
         team = Team(models, **columns, own_limits=self._own_limits())
         size = team.state_size  # asks every robot
@@ -176,6 +187,7 @@ class ProblemFile(Entry):
             margin=self.margin,
             goal_radius=self.goal_radius,
             goal_speed=self.goal_speed,
+            arrival=self.arrival,
             name=self.name,
         )
 
@@ -194,7 +206,7 @@ class ProblemFile(Entry):
 
 
 class ScenarioFile(BaseModel):
-    """The short form: a scenario's name and arguments, which :func:`make_problem` checks."""
+    """The short form: a scenario's name and arguments, which :class:`~d4orm_env.scenarios.scenario.Scenario` checks."""
 
     model_config = ConfigDict(extra="allow", strict=True, frozen=True)
 
@@ -205,13 +217,13 @@ class ScenarioFile(BaseModel):
     def build(self) -> Problem:
         arguments = self.model_extra or {}
         # A name only: a file neither imports code nor reads other files.
-        scenario = get_scenario(self.scenario)
-        complaint = unknown_argument(scenario, arguments)
+        scenario = SCENARIOS.look_up(self.scenario)
+        complaint = scenario.complaint(arguments)
         if complaint:
             raise ValueError(complaint)
         if scenario.name == "map":
             raise ValueError("scenario 'map' reads another file, as none does; write its problem with save_problem()")
-        problem = make_problem(scenario, **arguments)
+        problem = scenario.problem(**arguments)
         return problem if self.name is None else problem.replace(name=self.name)
 
 
@@ -224,6 +236,7 @@ PARTS: dict[tuple[str, ...], type[BaseModel]] = {
     ("world", "spheres"): SphereEntry,
     ("world", "cylinders"): RoundEntry,
     ("world", "boxes"): BoxEntry,
+    ("world", "polygons"): PolygonEntry,
 }
 """The schema of each part of the explicit form."""
 
@@ -238,7 +251,7 @@ def start_fields(model: Model) -> tuple[str, ...]:
     return ("state",)
 
 
-def parse(data: Any) -> Problem:
+def parse(data: object) -> Problem:
     """The problem that the content of a file means.
 
     Raises:
@@ -261,6 +274,8 @@ def parse(data: Any) -> Problem:
 def describe(problem: Problem) -> dict[str, Any]:
     """The content of a file that means that problem, to the bit: the inverse of :func:`parse`."""
     settings = {name: getattr(problem, name) for name in ("dt", "horizon", "margin", "goal_radius", "goal_speed")}
+    if not problem.docks:
+        settings["arrival"] = problem.arrival
     robots = [_describe_robot(problem, robot) for robot in range(problem.num_robots)]
     return {
         "version": VERSION,
@@ -295,16 +310,18 @@ def _describe_world(problem: Problem) -> dict[str, Any]:
     world, dimension = problem.world, problem.dimension
     content: dict[str, Any] = {}
     if world.lower is not None:
-        content["bounds"] = {"lower": _decimals(world.lower), "upper": _decimals(world.upper)}
+        lower, upper = map(_decimals, world.bounds)
+        content["bounds"] = {"lower": lower, "upper": upper}
     for kind in ("circles", "spheres", "cylinders"):
         rows = [_decimals(row) for row in getattr(world, kind)]
         content[kind] = [{"center": row[:-1], "radius": row[-1]} for row in rows]
     boxes = [_decimals(row) for row in world.boxes]
     content["boxes"] = [{"lower": row[:dimension], "upper": row[dimension:]} for row in boxes]
+    content["polygons"] = [{"corners": [_decimals(corner) for corner in corners]} for corners in world.polygons]
     return {kind: entries for kind, entries in content.items() if entries}
 
 
-def _decimals(values: Any) -> list[float]:
+def _decimals(values: Iterable[np.float32]) -> list[float]:
     """float32 values as the shortest decimals that read back as the same float32."""
     shortest = [float(str(value)) for value in values]
     # Reading a decimal by way of float64 may round twice; the exact value never does.

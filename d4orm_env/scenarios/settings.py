@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import SupportsFloat
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import positive_number, whole_number
 from d4orm_env.core.dynamics import get_model
-from d4orm_env.core.problem import MAX_HORIZON
+from d4orm_env.core.problem import MAX_HORIZON, Arrival, check_arrival
 from d4orm_env.core.team import Team
 
 MAX_COUNT = 10_000
@@ -38,6 +39,7 @@ class Settings:
         horizon: Number of steps; ``None`` follows :func:`~d4orm_env.scenarios.layout.default_horizon`.
         goal_radius: A robot within it has arrived [m].
         goal_speed: Speed at which a robot may still dock [m/s]; ``None`` is no limit.
+        arrival: ``"dock"``: who arrives stands there for ever. ``"stay"``: it may be moved again, to make way.
         max_speed: Speed limit [m/s], one or ``K``.
         max_acceleration: Acceleration limit [m/s^2], one or ``K``.
         max_turn_rate: Turn rate limit [rad/s], one or ``K``.
@@ -50,19 +52,20 @@ class Settings:
     scenario: str
     num_robots: int = 8
     seed: int = 0
-    model: Any = "holonomic2d"
+    model: str | Sequence[str] | None = "holonomic2d"
     num_obstacles: int = 0
     obstacle_radius: float = 0.15
-    radius: Any = 0.15
+    radius: ArrayLike = 0.15
     margin: float = 0.05
     dt: float = 0.1
     horizon: int | None = None
     goal_radius: float = 0.075
     goal_speed: float | None = None
-    max_speed: Any = 1.0
-    max_acceleration: Any = 1.0
-    max_turn_rate: Any = float(np.pi / 2)
-    own_limits: Any = field(default_factory=dict)
+    arrival: Arrival = "dock"
+    max_speed: ArrayLike = 1.0
+    max_acceleration: ArrayLike = 1.0
+    max_turn_rate: ArrayLike = float(np.pi / 2)
+    own_limits: Mapping[str, ArrayLike] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, minimum in (("num_robots", 1), ("seed", 0), ("num_obstacles", 0)):
@@ -75,6 +78,7 @@ class Settings:
         for name in ("dt", "goal_radius", "obstacle_radius"):
             object.__setattr__(self, name, bounded(getattr(self, name), name))
         object.__setattr__(self, "margin", bounded(self.margin, "margin", zero_allowed=True))
+        check_arrival(self.arrival)
         if self.goal_speed is not None:
             object.__setattr__(self, "goal_speed", bounded(self.goal_speed, "goal_speed", zero_allowed=True))
 
@@ -111,7 +115,7 @@ STARTS_AND_GOALS, OBSTACLES, JITTER, WALLS = range(4)
 """Purposes of :meth:`Settings.generator`."""
 
 
-def bounded(value: Any, name: str, *, zero_allowed: bool = False) -> float:
+def bounded(value: SupportsFloat, name: str, *, zero_allowed: bool = False) -> float:
     """``value`` as a positive number no larger than scenarios are.
 
     Raises:
@@ -136,7 +140,7 @@ def require_plane(settings: Settings) -> None:
         )
 
 
-def grid_size(value: Any, name: str) -> tuple[int, int]:
+def grid_size(value: object, name: str) -> tuple[int, int]:
     """Columns and rows from what was given for them.
 
     Raises:

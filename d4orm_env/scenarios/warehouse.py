@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from d4orm_env.scenarios.settings import Settings, bounded, grid_size, require_p
 def warehouse(
     settings: Settings,
     *,
-    shelves: Any = None,
+    shelves: Sequence[int] | None = None,
     shelf_length: float = 3.0,
     shelf_width: float = 0.8,
     aisle_width: float = 1.2,

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.verify.contact import MAX_NUMBERS, Pairs, Stretch, Watch, surroundings
 from d4orm_env.verify.docking import Docking, find_docking
@@ -36,7 +36,7 @@ LIMIT_TOLERANCE = 1e-5
 """Relative excess over a control limit that float32 rounding may cause."""
 
 
-def verify(problem: Problem, controls: Any) -> VerificationReport:
+def verify(problem: Problem, controls: ArrayLike) -> VerificationReport:
     """Judge a plan: do all robots arrive by the horizon, within their limits, touching nothing at any time?
 
     Contact is judged, not the safety margin: it is a gap of zero or less at any moment, also between steps, known to
@@ -47,6 +47,9 @@ def verify(problem: Problem, controls: Any) -> VerificationReport:
     The environments decide it in float32. Where a robot ends a step so close to the goal radius, or at a speed so close
     to the goal speed, that rounding decides (see :mod:`d4orm_env.verify.docking`), both readings are judged, that it
     docks there and that it drives on, and the plan is fine only if everyone arrives and nobody touches in all of them.
+
+    Where arrival is to stay rather than to dock, nobody stands for ever: a robot must be at its goal, beyond what
+    rounding decides, from some step to the last.
 
     Controls that are not finite define no motion: they are reported, and nothing else is judged. So are robots that
     turn or accelerate so hard that ``MAX_SUB_STEPS`` sub-steps do not follow them through one step.
@@ -68,9 +71,13 @@ def verify(problem: Problem, controls: Any) -> VerificationReport:
     sub_steps = np.ceil(problem.dt * np.sqrt(motion.bend / (8 * CHORD_ERROR)))
     if sub_steps.max() > MAX_SUB_STEPS:
         return _unjudged(problem, list(_too_violent(sub_steps, motion, problem.dt)))
-    course = _Course(motion, max(MIN_SUB_STEPS, int(sub_steps.max())), np.asarray(problem.start, np.float64))
+    course = _Course(motion, max(MIN_SUB_STEPS, int(sub_steps.max())), problem.start.astype(np.float64))
+    return _judged(problem, motion, course)
+
+
+def _judged(problem: Problem, motion: TeamMotion, course: _Course) -> VerificationReport:
     docking = find_docking(problem, motion, course.ends)
-    radius = np.asarray(problem.team.radius, np.float64)
+    radius = problem.team.radius.astype(np.float64)
     pairs, obstacles = Pairs(docking.robot, radius), surroundings(problem.world, docking.robot, radius)
     watches: list[Watch] = [pairs, *obstacles]
     for stretch in course.stretches(docking, max(len(watch.rows) for watch in watches)):
@@ -122,7 +129,7 @@ class _Course:
             yield Stretch(place[:, None] + way, norm(way).max(axis=1), steps.start * dt, dt)
 
 
-def _checked_controls(problem: Problem, controls: Any) -> Floats:
+def _checked_controls(problem: Problem, controls: ArrayLike) -> Floats:
     try:
         array = np.asarray(controls, np.float64)
     except OverflowError as error:

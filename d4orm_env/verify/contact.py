@@ -14,7 +14,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.verify.geometry import Floats, box_approach, box_distance, closest_approach, norm
+from d4orm_env.verify.geometry import (
+    Floats,
+    box_approach,
+    box_distance,
+    closest_approach,
+    norm,
+    polygon_approach,
+    polygon_distance,
+)
 from d4orm_env.verify.report import Violation
 
 if TYPE_CHECKING:
@@ -204,6 +212,20 @@ class Boxes(Static):
         return box_approach(start, end, self._boxes[columns])
 
 
+class Polygon(Static):
+    """Robots against one polygon."""
+
+    def __init__(self, robot: NDArray[np.intp], radius: Floats, corners: Floats, name: str) -> None:
+        super().__init__("obstacle contact", robot, radius, [name])
+        self._corners = corners
+
+    def distance(self, places: Floats, columns: Any) -> Floats:
+        return polygon_distance(places, self._corners)
+
+    def pass_by(self, start: Floats, end: Floats, columns: Any) -> tuple[Floats, Floats]:
+        return polygon_approach(start, end, self._corners)
+
+
 class Bounds(Static):
     """Robots against the sides of the world."""
 
@@ -234,6 +256,8 @@ def surroundings(world: World, robot: NDArray[np.intp], radius: Floats) -> list[
             watches.append(Round(robot, radius, obstacles, shape))
     if len(world.boxes):
         watches.append(Boxes(robot, radius, np.asarray(world.boxes, np.float64)))
+    for index, corners in enumerate(world.polygons):
+        watches.append(Polygon(robot, radius, np.asarray(corners, np.float64), f"polygons[{index}]"))
     if world.lower is not None:
         lower, upper = (np.asarray(bound, np.float64) for bound in (world.lower, world.upper))
         watches.append(Bounds(robot, radius, lower, upper))

@@ -61,6 +61,8 @@ def find_docking(problem: Problem, motion: TeamMotion, ends: Floats) -> Docking:
     distance = norm(ends[1:] - np.asarray(problem.goal, np.float64))
     possible, certain = _docks(problem, motion, ends, distance)
     never = len(distance) + 1
+    if problem.arrival == "stay":
+        return _staying(problem, motion, distance, certain)
     robots, steps, times, last, violations = [], [], [], [], []
     for robot in range(distance.shape[1]):
         sure = np.flatnonzero(certain[:, robot])[:1] + 1
@@ -76,6 +78,23 @@ def find_docking(problem: Problem, motion: TeamMotion, ends: Floats) -> Docking:
             detail = "".join(_failure(problem, distance[:, robot], motion.pace[:, robot], unsure.tolist()))
             violations.append(Violation("not arrived", (robot,), problem.dt * problem.horizon, detail))
     return Docking(np.array(robots), np.array(steps), np.array(times), np.array(last), violations)
+
+
+def _staying(problem: Problem, motion: TeamMotion, distance: Floats, certain: NDArray[np.bool_]) -> Docking:
+    """Nobody docks: a robot has arrived when it is at its goal, beyond doubt, from some step to the last."""
+    horizon, num_robots = distance.shape
+    away = horizon - np.argmax(~certain[::-1], axis=0)
+    since = np.where(certain.all(axis=0), 1, away + 1)
+    times = np.where(certain[-1], since * problem.dt, np.inf)
+    violations = [
+        Violation(
+            "not arrived", (robot,), problem.dt * horizon,
+            "".join(_failure(problem, distance[:, robot], motion.pace[:, robot], [])),
+        )
+        for robot in np.flatnonzero(~certain[-1]).tolist()
+    ]  # fmt: skip
+    never = np.full(num_robots, horizon + 1)
+    return Docking(np.arange(num_robots), never, times, never, violations)
 
 
 def _docks(problem: Problem, motion: TeamMotion, ends: Floats, distance: Floats) -> tuple[NDArray[np.bool_], ...]:

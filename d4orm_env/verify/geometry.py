@@ -5,8 +5,6 @@ Sums over components are written out: how NumPy's own reductions group them depe
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +16,7 @@ _SECTION_ROUNDS = 14  # each narrows the bracket to a quarter: 4e-9 of the chord
 
 def dot(a: Floats, b: Floats) -> Floats:
     """Inner product over the last axis."""
-    total: Any = a[..., 0] * b[..., 0]
+    total: Floats = a[..., 0] * b[..., 0]
     for axis in range(1, a.shape[-1]):
         total = total + a[..., axis] * b[..., axis]
     product: Floats = total
@@ -67,3 +65,53 @@ def box_approach(start: Floats, end: Floats, boxes: Floats) -> tuple[Floats, Flo
         width /= (len(_SECTIONS) - 1) / 2
         lower = np.maximum(best - width / 2, 0.0)
     return distance.min(axis=0), best
+
+
+def segment_distance(points: Floats, begin: Floats, end: Floats) -> tuple[Floats, Floats]:
+    """Distance from points in the plane to a segment, and at what fraction of it the nearest point lies."""
+    along, offset = end - begin, points - begin
+    fraction = np.clip(dot(offset, along) / dot(along, along), 0.0, 1.0)
+    return norm(offset - fraction[..., None] * along), fraction
+
+
+def polygon_distance(points: Floats, corners: Floats) -> Floats:
+    """Signed distance from points ``(..., 2)`` to the outline of a simple polygon ``(v, 2)``, negative inside."""
+    nearest, inside = np.full(points.shape[:-1], np.inf), np.zeros(points.shape[:-1], bool)
+    x, y = points[..., 0], points[..., 1]
+    for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        nearest = np.minimum(nearest, segment_distance(points, begin, end)[0])
+        # A ray to the right crosses the outline of what it starts inside of an odd number of times.
+        spans = (begin[1] > y) != (end[1] > y)
+        if begin[1] != end[1]:
+            inside ^= spans & (x < begin[0] + (y - begin[1]) * (end[0] - begin[0]) / (end[1] - begin[1]))
+    distance: Floats = np.where(inside, -nearest, nearest)
+    return distance
+
+
+def polygon_approach(start: Floats, end: Floats, corners: Floats) -> tuple[Floats, Floats]:
+    """As :func:`closest_approach`, for the signed distance to a simple polygon; where a chord crosses its outline from
+    outside to outside, zero at the crossing.
+    """
+    before, after = polygon_distance(start, corners), polygon_distance(end, corners)
+    smallest, fraction = np.minimum(before, after), (after < before).astype(np.float64)
+    move = end - start
+    for one, other in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        # Two segments that do not cross are nearest to each other at an end of one of them.
+        distance, at = _chord_distance(one, start, move)
+        closer = (distance < smallest) & (smallest > 0)
+        smallest, fraction = np.where(closer, distance, smallest), np.where(closer, at, fraction)
+        edge, offset = other - one, start - one
+        turn = move[..., 0] * edge[1] - move[..., 1] * edge[0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            at = (offset[..., 1] * edge[0] - offset[..., 0] * edge[1]) / turn
+            along = (offset[..., 1] * move[..., 0] - offset[..., 0] * move[..., 1]) / turn
+        crosses = (turn != 0) & (at >= 0) & (at <= 1) & (along >= 0) & (along <= 1) & (smallest > 0)
+        smallest, fraction = np.where(crosses, 0.0, smallest), np.where(crosses, at, fraction)
+    return smallest, fraction
+
+
+def _chord_distance(point: Floats, start: Floats, move: Floats) -> tuple[Floats, Floats]:
+    """Distance from one point to chords, and at what fraction of them."""
+    square = dot(move, move)
+    fraction = np.clip(dot(point - start, move) / np.where(square > 0, square, 1.0), 0.0, 1.0)
+    return norm(start + fraction[..., None] * move - point), fraction

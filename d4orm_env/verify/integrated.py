@@ -6,6 +6,7 @@ Runge-Kutta in many sub-steps of a control step, with the same bits on every pro
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 
 from d4orm_env.core import portable
 from d4orm_env.verify.geometry import Floats, norm
+
+Limits = NDArray[np.float32]
 
 SUB_STEPS = 20
 """To find how much the way bends within a control step."""
@@ -37,10 +40,10 @@ class Integrated:
     """
 
     def __init__(
-        self, model: Any, robots: NDArray[np.intp], start: Floats, controls: Floats, limits: Any, dt: float
+        self, model: Any, robots: NDArray[np.intp], start: Floats, controls: Floats, limits: Limits, dt: float
     ) -> None:
         self.robots, self._model, self._dt = robots, model, dt
-        self._limits = tuple(np.asarray(limits, np.float64)[robots].T)
+        self._limits = tuple(limits.astype(np.float64)[robots].T)
         asked = np.moveaxis(controls[:, robots, : model.control_size], 2, 0)
         within = np.clip(asked, -LARGEST_CONTROL, LARGEST_CONTROL)
         self._commands = self._call(model.functions.limit_control, within)
@@ -89,7 +92,7 @@ class Integrated:
     def _slope(self, x: Floats, u: Floats) -> Floats:
         return self._call(self._model.functions.derivative, x, u)
 
-    def _call(self, function: Any, *arguments: Floats) -> Floats:
+    def _call(self, function: Callable[..., Any], *arguments: Floats) -> Floats:
         """A function of the model over arrays whose first axis is the component; it may return single numbers too."""
         result = function(*map(tuple, arguments), self._limits, _ops())
         rows: Floats = np.stack([np.broadcast_to(part, arguments[0].shape[1:]) for part in result])
@@ -108,9 +111,9 @@ class Integrated:
 
 def _ops() -> Any:
     """The portable functions, which compute sine and cosine of the same array once: they take most of the time."""
-    known: list[tuple[Any, Any]] = []
+    known: list[tuple[Floats, tuple[Floats, Floats]]] = []
 
-    def sin_cos(x: Any) -> Any:
+    def sin_cos(x: Floats) -> tuple[Floats, Floats]:
         for asked, answer in known:
             if asked is x:
                 return answer

@@ -1,112 +1,125 @@
-"""``d4orm evaluate`` and ``d4orm leaderboard``: policies compared, and the page made of it."""
+"""``d4orm evaluate``: policies compared; and the options of everything that runs a study."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from d4orm_planners.commands.dataclass_options import takes
 from d4orm_planners.commands.inputs import (
     MOST_SEEDS,
     decimals,
-    find_here,
     make_folder,
     names,
     numbers,
     parse_settings,
-    require_trials,
 )
+from d4orm_planners.commands.options import Model, Quiet, TimeLimit
+
+if TYPE_CHECKING:
+    from d4orm_planners.evaluation.summary import SuccessRate
+
+Noise = Annotated[str, typer.Option("--noise", help="Standard deviations of the execution noise, as 0,0.1.")]
+Out = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to, and to go on from.")]
 
 
-def evaluate(
+@dataclass(frozen=True, kw_only=True)
+class StudyOptions:
+    """What to compare, and how to run it."""
+
     policies: Annotated[
         list[str] | None,
         typer.Option(
             "--policy",
             "--policies",
             "-p",
-            help="Names or package.module:Name with commas, or one with settings, d4orm:num_samples=512; repeatable.",
+            help="Names or package.module:Name with commas, or one with settings, d4orm:num_samples=512; repeatable; "
+            "d4orm,goal by default.",
         ),
-    ] = None,
+    ] = None
     scenario: Annotated[
         str, typer.Option("--scenario", "--scenarios", "-s", help="Scenarios or YAML files, separated by commas.")
-    ] = "circle",
+    ] = "circle"
     robots: Annotated[
         str | None, typer.Option("--robots", "-k", help="Team sizes, as 4,8; the scenario's own by default.")
-    ] = None,
-    model: Annotated[
-        str | None, typer.Option("--model", "-m", help="Robot model; the scenario's own by default.")
-    ] = None,
-    seeds: Annotated[
-        str, typer.Option("--seeds", "-n", help="How many, or which: 50 for 0 to 49, 10-19, or 3,5,8.")
-    ] = "50",
-    noise: Annotated[str, typer.Option("--noise", help="Standard deviations of the execution noise, as 0,0.1.")] = "0",
-    time_limit: Annotated[float | None, typer.Option("--time-limit", help="Seconds for planning.")] = None,
+    ] = None
+    model: Model = None
+    noise: Noise = "0"
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="A setting of all policies that have it, or of one, as orca.time_horizon=2."),
+    ] = None
+    time_limit: TimeLimit = None
     trial_timeout: Annotated[
         float | None, typer.Option("--trial-timeout", help="Seconds after which a trial ends with an error.")
-    ] = None,
-    workers: Annotated[int | None, typer.Option("--workers", "-j", help="Processes; all cores by default.")] = None,
+    ] = None
+    workers: Annotated[int | None, typer.Option("--workers", "-j", help="Processes; all cores by default.")] = None
     ray: Annotated[
         str | None, typer.Option("--ray", help="Address of a Ray cluster to run on, or auto; needs ray.")
-    ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to, and to go on from.")] = Path(
-        "evaluation"
-    ),
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,
-) -> None:
-    """Compare policies on scenarios, team sizes, seeds and levels of noise; goes on where it was stopped."""
-    from d4orm_planners.evaluation.exports import PARQUET_HINT, write_results
-    from d4orm_planners.evaluation.harness import measure
-    from d4orm_planners.evaluation.live import PartsProgress
-    from d4orm_planners.evaluation.tables import markdown
+    ] = None
+    out: Out = Path("evaluation")
+    quiet: Quiet = False
 
-    given: dict[str, Any] = {
-        "policies": _policies(policies or ["d4orm,goal"]),
-        "scenarios": names(scenario) or (),
-        "seeds": _seeds(seeds),
-        "control_noise_std": decimals("--noise", noise),
-        "num_robots": numbers("--robots", robots) or (None,),
-    }
-    make_folder(out)
-    limits: dict[str, Any] = {"time_limit": time_limit, "trial_timeout": trial_timeout}
-    try:
-        with PartsProgress(enabled=not quiet) as progress:
-            rates = measure(**given, **limits, model=model, workers=workers, ray=ray, out=out, progress=progress.update)
-    except KeyboardInterrupt:
-        typer.echo(f"stopped; the finished trials are kept in {out}, the same command goes on from there", err=True)
-        raise
-    written = write_results(out, rates)
-    if not quiet:
-        typer.echo(markdown(rates))
-        for path in written:
-            typer.echo(f"wrote {path}")
-    if out / "trials.parquet" not in written:
+    def run(self, seeds: Iterable[int]) -> list[SuccessRate]:
+        """Run the trials that are not stored yet, and sum all up.
+
+        Raises:
+            ValueError: For an option that makes no sense. Nothing has run then.
+        """
+        from d4orm_planners.commands.progress import resumable
+        from d4orm_planners.evaluation.evaluate import run_study
+        from d4orm_planners.evaluation.study import Study
+        from d4orm_planners.evaluation.summary import success_rates
+
+        study = Study(
+            policies=_with_settings(_policies(self.policies or ["d4orm,goal"]), parse_settings(self.settings)),
+            scenarios=names(self.scenario) or (),
+            seeds=seeds,
+            control_noise_std=decimals("--noise", self.noise),
+            num_robots=numbers("--robots", self.robots) or (None,),
+            model=self.model,
+            time_limit=self.time_limit,
+        )
+        make_folder(self.out)
+        how: dict[str, Any] = {"trial_timeout": self.trial_timeout, "workers": self.workers, "ray": self.ray}
+        with resumable(f"the finished trials are kept in {self.out}", enabled=not self.quiet) as progress:
+            return success_rates(run_study(study, self.out, **how, progress=progress))
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions(StudyOptions):
+    """Those of ``d4orm evaluate``."""
+
+    seeds: Annotated[
+        str, typer.Option("--seeds", "-n", help="How many, or which: 50 for 0 to 49, 10-19, or 3,5,8.")
+    ] = "50"
+
+
+@takes(EvaluateOptions)
+def evaluate(options: EvaluateOptions) -> None:
+    """Compare policies on scenarios, team sizes, seeds and levels of noise; goes on where it was stopped."""
+    from d4orm_planners.commands.progress import tell_results
+    from d4orm_planners.evaluation.report import PARQUET_HINT, markdown, write_results
+
+    rates = options.run(_seeds(options.seeds))
+    written = write_results(options.out, rates)
+    if not options.quiet:
+        tell_results(markdown(rates), written)
+    if options.out / "trials.parquet" not in written:
         typer.echo(PARQUET_HINT, err=True)
     require_trials(rates)
 
 
-def leaderboard(
-    store: Annotated[Path, typer.Argument(help="Folder that d4orm evaluate wrote to, or its trials.sqlite.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Page to write, .md.")] = Path("leaderboard.md"),
-    deadlines: Annotated[
-        str | None, typer.Option("--deadlines", help="Seconds for planning, as 0.1,0.5,1: success within them.")
-    ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing.")] = False,
-) -> None:
-    """Write a page with the results of all trials in a store."""
-    from d4orm_planners.evaluation.exports import target
-    from d4orm_planners.evaluation.leaderboard import leaderboard as page
-    from d4orm_planners.evaluation.store import TrialStore
-
-    if out.suffix != ".md":
-        raise ValueError(f"output file {str(out)!r} must end in .md")
-    limits = () if deadlines is None else decimals("--deadlines", deadlines)
-    text = page(TrialStore.existing(store).trials(), limits)
-    with target(out) as path:
-        path.write_text(text, encoding="utf-8")
-    if not quiet:
-        typer.echo(f"wrote {out}")
+def require_trials(rates: list[SuccessRate]) -> None:
+    """Say so, and end with status 1, if every trial ended with an error."""
+    if all(rate.errors == rate.trials for rate in rates):
+        trials = sum(rate.trials for rate in rates)
+        typer.echo(f"every trial ({trials}) ended with an error; the first: {rates[0].error}", err=True)
+        raise typer.Exit(1)
 
 
 def _policies(texts: list[str]) -> dict[str, dict[str, Any]]:
@@ -123,7 +136,30 @@ def _policies(texts: list[str]) -> dict[str, dict[str, Any]]:
         if "policy" in (values := parse_settings(text.removeprefix(policy + colon).split(","), "--policy")):
             raise ValueError(f"--policy {text!r}: 'policy' is no setting; the name stands before the colon")
         chosen[text] = {"policy": policy, **values}
-    find_here(settings.get("policy", label) for label, settings in chosen.items())
+    return chosen
+
+
+def _with_settings(chosen: dict[str, dict[str, Any]], settings: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Add what ``--set`` says: ``orca.time_horizon`` to one policy, ``num_samples`` to all that have it."""
+    from d4orm_planners.registry import setting_names
+
+    policies = {label: given.get("policy", label) for label, given in chosen.items()}
+    known = {
+        label: setting_names(
+            own, {name.removeprefix(f"{own}."): value for name, value in settings.items()} | chosen[label]
+        )
+        for label, own in policies.items()
+    }
+    # What is said of one configuration counts most, then what is said of one policy, whichever was given first.
+    for name, value in sorted(settings.items(), key=lambda setting: "." not in setting[0]):
+        policy, separator, setting = name.rpartition(".")
+        owners = [label for label, own in policies.items() if (own == policy if separator else name in known[label])]
+        if not owners:
+            listed = ", ".join(policies.values())
+            one, several = f"{policy!r} is not among the policies; they are", f"{name!r} is a setting of none of the"
+            raise ValueError(f"--set {name}: {one if separator else several + ' policies'} {listed}")
+        for label in owners:
+            chosen[label].setdefault(setting, value)
     return chosen
 
 

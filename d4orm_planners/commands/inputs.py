@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
-
-if TYPE_CHECKING:
-    from d4orm_planners.evaluation.summary import SuccessRate
 
 MOST_SEEDS = 1_000_000
 """Trials of one policy at most: a slip of the finger must not fill the memory."""
@@ -40,12 +35,6 @@ def parse_settings(settings: list[str] | None, option: str = "--set") -> dict[st
     return values
 
 
-def find_here(policies: Iterable[str]) -> None:
-    """Let Python find modules in the present folder, behind all others, if a policy is given by import path."""
-    if any(":" in policy for policy in policies) and os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
-
-
 def refuse_options(context: typer.Context, options: Iterable[str], reason: str) -> None:
     """Refuse what was given on the command line although it would count for nothing.
 
@@ -61,14 +50,6 @@ def refuse_options(context: typer.Context, options: Iterable[str], reason: str) 
         source = context.get_parameter_source(parameter.name or "")
         if parameter.name in options and source is not None and source.name == "COMMANDLINE":
             raise ValueError(f"{parameter.opts[0]} {reason}")
-
-
-def require_trials(rates: Sequence[SuccessRate]) -> None:
-    """Say so, and end with status 1, if every trial ended with an error."""
-    if all(rate.errors == rate.trials for rate in rates):
-        trials = sum(rate.trials for rate in rates)
-        typer.echo(f"every trial ({trials}) ended with an error; the first: {rates[0].error}", err=True)
-        raise typer.Exit(1)
 
 
 def names(text: str | None) -> tuple[str, ...] | None:

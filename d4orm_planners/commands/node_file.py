@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
-    from d4orm_planners.d_d4orm import DD4orm
+    from d4orm_planners.d_d4orm.planner import DD4orm
 
 REQUIRED = ("node", "nodes", "problem", "time_limit", "out")
 OPTIONAL = ("seed", "settings", "zenoh")

@@ -2,72 +2,80 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from d4orm_planners.commands.dataclass_options import takes
 from d4orm_planners.commands.inputs import MOST_SEEDS, make_folder, refuse_options
+from d4orm_planners.commands.options import Quiet
 
 
-def reproduce(
-    context: typer.Context,
-    figure: Annotated[str | None, typer.Argument(help="Which; without it, what there is.")] = None,
-    list_: Annotated[bool, typer.Option("--list", help="List the figures.")] = False,
-    quick: Annotated[bool, typer.Option("--quick", help="Tiny sizes, to see that it works: under a minute.")] = False,
+@dataclass(frozen=True, kw_only=True)
+class ReproduceOptions:
+    """Which figure, and which part of it."""
+
+    context: typer.Context
+    figure: Annotated[str | None, typer.Argument(help="Which; without it, what there is.")] = None
+    list_: Annotated[bool, typer.Option("--list", help="List the figures.")] = False
+    quick: Annotated[bool, typer.Option("--quick", help="Tiny sizes, to see that it works: under a minute.")] = False
     sections: Annotated[
         list[str] | None, typer.Option("--section", "-s", help="Only this panel; repeatable, all by default.")
-    ] = None,
+    ] = None
     policies: Annotated[
         list[str] | None,
         typer.Option("--policy", "-p", help="Only the policy of this label; repeatable, all by default."),
-    ] = None,
+    ] = None
     seeds: Annotated[
         int | None,
         typer.Option(
             "--seeds", "-n", max=MOST_SEEDS, help="Trials per row; the paper's 50 by default, 1 with --quick."
         ),
-    ] = None,
+    ] = None
     workers: Annotated[
         int, typer.Option("--workers", "-j", help="Processes of one thread each; with 1, one trial on all cores.")
-    ] = 1,
+    ] = 1
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Folder to make the figure's folder in, and to go on from.")
-    ] = Path("reproduction"),
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no tables.")] = False,
-) -> None:
+    ] = Path("reproduction")
+    quiet: Quiet = False
+
+
+@takes(ReproduceOptions)
+def reproduce(options: ReproduceOptions) -> None:
     """Measure a figure or table of the paper, and set it beside the paper's numbers; goes on where it was stopped."""
-    from d4orm_planners.evaluation.figures import FIGURES, find_figure
-
-    if figure is None or list_:
-        refuse_options(
-            context,
-            ("figure", "quick", "sections", "policies", "seeds", "workers", "out", "quiet"),
-            "does not go with the list of figures; give a figure, and leave out --list",
-        )
-        for chosen in FIGURES.values():
-            typer.echo(f"{chosen.name:<15} {chosen.title} ({chosen.source})")
+    if options.figure is None or options.list_:
+        _list_figures(options.context)
         return
-    from d4orm_planners.evaluation.live import PartsProgress
-    from d4orm_planners.evaluation.reproduction import reproduce as run
-    from d4orm_planners.evaluation.reproduction_report import markdown, write_reproduction
-    from d4orm_planners.evaluation.warmup import warm_up
+    from d4orm_planners.commands.progress import resumable, tell_results
+    from d4orm_planners.commands.warmup import warm_up
+    from d4orm_planners.reproduction.figure import reproduce as run
+    from d4orm_planners.reproduction.paper import find_figure
+    from d4orm_planners.reproduction.report import markdown, write_reproduction
 
-    chosen = find_figure(figure).only(sections or (), policies or ())
-    if quick:
-        chosen = chosen.quick()
-    folder = out / (f"{chosen.name}-quick" if quick else chosen.name)
+    figure = find_figure(options.figure).only(options.sections or (), options.policies or ())
+    folder = options.out / (f"{figure.name}-quick" if options.quick else figure.name)
     make_folder(folder)
-    if not quick:
+    if options.quick:
+        figure = figure.quick()
+    else:
         warm_up()  # the time of a controller would include its compilation
-    try:
-        with PartsProgress(enabled=not quiet) as progress:
-            groups = run(chosen, folder, seeds=seeds, workers=workers, progress=progress.update)
-    except KeyboardInterrupt:
-        typer.echo(f"stopped; the finished trials are kept in {folder}, the same command goes on from there", err=True)
-        raise
-    written = write_reproduction(folder, chosen, groups)
-    if not quiet:
-        typer.echo(markdown(chosen, groups))
-        for path in written:
-            typer.echo(f"wrote {path}")
+    with resumable(f"the finished trials are kept in {folder}", enabled=not options.quiet) as progress:
+        groups = run(figure, folder, seeds=options.seeds, workers=options.workers, progress=progress)
+    written = write_reproduction(folder, figure, groups)
+    if not options.quiet:
+        tell_results(markdown(figure, groups), written)
+
+
+def _list_figures(context: typer.Context) -> None:
+    from d4orm_planners.reproduction.paper import FIGURES
+
+    refuse_options(
+        context,
+        ("figure", "quick", "sections", "policies", "seeds", "workers", "out", "quiet"),
+        "does not go with the list of figures; give a figure, and leave out --list",
+    )
+    for figure in FIGURES.values():
+        typer.echo(f"{figure.name:<15} {figure.title} ({figure.source})")

@@ -10,11 +10,13 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Sequence
 
-from d4orm_planners.base import Candidate, Iteration, Search
+from d4orm_planners.candidate import Candidate
 from d4orm_planners.distributed.inbox import Inbox
 from d4orm_planners.distributed.judge import Judge, Stopped
 from d4orm_planners.distributed.node import Node
 from d4orm_planners.distributed.transport import Transport
+from d4orm_planners.planner import Iteration
+from d4orm_planners.search import Search
 
 logger = logging.getLogger(__name__)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from d4orm_planners.base import Candidate
+from d4orm_planners.candidate import Candidate
 
 KINDS = ("computed", "sent", "received", "selected")
 """A node has made a candidate, told it, got one, or chosen it to go on from."""

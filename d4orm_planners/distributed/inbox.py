@@ -8,9 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from d4orm_env.core.problem import Problem
-from d4orm_env.engine.base import Engine
-from d4orm_planners.base import Candidate
+from d4orm_planners.candidate import Candidate
 from d4orm_planners.distributed.judge import Judge
 from d4orm_planners.distributed.messages import KINDS, Message, MessageError, decode
 from d4orm_planners.distributed.selection import merge
@@ -40,6 +38,12 @@ class Report:
 class Inbox:
     """Takes messages from a transport; nothing that arrives makes it raise.
 
+    Args:
+        judge: What judges the candidates.
+        transport: Where messages arrive.
+        num_nodes: How many nodes there are.
+        own: The node that it belongs to, or ``None`` for an observer's.
+
     Attributes:
         newest: The newest report of every node heard from, by node.
         dropped: How many messages were dropped, by :data:`~d4orm_planners.distributed.messages.KINDS`.
@@ -47,17 +51,8 @@ class Inbox:
         namesake: The number of the last candidate that another node told under this one's own number, or ``None``.
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        engine: Engine,
-        transport: Transport,
-        num_nodes: int,
-        own: int | None = None,
-        judge: Judge | None = None,
-    ) -> None:
-        self._problem, self._transport = problem, transport
-        self._judge = judge or Judge(engine, problem)
+    def __init__(self, judge: Judge, transport: Transport, num_nodes: int, own: int | None = None) -> None:
+        self._judge, self._transport = judge, transport
         self._num_nodes, self._own = num_nodes, own
         self._owner = "the observer" if own is None else f"node {own}"
         self._logged: set[str] = set()
@@ -85,7 +80,7 @@ class Inbox:
         return reports
 
     def _decoded(self, data: bytes) -> Message:
-        message = decode(data, self._problem, self._num_nodes)
+        message = decode(data, self._judge.problem, self._num_nodes)
         if message.node == self._own:
             self.namesake = message.sequence
             raise MessageError("node", f"claims to be from node {message.node}, which has received it")
@@ -96,7 +91,7 @@ class Inbox:
         known = (report.candidate for report in self.newest.values())
         same = (candidate for candidate in known if np.array_equal(candidate.planned, message.controls))
         candidate = next(same, None) or self._judge.received(message.controls)
-        reward = float(candidate.trajectory.rewards.mean())
+        reward = candidate.reward
         if candidate.solved != message.feasible or abs(reward - message.reward) > TOLERANCE:
             self.false_claims += 1
             claimed, found = (f"reward {r:g}, feasible {f}" for r, f in

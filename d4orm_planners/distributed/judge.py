@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import replace
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.base import Engine
-from d4orm_planners.base import Candidate, Iteration, Planner, Search, evaluate_controls
+from d4orm_planners.candidate import Candidate, evaluate_controls
 
 
 class Stopped(Exception):
@@ -24,6 +23,8 @@ class Judge:
         remembered: Candidates of this process's own nodes that are remembered.
 
     Attributes:
+        engine: What rolls out.
+        problem: The problem.
         stop: Once set, nodes leave their iterations between denoising steps.
         solution_ends: Whether to set it at the first solution.
     """
@@ -31,7 +32,7 @@ class Judge:
     def __init__(self, engine: Engine, problem: Problem, remembered: int = 0) -> None:
         self.stop = threading.Event()
         self.solution_ends = False
-        self._engine, self._problem, self._remembered = engine, problem, remembered
+        self.engine, self.problem, self._remembered = engine, problem, remembered
         self._known: dict[bytes, Candidate] = {}
         self._lock = threading.Lock()
 
@@ -45,7 +46,7 @@ class Judge:
         with self._lock:
             if self.stop.is_set():
                 raise Stopped
-            candidate = evaluate_controls(self._engine, self._problem, controls)
+            candidate = evaluate_controls(self.engine, self.problem, controls)
             self._known[candidate.planned.tobytes()] = candidate
             while len(self._known) > self._remembered:
                 del self._known[next(iter(self._known))]
@@ -55,26 +56,4 @@ class Judge:
 
     def received(self, controls: FloatArray) -> Candidate:
         """Judge what has arrived; the very controls that a node of this process has made are known already."""
-        return self._known.get(controls.tobytes()) or evaluate_controls(self._engine, self._problem, controls)
-
-
-class JudgedPlanner(Planner):
-    """A planner whose candidates a common judge looks at.
-
-    Attributes:
-        inner: The planner.
-    """
-
-    def __init__(self, inner: Planner, judge: Judge) -> None:
-        super().__init__(inner.config)
-        self.inner = inner
-        self._judge = judge
-
-    def iterate(self, search: Search) -> Iteration:
-        """See :meth:`Planner.iterate`."""
-        iteration = self.inner.iterate(search)
-        return replace(iteration, judged=self._judge.own(iteration.controls))
-
-    def finish(self, search: Search) -> None:
-        """See :meth:`Planner.finish`."""
-        self.inner.finish(search)
+        return self._known.get(controls.tobytes()) or evaluate_controls(self.engine, self.problem, controls)

@@ -14,7 +14,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
-from d4orm_planners.base import PLAN_REACH
+from d4orm_planners.candidate import PLAN_REACH
 
 MAGIC = b"D4DC"
 VERSION = 1
@@ -90,7 +90,7 @@ def decode(data: bytes, problem: Problem, num_nodes: int) -> Message:
 
     Raises:
         MessageError: If it is anything but a message of this version with finite controls, none beyond
-            :data:`~d4orm_planners.base.PLAN_REACH`, for this problem from one of the nodes.
+            :data:`~d4orm_planners.candidate.PLAN_REACH`, for this problem from one of the nodes.
     """
     if len(data) > MAX_BYTES:
         raise MessageError("too_large", f"{len(data)} bytes; at most {MAX_BYTES} are read")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from d4orm_planners.base import Candidate
+from d4orm_planners.candidate import Candidate
 from d4orm_planners.distributed.crew import SyncCrew
 from d4orm_planners.distributed.judge import Judge
 from d4orm_planners.distributed.node import Node

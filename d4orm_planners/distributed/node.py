@@ -9,28 +9,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
-from d4orm_env.engine.base import Engine
-from d4orm_planners.base import Candidate, Planner, Search
+from d4orm_planners.candidate import Candidate
 from d4orm_planners.distributed.events import Event, Observer
 from d4orm_planners.distributed.inbox import TOLERANCE, Inbox
-from d4orm_planners.distributed.judge import Judge, JudgedPlanner
+from d4orm_planners.distributed.judge import Judge
 from d4orm_planners.distributed.messages import Message, encode
 from d4orm_planners.distributed.meter import Meter
 from d4orm_planners.distributed.selection import choose
 from d4orm_planners.distributed.transport import Transport
+from d4orm_planners.planner import Planner
+from d4orm_planners.search import Search
 
 RETELL = 0.2
 """Seconds after which a candidate is told again, as messages may get lost."""
-
-
-@dataclass(frozen=True)
-class Selection:
-    """How a node chooses what to go on from; see :func:`~d4orm_planners.distributed.selection.choose`."""
-
-    rule: str
-    k: int
 
 
 def node_seed(seed: int, node: int) -> int:
@@ -38,19 +30,34 @@ def node_seed(seed: int, node: int) -> int:
     return seed if node == 0 else derived_seed(seed, Stream.NODE, node)
 
 
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What the nodes of one solve have in common.
+
+    Attributes:
+        num_nodes: How many nodes there are.
+        seed: That of the whole solve.
+        controls: ``(H, K, m)`` to start from; ``None`` for zeros.
+        selection: How a node chooses what to go on from; see :func:`~d4orm_planners.distributed.selection.choose`.
+        k: How many candidates it draws from.
+    """
+
+    num_nodes: int
+    seed: int
+    controls: FloatArray | None
+    selection: str
+    k: int
+
+
 class Node:
     """A planner that exchanges candidates with others.
 
     Args:
         number: Its number, from 0.
-        num_nodes: How many there are.
+        task: What it has in common with the others.
         planner: What it refines its candidate with.
-        problem: The problem.
-        seed: That of the whole solve.
-        controls: ``(H, K, m)`` to start from.
-        engine: What rolls out and samples.
         transport: Its access to the others.
-        selection: How it chooses what to go on from.
+        judge: What rolls out and judges, in common with other nodes of this process.
         told: What it begins to number its messages after; more than it had told before, if it did, and on a network the
             time at which it began, by which two nodes of one number tell who was first.
         observer: Called with every :class:`~d4orm_planners.distributed.events.Event`, in the node's own thread.
@@ -67,30 +74,25 @@ class Node:
     def __init__(
         self,
         number: int,
-        num_nodes: int,
+        task: Task,
         planner: Planner,
-        problem: Problem,
-        seed: int,
-        controls: FloatArray,
-        engine: Engine,
         transport: Transport,
-        selection: Selection,
-        judge: Judge | None = None,
+        judge: Judge,
         told: int = 0,
         observer: Observer | None = None,
     ) -> None:
         self.number = number
-        judge = judge or Judge(engine, problem)
-        self.search = Search(JudgedPlanner(planner, judge), problem, node_seed(seed, number), controls, engine)
+        seed = node_seed(task.seed, number)
+        self.search = Search(planner, judge.problem, seed, task.controls, judge.engine, judge.own)
         self.search.cancelled = judge.stop
         self.candidate = self.search.current
         self.transport = Meter(transport)
-        self.inbox = Inbox(problem, engine, self.transport, num_nodes, number, judge)
+        self.inbox = Inbox(judge, self.transport, task.num_nodes, number)
         self.excluded = 0
-        self._selection = selection
+        self._task = task
         self._told = self._began = told
         self._observer = observer
-        self._others = set(range(num_nodes)) - {number}
+        self._others = set(range(task.num_nodes)) - {number}
         self._awaited = self._others
 
     def refine(self) -> None:
@@ -160,8 +162,7 @@ class Node:
 
     def _tell(self, candidate: Candidate) -> None:
         self._told += 1
-        reward = float(candidate.trajectory.rewards.mean())
-        message = Message(self.number, self._told, candidate.planned, reward, bool(candidate.solved))
+        message = Message(self.number, self._told, candidate.planned, candidate.reward, bool(candidate.solved))
         data = encode(message, self.search.problem)
         self.transport.publish(data)
         self._note("sent", self.number, self._told, candidate, size=len(data))
@@ -179,7 +180,7 @@ class Node:
 
     def close(self) -> None:
         """Let go of what the planner left open."""
-        self.search.planner.finish(self.search)
+        self.search.close()
 
     def _await_others(self, stop: threading.Event, patience: float) -> None:
         """Gather until everybody heard from the last time is heard from again, or patience ends."""
@@ -209,10 +210,10 @@ class Node:
         nodes = sorted(received)
         candidates = [received[node][1] for node in nodes]
         chosen = choose(
-            self._selection.rule,
+            self._task.selection,
             [candidate.trajectory.rewards.mean() for candidate in candidates],
             np.stack([candidate.controls for candidate in candidates]),
-            self._selection.k,
+            self._task.k,
             np.random.default_rng(self.search.iteration_seed(Stream.CHOICE)),
         )
         self.search.current = candidates[chosen]

@@ -9,11 +9,13 @@ from math import ceil
 from typing import Any, NamedTuple
 
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.threads import available_cores
-from d4orm_planners.base import Iteration, Planner, Search, evaluate_controls
+from d4orm_planners.candidate import evaluate_controls
 from d4orm_planners.distributed.messages import Message, decode, encode
 from d4orm_planners.distributed.ray_connection import RayConnection
+from d4orm_planners.planner import Iteration, Planner
+from d4orm_planners.search import Search
 
 RESTARTS = 3
 """How many times an actor that was lost is started again, before its node is done without."""
@@ -32,7 +34,7 @@ class Outcome(NamedTuple):
     Attributes:
         data: The candidate, a message.
         denoising_steps: Spent on it.
-        excluded: See :class:`~d4orm_planners.base.Iteration`.
+        excluded: See :class:`~d4orm_planners.planner.Iteration`.
         compiling: Seconds of it that went into compiling.
         process: Who did it.
     """
@@ -123,7 +125,7 @@ class RayPlanner(Planner):
                 "check that d4orm-env is installed on every machine of the cluster"
             ) from error
 
-    def iterate(self, search: Search) -> Iteration:
+    def iterate(self, search: Search, state: None) -> tuple[None, Iteration]:
         """See :meth:`Planner.iterate`."""
         with self._calling:
             outcome = self._outcome(search.iteration, _message(self._node, search), search.time_left)
@@ -131,11 +133,10 @@ class RayPlanner(Planner):
         note = "" if outcome.process == self.process else f"the actor of node {self._node} was lost and restarted"
         self.process = outcome.process
         controls = decode(outcome.data, search.problem, self._num_nodes).controls
-        return Iteration(controls, outcome.denoising_steps, outcome.excluded, note)
+        return None, Iteration(controls, outcome.denoising_steps, outcome.excluded, note)
 
-    def finish(self, search: Search) -> None:
+    def finish(self, search: Search, state: None) -> None:
         """See :meth:`Planner.finish`: end the actor, whatever it is at."""
-        del search
         self._closed.set()
         self._ray.kill(self._actor)
         # Ray ends the process of whoever calls it once it is shut down.
@@ -192,8 +193,7 @@ def ray_planners(
 def _message(node: int, search: Search) -> bytes:
     """The search's current candidate."""
     candidate = search.current
-    reward = float(candidate.trajectory.rewards.mean())
-    message = Message(node, search.iteration, candidate.planned, reward, bool(candidate.solved))
+    message = Message(node, search.iteration, candidate.planned, candidate.reward, bool(candidate.solved))
     return encode(message, search.problem)
 
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from d4orm_env.core.arrays import IntArray
 
 SELECTIONS = ("top-k", "max", "k-means")
 
@@ -54,12 +57,12 @@ def merge(newest: Mapping[int, Item], arrivals: Iterable[Item]) -> tuple[dict[in
     return merged, tuple(stale)
 
 
-def top_k(rewards: Any, k: int) -> tuple[int, ...]:
+def top_k(rewards: ArrayLike, k: int) -> tuple[int, ...]:
     """Indices of the ``k`` largest of ``(n,)`` rewards, best first; of equal ones the first."""
     return tuple(int(i) for i in np.argsort(-np.asarray(rewards), kind="stable")[:k])
 
 
-def k_means(points: Any, k: int, generator: np.random.Generator) -> np.ndarray:
+def k_means(points: ArrayLike, k: int, generator: np.random.Generator) -> IntArray:
     """Cluster points by Lloyd's rounds from a k-means++ start.
 
     Args:
@@ -70,26 +73,26 @@ def k_means(points: Any, k: int, generator: np.random.Generator) -> np.ndarray:
     Returns:
         ``(n,)`` the cluster of each point, numbered from 0.
     """
-    points = np.asarray(points, np.float64)
-    centres = points[[generator.integers(len(points))]]
+    places = np.asarray(points, np.float64)
+    centres = places[[generator.integers(len(places))]]
     while len(centres) < k:
-        gap2 = _square_distances(points, centres).min(axis=1)
+        gap2 = _square_distances(places, centres).min(axis=1)
         if gap2.sum() == 0:
             break
-        centres = np.vstack([centres, points[generator.choice(len(points), p=gap2 / gap2.sum())]])
-    labels = _square_distances(points, centres).argmin(axis=1)
+        centres = np.vstack([centres, places[generator.choice(len(places), p=gap2 / gap2.sum())]])
+    labels = _square_distances(places, centres).argmin(axis=1)
     for _ in range(ROUNDS):
         former = labels
         # A cluster that has lost all its points stays where it was.
         full = np.unique(labels)
-        centres[full] = [points[labels == cluster].mean(axis=0) for cluster in full]
-        labels = _square_distances(points, centres).argmin(axis=1)
+        centres[full] = [places[labels == cluster].mean(axis=0) for cluster in full]
+        labels = _square_distances(places, centres).argmin(axis=1)
         if (labels == former).all():
             break
     return labels
 
 
-def diverse(rewards: Any, points: Any, k: int, generator: np.random.Generator) -> tuple[int, ...]:
+def diverse(rewards: ArrayLike, points: ArrayLike, k: int, generator: np.random.Generator) -> tuple[int, ...]:
     """Indices of the best of each of at most ``k`` clusters of candidates, best first.
 
     Args:
@@ -98,15 +101,15 @@ def diverse(rewards: Any, points: Any, k: int, generator: np.random.Generator) -
         k: Clusters.
         generator: See :func:`k_means`.
     """
-    rewards = np.asarray(rewards)
-    labels = k_means(np.reshape(points, (len(rewards), -1)), k, generator)
+    count = np.size(rewards)
+    labels = k_means(np.reshape(points, (count, -1)), k, generator)
     first: dict[int, int] = {}
-    for i in top_k(rewards, len(rewards)):
+    for i in top_k(rewards, count):
         first.setdefault(int(labels[i]), i)
     return tuple(first.values())
 
 
-def choose(selection: str, rewards: Any, points: Any, k: int, generator: np.random.Generator) -> int:
+def choose(selection: str, rewards: ArrayLike, points: ArrayLike, k: int, generator: np.random.Generator) -> int:
     """Index of the candidate to go on from.
 
     Args:
@@ -131,6 +134,7 @@ def choose(selection: str, rewards: Any, points: Any, k: int, generator: np.rand
     return among[int(generator.integers(len(among)))]
 
 
-def _square_distances(points: Any, centres: Any) -> Any:
+def _square_distances(points: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
     """``(n, c)``."""
-    return ((points[:, None] - centres[None]) ** 2).sum(axis=2)
+    gap2: NDArray[np.float64] = ((points[:, None] - centres[None]) ** 2).sum(axis=2)
+    return gap2

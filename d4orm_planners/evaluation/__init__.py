@@ -1,1 +1,1 @@
-"""Comparing policies, and how fast the engines, environments and planners are."""
+"""Comparing policies: studies of trials, their store, and what they come to."""

@@ -7,17 +7,17 @@ from collections.abc import Iterator
 from itertools import count
 from typing import Any
 
+from d4orm_env.core.errors import describe
 from d4orm_planners.distributed.ray_connection import RayConnection
-from d4orm_planners.evaluation.schedule import Lost, Message, Sign
+from d4orm_planners.evaluation.pool import Lost, Message, Sign
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.trials import Job, run_job
-from d4orm_planners.references import describe
 
 QUEUED = 2
 """Jobs under way per core of the cluster: one that runs, and one that need not be waited for."""
 
 
-class RayCrew:
+class RayPool:
     """Tasks on a Ray cluster, one per job and core, never tried again by Ray itself.
 
     Args:

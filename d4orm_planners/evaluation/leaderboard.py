@@ -5,10 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 
-from d4orm_planners.evaluation.report import table
+from d4orm_planners.evaluation.report import HEADER, cells, deadline_table, errors, panels, share, table
 from d4orm_planners.evaluation.store import Trial
-from d4orm_planners.evaluation.summary import SuccessRate, success_by, success_rate
-from d4orm_planners.evaluation.tables import HEADER, cells, deadline_table, errors, panels
+from d4orm_planners.evaluation.summary import SuccessRate, success_by, success_rates
 
 INTRODUCTION = """\
 # Leaderboard
@@ -37,15 +36,15 @@ def leaderboard(trials: Sequence[Trial], deadlines: Sequence[float] = ()) -> str
     if not trials:
         raise ValueError("the store holds no trials yet; run `d4orm evaluate` first")
     groups = _groups(trials)
-    rates = [success_rate(group, label) for (label, *_), group in groups.items()]
+    rates = success_rates((label, group) for (label, *_), group in groups.items())
     blocks = [INTRODUCTION, "## Success", *_matrices(rates), "## Scenario by scenario"]
-    for (scenario, robots, model), panel in panels(rates).items():
+    for title, panel in panels(rates).items():
         # The best first, at every level of noise.
         ranked = sorted(panel, key=lambda rate: (rate.noise, -rate.rate, rate.travel_time or float("inf")))
-        blocks.append(table(f"{scenario}, {robots} robots, {model}", HEADER, [cells(rate) for rate in ranked]))
+        blocks.append(table(title, HEADER, [cells(rate) for rate in ranked]))
     if deadlines:
         blocks += ["## Success within a deadline for planning", WITHIN, *_deadlines(groups, deadlines)]
-    return "\n\n".join([*blocks, *errors(rates), origin(trials)]) + "\n"
+    return "\n\n".join([*blocks, *errors((rate.label, rate.error) for rate in rates), origin(trials)]) + "\n"
 
 
 def _groups(trials: Sequence[Trial]) -> dict[tuple[str, str, int, str, float], list[Trial]]:
@@ -75,21 +74,20 @@ def _labels(trials: Iterable[Trial]) -> dict[tuple[str, str], str]:
 
 def _matrices(rates: Sequence[SuccessRate]) -> list[str]:
     """Policies against scenarios, one table per level of noise."""
-    columns = list(panels(rates))
+    columns = panels(rates)
     blocks = []
     for noise in sorted({rate.noise for rate in rates}):
         found = {
-            (rate.label, (rate.scenario, rate.robots, rate.model)): f"{rate.rate:.0%} ({rate.lower:.0%} to "
-            f"{rate.upper:.0%})"
-            for rate in rates
+            (rate.label, title): share(rate)
+            for title, panel in columns.items()
+            for rate in panel
             if rate.noise == noise
         }
         rows = [
-            (label, *(found.get((label, column), "-") for column in columns))
+            (label, *(found.get((label, title), "-") for title in columns))
             for label in sorted({label for label, _ in found})
         ]
-        header = ("policy", *(f"{scenario}, {robots} robots, {model}" for scenario, robots, model in columns))
-        blocks.append(table("No noise" if noise == 0 else f"Noise {noise:g}", header, rows))
+        blocks.append(table("No noise" if noise == 0 else f"Noise {noise:g}", ("policy", *columns), rows))
     return blocks
 
 

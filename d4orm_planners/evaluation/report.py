@@ -1,60 +1,166 @@
-"""Benchmark results as JSON and as Markdown tables."""
+"""What a study came to as tables, files and a picture: Markdown, CSV, Parquet, and success against noise."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+import csv
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from d4orm_env.core.files import replaced_when_done
-from d4orm_planners.evaluation.benchmark import BenchmarkSettings
-from d4orm_planners.evaluation.timing import Spread
+from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
+from d4orm_planners.evaluation.summary import SuccessRate, SuccessWithin
 
-FORMAT = "d4orm-bench-1"
+PARQUET_HINT = 'trials.parquet is not written, which needs pyarrow; install it with pip install "d4orm-env[evaluate]"'
+HEADER = ("policy", "noise", "success", "95% interval", "verified", "contact", "not in time", "errors",
+          "travel time, s", "planning, s", "computing per s of motion, s")  # fmt: skip
 
 
-def write_report(
-    folder: Path,
-    settings: BenchmarkSettings,
-    machine: dict[str, Any],
-    command: str,
-    date: str,
-    results: dict[str, list[Any]],
-) -> tuple[Path, Path]:
-    """Write ``bench.json`` and ``bench.md``.
+def write_results(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) -> list[Path]:
+    """Write ``table.md`` and ``table.csv``, and of the store in the folder ``trials.csv`` and ``trials.parquet``.
+
+    Args:
+        folder: Where the store is.
+        rates: What :func:`~d4orm_planners.evaluation.evaluate.evaluate` returned.
 
     Returns:
-        The two paths.
+        The paths; ``trials.parquet`` is not among them, and not written, where pyarrow is not installed.
+
+    Raises:
+        OSError: If the folder cannot be written to.
+    """
+    trials = TrialStore.existing(Path(folder) / STORE).trials()
+    paths = [Path(folder, name) for name in ("table.md", "table.csv", "trials.csv", "trials.parquet")]
+    with target(paths[0]) as path:
+        path.write_text(markdown(rates), encoding="utf-8")
+    _write_rates(paths[1], rates)
+    write_csv(paths[2], [vars(trial) for trial in trials])
+    return paths if write_parquet(paths[3], trials) else paths[:3]
+
+
+def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) -> list[Path]:
+    """Write ``robustness.csv``, ``robustness.md`` and ``robustness.png``, success against noise.
+
+    Args:
+        folder: Where to.
+        rates: What :func:`~d4orm_planners.evaluation.evaluate.evaluate` returned.
+
+    Returns:
+        The three paths.
 
     Raises:
         OSError: If the folder does not exist or cannot be written to.
     """
-    document = {"format": FORMAT, "date": date, "command": command, "machine": machine, "settings": asdict(settings)}
-    text = json.dumps({**document, **results}, indent=1, default=asdict, allow_nan=False)
-    with replaced_when_done(folder / "bench.json") as path:
-        path.write_text(text + "\n", encoding="utf-8")
-    with replaced_when_done(folder / "bench.md") as path:
-        path.write_text(markdown(settings, machine, command, date, results), encoding="utf-8")
-    return folder / "bench.json", folder / "bench.md"
+    paths = [Path(folder, f"robustness.{kind}") for kind in ("csv", "md", "png")]
+    _write_rates(paths[0], rates)
+    with target(paths[1]) as path:
+        path.write_text(robustness_markdown(rates), encoding="utf-8")
+    with target(paths[2]) as path:
+        _draw(path, rates)
+    return paths
 
 
-def markdown(
-    settings: BenchmarkSettings, machine: dict[str, Any], command: str, date: str, results: dict[str, list[Any]]
-) -> str:
-    """The results as Markdown tables. Times are medians, with quartiles in brackets."""
-    libraries = ", ".join(f"{name} {version}" for name, version in machine["libraries"].items() if version)
-    blocks = [
-        f"- date: {date}\n- command: `{command}`\n- processor: {machine['processor']}, {machine['cores_used']} of "
-        f"{machine['cores']} cores\n- Python {machine['python']}, {libraries}",
-        f"M = {settings.num_samples} samples, H = {settings.horizon} steps, {settings.num_steps} denoising steps in an "
-        "iteration. Medians, quartiles in brackets.",
-    ]
-    for section, draw in _SECTIONS.items():
-        if results.get(section):
-            blocks.append(draw(results[section]))
-    return "\n\n".join(blocks) + "\n"
+def _write_rates(path: Path, rates: Sequence[SuccessRate]) -> None:
+    """Write success rates as CSV, with a column ``rate`` in front."""
+    write_csv(path, [{"rate": rate.rate, **vars(rate)} for rate in rates])
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write at least one row, all with the same columns, as CSV; what is ``None`` is empty.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    with target(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def write_parquet(path: Path, trials: Sequence[Trial]) -> bool:
+    """Write trials as Parquet, one column per attribute.
+
+    Returns:
+        Whether it was written: ``False`` where pyarrow is not installed.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError:
+        return False
+    kinds = {"str": pyarrow.string(), "int": pyarrow.int64(), "float": pyarrow.float64(), "bool": pyarrow.bool_()}
+    columns = {
+        field.name: pyarrow.array(
+            [getattr(trial, field.name) for trial in trials], kinds[str(field.type).partition(" ")[0]]
+        )
+        for field in fields(Trial)
+    }
+    with target(path) as temporary:
+        parquet.write_table(pyarrow.table(columns), temporary)
+    return True
+
+
+@contextmanager
+def target(path: Path) -> Iterator[Path]:
+    """A temporary file that takes the place of ``path``; what goes wrong with it names ``path``.
+
+    Raises:
+        OSError: If it cannot be written.
+    """
+    try:
+        with replaced_when_done(path) as temporary:
+            yield temporary
+    except OSError as error:
+        reason = error.strerror or error
+        raise OSError(f"{path} cannot be written: {reason}; free some space or choose another folder") from error
+
+
+def markdown(rates: Sequence[SuccessRate]) -> str:
+    """One table per scenario and team, with errors below. Intervals of means stand in brackets."""
+    return _tables(rates, HEADER, cells)
+
+
+def robustness_markdown(rates: Sequence[SuccessRate]) -> str:
+    """:func:`markdown` without the verdicts, the intervals of means and computing."""
+    header = (*HEADER[:4], *HEADER[5:-1])
+
+    def row(rate: SuccessRate) -> tuple[str, ...]:
+        cell = cells(rate)
+        return *cell[:4], *cell[5:8], cell[8].partition(" ")[0], cell[9]
+
+    return _tables(rates, header, row)
+
+
+def _tables(rates: Sequence[SuccessRate], header: Sequence[str], row: Callable[[SuccessRate], tuple[str, ...]]) -> str:
+    blocks = [table(title, header, [row(rate) for rate in group]) for title, group in panels(rates).items()]
+    return "\n\n".join([*blocks, *errors((rate.label, rate.error) for rate in rates)]) + "\n"
+
+
+def cells(rate: SuccessRate) -> tuple[str, ...]:
+    """A row under :data:`HEADER`."""
+    return (
+        rate.label,
+        f"{rate.noise:g}",
+        f"{rate.successes} of {rate.trials} ({rate.rate:.0%})",
+        f"{rate.lower:.0%} to {rate.upper:.0%}",
+        *(str(count) for count in (rate.verified, rate.contacts, rate.late, rate.errors)),
+        _interval(rate.travel_time, rate.travel_time_lower, rate.travel_time_upper, 2),
+        "-" if rate.wall_time is None else f"{rate.wall_time:.2f}",
+        _interval(rate.compute, rate.compute_lower, rate.compute_upper, 3),
+    )
+
+
+def _interval(mean: float | None, lower: float | None, upper: float | None, digits: int) -> str:
+    """A mean with its interval in brackets; a dash where nothing was measured."""
+    if mean is None:
+        return "-"
+    return f"{mean:.{digits}f}" + ("" if lower is None else f" ({lower:.{digits}f} to {upper:.{digits}f})")
 
 
 def table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -63,83 +169,53 @@ def table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> s
     return "\n".join(lines + [f"| {' | '.join(row)} |" for row in rows])
 
 
-def milliseconds(spread: Spread | None) -> str:
-    """Median and quartiles in ms; a dash where nothing was measured."""
-    if spread is None:
-        return "-"
-    digits = 1 if spread.median >= 0.01 else 2
-    low, high = spread.lower_quartile, spread.upper_quartile
-    return f"{spread.median * 1e3:.{digits}f} ({low * 1e3:.{digits}f}-{high * 1e3:.{digits}f})"
+def share(rate: SuccessRate | SuccessWithin) -> str:
+    """A success rate with its interval in brackets."""
+    return f"{rate.rate:.0%} ({rate.lower:.0%} to {rate.upper:.0%})"
 
 
-def seconds(spread: Spread) -> str:
-    """Median and quartiles in s."""
-    return f"{spread.median:.2f} ({spread.lower_quartile:.2f}-{spread.upper_quartile:.2f})"
+def deadline_table(title: str, rows: Iterable[tuple[str, Sequence[SuccessWithin]]]) -> str:
+    """Success by deadline: one row per policy, one column per deadline."""
+    listed = list(rows)
+    header = ("policy", *(f"{within.deadline:g} s" for within in listed[0][1]))
+    lines = [(label, *map(share, line)) for label, line in listed]
+    return table(title, header, lines)
 
 
-def _denoising(rows: list[dict[str, Any]]) -> str:
-    plain = {(row["model"], row["num_robots"]): row["step"].median for row in rows if row["engine"] == "plain"}
-    lines = []
-    for row in rows:
-        reference = plain.get((row["model"], row["num_robots"]))
-        pair = row["ns_per_pair"]
-        lines.append((
-            row["model"],
-            str(row["num_robots"]),
-            row["engine"],
-            row["rules"],
-            milliseconds(row["step"]),
-            milliseconds(row["iteration"]),
-            f"{row['ns_per_robot_step']:.2f}",
-            "-" if pair is None else f"{pair:.2f}",
-            "-" if reference is None else f"{reference / row['step'].median:.1f}",
-        ))  # fmt: skip
-    header = ("model", "robots", "engine", "rules", "first step, ms", "iteration, ms", "ns per robot-step",
-              "ns added per pair check", "times plain JAX")  # fmt: skip
-    return table("Denoising", header, lines)
+def panels(rates: Iterable[SuccessRate]) -> dict[str, list[SuccessRate]]:
+    """Rates by scenario, team size and models, as titles, in order of appearance."""
+    groups: dict[str, list[SuccessRate]] = {}
+    for rate in rates:
+        groups.setdefault(f"{rate.scenario}, {rate.robots} robots, {rate.model}", []).append(rate)
+    return groups
 
 
-def _environments(rows: list[dict[str, Any]]) -> str:
-    lines = [
-        (row["environment"], str(row["num_worlds"]), str(row["num_robots"]), f"{row['steps_per_second']:,.0f}")
-        for row in rows
-    ]
-    return table("Environment steps", ("environment", "worlds", "robots", "env-steps per second"), lines)
+def errors(found: Iterable[tuple[str, str]]) -> list[str]:
+    """Labels with their errors, listed as the only block; no block where all errors are empty."""
+    lines = dict.fromkeys(f"- `{label}`: {error}" for label, error in found if error)
+    return ["\n".join(["### Errors", "", *lines])] if lines else []
 
 
-def _startup(rows: list[dict[str, Any]]) -> str:
-    lines = [(str(row["num_robots"]), f"{row['compiling']:.1f}", f"{row['cold']:.1f}", seconds(row["warm"]))
-             for row in rows]  # fmt: skip
-    header = ("robots", "compiling, s", "process with an empty cache, s", "process with a full cache, s")
-    return table("From the start of a process to its first plan", header, lines)
+def _draw(path: Path, rates: Sequence[SuccessRate]) -> None:
+    """Success against noise with confidence bands: one line per policy, one panel per scenario and team."""
+    # The figure is made without pyplot, which would keep state and want a display.
+    from matplotlib.figure import Figure
 
-
-def _memory(rows: list[dict[str, Any]]) -> str:
-    lines = [(str(row["num_robots"]), f"{row['imported'] / 2**20:.0f}", f"{row['peak'] / 2**20:.0f}") for row in rows]
-    return table("Memory", ("robots", "after importing, MiB", "peak while planning, MiB"), lines)
-
-
-def _plans(rows: list[dict[str, Any]]) -> str:
-    lines = [
-        (
-            str(row["num_robots"]),
-            row["rules"],
-            f"{row['solved']} of {row['seeds']}",
-            seconds(row["seconds"]),
-            f"{row['seconds'].largest:.2f}",
-            f"{row['iterations'].median:.1f}",
-            f"{row['travel_time'].median:.2f}",
-        )
-        for row in rows
-    ]
-    header = ("robots", "preset", "solved", "planning, s", "slowest, s", "iterations", "travel time, s")
-    return table("First feasible verified plan, circle of 5 m", header, lines)
-
-
-_SECTIONS: dict[str, Callable[[list[dict[str, Any]]], str]] = {
-    "denoising": _denoising,
-    "environments": _environments,
-    "startup": _startup,
-    "memory": _memory,
-    "plans": _plans,
-}
+    groups = panels(rates)
+    columns = min(len(groups), 3)
+    rows = -(-len(groups) // columns)
+    figure = Figure(figsize=(4.8 * columns, 3.6 * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
+    for ax in axes[len(groups) :]:
+        ax.set_visible(False)
+    for ax, (title, group) in zip(axes, groups.items()):
+        for policy in dict.fromkeys(rate.label for rate in group):
+            line = sorted((rate for rate in group if rate.label == policy), key=lambda rate: rate.noise)
+            noise = [rate.noise for rate in line]
+            (drawn,) = ax.plot(noise, [rate.rate for rate in line], marker="o", label=policy, clip_on=False)
+            lower, upper = [rate.lower for rate in line], [rate.upper for rate in line]
+            ax.fill_between(noise, lower, upper, color=drawn.get_color(), alpha=0.15, linewidth=0)
+        ax.set(title=title, xlabel="standard deviation of the control noise", ylabel="success rate", ylim=(0, 1))
+        ax.grid(alpha=0.3)
+    axes[0].legend(loc="best")
+    figure.savefig(path, dpi=150)

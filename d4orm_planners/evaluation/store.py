@@ -44,14 +44,11 @@ class TrialKey(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """One episode of one policy and how it ended. The first five fields are its :class:`TrialKey`.
+    """One episode of one policy and how it ended: a row of the store, with a column per field, in this order.
+
+    The first five fields are its :class:`TrialKey`.
 
     Attributes:
-        policy: See :class:`TrialKey`.
-        config: See :class:`TrialKey`.
-        problem: See :class:`TrialKey`.
-        noise: See :class:`TrialKey`.
-        seed: See :class:`TrialKey`.
         label: What the policy with these settings was called.
         scenario: Name of the scenario.
         robots: Team size.
@@ -127,6 +124,7 @@ _NAMES = tuple(field.name for field in fields(Trial))
 _KEY = ", ".join(TrialKey._fields)
 _TRUTHS = ("success", "verified")
 _JSON = {"config": dict, "versions": dict, "machine": dict, "history": list}
+_SQL = {"str": "TEXT", "int": "INTEGER", "float": "REAL", "bool": "INTEGER"}
 _PYTHON: Mapping[str, tuple[type, ...]] = {
     "str": (str,),
     "int": (int,),
@@ -134,24 +132,11 @@ _PYTHON: Mapping[str, tuple[type, ...]] = {
     "bool": (int,),
     "None": (type(None),),
 }
-_KINDS = {
-    field.name: tuple(chain(*(_PYTHON[kind] for kind in str(field.type).split(" | ")))) for field in fields(Trial)
-}
+_TYPES = {field.name: str(field.type).split(" | ") for field in fields(Trial)}
+_KINDS = {name: tuple(chain(*(_PYTHON[kind] for kind in kinds))) for name, kinds in _TYPES.items()}
 """What may be in a row, by column."""
-_CREATE = f"""
-CREATE TABLE trials (
-    policy TEXT NOT NULL, config TEXT NOT NULL, problem TEXT NOT NULL, noise REAL NOT NULL, seed INTEGER NOT NULL,
-    label TEXT NOT NULL, scenario TEXT NOT NULL, robots INTEGER NOT NULL, model TEXT NOT NULL, dt REAL NOT NULL,
-    versions TEXT NOT NULL, machine TEXT NOT NULL, date TEXT NOT NULL,
-    success INTEGER NOT NULL, verified INTEGER, violation TEXT NOT NULL,
-    collided INTEGER NOT NULL, arrived INTEGER NOT NULL,
-    travel_time REAL, makespan REAL, reward REAL, mean_squared_jerk REAL,
-    steps INTEGER NOT NULL, iterations INTEGER, status TEXT NOT NULL,
-    wall_time REAL, preparation REAL, elapsed REAL, history TEXT NOT NULL,
-    messages INTEGER, message_bytes INTEGER, waiting_share REAL, error TEXT NOT NULL,
-    PRIMARY KEY ({_KEY})
-) WITHOUT ROWID
-"""
+_COLUMNS = (f"{name} {_SQL[kinds[0]]}{'' if 'None' in kinds else ' NOT NULL'}" for name, kinds in _TYPES.items())
+_CREATE = f"CREATE TABLE trials ({', '.join(_COLUMNS)}, PRIMARY KEY ({_KEY})) WITHOUT ROWID"
 # What has run to its end stays as it is; only a trial that failed may be tried again.
 _ADD = (
     f"INSERT INTO trials ({', '.join(_NAMES)}) VALUES ({', '.join('?' * len(_NAMES))}) ON CONFLICT ({_KEY}) "

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from d4orm_env.core.arrays import positive_number
-from d4orm_planners.evaluation.statistics import mean_interval, wilson_interval
 from d4orm_planners.evaluation.store import Trial
 
 
@@ -91,6 +90,46 @@ class SuccessWithin:
     @property
     def rate(self) -> float:
         return self.successes / self.trials
+
+
+def mean_interval(values: Sequence[float]) -> tuple[float | None, float | None, float | None]:
+    """Mean of a sample, and its 95% confidence interval by Student's t.
+
+    Returns:
+        Mean, lower and upper end; the ends are ``None`` for fewer than two values, and the mean for none.
+    """
+    if not values:
+        return None, None, None
+    mean = float(np.mean(values))
+    if len(values) == 1:
+        return mean, None, None
+    from scipy import stats  # takes a second to import
+
+    reach = float(stats.t.ppf(0.975, len(values) - 1) * stats.sem(values))
+    return mean, mean - reach, mean + reach
+
+
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """95% confidence interval of a success rate by Wilson's method.
+
+    Unlike the normal approximation it stays inside [0, 1] and says something at 0 and at all successes.
+
+    Args:
+        successes: How many succeeded.
+        trials: Out of how many.
+
+    Raises:
+        ValueError: If there are no trials, more successes than trials, or fewer than none.
+    """
+    from scipy import stats
+
+    interval = stats.binomtest(successes, trials).proportion_ci(0.95, method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def success_rates(groups: Iterable[tuple[str, Sequence[Trial]]]) -> list[SuccessRate]:
+    """Sum up groups of trials behind their labels, see :func:`success_rate`."""
+    return [success_rate(trials, label) for label, trials in groups]
 
 
 def success_rate(trials: Sequence[Trial], label: str | None = None) -> SuccessRate:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import importlib.metadata
 import json
 import time
 from collections.abc import Iterator, Mapping
@@ -15,14 +14,13 @@ from typing import Any
 import numpy as np
 
 from d4orm_env import navigation_v0, verify
-from d4orm_env.core.errors import UnknownKeywordError
+from d4orm_env.core.errors import UnknownKeywordError, describe
 from d4orm_env.core.problem import Problem
 from d4orm_planners.episode import run_episode
 from d4orm_planners.evaluation.store import Trial, TrialKey
-from d4orm_planners.evaluation.timing import describe_machine
+from d4orm_planners.machine import describe_machine, versions
 from d4orm_planners.plan import IterationRecord, Plan
 from d4orm_planners.policy import Actions, OpenLoop, Policy
-from d4orm_planners.references import describe
 from d4orm_planners.registry import is_planned, make_policy, policy_settings
 
 LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "pyrvo", "casadi")
@@ -88,11 +86,6 @@ class Job:
     seed: int
     noise: tuple[float, ...]
 
-    @property
-    def name(self) -> str:
-        """For people who watch."""
-        return f"{self.policy.label}, {self.problem.name}, {self.problem.num_robots} robots"
-
     def key(self, noise: float) -> TrialKey:
         """Of the trial at one level of noise."""
         return TrialKey(self.policy.policy, self.policy.config, self.problem.digest, noise, self.seed)
@@ -128,8 +121,8 @@ def run_job(job: Job) -> Iterator[Trial]:
             outcome = _outcome(timed, job, noise)
         except Exception as problem:
             error = describe(problem)
-        versions, machine = _origin()
-        trial = replace(job.failed(noise, error), versions=versions, machine=machine, **outcome)
+        libraries, machine = _origin()
+        trial = replace(job.failed(noise, error), versions=libraries, machine=machine, **outcome)
         yield replace(trial, elapsed=time.perf_counter() - begin)
 
 
@@ -201,12 +194,4 @@ class _TimedPolicy(Policy):
 @cache
 def _origin() -> tuple[str, str]:
     """Versions of the libraries, and the machine, as JSON."""
-    installed = {}
-    for name in LIBRARIES:
-        try:
-            installed[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    machine = describe_machine()
-    kept = {name: machine[name] for name in ("processor", "cores", "cores_used", "system", "python")}
-    return json.dumps(installed, sort_keys=True), json.dumps(kept, sort_keys=True)
+    return json.dumps(versions(LIBRARIES), sort_keys=True), json.dumps(describe_machine(), sort_keys=True)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.observation_layout import ObservationSlices
 
 TURNED_MODELS = frozenset({"holonomic2d", "holonomic3d", "velocity2d"})
 """Models whose controls are vectors of the world."""
@@ -25,41 +26,31 @@ _HORIZON = 5.0
 class Features:
     """A map from observations to features, and from a network's actions to controls.
 
-    An observation is laid out as :class:`d4orm_env.core.observation.ObservationLayout` says. Its ``F`` features are
-    all of order one: velocity (``d``) in units of the speed limit; heading (2); direction to the goal (``d``); two
-    functions of the distance to it; share of the time left; radius; acceleration over speed limit. For each
+    The ``F`` features of an observation are all of order one: velocity (``d``) in units of the speed limit; heading
+    (2); direction to the goal (``d``); two functions of the distance to it; share of the time left; radius;
+    acceleration over speed limit. For each
     neighbour: presence, direction (``d``), two functions of the gap, relative velocity (``d``), and, with velocities
     kept as they are, when the two come closest and how close. For each obstacle: presence, direction (``d``), two
     functions of the gap.
 
     Attributes:
-        dimension: Position dimensions ``d``.
-        num_neighbors: Neighbours in an observation.
-        num_obstacles: Obstacles in an observation.
+        slices: Where the parts of an observation lie.
         turned: Whether controls are vectors of the world.
     """
 
-    dimension: int
-    num_neighbors: int
-    num_obstacles: int
+    slices: ObservationSlices
     turned: bool
 
     @classmethod
-    def of(cls, layout: Any, model: str) -> Features:
-        """For an :class:`~d4orm_env.core.observation.ObservationLayout` and the model of the robots."""
-        return cls(layout.dimension, layout.num_neighbors, layout.num_obstacles, model in TURNED_MODELS)
-
-    @property
-    def observation_size(self) -> int:
-        """Components of an observation."""
-        d = self.dimension
-        return 2 * d + 8 + self.num_neighbors * (2 + 2 * d) + self.num_obstacles * (2 + d)
+    def of(cls, slices: ObservationSlices, model: str) -> Features:
+        """For the observations of robots of a model."""
+        return cls(slices, model in TURNED_MODELS)
 
     @property
     def size(self) -> int:
         """Number of features ``F``."""
-        d = self.dimension
-        return 2 * d + 7 + self.num_neighbors * (2 * d + 5) + self.num_obstacles * (d + 3)
+        d = self.slices.dimension
+        return 2 * d + 7 + self.slices.num_neighbors * (2 * d + 5) + self.slices.num_obstacles * (d + 3)
 
     def encode(self, observations: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Features of ``N`` robots.
@@ -70,29 +61,22 @@ class Features:
         Returns:
             Features ``(N, F)``, and frames ``(N, 2)``: cosine and sine of the direction to the goal.
         """
-        d, count = self.dimension, len(observations)
-        goal = observations[:, d + 3 : 2 * d + 3]
+        own, count = self.slices.own, len(observations)
+        goal, max_speed = observations[:, own.goal], observations[:, own.max_speed]
         frame = _unit(goal[:, :2])
         # On the goal itself any direction will do.
         frame[(frame == 0).all(axis=1), 0] = 1
-        max_speed = observations[:, 2 * d + 6, None]
-        distance = _norm(goal)
-        heading = observations[:, d : d + 2]
         parts = [
-            _into(frame, observations[:, :d]) / max_speed,
-            _into(frame, heading),
+            _into(frame, observations[:, own.velocity]) / max_speed,
+            _into(frame, observations[:, own.heading]),
             _into(frame, _unit(goal)),
-            *_scales(distance),
-            observations[:, 2 * d + 3, None],
-            observations[:, 2 * d + 5, None],
-            observations[:, 2 * d + 7, None] / max_speed,
+            *_scales(_norm(goal)),
+            observations[:, own.time_left],
+            observations[:, own.radius],
+            observations[:, own.max_acceleration] / max_speed,
+            self._neighbors(frame, observations).reshape(count, -1),
+            self._obstacles(frame, observations).reshape(count, -1),
         ]
-        begin = 2 * d + 8
-        end = begin + self.num_neighbors * (2 + 2 * d)
-        neighbors = observations[:, begin:end].reshape(count, self.num_neighbors, 2 + 2 * d)
-        obstacles = observations[:, end:].reshape(count, self.num_obstacles, 2 + d)
-        parts.append(self._neighbors(frame, neighbors, observations[:, 2 * d + 5], max_speed).reshape(count, -1))
-        parts.append(self._obstacles(frame, obstacles).reshape(count, -1))
         features = np.concatenate(parts, axis=1, dtype=np.float32)
         return features, frame.astype(np.float32)
 
@@ -113,10 +97,11 @@ class Features:
         within: FloatArray = np.clip(controls, -limits, limits)
         return within
 
-    def _neighbors(self, frame: FloatArray, seen: FloatArray, radius: FloatArray, max_speed: FloatArray) -> FloatArray:
-        d = self.dimension
-        present, position, velocity = seen[..., :1], seen[..., 1 : 1 + d], seen[..., 1 + d : 1 + 2 * d]
-        reach = radius[:, None, None] + seen[..., 1 + 2 * d :]
+    def _neighbors(self, frame: FloatArray, observations: FloatArray) -> FloatArray:
+        own, part, seen = self.slices.own, self.slices.neighbor, self.slices.neighbors(observations)
+        max_speed = observations[:, own.max_speed]
+        position, velocity = seen[..., part.position], seen[..., part.velocity]
+        reach = observations[:, None, own.radius] + seen[..., part.radius]
         gap = np.maximum(_norm(position) - reach, 0)
         approach = -_dot(position, velocity)
         time = np.clip(approach / np.maximum(_dot(velocity, velocity), 1e-6), 0, _HORIZON)
@@ -129,16 +114,17 @@ class Features:
             time / _HORIZON,
             np.exp(-4 * miss),
         ]
-        features: FloatArray = np.concatenate(parts, axis=2) * present
+        features: FloatArray = np.concatenate(parts, axis=2) * seen[..., part.present]
         return features
 
-    def _obstacles(self, frame: FloatArray, seen: FloatArray) -> FloatArray:
-        d = self.dimension
-        if not seen[..., 0].any():
-            return np.zeros((*seen.shape[:2], d + 3), np.float32)
-        gap = np.maximum(seen[..., 1 + d :], 0)
-        parts = [np.ones_like(gap), _into(frame[:, None], _unit(seen[..., 1 : 1 + d])), *_scales(gap)]
-        features: FloatArray = np.concatenate(parts, axis=2) * seen[..., :1]
+    def _obstacles(self, frame: FloatArray, observations: FloatArray) -> FloatArray:
+        part, seen = self.slices.obstacle, self.slices.obstacles(observations)
+        present = seen[..., part.present]
+        if not present.any():
+            return np.zeros((*seen.shape[:2], self.slices.dimension + 3), np.float32)
+        gap = np.maximum(seen[..., part.gap], 0)
+        parts = [np.ones_like(gap), _into(frame[:, None], _unit(seen[..., part.position])), *_scales(gap)]
+        features: FloatArray = np.concatenate(parts, axis=2) * present
         return features
 
 

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_planners.policy import Actions, Policy, require_reset, robot_indices
+from d4orm_planners.policy import Actions, Observations, Policy, require_reset, robot_indices
 from d4orm_planners.rl.network import SUFFIX, Network, load_network
 from d4orm_planners.settings import CheckedSettings, PathText
+
+if TYPE_CHECKING:
+    from pettingzoo import ParallelEnv
+
+    from d4orm_env.core.problem import Problem
 
 SHIPPED = Path(__file__).parent / "policies"
 
@@ -59,12 +64,12 @@ class LearnedPolicy(Policy):
         else:
             self._actor = _NetworkActor(self.name, path)
 
-    def reset(self, env: Any, seed: int = 0) -> None:
+    def reset(self, env: ParallelEnv, seed: int = 0) -> None:
         super().reset(env, seed)
         agent = env.possible_agents[0]
         self._actor.check(self.problem, env.observation_space(agent).shape, env.action_space(agent).shape)
 
-    def act(self, observations: dict[str, Any], state: Any) -> Actions:
+    def act(self, observations: Observations, state: FloatArray) -> Actions:
         require_reset(self)
         if not observations:
             return {}
@@ -98,16 +103,16 @@ class _NetworkActor:
                 f"{self.network.header.algorithm!r}, path=...)"
             )
 
-    def check(self, problem: Any, observation_shape: tuple[int, ...], action_shape: tuple[int, ...]) -> None:
+    def check(self, problem: Problem, observation_shape: tuple[int, ...], action_shape: tuple[int, ...]) -> None:
         header, features = self.network.header, self.network.features
         if set(problem.team.models) != {header.model}:
             raise ValueError(
                 f"the policy in {self.path.name} was trained for {header.model} robots, and this team has "
                 f"{', '.join(sorted(set(problem.team.models)))}; train one for them with 'd4orm train --model'"
             )
-        if observation_shape != (features.observation_size,):
+        if observation_shape != (features.slices.size,):
             raise ValueError(
-                f"the policy in {self.path.name} was trained for observations of {features.observation_size} numbers, "
+                f"the policy in {self.path.name} was trained for observations of {features.slices.size} numbers, "
                 f"and this environment's have shape {observation_shape}; make it with observed_robots="
                 f"{header.num_neighbors}, observed_obstacles={header.num_obstacles}, and do not wrap its observations"
             )
@@ -136,7 +141,7 @@ class _ZipActor:
             raise ValueError(f"policy file {path} is no {algorithm.upper()} model of SB3: {message}") from error
         self.path = path
 
-    def check(self, problem: Any, observation_shape: tuple[int, ...], action_shape: tuple[int, ...]) -> None:
+    def check(self, problem: Problem, observation_shape: tuple[int, ...], action_shape: tuple[int, ...]) -> None:
         for what, mine, theirs in (
             ("observations", self.model.observation_space.shape, observation_shape),
             ("actions", self.model.action_space.shape, action_shape),

@@ -16,7 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.dynamics import get_model
 from d4orm_env.core.files import replaced_when_done
-from d4orm_planners.rl.features import TURNED_MODELS, Features
+from d4orm_env.core.observation_layout import ObservationSlices
+from d4orm_planners.rl.features import Features
 
 FORMAT = 1
 EPSILON = 0.1
@@ -77,7 +78,7 @@ class Network:
     def features(self) -> Features:
         """What it sees."""
         head = self.header
-        return Features(head.dimension, head.num_neighbors, head.num_obstacles, head.model in TURNED_MODELS)
+        return Features.of(ObservationSlices(head.dimension, head.num_neighbors, head.num_obstacles), head.model)
 
     def __call__(self, features: FloatArray) -> FloatArray:
         """``(N, m)`` most likely actions in ``[-1, 1]`` for ``(N, F)`` features."""

@@ -60,6 +60,10 @@ class RobotVecEnv(VecEnv):
         kwargs |= {"reward": reward, "autoreset_mode": "SameStep"}
         self._env = NavigationVectorEnv(num_worlds, scenario, num_robots, **kwargs)
         problem = self.problem = self._env.problem
+        if not problem.docks:
+            raise ValueError(
+                "arrival is 'stay', and one robot's episode ends where it docks; train with arrival='dock'"
+            )
         if len(set(problem.team.models)) > 1:
             raise ValueError(
                 f"the team mixes {', '.join(sorted(set(problem.team.models)))}; one policy is learned for robots of "

@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.scenarios import make_problem
-from d4orm_env.scenarios.registry import unknown_argument
+from d4orm_env.scenarios.problems import unknown_argument
 from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm
 from d4orm_planners.rl.checkpoints import Checkpoints
 from d4orm_planners.rl.curriculum import Lesson, common_batch, make_lessons, team_sizes
@@ -212,9 +212,9 @@ class _Run:
         return {
             "algorithm": self.settings.algorithm,
             "model": problem.team.models[0],
-            "dimension": features.dimension,
-            "num_neighbors": features.num_neighbors,
-            "num_obstacles": features.num_obstacles,
+            "dimension": features.slices.dimension,
+            "num_neighbors": features.slices.num_neighbors,
+            "num_obstacles": features.slices.num_obstacles,
             "training": {"command": self._command, "lesson": index + 1, **asdict(self.settings)},
         }
 

@@ -12,7 +12,7 @@ import numpy as np
 from d4orm_env import Problem, Team
 from d4orm_env.engine.base import Engine
 from d4orm_env.joint_state import JointState
-from d4orm_planners.base import Candidate, evaluate_controls
+from d4orm_planners.candidate import Candidate, evaluate_controls
 from d4orm_planners.steering import straight_drives
 
 LEAST_MARGIN = 0.01

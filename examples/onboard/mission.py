@@ -9,7 +9,8 @@ import numpy as np
 
 from d4orm_env import Problem, Team, World
 from d4orm_env.scenarios import make_problem
-from d4orm_planners.d_d4orm import DD4ormConfig
+from d4orm_planners.d4orm import D4ormConfig
+from d4orm_planners.d_d4orm.settings import DD4ormConfig
 from d4orm_planners.distributed.zenoh_transport import ZenohSettings, ZenohTransport
 
 TICK = 0.1
@@ -87,9 +88,8 @@ class Mission:
 
     def planning(self) -> DD4ormConfig:
         """The settings of D-D4orm."""
-        return DD4ormConfig(
-            nodes=self.robots, num_samples=self.samples, num_steps=self.denoising_steps, engine="cpu", improve=True
-        )
+        samples = D4ormConfig(num_samples=self.samples, num_steps=self.denoising_steps)
+        return DD4ormConfig(nodes=self.robots, refinement=samples, engine="cpu", improve=True)
 
     def join(self, part: str, listen: bool) -> ZenohTransport:
         """An end of the world's network (``"world"``) or of the robots' own (``"team"``)."""

@@ -16,15 +16,14 @@ from pathlib import Path
 
 import numpy as np
 
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.joint_state import JointState, split_state
-from d4orm_planners.d4orm import D4orm, D4ormConfig
 from d4orm_planners.distributed.transport import Transport
 from onboard import wire
 from onboard.course import Course, first_guess, goals_to_plan_for, present_problem
 from onboard.log import Log
 from onboard.mission import Mission
-from onboard.thinking import Round
+from onboard.thinking import Agenda, Round
 
 LOOK = 0.5
 """Longest time between two looks at the clock [s]."""
@@ -53,15 +52,15 @@ class Robot:
 
     def prepare(self) -> None:
         """Compile whatever is not yet, before time counts."""
-        settings = self._mission.planning().node_settings(self._mission.robots)[self._number]
-        D4orm(D4ormConfig(**settings)).solve(self._problem, max_iterations=1)
+        planner = self._mission.planning().node_planners(self._mission.robots)[self._number]
+        planner.solve(self._problem, max_iterations=1)
 
     def answer(self, tick: wire.Tick) -> wire.Command:
         """What to do in a tick."""
         joint = split_state(self._problem, tick.state)
         self._log.tick = tick.number
         self._heed_stops(joint, tick.lost)
-        if self._round is not None and tick.number >= self._round.takeover:
+        if self._round is not None and tick.number >= self._round.agenda.takeover:
             self._take_over(tick)
         if self._round is None:
             self._begin_round(joint)
@@ -120,23 +119,21 @@ class Robot:
             guess = first_guess(self._course, problem, takeover)
         members = [robot for robot in range(self._mission.robots) if robot not in self._lost]
         self._log.members = members
-        self._round = Round(
-            self._mission, members, self._number, takeover, self._rounds, problem, guess, self._engine, self._team,
-            self._log.observe,
-        )  # fmt: skip
+        agenda = Agenda(self._rounds, tuple(members), takeover, problem, guess)
+        self._round = Round(agenda, self._mission, self._number, self._engine, self._team, self._log.observe)
 
     def _choose(self, tick: wire.Tick) -> None:
         """When thinking is over announce the best plan known, and then the best of those that all have announced."""
         if self._round is None:
             return
-        left, wait = self._round.takeover - tick.number, self._mission.patience / 3
+        left, wait = self._round.agenda.takeover - tick.number, self._mission.patience / 3
         if left == self._mission.agree:
             self._round.enough(wait)
         elif left == 2:
             self._round.settle(wait)
             self._announce(self._round.best())
         elif left == 1:
-            announced = [(tick.rewards[robot], -robot) for robot in self._round.members if tick.ballots[robot]]
+            announced = [(tick.rewards[robot], -robot) for robot in self._round.agenda.members if tick.ballots[robot]]
             if announced:
                 _, robot = max(announced)
                 self._announce(self._round.named(tick.ballots[-robot], wait))

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from d4orm_env import Problem
+from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.engine.base import Engine
-from d4orm_planners.base import Candidate
-from d4orm_planners.d4orm import D4orm, D4ormConfig
+from d4orm_planners.candidate import Candidate
 from d4orm_planners.distributed.events import Event
-from d4orm_planners.distributed.node import Node, Selection
+from d4orm_planners.distributed.judge import Judge
+from d4orm_planners.distributed.node import Node, Task
 from d4orm_planners.distributed.transport import Transport
 from onboard.course import Course, digest
 from onboard.mission import Mission
@@ -30,17 +31,32 @@ TOLD = 10_000
 """More messages than a node sends in a round; a later round's are numbered on from there."""
 
 
+@dataclass(frozen=True)
+class Agenda:
+    """What a round of planning is about.
+
+    Attributes:
+        number: Of the round; later ones have larger numbers.
+        members: The robots that are alive, whose nodes are numbered in this order.
+        takeover: Tick at which the plan begins.
+        problem: The problem that begins then.
+        guess: ``(H, K, m)`` controls to start from.
+    """
+
+    number: int
+    members: tuple[int, ...]
+    takeover: int
+    problem: Problem
+    guess: FloatArray
+
+
 class Round:
     """Planning from where the team will be when the plan takes over.
 
     Args:
+        agenda: What to plan.
         mission: The settings.
-        members: The robots that are alive, whose nodes are numbered in this order.
         robot: Whose node it is.
-        takeover: Tick at which the plan begins.
-        number: Of the round; later ones have larger numbers.
-        problem: The problem that begins then.
-        guess: ``(H, K, m)`` controls to start from.
         engine: What rolls out and samples.
         team: Where candidates are exchanged.
         observer: Is told what the node does, and the digest of the plan that it is about.
@@ -48,53 +64,48 @@ class Round:
 
     def __init__(
         self,
+        agenda: Agenda,
         mission: Mission,
-        members: Sequence[int],
         robot: int,
-        takeover: int,
-        number: int,
-        problem: Problem,
-        guess: Any,
         engine: Engine,
         team: Transport,
         observer: Callable[[Event, str], None],
     ) -> None:
-        self.members, self.takeover, self.number, self.problem = tuple(members), takeover, number, problem
-        self._mission, self._engine = mission, engine
+        self.agenda = agenda
+        self._mission, self._engine, self._team, self._observer = mission, engine, team, observer
         self._iterated, self._enough, self._settled, self._over = (threading.Event() for _ in range(4))
         self._node: Node | None = None
         self._error: Exception | None = None
-        nodes, own = len(members), self.members.index(robot)
         self._known: dict[str, Candidate] = {}
         self._learned = threading.Condition()
-        planning = mission.planning()
-        planner = D4orm(D4ormConfig(**planning.node_settings(nodes)[own]))
-        choice = Selection(planning.selection, planning.k)
-        seed = derived_seed(mission.seed, Stream.TAKEOVER, takeover)
-
-        def observe(event: Event) -> None:
-            plan = digest(engine, problem, event.candidate)
-            with self._learned:
-                self._known[plan] = event.candidate
-                self._learned.notify_all()
-            observer(event, plan)
-
-        def work() -> None:
-            try:
-                self._node = Node(
-                    own, nodes, planner, problem, seed, guess, engine, team, choice,
-                    told=TOLD * number, observer=observe,
-                )  # fmt: skip
-                self._think(self._node)
-            except Exception as error:
-                self._error = error
-            finally:
-                self._iterated.set()
-                self._settled.set()
-
         # A node that is at its last iteration must not keep the robot from ending.
-        self._thread = threading.Thread(target=work, daemon=True, name=f"round-{number}")
+        self._thread = threading.Thread(target=self._work, args=(robot,), daemon=True, name=f"round-{agenda.number}")
         self._thread.start()
+
+    def _work(self, robot: int) -> None:
+        try:
+            self._node = self._make_node(robot)
+            self._think(self._node)
+        except Exception as error:
+            self._error = error
+        finally:
+            self._iterated.set()
+            self._settled.set()
+
+    def _make_node(self, robot: int) -> Node:
+        agenda, planning = self.agenda, self._mission.planning()
+        nodes, own = len(agenda.members), agenda.members.index(robot)
+        seed = derived_seed(self._mission.seed, Stream.TAKEOVER, agenda.takeover)
+        task = Task(nodes, seed, agenda.guess, planning.selection, planning.k)
+        planner, judge = planning.node_planners(nodes)[own], Judge(self._engine, agenda.problem)
+        return Node(own, task, planner, self._team, judge, told=TOLD * agenda.number, observer=self._observe)
+
+    def _observe(self, event: Event) -> None:
+        plan = digest(self._engine, self.agenda.problem, event.candidate)
+        with self._learned:
+            self._known[plan] = event.candidate
+            self._learned.notify_all()
+        self._observer(event, plan)
 
     def _think(self, node: Node) -> None:
         iterations = 0
@@ -124,12 +135,12 @@ class Round:
             RuntimeError: If the node has failed.
         """
         if self._error is not None:
-            raise RuntimeError(f"round {self.number} has failed: {self._error}") from self._error
+            raise RuntimeError(f"round {self.agenda.number} has failed: {self._error}") from self._error
         return None if self._node is None else self._course(self._node.search.best)
 
-    def progress_on(self, problem: Problem) -> Any:
+    def progress_on(self, problem: Problem) -> FloatArray | None:
         """``(H, K, m)`` controls that this round ended with, if it was about the same problem; else ``None``."""
-        return self._node.search.best.controls if self._node is not None and problem == self.problem else None
+        return self._node.search.best.controls if self._node is not None and problem == self.agenda.problem else None
 
     def named(self, plan: str, timeout: float) -> Course | None:
         """The solution of that digest, if this robot has it or gets it within the seconds, and it is one."""
@@ -145,4 +156,4 @@ class Round:
         self._thread.join(timeout)
 
     def _course(self, candidate: Candidate) -> Course | None:
-        return Course.of(self.takeover, self.problem, self._engine, candidate)
+        return Course.of(self.agenda.takeover, self.agenda.problem, self._engine, candidate)

@@ -19,7 +19,7 @@ from planner_support import hop_problem
 
 from d4orm_env import load_problem, verify
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.commands.node_file import load_node
 from d4orm_planners.distributed.messages import Message, decode, encode

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from importlib.util import find_spec
 from typing import Any
 
@@ -14,7 +13,7 @@ from planner_support import CHEAP, hop_problem
 
 from d4orm_env import navigation_v0
 from d4orm_planners import make_planner, make_policy
-from d4orm_planners.base import Planner
+from d4orm_planners.planner import Planner
 from d4orm_planners.policy import Policy
 from d4orm_planners.registry import PLANNERS, POLICIES
 
@@ -27,7 +26,7 @@ RUNS = 2_000
 
 def settings_of(name: str) -> list[str]:
     kind: Any = PLANNERS.get(name) or POLICIES[name]
-    return [] if kind.config_class is None else [field.name for field in fields(kind.config_class)]
+    return [] if kind.config_class is None else list(kind.config_class.setting_names())
 
 
 @st.composite
@@ -56,7 +55,7 @@ def test_settings_are_used_or_refused_by_name(case: tuple[str, dict[str, Any]], 
 
 def _is_small(made: Planner | Policy) -> bool:
     config = made.config if isinstance(made, Planner) else getattr(made, "config", None)
-    values = [] if config is None else [getattr(config, field.name) for field in fields(config)]
+    values = [] if config is None else config.keywords().values()
     return all(value <= RUNS for value in values if isinstance(value, int))
 
 

@@ -1,0 +1,198 @@
+"""The components of one robot's observation: where each part lies, what it is called and how large it gets."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import accumulate, pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray, whole_number
+from d4orm_env.core.problem import Problem
+
+
+class OwnParts(NamedTuple):
+    """Where a robot sees itself; ``d`` position dimensions, lengths in m and speeds in m/s."""
+
+    velocity: slice  # d
+    heading: slice  # cosine and sine, both zero for a model without a heading
+    speed: slice
+    goal: slice  # d, vector to the goal
+    time_left: slice  # share of the time that is left, 1 to 0
+    arrived: slice
+    radius: slice
+    max_speed: slice
+    max_acceleration: slice
+
+
+class NeighborParts(NamedTuple):
+    """Where it sees another robot, in the row of that one; all zeros for an absent one."""
+
+    present: slice
+    position: slice  # d, relative to its own
+    velocity: slice  # d, relative to its own
+    radius: slice
+
+
+class ObstacleParts(NamedTuple):
+    """Where it sees an obstacle or a wall of the bounds, likewise."""
+
+    present: slice
+    position: slice  # d, vector to the nearest point of the surface
+    gap: slice  # between the two surfaces
+
+
+@dataclass(frozen=True)
+class ObservationSlices:
+    """Where the parts of an observation lie: the robot's own, then each neighbour's, then each obstacle's.
+
+    Attributes:
+        dimension: ``d``.
+        num_neighbors: Neighbours listed, nearest first.
+        num_obstacles: Obstacles listed, nearest first; walls of the bounds are among them.
+    """
+
+    dimension: int
+    num_neighbors: int
+    num_obstacles: int
+
+    def __post_init__(self) -> None:
+        whole_number(self.num_neighbors, "num_neighbors", 0)
+        whole_number(self.num_obstacles, "num_obstacles", 0)
+
+    @cached_property
+    def own(self) -> OwnParts:
+        """Slices of the observation."""
+        d = self.dimension
+        return OwnParts(*_slices(d, 2, 1, d, 1, 1, 1, 1, 1))
+
+    @cached_property
+    def neighbor(self) -> NeighborParts:
+        """Slices of a row of :meth:`neighbors`."""
+        return NeighborParts(*_slices(1, self.dimension, self.dimension, 1))
+
+    @cached_property
+    def obstacle(self) -> ObstacleParts:
+        """Slices of a row of :meth:`obstacles`."""
+        return ObstacleParts(*_slices(1, self.dimension, 1))
+
+    @cached_property
+    def size(self) -> int:
+        """Number of components ``D``."""
+        return self._neighbors_end + self.num_obstacles * self.obstacle[-1].stop
+
+    @property
+    def _neighbors_end(self) -> int:
+        return self.own[-1].stop + self.num_neighbors * self.neighbor[-1].stop
+
+    def neighbors(self, observations: FloatArray) -> FloatArray:
+        """``(..., num_neighbors, .)`` the rows of neighbours of observations ``(..., D)``."""
+        rows = observations[..., self.own[-1].stop : self._neighbors_end]
+        return rows.reshape(*rows.shape[:-1], self.num_neighbors, self.neighbor[-1].stop)
+
+    def obstacles(self, observations: FloatArray) -> FloatArray:
+        """``(..., num_obstacles, .)`` the rows of obstacles of observations ``(..., D)``."""
+        rows = observations[..., self._neighbors_end :]
+        return rows.reshape(*rows.shape[:-1], self.num_obstacles, self.obstacle[-1].stop)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """One name per component, as ``neighbor_0.velocity_y``."""
+        blocks: list[tuple[str, OwnParts | NeighborParts | ObstacleParts]] = [("", self.own)]
+        blocks += [(f"neighbor_{row}.", self.neighbor) for row in range(self.num_neighbors)]
+        blocks += [(f"obstacle_{row}.", self.obstacle) for row in range(self.num_obstacles)]
+        return tuple(prefix + name for prefix, parts in blocks for name in _component_names(parts))
+
+
+@dataclass(frozen=True, eq=False)
+class ObservationLayout(ObservationSlices):
+    """The same with the finite bounds that observations stay in.
+
+    Attributes:
+        low: ``(D,)`` float32 lower bounds.
+        high: ``(D,)`` float32 upper bounds.
+    """
+
+    low: FloatArray
+    high: FloatArray
+
+    @classmethod
+    def for_problem(cls, problem: Problem, num_neighbors: int = 4, num_obstacles: int = 4) -> ObservationLayout:
+        """The layout for a problem, with bounds that no motion of its robots can leave.
+
+        Raises:
+            ValueError: If a number of neighbours or obstacles is negative or not whole.
+        """
+        slices = ObservationSlices(problem.dimension, num_neighbors, num_obstacles)
+        team, reach = problem.team, _reach(problem)
+        radius, speed, acceleration = (
+            float(values.max()) for values in (team.radius, team.max_speed, team.max_acceleration)
+        )
+        high = np.empty(slices.size, np.float32)
+        own = {"velocity": speed, "heading": 1, "speed": speed, "goal": reach, "time_left": 1, "arrived": 1}
+        own |= {"radius": radius, "max_speed": speed, "max_acceleration": acceleration}
+        neighbor = {"present": 1, "position": reach, "velocity": 2 * speed, "radius": radius}
+        _fill(high, slices.own, own)
+        _fill(slices.neighbors(high), slices.neighbor, neighbor)
+        _fill(slices.obstacles(high), slices.obstacle, {"present": 1, "position": reach, "gap": reach})
+        low = -high
+        _fill(low, slices.own, {"time_left": 0, "arrived": 0})
+        _fill(slices.neighbors(low), slices.neighbor, {"present": 0})
+        _fill(slices.obstacles(low), slices.obstacle, {"present": 0})
+        for bound in (low, high):
+            bound.setflags(write=False)
+        return cls(problem.dimension, num_neighbors, num_obstacles, low, high)
+
+    @cached_property
+    def bounds(self) -> FloatArray:
+        """``(2, D)`` lower and upper bounds in one array, read-only."""
+        bounds: FloatArray = np.stack([self.low, self.high])
+        bounds.setflags(write=False)
+        return bounds
+
+
+def _slices(*widths: int) -> Iterator[slice]:
+    """Where parts of these widths lie, one after the other."""
+    return (slice(begin, end) for begin, end in pairwise(accumulate(widths, initial=0)))
+
+
+def _component_names(parts: OwnParts | NeighborParts | ObstacleParts) -> Iterator[str]:
+    for name, part in zip(parts._fields, parts, strict=True):
+        width = part.stop - part.start
+        suffixes = ("_cos", "_sin") if name == "heading" else ("",) if width == 1 else ("_x", "_y", "_z")[:width]
+        yield from (name + suffix for suffix in suffixes)
+
+
+def _fill(values: FloatArray, parts: NamedTuple, bounds: Mapping[str, float]) -> None:
+    """Set parts of ``values`` ``(..., .)`` in place."""
+    for name, bound in bounds.items():
+        values[..., getattr(parts, name)] = bound
+
+
+def _reach(problem: Problem) -> float:
+    """Farthest that anything may be from a robot [m]."""
+    team, places = (
+        problem.team,
+        np.concatenate([problem.start[:, : problem.dimension], problem.goal, *_corners(problem)]),
+    )
+    speed, acceleration = float(team.max_speed.max()), float(team.max_acceleration.max())
+    # Nobody gets further than the widest distance between places, plus a full-speed drive from either end. Within a
+    # step a robot may exceed the speed limit, which is applied at its end.
+    drive = (speed + acceleration * problem.dt / 2) * problem.duration
+    return float(np.sqrt(np.square(np.ptp(places, axis=0)).sum())) + 2 * drive + 2 * float(team.radius.max())
+
+
+def _corners(problem: Problem) -> list[FloatArray]:
+    """Extreme points of the world's obstacles and bounds, to bound distances to them."""
+    world, d = problem.world, problem.dimension
+    corners = [world.balls[:, :d] + sign * world.balls[:, d:] for sign in (-1, 1)]
+    corners += [world.boxes[:, :d], world.boxes[:, d:], *world.polygons]
+    if len(world.cylinders):
+        xy = np.concatenate([world.cylinders[:, :2] + sign * world.cylinders[:, 2:] for sign in (-1, 1)])
+        corners.append(np.concatenate([xy, np.zeros((len(xy), 1))], axis=1))
+    if world.lower is not None:
+        corners.append(world.bounds)
+    return corners

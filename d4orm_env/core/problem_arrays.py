@@ -1,0 +1,55 @@
+"""A problem as the engines read it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.world_index import WorldIndex
+
+
+class ProblemArrays(NamedTuple):
+    """A problem as the engines read it: plain arrays, float32 unless said, one struct for numba and JAX alike.
+
+    Attributes:
+        model_codes: ``(K,)`` int32.
+        limits: ``(K, L)`` see :attr:`~d4orm_env.core.team.Team.limits`.
+        radius: ``(K,)``.
+        start: ``(K, n)``.
+        goal: ``(K, d)``.
+        inverse_initial_distance: ``(K,)`` one over the distance from start to goal (at least the goal radius).
+        boxes: ``(., 2 d + 1)`` obstacles, see :class:`~d4orm_env.core.shapes.Shapes`.
+        triangles: ``(., 6)`` more of them.
+        grid: Where they are.
+        bounds: ``(2, d)``, infinite where open.
+        time_step: ``(4,)`` dt, dt/2, dt/3, dt/6.
+        margin: ``()``.
+        squared_goal_radius: ``()``.
+        squared_goal_speed: ``()``, infinite without a limit.
+        docks: ``()`` bool: who has arrived stands there for ever.
+    """
+
+    model_codes: NDArray[np.int32]
+    limits: FloatArray
+    radius: FloatArray
+    start: FloatArray
+    goal: FloatArray
+    inverse_initial_distance: FloatArray
+    boxes: FloatArray
+    triangles: FloatArray
+    grid: WorldIndex
+    bounds: FloatArray
+    time_step: FloatArray
+    margin: np.float32
+    squared_goal_radius: np.float32
+    squared_goal_speed: np.float32
+    docks: np.bool_
+
+
+def inverse_initial_distance(positions: FloatArray, goal: FloatArray, goal_radius: float) -> FloatArray:
+    """``(K,)`` one over the start distance; a robot that starts at its goal counts from the goal radius."""
+    inverse: FloatArray = (1.0 / np.maximum(np.linalg.norm(goal - positions, axis=-1), goal_radius)).astype(np.float32)
+    return inverse

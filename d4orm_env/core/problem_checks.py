@@ -1,0 +1,115 @@
+"""What the physics asks of a problem; each refusal is a ``ValueError`` that names the robot."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.robot_model import SPEED, STANDARD_LIMITS, TURN_RATE, Model
+from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
+
+MAX_HEADING = 1000.0
+"""Largest heading of a start [rad]; float32 resolves it to 6e-5 rad."""
+RESOLUTION = 100
+"""The goal radius is at least so many times what float32 resolves at the farthest start or goal."""
+STEP_RESOLUTION = 10
+"""A robot at its speed limit moves at least so many times that in one step."""
+INTEGRATION_ERROR = 0.01
+"""Most that one step of RK4 may be off where a robot turns at its limits [m]."""
+
+
+def check_states(team: Team, states: FloatArray, what: str = "start") -> None:
+    """Refuse states (``what``) ``(K, n)`` whose padding is not zero, or whose speed or heading is too large."""
+    limits = team.limits
+    for robot, model in enumerate(team.robot_models):
+        state = states[robot]
+        if state[model.state_size :].any():
+            raise ValueError(
+                f"{what} of robot_{robot} is {state.tolist()}; a {model.name} has {model.state_size} components, "
+                f"so set the padding after them to zero"
+            )
+        speed = float(np.linalg.norm(state[list(model.speed_indices)])) if model.speed_indices else 0.0
+        limit = float(team.max_speed[robot])
+        if speed > limit * (1 + 1e-5):
+            raise ValueError(f"{what} speed of robot_{robot} is {speed:g} m/s, above its limit of {limit:g} m/s")
+        for index, column in model.state_limits:
+            value, limit = float(state[index]), float(limits[robot, column])
+            if abs(value) > limit * (1 + 1e-5):
+                raise ValueError(
+                    f"{what} {model.state_names[index]} of robot_{robot} is {value:g}, "
+                    f"above its {model.limit_names[column]} of {limit:g}"
+                )
+        heading = 0.0 if model.heading_index is None else float(state[model.heading_index])
+        if abs(heading) > MAX_HEADING:
+            raise ValueError(
+                f"{what} heading of robot_{robot} is {heading:g} rad; it must be at most {MAX_HEADING:g} in "
+                f"magnitude, so take whole turns off"
+            )
+
+
+def check_resolution(team: Team, places: FloatArray, dt: float, goal_radius: float) -> None:
+    """Refuse ``places`` ``(K, .)`` that float32 does not resolve as the goal radius, and a step of a robot, ask."""
+    farthest = np.abs(places).max(axis=1)
+    grain = np.spacing(farthest).astype(np.float64)
+    stride = team.max_speed.astype(np.float64) * dt
+    for robot in range(team.num_robots):
+        where = f"robot_{robot} starts or ends at a coordinate of {farthest[robot]:g} m, where float32 resolves "
+        if RESOLUTION * grain[robot] > goal_radius:
+            raise ValueError(
+                f"{where}{grain[robot]:.2g} m, more than 1/{RESOLUTION} of the goal radius of {goal_radius:g} "
+                f"m; move the problem nearer to the origin, or use a larger goal_radius"
+            )
+        if STEP_RESOLUTION * grain[robot] > stride[robot]:
+            raise ValueError(
+                f"{where}{grain[robot]:.2g} m, and moves at most {stride[robot]:.2g} m in a step of {dt:g} s; "
+                f"move the problem nearer to the origin, or use a larger dt or max_speed"
+            )
+
+
+def check_turning(team: Team, dt: float) -> None:
+    """Refuse a time step in which one step of RK4 does not follow a robot that turns as fast as it may."""
+    team_limits = team.limits
+    for robot, model in enumerate(team.robot_models):
+        if model.heading_index is None:
+            continue
+        speed = float(team_limits[robot, SPEED])
+        angle = model.turn_rate(team_limits[robot]) * dt
+        error = speed * dt * angle**4 / 2880
+        if error > INTEGRATION_ERROR:
+            raise ValueError(
+                f"robot_{robot} may turn by {angle:.3g} rad in a step of {dt:g} s, and at {speed:g} m/s one "
+                f"step of RK4 may then be {error:.2g} m off (most: {INTEGRATION_ERROR:g} m); use a smaller dt, "
+                f"{_turning_limits(model)} or max_speed"
+            )
+
+
+def check_places(team: Team, world: World, what: str, places: FloatArray) -> None:
+    """Refuse starts or goals (``what``) ``(K, d)`` outside the world, or that touch something."""
+    radius = team.radius.astype(np.float64)
+    clearance = world.clearance(places) - radius
+    for robot in np.flatnonzero(clearance <= 0):
+        raise ValueError(
+            f"{what} of robot_{robot} at {_point(places[robot])} is {0 - clearance[robot]:.3g} m inside an "
+            f"obstacle or outside the bounds (robot radius {radius[robot]:g} m); move it, or change the world"
+        )
+    points = places.astype(np.float64)
+    for later in range(1, len(points)):
+        gaps = np.linalg.norm(points[:later] - points[later], axis=1) - radius[:later] - radius[later]
+        other = int(np.argmin(gaps))
+        if gaps[other] <= 0:
+            raise ValueError(
+                f"{what}s of robot_{other} at {_point(points[other])} and robot_{later} at {_point(points[later])} "
+                f"overlap by {0 - gaps[other]:.3g} m; move them more than {radius[later] + radius[other]:g} m apart"
+            )
+
+
+def _turning_limits(model: Model) -> str:
+    """The limits to lower where a robot turns too fast."""
+    if TURN_RATE in model.control_limits:
+        return STANDARD_LIMITS[TURN_RATE]
+    return ", ".join(model.limit_names[column] for _, column in model.state_limits) or "limits"
+
+
+def _point(place: FloatArray) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in place) + ")"

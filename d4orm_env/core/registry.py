@@ -1,0 +1,197 @@
+"""Things by name, which users and installed packages add to: scenarios, robot models, planners and policies."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+from typing import Any, TypeVar
+
+from d4orm_env.core.arrays import shown
+from d4orm_env.core.errors import describe
+
+T = TypeVar("T")
+
+FORMS = "package.module:Name or folder/file.py:Name"
+
+_NAME = re.compile(r"[\w][\w.-]*")
+
+
+class Registry(Mapping[str, T]):
+    """Things by name: registered in this process, or entry points of installed packages; loaded when looked up.
+
+    Args:
+        what: Kind of thing, for messages.
+        group: Group of the entry points.
+        admit: ``(name, thing) -> `` what is handed out under the name; it raises ``ValueError`` for what does not
+            belong here.
+        identity: Two things of equal identity are the same one, defined anew as in a notebook.
+    """
+
+    def __init__(
+        self, what: str, group: str, admit: Callable[[str, Any], T], identity: Callable[[Any], object] | None = None
+    ) -> None:
+        self.what, self.group = what, group
+        self._admit, self._identity = admit, identity or _place
+        self._registered: dict[str, Any] = {}
+        self._admitted: dict[str, T] = {}
+
+    def add(self, name: str, thing: Any) -> None:
+        """Register a thing, or the text ``"package.module:Name"`` of one; again if defined anew.
+
+        Raises:
+            ValueError: If the name is none, or taken by another, or the thing does not belong here.
+        """
+        if not isinstance(name, str) or not _NAME.fullmatch(name):
+            raise ValueError(
+                f"{self.what} name {shown(name)} is none; give one of letters, digits, hyphens, dots and underscores"
+            )
+        if not isinstance(thing, str):
+            self._admit(name, thing)
+        known = self._registered.get(name, thing)
+        if known is not thing and self._identity(known) != self._identity(thing):
+            raise ValueError(f"{self.what} name {name!r} is taken; register yours under another")
+        self._registered[name] = thing
+        self._admitted.pop(name, None)
+
+    def own(self) -> tuple[str, ...]:
+        """Names registered in this process, in order."""
+        return tuple(self._registered)
+
+    def origin(self, name: str) -> Any:
+        """What was registered under a name, or its import path.
+
+        Raises:
+            KeyError: If there is no such name.
+            ValueError: If several lay claim to it.
+        """
+        claims = [self._registered[name]] if name in self._registered else []
+        claims += [f"{entry.module}:{entry.attr}" for entry in self._entry_points.get(name, ())]
+        if not claims:
+            raise KeyError(name)
+        if len(claims) > 1 and not self._same(claims):
+            owners = " and ".join(claim if isinstance(claim, str) else shown(claim) for claim in claims)
+            raise ValueError(f"{self.what} name {name!r} is claimed by {owners}; uninstall one of them")
+        return claims[0]
+
+    def _same(self, claims: list[Any]) -> bool:
+        """Whether all are the same thing, such as one that its module registers and its package offers too."""
+        try:
+            first, *others = (self._identity(load_reference(one) if isinstance(one, str) else one) for one in claims)
+        except ValueError:
+            return False
+        return all(other == first for other in others)
+
+    def look_up(self, name: object) -> T:
+        """What has this name.
+
+        Raises:
+            ValueError: If nothing has, several lay claim to it, or it cannot be loaded.
+        """
+        if not isinstance(name, str) or name not in self:
+            raise ValueError(f"{self.what} {shown(name)} is unknown; choose one of {', '.join(self)}")
+        return self[name]
+
+    def find(self, text: object) -> T:
+        """What a name, or an import path, stands for.
+
+        Raises:
+            ValueError: As :meth:`look_up` and :func:`load_reference`.
+        """
+        if not isinstance(text, str) or text in self or ":" not in text:
+            return self.look_up(text)
+        try:
+            thing = load_reference(text)
+        except ValueError as error:
+            raise ValueError(f"{self.what} {error}") from error
+        return self._admit(text, thing)
+
+    def __getitem__(self, name: str) -> T:
+        if name not in self._admitted:
+            thing = self.origin(name)
+            try:
+                thing = load_reference(thing) if isinstance(thing, str) else thing
+            except ValueError as error:
+                raise ValueError(f"{self.what} {name!r}: {error}") from error
+            self._admitted[name] = self._admit(name, thing)
+        return self._admitted[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._registered or name in self._entry_points
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(dict.fromkeys((*self._registered, *self._entry_points)))
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+    @cached_property
+    def _entry_points(self) -> dict[str, list[EntryPoint]]:
+        found: dict[str, list[EntryPoint]] = {}
+        for entry in entry_points(group=self.group):
+            found.setdefault(entry.name, []).append(entry)
+        return found
+
+
+def load_reference(text: str) -> Any:
+    """What ``"package.module:Name"`` or ``"folder/file.py:Name"`` names; modules of the present folder are found too.
+
+    Raises:
+        ValueError: If the text has another form, or the module cannot be imported or has no such name.
+    """
+    place, _, name = text.rpartition(":")
+    if not place or not all(part.isidentifier() for part in name.split(".")):
+        raise ValueError(f"{text!r} is no import path; give {FORMS}")
+    try:
+        found: Any = _load_file(Path(place)) if place.endswith(".py") else _import(place)
+    except Exception as error:  # whatever foreign code raises when it is imported
+        raise ValueError(
+            f"{text!r} cannot be imported ({describe(error)}); give {FORMS}, of a module that Python finds and that "
+            "can be imported by itself"
+        ) from error
+    for part in name.split("."):
+        if not hasattr(found, part):
+            raise ValueError(f"{text!r} names nothing: {place} has no {name!r}; give a name that the module defines")
+        found = getattr(found, part)
+    return found
+
+
+def _import(name: str) -> ModuleType:
+    try:
+        return import_module(name)
+    except ModuleNotFoundError:
+        if os.getcwd() in sys.path:
+            raise
+        sys.path.append(os.getcwd())
+        return import_module(name)
+
+
+def _load_file(path: Path) -> ModuleType:
+    """A file as a module, executed once in a process."""
+    name = f"d4orm_file_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:16]}"
+    if name not in sys.modules:
+        spec = spec_from_file_location(name, path)
+        assert spec is not None
+        assert spec.loader is not None
+        module = module_from_spec(spec)
+        sys.modules[name] = module  # dataclasses look their module up there while it is executed
+        try:
+            spec.loader.exec_module(module)
+        except BaseException:
+            del sys.modules[name]
+            raise
+    return sys.modules[name]
+
+
+def _place(thing: object) -> object:
+    """Where a class or function is defined; anything else is told from others by what it is."""
+    name = getattr(thing, "__qualname__", "<")
+    return thing if "<" in name else (thing.__module__, name)

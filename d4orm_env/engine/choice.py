@@ -1,0 +1,45 @@
+"""Engines by name."""
+
+from __future__ import annotations
+
+import sys
+from importlib.util import find_spec
+
+from d4orm_env.engine.base import Engine
+
+__all__ = ["ENGINES", "get_engine"]
+
+ENGINES = ("auto", "cpu", "jax")
+
+
+def get_engine(name: str = "auto", num_threads: int | None = None) -> Engine:
+    """The engine of that name.
+
+    Args:
+        name: ``"auto"`` is JAX where JAX sees an accelerator, and the CPU engine elsewhere.
+        num_threads: Of the CPU engine; as many as there are cores by default.
+
+    Raises:
+        ValueError: If there is no such engine.
+    """
+    if name not in ENGINES:
+        raise ValueError(f"engine {name!r} is unknown; choose one of {', '.join(ENGINES)}")
+    if name == "auto":
+        name = "jax" if _accelerator_visible() else "cpu"
+    if name == "jax":
+        from d4orm_env.engine.jax import JaxEngine
+
+        return JaxEngine()
+    from d4orm_env.engine.cpu import CpuEngine
+
+    return CpuEngine(num_threads)
+
+
+def _accelerator_visible() -> bool:
+    # JAX sees accelerators through plugin packages. Where none is installed there is no need to import JAX to ask it,
+    # which would take longer than planning.
+    if "jax" not in sys.modules and not any(find_spec(plugin) for plugin in ("jax_plugins", "libtpu")):
+        return False
+    import jax
+
+    return jax.default_backend() != "cpu"

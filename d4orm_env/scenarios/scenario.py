@@ -1,0 +1,159 @@
+"""What a scenario is: a function that makes problems, the package's own or a user's."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from d4orm_env.core.arrays import shown, whole_number
+from d4orm_env.core.errors import UnknownKeywordError
+from d4orm_env.core.problem import Problem
+from d4orm_env.scenarios.settings import Settings
+
+DEFAULT_ROBOTS = 8
+COMMON_ARGUMENTS = tuple(attribute.name for attribute in fields(Settings) if attribute.name != "scenario")
+_KEYWORDS = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+
+
+class BuiltIn:
+    """One of :mod:`~d4orm_env.scenarios.generators` as ``(seed, num_robots, **settings) -> Problem``.
+
+    Args:
+        function: The generator, ``(Settings, **own arguments) -> Problem``.
+        draws: Whether every seed is known to give other places, and never another team; ``False`` leaves it to be found
+            out.
+        **defaults: Where its defaults differ from those of :class:`~d4orm_env.scenarios.settings.Settings`.
+    """
+
+    def __init__(self, function: Callable[..., Problem], *, draws: bool = False, **defaults: Any) -> None:
+        self.__name__, self.__doc__ = function.__name__, function.__doc__
+        self._function, self._defaults = function, defaults
+        self.draws = draws
+        self._own = tuple(inspect.signature(function).parameters)[1:]
+        self.arguments = self._own + COMMON_ARGUMENTS
+
+    def __call__(self, seed: int = 0, num_robots: int | None = None, **settings: Any) -> Problem:
+        own = {name: settings.pop(name) for name in self._own if name in settings}
+        size = {} if num_robots is None else {"num_robots": num_robots}
+        common = {**self._defaults, **size, **settings}
+        # A value too large for float32 becomes infinite, and is then refused by name.
+        with np.errstate(over="ignore"):
+            return self._function(Settings(scenario=self.__name__, seed=seed, **common), **own)
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Something that makes problems.
+
+    Attributes:
+        name: What it is called in tables and messages.
+        generator: ``(seed, num_robots, **settings) -> Problem``.
+
+    Raises:
+        ValueError: If the generator cannot be called like that.
+    """
+
+    name: str
+    generator: Callable[..., Problem]
+
+    def __post_init__(self) -> None:
+        try:
+            self._signature.bind_partial(0, DEFAULT_ROBOTS)
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"scenario {self.name!r} is {shown(self.generator)}; it must be a callable "
+                "(seed, num_robots, **settings) that returns a Problem"
+            ) from None
+
+    @property
+    def description(self) -> str:
+        """The first line of the generator's docstring."""
+        return (inspect.getdoc(self.generator) or "").partition("\n")[0]
+
+    @cached_property
+    def _signature(self) -> inspect.Signature:
+        return inspect.signature(self.generator)
+
+    @property
+    def _parameters(self) -> list[inspect.Parameter]:
+        return list(self._signature.parameters.values())
+
+    @property
+    def arguments(self) -> tuple[str, ...]:
+        """All arguments of :meth:`problem`."""
+        if isinstance(self.generator, BuiltIn):
+            return self.generator.arguments
+        settings = [parameter.name for parameter in self._parameters[2:] if parameter.kind in _KEYWORDS]
+        return (*settings, "num_robots", "seed")
+
+    @property
+    def takes_any(self) -> bool:
+        """Whether the generator looks at its settings itself."""
+        several = any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in self._parameters)
+        return several and not isinstance(self.generator, BuiltIn)
+
+    @property
+    def draws(self) -> bool:
+        """Whether every seed is known to give other places, and never another team."""
+        return isinstance(self.generator, BuiltIn) and self.generator.draws
+
+    @property
+    def has_own_size(self) -> bool:
+        """Whether the generator has a team size of its own, for when none is asked for."""
+        second = self._parameters[1:2]
+        return bool(second) and second[0].default is not inspect.Parameter.empty
+
+    def complaint(self, names: Iterable[str], others: Iterable[str] = ()) -> str:
+        """What is wrong with the first of ``names`` that is no argument of this; the empty string if none is.
+
+        Args:
+            names: The arguments given.
+            others: Further arguments that the caller takes.
+        """
+        return "" if self.takes_any else complain(f"scenario {self.name!r}", {*others, *self.arguments}, names)
+
+    def problem(self, num_robots: int | None = None, seed: int | None = None, **arguments: Any) -> Problem:
+        """See :func:`~d4orm_env.scenarios.problems.make_problem`."""
+        given = {name: value for name, value in arguments.items() if value is not None}
+        # Whatever the scenario, leaving a common argument out is no mistake.
+        complaint = self.complaint(name for name in arguments if name in given or name not in COMMON_ARGUMENTS)
+        if complaint:
+            raise UnknownKeywordError(complaint)
+        return self._make(num_robots, seed, given)
+
+    def _make(self, num_robots: int | None, seed: int | None, settings: Mapping[str, Any]) -> Problem:
+        """The problem for that seed, checked to be one and to have that many robots."""
+        seed = 0 if seed is None else whole_number(seed, "seed", 0)
+        if num_robots is None and not self.has_own_size:
+            num_robots = DEFAULT_ROBOTS
+        size = () if num_robots is None else (whole_number(num_robots, "num_robots", 1),)
+        try:
+            self._signature.bind(seed, *size, **settings)
+        except TypeError as error:
+            raise UnknownKeywordError(f"scenario {self.name!r}: {error}; give it by name") from None
+        problem = self.generator(seed, *size, **settings)
+        if not isinstance(problem, Problem):
+            raise ValueError(f"scenario {self.name!r} returned {shown(problem)}; it must return a d4orm_env.Problem")
+        if num_robots is not None and problem.num_robots != num_robots:
+            raise ValueError(
+                f"scenario {self.name!r} returned a problem of {problem.num_robots} robots where num_robots is "
+                f"{num_robots}; it must return as many as it is asked for"
+            )
+        return problem.replace(name=self.name) if problem.name == "custom" else problem
+
+
+def complain(owner: str, known: Iterable[str], names: Iterable[str]) -> str:
+    """What is wrong with the first of ``names`` that is not ``known``; the empty string if all are."""
+    known = sorted(known)
+    for name in names:
+        if name not in known:
+            close = difflib.get_close_matches(name, known, 1)
+            hint = f"; did you mean {close[0]!r}?" if close else ""
+            return f"{owner} takes no argument {name!r}; it takes {', '.join(known)}{hint}"
+    return ""

@@ -1,0 +1,48 @@
+"""What a step tells about a team, and the infos that environments make of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple, TypeAlias
+
+from d4orm_env.core.arrays import BoolArray, FloatArray
+
+Info: TypeAlias = dict[str, Any]
+"""What an environment says beside observations and rewards, by name."""
+AgentInfos: TypeAlias = dict[str, Info]
+"""The same by agent."""
+
+
+class TeamStep(NamedTuple):
+    """What a step or a reset tells about the team; every array is the caller's to keep.
+
+    Attributes:
+        observations: ``(K, D)`` local observations.
+        rewards: ``(K,)``; zero at a reset.
+        arrived: ``(K,)`` bool: docked, or in lifelong mode, reached a goal in this step.
+        collided: ``(K,)`` bool, hard contact.
+        margin_violated: ``(K,)`` bool.
+        distances: ``(K,)`` to the present goals [m].
+    """
+
+    observations: FloatArray
+    rewards: FloatArray
+    arrived: BoolArray
+    collided: BoolArray
+    margin_violated: BoolArray
+    distances: FloatArray
+
+
+def agent_infos(names: Iterable[str], robots: Iterable[int], step: TeamStep) -> AgentInfos:
+    """Fresh info dictionaries of some robots, in plain Python values."""
+    arrived, collided = step.arrived.tolist(), step.collided.tolist()
+    margin_violated, distances = step.margin_violated.tolist(), step.distances.tolist()
+    return {
+        name: {
+            "arrived": arrived[robot],
+            "collided": collided[robot],
+            "margin_violated": margin_violated[robot],
+            "distance_to_goal": distances[robot],
+        }
+        for name, robot in zip(names, robots)
+    }

@@ -1,0 +1,301 @@
+"""The benchmark: what a denoising step, an iteration, an environment step and a first plan take on this machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from d4orm_env.core.dynamics import get_model
+from d4orm_env.core.problem import Problem
+from d4orm_env.engine.base import SamplingTask
+from d4orm_env.engine.choice import get_engine
+from d4orm_env.scenarios import make_problem
+from d4orm_planners.benchmark.probes import measure_memory, measure_startup
+from d4orm_planners.benchmark.timing import Spread, measure
+from d4orm_planners.benchmark.walls import Where, boxed_problem, measure_index, measure_obstacles
+from d4orm_planners.registry import make_planner
+from d4orm_planners.settings import CheckedSettings, Count, Positive, Samples, Steps, Whole
+
+ENGINES = ("cpu", "jax", "plain")
+MODELS = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive")
+PRESETS = (None, "paper")
+
+Robots = Annotated[Count, Field(le=10_000)]
+"""As many as scenarios make."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkSettings(CheckedSettings):
+    """What to measure, and how long.
+
+    Attributes:
+        robots: Team sizes.
+        models: Robot models.
+        engines: Of :data:`ENGINES`; ``"plain"`` is :mod:`d4orm_planners.benchmark.plain`.
+        num_samples: ``M``.
+        horizon: ``H``.
+        num_steps: Denoising steps in an iteration.
+        repetitions: Calls per measurement at most.
+        time_limit: Seconds per measurement, after which no further call begins.
+        iteration_limit: Whole iterations expected to take longer than this are left out [s].
+        most_robots_slow: Largest team for the engines other than the CPU engine.
+        env_steps: Environment steps per repetition.
+        num_worlds: Worlds in the batched environment.
+        plan_robots: Team sizes for the first feasible plan.
+        seeds: Seeds ``0, 1, ...`` per team size.
+        plan_time_limit: Seconds per plan.
+        memory_robots: Team size of the memory measurement.
+        obstacles: How many boxes stand among the ways of 8 robots.
+        far_obstacles: The same of boxes far away; also what environments are stepped among.
+        map_cells: Cells along a side of the maps whose index of obstacles is timed.
+
+    Raises:
+        ValueError: If a value makes no sense; the message names it.
+    """
+
+    robots: tuple[Robots, ...] = (4, 8, 16, 32, 64, 100)
+    models: tuple[str, ...] = MODELS
+    engines: tuple[str, ...] = ENGINES
+    num_samples: Samples = 1024
+    horizon: Steps = 100
+    num_steps: Steps = 100
+    repetitions: Count = 20
+    time_limit: Positive = 2.0
+    iteration_limit: Positive = 20.0
+    most_robots_slow: Annotated[Whole, Field(ge=0)] = 16
+    env_steps: Count = 2000
+    num_worlds: Steps = 1024
+    plan_robots: tuple[Robots, ...] = (4, 8, 12, 16)
+    seeds: Count = 20
+    plan_time_limit: Positive = 20.0
+    memory_robots: Robots = 64
+    obstacles: tuple[Count, ...] = (4, 200, 1000, 5000)
+    far_obstacles: tuple[Count, ...] = (200,)
+    map_cells: tuple[Count, ...] = (32, 256)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for model in self.models:
+            get_model(model)
+        for engine in self.engines:
+            if engine not in ENGINES:
+                raise ValueError(f"engine {engine!r} is no engine of the benchmark; choose from {', '.join(ENGINES)}")
+
+
+QUICK: dict[str, Any] = {
+    "robots": (4, 8),
+    "models": ("holonomic2d", "differential_drive"),
+    "num_steps": 20,
+    "repetitions": 3,
+    "time_limit": 0.5,
+    "iteration_limit": 2.0,
+    "most_robots_slow": 8,
+    "env_steps": 500,
+    "num_worlds": 128,
+    "plan_robots": (4, 8),
+    "seeds": 2,
+    "plan_time_limit": 5.0,
+    "memory_robots": 16,
+    "obstacles": (4, 200),
+    "map_cells": (32,),
+}
+"""What differs in a benchmark of about a minute, for a first look."""
+
+FIRST_STEPS = 5
+"""Steps at the largest noise that are run together to time one."""
+
+Part = tuple[str, str, Callable[[], Any]]
+
+
+def circle(num_robots: int, model: str, horizon: int) -> Problem:
+    """The paper's circle, 5 m wide, and wider from 28 robots on so that all find room."""
+    return make_problem("circle", num_robots=num_robots, model=model, horizon=horizon, diameter=diameter(num_robots))
+
+
+def diameter(num_robots: int) -> float:
+    """Of the circle [m]: 18 m for 100 robots, as in the paper."""
+    return max(5.0, 0.18 * num_robots)
+
+
+def parts(settings: BenchmarkSettings) -> Iterator[Part]:
+    """``(section, what, measurement)`` for everything that the settings ask for."""
+    for model in settings.models:
+        for num_robots in settings.robots:
+            for engine in settings.engines:
+                if engine != "cpu" and num_robots > settings.most_robots_slow:
+                    continue
+                # The default planner's weights, by robot and with a cut-off, on the engine that it is meant for.
+                for preset in PRESETS if engine == "cpu" else ("paper",):
+                    label = f"{num_robots} {model} on {engine}"
+                    yield "denoising", label, partial(_measure_denoising, settings, engine, preset, num_robots, model)
+    for num_boxes in (0, *settings.far_obstacles):
+        among = f" among {num_boxes} boxes" if num_boxes else ""
+        yield "environments", f"one environment{among}", partial(_measure_env, settings, num_boxes)
+        yield "environments", f"{settings.num_worlds} worlds{among}", partial(_measure_worlds, settings, num_boxes)
+    for where, counts in (("near", settings.obstacles), ("far", settings.far_obstacles)):
+        for count in counts:
+            yield "obstacles", f"{count} boxes {where}", partial(_measure_obstacles, settings, count, where)
+    for cells in settings.map_cells:
+        yield "index", f"index of {cells} x {cells} cells", partial(measure_index, cells)
+    yield "startup", "first plan of a process", partial(measure_startup, 8, min(settings.repetitions, 5))
+    size = settings.memory_robots
+    memory = partial(measure_memory, size, settings.num_samples, settings.horizon, diameter(size))
+    yield "memory", f"memory of {size} robots", memory
+    for preset in PRESETS:
+        for num_robots in settings.plan_robots:
+            yield "plans", f"first plans of {num_robots} robots", partial(_measure_plans, settings, preset, num_robots)
+
+
+def run_parts(todo: Sequence[Part], progress: Callable[[str, int, int], Any]) -> dict[str, list[Any]]:
+    """Measurements by section; ``progress(what, number done, number in all)`` is called before each."""
+    results: dict[str, list[Any]] = {section: [] for section, _, _ in todo}
+    for done, (section, what, work) in enumerate(todo):
+        progress(what, done, len(todo))
+        results[section].append(work())
+    progress("done", len(todo), len(todo))
+    return results
+
+
+def _measure_denoising(
+    settings: BenchmarkSettings, engine: str, preset: str | None, num_robots: int, model: str
+) -> dict[str, Any]:
+    problem = circle(num_robots, model, settings.horizon)
+    run = _plain_run(problem, settings) if engine == "plain" else _engine_run(problem, settings, engine, preset)
+    planner: Any = make_planner("d4orm", num_steps=settings.num_steps)
+    noise_scale = planner.noise_scale()
+    timed = partial(measure, repetitions=settings.repetitions, time_limit=settings.time_limit)
+    # Steps in a row, because what a run begins with is no part of a step.
+    first = np.repeat(noise_scale[:1], FIRST_STEPS)
+    step = timed(lambda: run(first, True)).times(1 / FIRST_STEPS)
+    free = timed(lambda: run(first, False)).times(1 / FIRST_STEPS)
+    expected = step.median * settings.num_steps
+    iteration = timed(lambda: run(noise_scale, True)) if expected <= settings.iteration_limit else None
+    robot_steps = settings.num_samples * settings.horizon * num_robots
+    pairs = robot_steps * (num_robots - 1) / 2
+    return {
+        "engine": engine,
+        "rules": preset or "default",
+        "model": model,
+        "num_robots": num_robots,
+        "step": step,
+        "step_without_collisions": free,
+        "iteration": iteration,
+        "ns_per_robot_step": step.median / robot_steps * 1e9,
+        # What pairs add. It comes out near zero, or below, where they cost less than the measurement varies.
+        "ns_per_pair": (step.median - free.median) / pairs * 1e9 if pairs else None,
+    }
+
+
+def _engine_run(problem: Problem, settings: BenchmarkSettings, name: str, preset: str | None) -> Callable[..., Any]:
+    planner: Any = make_planner("d4orm", preset=preset, num_samples=settings.num_samples)
+    engine, rules = get_engine(name), planner.rules()
+    base = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
+
+    def run(noise_scale: Any, collisions: bool) -> None:
+        task = SamplingTask(problem, base, collisions=collisions, credit=planner.config.credit)
+        engine.denoise(task, rules, base, noise_scale, settings.num_samples, 0)
+
+    return run
+
+
+def _plain_run(problem: Problem, settings: BenchmarkSettings) -> Callable[..., Any]:
+    from d4orm_planners.benchmark import plain
+
+    planner: Any = make_planner("d4orm", preset="paper")
+    temperature = float(planner.config.temperature)
+    return lambda noise_scale, collisions: plain.denoise_around_rest(
+        problem, noise_scale, settings.num_samples, temperature, 0, collisions
+    )
+
+
+def _measure_obstacles(settings: BenchmarkSettings, num_boxes: int, where: Where) -> dict[str, Any]:
+    """An iteration of the paper's planner among boxes, beside one in the open."""
+    planner: Any = make_planner("d4orm", preset="paper", num_steps=settings.num_steps)
+    noise_scale = planner.noise_scale()
+
+    def iterate(problem: Problem) -> None:
+        _engine_run(problem, settings, "cpu", "paper")(noise_scale, True)
+
+    return measure_obstacles(iterate, num_boxes, where, settings.repetitions, settings.time_limit)
+
+
+def _measure_env(settings: BenchmarkSettings, num_boxes: int) -> dict[str, Any]:
+    """One PettingZoo environment of 8 robots under random controls, resets included."""
+    from d4orm_env import navigation_v0
+
+    env = navigation_v0.parallel_env(problem=boxed_problem(num_boxes, "near"))
+    env.reset(seed=0)
+    space = env.action_space(env.possible_agents[0])
+    random = np.random.default_rng(0)
+    table = [
+        {agent: random.uniform(space.low, space.high).astype(np.float32) for agent in env.possible_agents}
+        for _ in range(64)
+    ]
+
+    def steps() -> None:
+        for index in range(settings.env_steps):
+            if not env.agents:
+                env.reset()
+            env.step(table[index % len(table)])
+
+    spread = measure(steps, settings.repetitions, settings.time_limit)
+    env.close()
+    row = {"environment": "parallel_env", "num_worlds": 1, "num_robots": 8, "obstacles": num_boxes}
+    return {**row, **_rate(spread, settings.env_steps)}
+
+
+def _measure_worlds(settings: BenchmarkSettings, num_boxes: int) -> dict[str, Any]:
+    """The batched environment of 8 robots per world under random controls, auto-reset included."""
+    import gymnasium
+
+    size = settings.num_worlds
+    env = gymnasium.make_vec(
+        "d4orm/Navigation-v0",
+        num_envs=size,
+        vectorization_mode="vector_entry_point",
+        problem=boxed_problem(num_boxes, "near"),
+    )
+    env.reset(seed=0)
+    space: Any = env.single_action_space
+    low, high = space.low, space.high
+    random = np.random.default_rng(0)
+    table = [random.uniform(low, high, (size, *low.shape)).astype(np.float32) for _ in range(16)]
+    calls = max(1, settings.env_steps // 10)
+
+    def steps() -> None:
+        for index in range(calls):
+            env.step(table[index % len(table)])
+
+    spread = measure(steps, settings.repetitions, settings.time_limit)
+    env.close()
+    row = {"environment": "make_vec", "num_worlds": size, "num_robots": 8, "obstacles": num_boxes}
+    return {**row, **_rate(spread, calls * size)}
+
+
+def _rate(seconds: Spread, steps: int) -> dict[str, Any]:
+    """Seconds per environment step, and steps per second at the median."""
+    return {"seconds_per_step": seconds.times(1 / steps), "steps_per_second": steps / seconds.median}
+
+
+def _measure_plans(settings: BenchmarkSettings, preset: str | None, num_robots: int) -> dict[str, Any]:
+    """Planning time to the first feasible plan; a seed without one counts with the time it took to give up."""
+    planner = make_planner("d4orm", preset=preset)
+    problem = make_problem("circle", num_robots=num_robots)
+    plans = [
+        planner.solve(problem, seed=seed, time_limit=settings.plan_time_limit) for seed in range(settings.seeds)
+    ]  # fmt: skip
+    return {
+        "planner": "d4orm",
+        "rules": preset or "default",
+        "num_robots": num_robots,
+        "seeds": settings.seeds,
+        "solved": sum(plan.solved for plan in plans),
+        "seconds": Spread.of([plan.wall_time for plan in plans]),
+        "iterations": Spread.of([plan.iterations for plan in plans]),
+        "travel_time": Spread.of([plan.metrics["travel_time"] for plan in plans]),
+    }

@@ -1,0 +1,70 @@
+"""Repeated wall-clock measurements."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A sample of measurements in five numbers, in the unit of what was measured.
+
+    Attributes:
+        median: The middle.
+        lower_quartile: A quarter lie below it.
+        upper_quartile: A quarter lie above it.
+        smallest: The smallest.
+        largest: The largest.
+        count: How many there were.
+    """
+
+    median: float
+    lower_quartile: float
+    upper_quartile: float
+    smallest: float
+    largest: float
+    count: int
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Spread:
+        """The spread of some values.
+
+        Raises:
+            ValueError: If there are none.
+        """
+        if not len(values):
+            raise ValueError("there are no measurements to summarise; measure at least once")
+        smallest, lower, median, upper, largest = (float(v) for v in np.percentile(values, [0, 25, 50, 75, 100]))
+        return cls(median, lower, upper, smallest, largest, len(values))
+
+    def times(self, factor: float) -> Spread:
+        """The same measurements in another unit.
+
+        Raises:
+            ValueError: If the factor is not positive, which would turn the order around.
+        """
+        if not factor > 0:
+            raise ValueError(f"factor is {factor:g}; it must be positive")
+        return replace(self, **{name: value * factor for name, value in vars(self).items() if name != "count"})
+
+
+def measure(work: Callable[[], Any], repetitions: int, time_limit: float) -> Spread:
+    """Seconds that ``work`` takes, after one call that does not count.
+
+    Args:
+        work: What to time.
+        repetitions: Calls at most, at least one.
+        time_limit: No further call begins once the counted ones have taken this long [s].
+    """
+    work()
+    seconds: list[float] = []
+    while not seconds or (len(seconds) < repetitions and sum(seconds) < time_limit):
+        begin = time.perf_counter()
+        work()
+        seconds.append(time.perf_counter() - begin)
+    return Spread.of(seconds)

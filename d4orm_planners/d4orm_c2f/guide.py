@@ -1,0 +1,184 @@
+"""The coarse plan that a team follows, where on it the team is, and when it is planned anew or made better."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.seeds import Stream, derived_seed
+from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.engine.base import Engine
+from d4orm_env.joint_state import JointState
+from d4orm_planners.d4orm_c2f.background import Background
+from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
+from d4orm_planners.d4orm_d.planner import D4ormD
+from d4orm_planners.d4orm_d.settings import D4ormDConfig
+from d4orm_planners.guidance import (
+    Guidance,
+    coarse_problem,
+    interpolate,
+    nearest_indices,
+    passes_checks,
+    rest_of,
+    subgoal_indices,
+)
+from d4orm_planners.search import Search
+from d4orm_planners.steering import straight_drives
+
+LAG = 5
+"""Waypoints that a robot may be behind the others without its subgoal staying behind too."""
+
+NEARER = 0.05
+"""What counts as coming nearer to the goals, all robots together [m]."""
+
+
+class Guide:
+    """Leads a team through an episode.
+
+    Args:
+        problem: The problem of the episode.
+        config: The settings.
+        seed: Of the episode.
+        refiner: What refinements roll out and sample with.
+        background: Where they are made, if not between control loops.
+
+    Attributes:
+        guidance: What is followed at present.
+        index: Waypoint at which the team is.
+        anew: ``(K,)`` robots that are sent another way than before, until :meth:`fresh_start` has told so.
+    """
+
+    guidance: Guidance
+    index: int
+    anew: BoolArray
+
+    def __init__(
+        self, problem: Problem, config: D4ormC2FConfig, seed: int, refiner: Engine, background: Background[Guidance]
+    ) -> None:
+        self._problem, self._config, self._seed = problem, config, seed
+        self._refiner, self._background = refiner, background
+        self._planner = D4ormD(
+            D4ormDConfig(
+                engine=config.engine,
+                num_samples=config.coarse_samples,
+                num_steps=config.coarse_steps,
+                repair_steps=config.coarse_repair_steps,
+                improve=True,
+            )
+        )
+
+    def begin(self, joint: JointState) -> None:
+        """Plan for the episode."""
+        guidance = self.plan(joint, None, self._config.coarse_iterations)
+        self._follow(joint, guidance, np.ones(self._problem.num_robots, bool))
+
+    def _follow(self, joint: JointState, guidance: Guidance, anew: BoolArray) -> None:
+        """Begin at the beginning of a guidance, which sends the robots ``anew`` ``(K,)`` another way than before."""
+        self.anew = anew
+        self.guidance = guidance
+        self.index, self._indices = 0, np.zeros(len(joint.goals), int)
+        self._goals = joint.goals
+        self._nearest, self._nearest_at = float("inf"), joint.steps
+
+    def plan(self, joint: JointState, initial: FloatArray | None, iterations: int) -> Guidance:
+        """Plan for the whole team from where it is, until a plan passes the checks (Algorithm 4, lines 1 to 3)."""
+        present = self._problem.moment(joint.states, joint.goals)
+        coarse = coarse_problem(present, self._config.coarse_factor)
+        search = Search(self._planner, coarse, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps), initial)
+        chosen = search.current
+        for _ in range(iterations):
+            if passes_checks(chosen.trajectory, self._config.check_interval):
+                break
+            search.advance()
+            chosen = search.current if search.current.rank >= search.best.rank else search.best
+            if passes_checks(search.current.trajectory, self._config.check_interval):
+                chosen = search.current
+        return self._guidance(coarse, chosen.trajectory)
+
+    def _guidance(self, coarse: Problem, trajectory: Trajectory) -> Guidance:
+        path = interpolate(trajectory.positions, self._config.coarse_factor)
+        return Guidance(coarse, trajectory.controls, trajectory.states, path)
+
+    def subgoals(self, joint: JointState, docked: BoolArray) -> IntArray:
+        """``(K,)`` waypoints that the robots head for; finds out where on the path they are (Algorithm 4, line 6)."""
+        path, offset = self.guidance.path, self._config.subgoal_offset
+        positions = joint.states[:, : self._problem.dimension]
+        self._indices = nearest_indices(path, positions, self._indices, offset)
+        if not docked.all():
+            self.index = round(float(self._indices[~docked].mean()))
+        return subgoal_indices(self._indices, self.index, offset, LAG, len(path) - 1)
+
+    def fresh_start(self, base: FloatArray) -> None:
+        """Have those that are sent another way begin ``base`` ``(H_predict, K, m)`` with the coarse plan's controls."""
+        if self.anew.any():
+            # Each is held for as long as it stands for.
+            held = np.repeat(self.guidance.controls, self._config.coarse_factor, axis=0)[: len(base)]
+            base[:, self.anew] = 0
+            base[: len(held), self.anew] = held[:, self.anew]
+            self.anew = np.zeros_like(self.anew)
+
+    def replan_if_needed(self, joint: JointState, docked: BoolArray) -> bool:
+        """Plan anew for robots with new goals, for a team that lost the guidance or has come to its end."""
+        changed = (joint.goals != self._goals).any(axis=1)
+        moving = ~docked
+        if not moving.any():
+            return False
+        lost = self._is_lost(joint, moving)
+        if not changed.any() and not lost:
+            return False
+        present = coarse_problem(self._problem.moment(joint.states, joint.goals), self._config.coarse_factor)
+        initial = straight_drives(present).controls[:, :, 0]
+        keep = moving & ~changed
+        if not lost and keep.any():
+            rest = self.guidance.controls[self.index // self._config.coarse_factor :]
+            initial[:, keep] = 0
+            initial[: len(rest), keep] = rest[:, keep]
+        iterations = self._config.coarse_iterations if lost else self._config.replan_iterations
+        self._follow(joint, self.plan(joint, initial, iterations), ~keep | lost)
+        return True
+
+    def _is_lost(self, joint: JointState, moving: BoolArray) -> bool:
+        """Whether the robots under way are far from their waypoints, at the end of the path, or get no nearer."""
+        positions = joint.states[:, : self._problem.dimension]
+        distance = float(np.linalg.norm((joint.goals - positions)[moving], axis=1).sum())
+        if distance < self._nearest - NEARER:
+            self._nearest, self._nearest_at = distance, joint.steps
+        waypoints = self.guidance.path[self._indices, np.arange(len(moving))]
+        away = np.linalg.norm(positions - waypoints, axis=1)[moving].mean()
+        return bool(
+            away > self._config.replan_distance
+            or self.index >= len(self.guidance.path) - 1
+            or joint.steps - self._nearest_at > self._config.patience
+        )
+
+    def refine(self, step: int, due: bool) -> bool:
+        """Take over what the refinement has done meanwhile, and give it more to do if that is ``due``."""
+        index = self.index + self._config.subgoal_offset
+        if self._config.refine == "off" or index >= len(self.guidance.path) - 1:
+            return False
+        guidance, seed = self.guidance, derived_seed(self._seed, Stream.REFINEMENT, step)
+        if self._config.refine == "sync":
+            if due:
+                self.guidance = self._refined(guidance, index, seed)
+            return self.guidance is not guidance
+        done, refined = self._background.result()
+        # What was refined may have been replanned since.
+        if refined is not None and refined.problem is guidance.problem:
+            self.guidance = guidance = refined
+        if done and due:
+            self._background.start(lambda: self._refined(guidance, index, seed))
+        return self.guidance is refined
+
+    def _refined(self, guidance: Guidance, index: int, seed: int) -> Guidance:
+        """The guidance with what is left of it from a waypoint on made better, if that succeeds (line 4)."""
+        left, controls = rest_of(guidance, index, self._config.coarse_factor)
+        search = Search(self._planner, left, seed, controls, self._refiner)
+        search.advance()
+        done = guidance.problem.horizon - left.horizon
+        before, after = guidance.states[: done + 1], search.best.trajectory
+        states = np.concatenate([before, after.states[1:]])
+        positions = np.concatenate([before[..., : left.dimension], after.positions[1:]])
+        all_controls = np.concatenate([guidance.controls[:done], after.controls])
+        path = interpolate(positions, self._config.coarse_factor)
+        return Guidance(guidance.problem, all_controls, states, path)

@@ -1,0 +1,139 @@
+"""D4orm-C2F: receding-horizon control along a coarse plan (paper, section VI, Algorithm 4)."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.seeds import Stream, derived_seed, generator
+from d4orm_env.engine.choice import get_engine
+from d4orm_env.joint_state import JointState, split_state
+from d4orm_planners.d4orm_c2f.background import Background
+from d4orm_planners.d4orm_c2f.guide import Guide
+from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
+from d4orm_planners.d4orm_c2f.window import Prediction, Window
+from d4orm_planners.guidance import Guidance
+from d4orm_planners.policy import StatePolicy
+from d4orm_planners.settings import CheckedSettings
+
+if TYPE_CHECKING:
+    from pettingzoo import ParallelEnv
+
+
+@dataclass(frozen=True)
+class LoopRecord:
+    """What one control loop did.
+
+    Attributes:
+        step: The environment's step at which it began.
+        wall_time: Time used [s].
+        subgoal_index: Waypoint of the guidance that the team headed for.
+        predicted_margin: Least gap between the surfaces of any two robots over the prediction [m]; infinite for one
+            robot.
+        missed: Whether it took longer than the deadline, so that the last plan went on.
+        replanned: Whether the guidance was planned anew.
+        refined: Whether a refined guidance was taken over.
+    """
+
+    step: int
+    wall_time: float
+    subgoal_index: int
+    predicted_margin: float
+    missed: bool
+    replanned: bool
+    refined: bool
+
+
+class D4ormC2F(StatePolicy):
+    """Follows a coarse plan of the whole team by short fine plans from wherever the robots are, loop by loop.
+
+    Attributes:
+        config: The settings.
+        loops: A :class:`LoopRecord` per control loop of the present episode.
+        coarse_time: Time that the first coarse plan took [s].
+    """
+
+    name = "d4orm-c2f"
+    config_class: ClassVar[type[CheckedSettings] | None] = D4ormC2FConfig
+
+    def __init__(self, config: D4ormC2FConfig | None = None) -> None:
+        self.config = config or D4ormC2FConfig()
+        self._engine = get_engine(self.config.engine)
+        # On one thread the refinement leaves the other cores, and their threads, to the control loop.
+        self._refiner = get_engine(self.config.engine, 1 if self.config.refine == "background" else None)
+        self._refinement: Background[Guidance] = Background(yielding=True)
+        self._control: Background[Prediction] = Background()
+
+    @property
+    def missed(self) -> int:
+        """Control loops that missed the deadline."""
+        return sum(loop.missed for loop in self.loops)
+
+    @property
+    def guidance(self) -> Guidance:
+        """What is followed at present."""
+        return self._guide.guidance
+
+    def _begin(self, env: ParallelEnv, seed: int) -> None:
+        self._seed = seed
+        self._random = generator(seed, Stream.CONTROLLER_NOISE)
+        self._refinement.forget()
+        self._control.forget()
+        self.loops: list[LoopRecord] = []
+        joint = split_state(self.problem, env.state())
+        self._window = Window(self.problem, self.config, self._engine, docks=not env.unwrapped.lifelong)
+        self._window.prepare(joint)
+        self._plan, self._next = self._window.no_controls(), 0
+        begin = time.perf_counter()
+        self._guide = Guide(self.problem, self.config, seed, self._refiner, self._refinement)
+        self._guide.begin(joint)
+        self.coarse_time = time.perf_counter() - begin
+
+    def _controls(self, joint: JointState) -> FloatArray:
+        if not self.loops or self._next >= self.config.execute_horizon:
+            self._loop(joint)
+        controls = self._plan[min(self._next, len(self._plan) - 1)]
+        self._next += 1
+        if self.config.control_noise_std:
+            noise = self._random.normal(0, self.config.control_noise_std, controls.shape)
+            limit = self.problem.team.control_limits
+            controls = np.clip(controls + noise, -limit, limit).astype(np.float32)
+        return controls
+
+    def _loop(self, joint: JointState) -> None:
+        """One control loop (Algorithm 4, lines 6 to 9)."""
+        begin = time.perf_counter()
+        guide, docked = self._guide, joint.arrived & self._at_goal(joint)
+        replanned = guide.replan_if_needed(joint, docked)
+        refined = not replanned and guide.refine(joint.steps, due=len(self.loops) % self.config.refine_every == 0)
+        targets = guide.subgoals(joint, docked)
+        subgoals = guide.guidance.path[targets, np.arange(len(targets))]
+        left, base = self._plan[self._next :], self._window.no_controls()
+        ahead = self._plan[self._next : len(base)]
+        base[: len(ahead)] = ahead
+        guide.fresh_start(base)
+        seed = derived_seed(self._seed, Stream.CONTROL_LOOP, joint.steps)
+
+        def predict() -> Prediction:
+            return self._window.predict(joint, docked, subgoals, base, left, seed)
+
+        result: Prediction | None
+        if self.config.deadline is None:
+            result = predict()
+        else:
+            result = self._control.run(predict, self.config.deadline - (time.perf_counter() - begin))
+        if result is not None:
+            self._plan, self._next = result.controls, 0
+        margin = float("nan") if result is None else result.gap
+        used = time.perf_counter() - begin
+        missed = result is None
+        self.loops.append(LoopRecord(joint.steps, used, int(targets.max()), margin, missed, replanned, refined))
+
+    def _at_goal(self, joint: JointState) -> BoolArray:
+        gap = joint.goals - joint.states[:, : self.problem.dimension]
+        near: BoolArray = np.linalg.norm(gap, axis=1) <= self.problem.goal_radius
+        return near

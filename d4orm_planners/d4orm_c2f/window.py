@@ -1,0 +1,157 @@
+"""A fine plan over the prediction horizon, and who may follow it: the sampling of one control loop (Algorithm 4)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.engine.base import Engine, SamplingRules, SamplingTask
+from d4orm_env.joint_state import JointState
+from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
+from d4orm_planners.steering import track_velocities
+
+NOT_AT_SUBGOALS = 1e-6
+"""Goal radius while everyone is on the way: a robot drives through its subgoal [m]."""
+
+SHORTER = 3
+"""How many times fewer fresh steps a robot takes before it stops if it would violate the margin otherwise."""
+
+
+class Prediction(NamedTuple):
+    """What a control loop comes to.
+
+    Attributes:
+        controls: ``(H_predict + S, K, m)`` with the ``S`` steps that a stop may take.
+        gap: Least gap between the surfaces of any two robots that they keep [m]; infinite for one robot.
+    """
+
+    controls: FloatArray
+    gap: float
+
+
+class Window:
+    """Plans finely over the prediction horizon, from wherever the robots are.
+
+    Args:
+        problem: The problem of the episode.
+        config: The settings.
+        engine: What rolls out and samples.
+        docks: Whether robots dock at their goals, rather than drive through them to others.
+    """
+
+    def __init__(self, problem: Problem, config: D4ormC2FConfig, engine: Engine, docks: bool) -> None:
+        self._problem, self._config, self._engine, self._docks = problem, config, engine, docks
+        self._rules = SamplingRules(config.weights)
+        self._noise_scale = config.noise_scale(config.num_steps)
+        limits = problem.team.limits
+        self._stop_steps = int(np.ceil(np.max(limits[:, 0] / (limits[:, 1] * problem.dt))))
+
+    def prepare(self, joint: JointState) -> None:
+        """Compile, so that the first control loop is as quick as the others."""
+        window = self._problem.moment(joint.states, joint.goals, horizon=self._config.predict_horizon)
+        task = SamplingTask(window, self.no_controls(), arrived=joint.arrived)
+        self._engine.prepare(task, self._rules, self._noise_scale, self._config.num_samples)
+
+    def no_controls(self) -> FloatArray:
+        """``(H_predict, K, m)`` zeros."""
+        shape = (self._config.predict_horizon, self._problem.num_robots, self._problem.control_size)
+        return np.zeros(shape, np.float32)
+
+    def predict(
+        self,
+        joint: JointState,
+        docked: BoolArray,
+        subgoals: FloatArray,
+        base: FloatArray,
+        before: FloatArray,
+        seed: int,
+    ) -> Prediction:
+        """Fine controls towards the subgoals.
+
+        Args:
+            joint: Where the robots are.
+            docked: ``(K,)`` who stays there.
+            subgoals: ``(K, d)`` [m].
+            base: ``(H_predict, K, m)`` controls to deform.
+            before: ``(T, K, m)`` controls that the robots had in mind, with the stop after them.
+            seed: Of the samples.
+        """
+        problem, config = self._problem, self._config
+        task = self._task(joint, docked, subgoals, base)
+        result = self._engine.denoise(
+            task, self._rules, np.zeros_like(base), self._noise_scale, config.num_samples, seed
+        )
+        limit = problem.team.control_limits
+        controls = np.clip(base + result.mean, -limit, limit).astype(np.float32)
+        radius = problem.goal_radius if self._docks else NOT_AT_SUBGOALS
+        truth = problem.moment(joint.states, joint.goals, horizon=config.predict_horizon, goal_radius=radius)
+        return self._safe_mix(truth, controls, before, docked)
+
+    def _task(self, joint: JointState, docked: BoolArray, subgoals: FloatArray, base: FloatArray) -> SamplingTask:
+        """Deform ``base`` so that everybody heads for its subgoal, or its goal where that is near."""
+        problem, config = self._problem, self._config
+        near = np.linalg.norm(subgoals - joint.goals, axis=1) <= problem.goal_radius
+        goals = np.where((near | docked)[:, None], joint.goals, subgoals)
+        window = problem.moment(
+            joint.states,
+            goals,
+            horizon=config.predict_horizon,
+            margin=problem.margin + config.extra_margin,
+            goal_radius=problem.goal_radius if near.any() and self._docks else NOT_AT_SUBGOALS,
+        )
+        ahead = problem.dt * config.subgoal_offset * float(np.max(np.asarray(problem.team.max_speed)))
+        return SamplingTask(
+            window, base, credit=config.credit, arrived=docked, penalty=config.penalty, reference_distance=ahead
+        )
+
+    def _with_stop(self, window: Problem, controls: FloatArray, steps: int, docked: BoolArray) -> FloatArray:
+        """The first ``steps`` controls, and after them those that bring everyone to rest as soon as can be.
+
+        Returns:
+            ``(H_predict + S, K, m)`` with the ``S`` steps that a stop may take.
+        """
+        stopping = np.zeros((len(controls) + self._stop_steps, *controls.shape[1:]), np.float32)
+        stopping[:steps] = controls[:steps]
+        states = self._engine.rollout(window, stopping[: len(controls)]).states[steps]
+        still = np.zeros(window.goal.shape, np.float32)
+        for t in range(steps, steps + self._stop_steps):
+            stopping[t] = track_velocities(window, states, still)
+            states = self._engine.step(window.arrays, states, docked, stopping[t]).states
+        return stopping
+
+    def _safe_mix(self, window: Problem, fresh: FloatArray, left: FloatArray, docked: BoolArray) -> Prediction:
+        """Fresh controls where they keep everyone apart; where not, robots stop earlier, or do as they had in mind.
+
+        What they had in mind was free of violations, and ends at rest. So without disturbances there always is a mix
+        that is free of them too: in the last resort everybody does as before.
+        """
+        horizon = len(fresh)
+        before = np.zeros((horizon + self._stop_steps, *fresh.shape[1:]), np.float32)
+        before[: len(left)] = left
+        controls = self._with_stop(window, fresh, horizon, docked)
+        window_to_rest = window.moment(window.start, window.goal, horizon=len(controls))
+        # After how many fresh steps each robot stops.
+        steps = np.full(window.num_robots, horizon)
+        trajectory = self._engine.rollout(window_to_rest, controls)
+        while (violating := trajectory.margin_violated[1:].any(axis=0) & (steps > 0)).any():
+            steps[violating] //= SHORTER
+            steps[steps < self._config.execute_horizon] = 0
+            for number in np.unique(steps[violating]):
+                fewer = self._with_stop(window, fresh, int(number), docked) if number else before
+                chosen = violating & (steps == number)
+                controls[:, chosen] = fewer[:, chosen]
+            trajectory = self._engine.rollout(window_to_rest, controls)
+        return Prediction(controls, least_gap(window, trajectory.positions))
+
+
+def least_gap(problem: Problem, positions: FloatArray) -> float:
+    """Least gap between the surfaces of any two robots on ``(T, K, d)`` after the first moment [m]."""
+    radius = np.asarray(problem.team.radius)
+    first, second = np.triu_indices(problem.num_robots, 1)
+    if not len(first):
+        return float("inf")
+    gap2 = ((positions[1:, first] - positions[1:, second]) ** 2).sum(axis=2)
+    return float((np.sqrt(gap2.min(axis=0)) - radius[first] - radius[second]).min())

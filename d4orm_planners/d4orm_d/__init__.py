@@ -1,0 +1,1 @@
+"""D4orm-D: failure-aware decoupling for big teams (paper, section V)."""

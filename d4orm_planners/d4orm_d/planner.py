@@ -1,0 +1,87 @@
+"""D4orm-D: failure-aware decoupling for big teams (paper, section V, Algorithm 3)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import ClassVar
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.engine.base import SamplingTask
+from d4orm_planners.d4orm import D4orm
+from d4orm_planners.d4orm_d.groups import Groups
+from d4orm_planners.d4orm_d.repairs import Repairs
+from d4orm_planners.d4orm_d.settings import D4ormDConfig
+from d4orm_planners.d4orm_d.team import TeamMotion
+from d4orm_planners.grouping import conflicts
+from d4orm_planners.planner import Iteration
+from d4orm_planners.search import Search
+from d4orm_planners.steering import prepare_drives, straight_drives
+
+State = Groups | Repairs
+"""What is kept between iterations, by the way of decoupling."""
+
+
+class D4ormD(D4orm):
+    """Failure-aware decoupling: replan only the robots that fail, around all others, until nobody fails."""
+
+    name: ClassVar[str] = "d4orm-d"
+    config_class = D4ormDConfig
+    presets: ClassVar = {
+        "paper": {
+            **D4orm.presets["paper"],
+            # The authors' code clips the controls of robots that keep failing; the paper says nothing of it.
+            "clip_between_iterations": True,
+            "decoupling": "groups",
+            "start": "team",
+            "first_collisions": False,
+            "big_team": None,
+        }
+    }
+    config: D4ormDConfig
+
+    def init(self, search: Search) -> State:
+        """See :meth:`Planner.init`."""
+        with search.watch.paused():
+            prepare_drives(search.problem)
+        return Groups() if self.config.decoupling == "groups" else Repairs.of(search.problem.num_robots)
+
+    def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
+        """See :meth:`Planner.iterate`: the whole team at first and once nobody fails, the failed robots in between."""
+        if search.iteration == 0 and not search.current.controls.any():
+            drives = self.straight_start(search.problem)
+            return self.whole_team(search, state) if drives is None else (state, Iteration(drives))
+        if not search.current.failed.any() or (isinstance(state, Groups) and search.best.solved):
+            return self.whole_team(search, state)
+        team = TeamMotion(self, search, search.current.trajectory)
+        state = state.replan(team) if isinstance(state, Groups) else state.repair(team, self.config)
+        return state, team.iteration()
+
+    def whole_team(self, search: Search, state: State) -> tuple[State, Iteration]:
+        """Deform everybody's controls at once; unless in groups, then straight home from wherever that is as good."""
+        iteration = self.run(search)
+        if isinstance(state, Groups):
+            return state, iteration
+        team = TeamMotion(self, search, search.engine.rollout(search.problem, iteration.controls))
+        return state.shorten(team), replace(iteration, controls=team.controls)
+
+    def num_samples(self, search: Search) -> int:
+        """See :meth:`SamplingPlanner.num_samples`."""
+        big = self.config.big_team is not None and search.problem.num_robots > self.config.big_team
+        return max(self.config.num_samples // 2, 2) if big else self.config.num_samples
+
+    def task(self, search: Search, base: FloatArray) -> SamplingTask:
+        """See :meth:`SamplingPlanner.task`."""
+        task = super().task(search, base)
+        return replace(task, collisions=search.iteration > 0 or self.config.first_collisions)
+
+    def straight_start(self, problem: Problem) -> FloatArray | None:
+        """Controls ``(H, K, m)`` that send everybody straight to its goal, or ``None`` to start with the whole team."""
+        if self.config.start == "team":
+            return None
+        drives = straight_drives(problem)
+        if self.config.start == "auto":
+            met = conflicts(drives.positions[1:, :, 0], problem.team.radius, problem.margin).sum(axis=1).mean()
+            if met >= problem.num_robots / 2:
+                return None
+        return drives.controls[:, :, 0]

@@ -1,0 +1,85 @@
+"""Settings of D4orm-D, and the numbers of its repairs that need no setting."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from d4orm_planners.d4orm import D4ormConfig
+from d4orm_planners.settings import Count, Positive, Samples, Steps, one_of
+
+Decoupling = Annotated[str, one_of(("independent", "groups"))]
+Start = Annotated[str, one_of(("auto", "team", "straight"))]
+
+
+@dataclass(frozen=True, kw_only=True)
+class D4ormDConfig(D4ormConfig):
+    """Settings of D4orm-D. The defaults find a first solution soonest; the preset ``"paper"`` is Algorithm 3.
+
+    Attributes:
+        num_samples: ``M`` of an iteration over the whole team or a group.
+        num_steps: ``N`` of such an iteration.
+        big_team: Teams of more robots than this are sampled half as often in iterations over all of them, whose time
+            grows with the team while repairs make up for their errors; ``None`` for no such team.
+        decoupling: ``"groups"`` replans every group of robots that conflict, the team's reward within it (the paper).
+            ``"independent"`` replans robots that have no conflict with each other at once, each by its own reward,
+            around all others, and takes over only what is no worse.
+        start: What the first iteration does without initial controls. ``"team"`` deforms the whole team at once;
+            ``"straight"`` sends everybody straight to its goal and leaves the rest to repairs; ``"auto"`` does the
+            second where robots so meet less than half of the others on average.
+        first_collisions: Whether the first iteration over the whole team minds collisions.
+        repair_samples: ``M`` of an independent repair. A few are better than many: their error is a search of its own.
+        repair_steps: ``N`` of an independent repair.
+        penalty: What a violation costs per step in an independent repair. At the paper's one it can be cheaper to brush
+            past a robot than to wait for it.
+    """
+
+    big_team: Count | None = 32
+    decoupling: Decoupling = "independent"
+    start: Start = "auto"
+    first_collisions: bool = True
+    repair_samples: Samples = 128
+    repair_steps: Steps = 50
+    penalty: Positive = 3.0
+
+
+@dataclass(frozen=True)
+class RepairRules:
+    """The numbers of independent repairs.
+
+    Attributes:
+        noise_factors: On the noise of successive repairs: what ordinary noise does not get around, wider noise may.
+        slack: Steps beyond the latest arrival of the robots repaired that their repair looks at. Farther on there is
+            nothing to search, and what happens there would dilute the rewards.
+        tiring: What a repair adds to a robot's weariness. The least weary go first, so that all get their turn.
+        rest: Share of it that is left after an iteration.
+        crowding: How much earlier a robot's turn is for every robot that it meets: it blocks the most.
+        joint_interval: Every so many iterations robots may be repaired jointly, each by their team's reward, ...
+        joint_vain: ... if all of them were repaired in vain so often ...
+        joint_robots: ... and they are so few: robots that only together can get out of each other's way.
+        shortenings: How many times in turn robots look for shorter ways home.
+        earlier: Steps before a robot's arrival, or its nearest approach, at which it may turn straight to its goal.
+        detour_vain: Repairs in vain after which a robot may take a detour.
+        detours: Random detours that it chooses from.
+        missing_cost: Conflicts that a robot may get into instead of never arriving, or of touching an obstacle.
+        time_cost: Conflicts that a robot may get into instead of using the whole horizon: of two ways as good, the
+            sooner one.
+    """
+
+    noise_factors: tuple[float, ...] = (1.0, 2.0)
+    slack: int = 40
+    tiring: float = 0.3
+    rest: float = 0.7
+    crowding: float = 0.2
+    joint_interval: int = 3
+    joint_vain: int = 2
+    joint_robots: int = 3
+    shortenings: int = 2
+    earlier: tuple[int, ...] = (0, 8, 16, 32, 64)
+    detour_vain: int = 2
+    detours: int = 32
+    missing_cost: float = 5.0
+    time_cost: float = 0.1
+
+
+RULES = RepairRules()

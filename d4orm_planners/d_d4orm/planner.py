@@ -1,0 +1,117 @@
+"""D-D4orm: planning across nodes that exchange their candidates (paper, section VII, Algorithm 5)."""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import ClassVar
+
+from d4orm_env.engine.choice import get_engine
+from d4orm_env.engine.threads import available_cores
+from d4orm_planners.d4orm_d.planner import D4ormD
+from d4orm_planners.d_d4orm.settings import DD4ormConfig
+from d4orm_planners.distributed.crew import AsyncCrew, Crew, SyncCrew
+from d4orm_planners.distributed.inbox import Inbox
+from d4orm_planners.distributed.judge import Judge
+from d4orm_planners.distributed.network import NetworkCrew
+from d4orm_planners.distributed.node import Node, Task, node_seed
+from d4orm_planners.distributed.ray_connection import RayConnection, import_ray
+from d4orm_planners.distributed.ray_planner import ray_planners
+from d4orm_planners.distributed.transport import LocalNetwork
+from d4orm_planners.distributed.zenoh_transport import ZenohSettings, ZenohTransport
+from d4orm_planners.planner import Iteration, Planner
+from d4orm_planners.search import Search
+
+
+@dataclass(frozen=True)
+class NodesAtWork:
+    """The state of a solve: its nodes live from one iteration to the next.
+
+    Attributes:
+        crew: The nodes.
+        opened: What they need and ends after them.
+    """
+
+    crew: Crew
+    opened: ExitStack
+
+
+class DD4orm(Planner):
+    """Distributed planning: nodes refine candidates by themselves, broadcast them, and go on from one of the best."""
+
+    name: ClassVar[str] = "d-d4orm"
+    config_class = DD4ormConfig
+    presets: ClassVar = {
+        "paper": {
+            **D4ormD.presets["paper"],
+            "clip_between_iterations": False,
+            "num_samples": 2048,
+            "planner": "d4orm",
+            "nodes": None,
+            "selection": "top-k",
+            "k": 4,
+            "mode": "sync",
+        }
+    }
+    config: DD4ormConfig
+
+    def __init__(self, config: DD4ormConfig) -> None:
+        super().__init__(config)
+        if config.transport == "ray":
+            import_ray("transport 'ray' of d-d4orm")
+
+    def init(self, search: Search) -> NodesAtWork:
+        """See :meth:`Planner.init`: the nodes, ready to begin."""
+        with ExitStack() as opened:
+            number = self.config.nodes or search.problem.num_robots
+            task = Task(number, search.seed, search.current.planned, self.config.selection, self.config.k)
+            zenoh = self.config.zenoh
+            crew = self._local_crew(search, task, opened) if zenoh is None else self._network_crew(search, task, zenoh)
+            return NodesAtWork(crew, opened.pop_all())
+
+    def iterate(self, search: Search, state: NodesAtWork) -> tuple[NodesAtWork, Iteration]:
+        """See :meth:`Planner.iterate`: one round of all nodes, and the best candidate that they made in it."""
+        return state, state.crew.iterate(search)
+
+    def finish(self, search: Search, state: NodesAtWork) -> None:
+        """See :meth:`Planner.finish`."""
+        with state.opened:
+            best = state.crew.close()
+            if best.rank > search.best.rank:
+                search.best = best
+            search.metrics |= state.crew.metrics()
+
+    def _network_crew(self, search: Search, task: Task, zenoh: ZenohSettings) -> Crew:
+        """The one node of a network that this process is."""
+        config = self.config
+        config.check_node(task.num_nodes)
+        assert config.node is not None
+        planner = config.node_planners(task.num_nodes)[config.node]
+        transport = ZenohTransport(zenoh)
+        judge = Judge(get_engine(config.engine), search.problem)
+        # Numbered by the clock, what a node tells that was started again is newer than what it told before.
+        node = Node(config.node, task, planner, transport, judge, told=time.time_ns())
+        return NetworkCrew(node, transport, config.patience, judge, zenoh.linger)
+
+    def _local_crew(self, search: Search, task: Task, opened: ExitStack) -> Crew:
+        """All nodes, in threads of this process; what is to be closed after them is ``opened``."""
+        config, problem, number = self.config, search.problem, task.num_nodes
+        planners: list[Planner] = list(config.node_planners(number))
+        if config.transport == "ray":
+            with search.watch.paused():
+                connection = RayConnection(config.address or "local", "transport 'ray'")
+                opened.callback(connection.close)
+                seeds = [node_seed(search.seed, i) for i in range(number)]
+                planners = list(ray_planners(connection, planners, problem, seeds))
+        # Nodes of one machine share its cores.
+        engine = get_engine(config.engine, max(available_cores() // number, 1))
+        network, judge = LocalNetwork(), Judge(engine, problem, 2 * number)
+        ends = [network.join() for _ in planners]
+        nodes = [
+            Node(i, task, planner, end, judge) for i, (planner, end) in enumerate(zip(planners, ends, strict=True))
+        ]
+        if config.mode == "sync":
+            return SyncCrew(nodes, ends, config.patience, judge)
+        observer = network.join()
+        return AsyncCrew(nodes, [*ends, observer], config.patience, judge, Inbox(judge, observer, number))

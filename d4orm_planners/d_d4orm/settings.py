@@ -1,0 +1,148 @@
+"""Settings of D-D4orm: those of the network, and those of the planner that every node runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from types import MappingProxyType
+from typing import Annotated, Any, Self
+
+from pydantic import Field, InstanceOf, SkipValidation
+
+from d4orm_env.core.arrays import shown
+from d4orm_planners.d4orm import D4orm, D4ormConfig
+from d4orm_planners.d4orm_d.planner import D4ormD
+from d4orm_planners.distributed.crew import MODES
+from d4orm_planners.distributed.ray_connection import host_and_port
+from d4orm_planners.distributed.selection import SELECTIONS, shares
+from d4orm_planners.distributed.transport import TRANSPORTS
+from d4orm_planners.distributed.zenoh_transport import ZenohSettings
+from d4orm_planners.planner import PlannerConfig
+from d4orm_planners.settings import NOTHING, Count, Seconds, Whole, one_of
+
+NODE_PLANNERS: Mapping[str, type[D4orm]] = MappingProxyType({kind.name: kind for kind in (D4orm, D4ormD)})
+"""The planners that a node can run."""
+
+MOST_NODES = 1024
+"""Each is a thread or a process with a candidate of its own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DD4ormConfig(PlannerConfig):
+    """Settings of D-D4orm. :func:`~d4orm_planners.make_planner` takes those of ``refinement`` beside the others.
+
+    There, ``planner`` says what every node refines its candidate with, ``"d4orm"`` (the default) or ``"d4orm-d"``.
+
+    Attributes:
+        refinement: The settings of that planner. Its ``num_samples`` and ``repair_samples`` are those of all nodes
+            together, of which each gets an equal share; what every planner takes is as it is here.
+        nodes: How many, at most 1024; ``None`` for one per robot, as where the robots themselves are the nodes.
+        selection: What a node goes on from: one of the ``k`` candidates of most reward (``"top-k"``), the best one
+            (``"max"``), or one of the best of ``k`` clusters (``"k-means"``).
+        k: How many candidates it draws from.
+        mode: ``"sync"``: all nodes refine, then all exchange; the same seed gives the same plan. ``"async"``: each at
+            its own pace; plans then depend on who is sooner.
+        patience: Seconds that are waited for stragglers: in asynchronous mode in every round, else beyond the time
+            limit of the solve, after which a node is given up.
+        transport: ``"local"``: nodes are threads of this process. ``"ray"``: their iterations run in actors of Ray.
+            ``"zenoh"``: this process is one node among others on a network, each at its own pace (``mode="async"``).
+        address: Of the Ray cluster, ``"host:port"``, or ``"auto"`` for the one that this machine belongs to; ``None``
+            for an instance on this machine that ends with the solve.
+        node: Which of the nodes this process is, from 0; over a network only.
+        zenoh: Where the other nodes are: :class:`~d4orm_planners.distributed.zenoh_transport.ZenohSettings`, or a
+            mapping of them; over a network only.
+    """
+
+    refinement: InstanceOf[D4ormConfig] = field(default_factory=D4ormConfig)
+    nodes: Annotated[Count, Field(le=MOST_NODES)] | None = 2
+    selection: Annotated[str, one_of(SELECTIONS)] = "top-k"
+    k: Count = 4
+    mode: Annotated[str, one_of(MODES)] = "sync"
+    patience: Seconds = 1.0
+    transport: Annotated[str, one_of(TRANSPORTS)] = "local"
+    node: Annotated[Whole, Field(ge=0)] | None = None
+    zenoh: Annotated[ZenohSettings | None, SkipValidation] = None  # checked once it is known to be of use
+    address: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.nodes is not None:
+            self.node_planners(self.nodes)
+        if self.address is not None:
+            if self.transport != "ray":
+                raise ValueError(f"address {self.address!r} goes with transport 'ray', not {self.transport!r}")
+            host_and_port(self.address)
+        if self.transport == "zenoh":
+            self._check_network()
+        else:
+            for name in ("node", "zenoh"):
+                if getattr(self, name) is not None:
+                    raise ValueError(f"{name} is {getattr(self, name)!r}; it is a setting of transport 'zenoh' only")
+
+    @classmethod
+    def setting_names(cls, given: Mapping[str, object] = NOTHING) -> tuple[str, ...]:
+        """See :meth:`CheckedSettings.setting_names`: those of the nodes' planner are among them."""
+        return tuple(dict.fromkeys((*_node_planner(given).config_class.setting_names(), "planner", *_own_names())))
+
+    @classmethod
+    def _made_of(cls, given: Mapping[str, Any]) -> Self:
+        own = {name: value for name, value in given.items() if name in _own_names()}
+        rest = {name: value for name, value in given.items() if name not in own and name != "planner"}
+        return cls(refinement=_node_planner(given).config_class(**rest), **own)
+
+    def keywords(self) -> dict[str, object]:
+        """See :meth:`CheckedSettings.keywords`."""
+        own = super().keywords()
+        del own["refinement"]
+        return {"planner": self.node_planner.name, **self.refinement.keywords(), **own}
+
+    @property
+    def node_planner(self) -> type[D4orm]:
+        """What every node refines its candidate with."""
+        return next(kind for kind in NODE_PLANNERS.values() if kind.config_class is type(self.refinement))
+
+    def node_planners(self, nodes: int) -> list[D4orm]:
+        """The planner of each of so many nodes.
+
+        Raises:
+            ValueError: If there are not two samples for each.
+        """
+        settings: list[dict[str, Any]] = [{"engine": self.engine, "improve": self.improve} for _ in range(nodes)]
+        for name in ("num_samples", "repair_samples"):
+            total = getattr(self.refinement, name, None)
+            if total is None:
+                continue
+            if total < 2 * nodes:
+                raise ValueError(
+                    f"{name} is {total} for {nodes} nodes together; give each two at least, {2 * nodes} or more"
+                )
+            for own, share in zip(settings, shares(total, nodes), strict=True):
+                own[name] = share
+        return [self.node_planner(replace(self.refinement, **own)) for own in settings]
+
+    def check_node(self, nodes: int) -> None:
+        """Raise ``ValueError`` if this process is none of so many nodes."""
+        if self.node is not None and self.node >= nodes:
+            raise ValueError(f"node is {self.node}; of {nodes} nodes the last one is {nodes - 1}")
+
+    def _check_network(self) -> None:
+        object.__setattr__(self, "zenoh", ZenohSettings.of({} if self.zenoh is None else self.zenoh))
+        if self.mode != "async":
+            raise ValueError(f"mode is {self.mode!r}; over a network it must be 'async', as there are no common rounds")
+        if self.node is None:
+            raise ValueError("node is None; over a network it must say which of the nodes this process is, from 0")
+        if self.nodes is not None:
+            self.check_node(self.nodes)
+
+
+def _own_names() -> tuple[str, ...]:
+    return tuple(own.name for own in fields(DD4ormConfig) if own.name != "refinement")
+
+
+def _node_planner(given: Mapping[str, object]) -> type[D4orm]:
+    name = given.get("planner", D4orm.name)
+    if not isinstance(name, str):
+        raise ValueError(f"planner must be text, not {shown(name)}")
+    if name not in NODE_PLANNERS:
+        raise ValueError(f"planner {name!r} is unknown; choose one of {', '.join(NODE_PLANNERS)}")
+    return NODE_PLANNERS[name]

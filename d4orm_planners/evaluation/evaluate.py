@@ -1,0 +1,170 @@
+"""Running a study: its trials are stored one by one, and those that are stored already are not run again."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Generator, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from d4orm_env.core.arrays import duration, whole_number
+from d4orm_env.engine.threads import available_cores
+from d4orm_planners.evaluation.cluster import RayPool
+from d4orm_planners.evaluation.pool import Pool, ProcessPool, run_here, run_jobs
+from d4orm_planners.evaluation.report import PARQUET_HINT, write_results
+from d4orm_planners.evaluation.store import STORE, Trial, TrialKey, TrialStore
+from d4orm_planners.evaluation.study import Policies, Scenarios, Study
+from d4orm_planners.evaluation.summary import SuccessRate, success_rates
+from d4orm_planners.evaluation.trials import Job
+from d4orm_planners.references import check_sendable
+
+Progress = Callable[[str, int, int], Any]
+
+
+def evaluate(
+    policies: Policies,
+    scenarios: Scenarios = ("circle",),
+    *,
+    out: str | os.PathLike[str],
+    seeds: Iterable[int] = range(50),
+    control_noise_std: float | Iterable[float] = 0.0,
+    num_robots: int | Iterable[int | None] | None = None,
+    model: str | None = None,
+    time_limit: float | None = None,
+    trial_timeout: float | None = None,
+    workers: int | None = None,
+    ray: str | None = None,
+    progress: Progress | None = None,
+) -> list[SuccessRate]:
+    """Run every policy on every scenario and team size with every seed at every level of noise, and write the results.
+
+    Trials are stored in ``out/trials.sqlite`` as they end. Those found there are not run again, so that a call that was
+    broken off, or one with more to do, goes on from there; those that ended with an error are. At the end the store is
+    written as ``trials.csv`` and, if pyarrow is installed, ``trials.parquet``, and what is returned as ``table.md`` and
+    ``table.csv``.
+
+    Args:
+        policies: A policy or several: names (:func:`d4orm_planners.list_policies`), ``"package.module:Name"``, or
+            whatever else :func:`d4orm_planners.make_policy` takes. Or by label policies of your own and settings:
+            ``{"mine": MyPolicy(), "f": my_function, "d4orm": {}, "d4orm, few": {"policy": "d4orm", "num_samples":
+            128}}``. Without ``"policy"`` the label is the name. The store tells policies of your own apart by label
+            or import path, settings and the digest of their source file.
+        scenarios: Scenarios as for :func:`d4orm_env.make_problem`, or problems.
+        out: Folder to write to; made if it does not exist.
+        seeds: Each seeds the scenario, the policy and the noise of a trial.
+        control_noise_std: Standard deviations of the Gaussian noise added to the controls, in their units.
+        num_robots: Team sizes for scenarios by name; ``None`` is the scenario's own.
+        model: Robot model for scenarios by name; ``None`` is the scenario's own.
+        time_limit: Seconds for planning, for planners without a ``time_limit`` of their own.
+        trial_timeout: Seconds after which a trial is ended with an error; ``None`` waits.
+        workers: Processes of one thread each, by default as many as there are cores; with 1, and without
+            ``trial_timeout``, trials run in this process on all its cores. On a cluster: jobs under way at most.
+        ray: Address of a Ray cluster to run on, or ``"auto"`` for the one that this machine belongs to.
+        progress: Called as ``progress(what, trials done, trials in all)``.
+
+    Returns:
+        One row per scenario, team size, policy and level of noise, in that order.
+
+    Raises:
+        ValueError: For an unknown name, a number that makes no sense, a policy of your own that worker processes cannot
+            import, or a store that is something else. Nothing has run then.
+        ImportError: If a policy, or the cluster, needs a library that is not installed.
+        OSError: If the folder or the store cannot be written to, workers do not start, or there is no cluster.
+    """
+    study = Study(
+        policies=policies,
+        scenarios=scenarios,
+        seeds=seeds,
+        control_noise_std=control_noise_std,
+        num_robots=num_robots,
+        model=model,
+        time_limit=time_limit,
+    )
+    trials = run_study(study, out, trial_timeout=trial_timeout, workers=workers, ray=ray, progress=progress)
+    rates = success_rates(trials)
+    if Path(out) / "trials.parquet" not in write_results(out, rates):
+        warnings.warn(PARQUET_HINT, stacklevel=2)
+    return rates
+
+
+def run_study(
+    study: Study,
+    out: str | os.PathLike[str],
+    *,
+    trial_timeout: float | None = None,
+    workers: int | None = None,
+    ray: str | None = None,
+    progress: Progress | None = None,
+) -> list[tuple[str, list[Trial]]]:
+    """Run those trials of a study that are not stored in a folder yet. Nothing is written apart from the store.
+
+    For the arguments and errors see :func:`evaluate`.
+
+    Returns:
+        Trials, one per seed, behind the policy's label, for every scenario, team size, policy and level of noise, in
+        that order.
+    """
+    if trial_timeout is not None:
+        trial_timeout = duration(trial_timeout, "trial_timeout")
+    if workers is not None:
+        whole_number(workers, "workers", 1)
+    groups = study.groups()
+    Path(out).mkdir(parents=True, exist_ok=True)
+    store = TrialStore(Path(out) / STORE)
+    missing, done, total = _missing([job for group in groups for job in group], store)
+    running = _run(missing, workers, ray, trial_timeout)
+    _store(running, store, done, total, progress or (lambda what, done, total: None))
+    stored = {trial.key: trial for trial in store.trials()}
+    return [
+        (group[0].policy.label, [stored[job.key(level)] for job in group])
+        for group in groups
+        for level in group[0].noise
+    ]
+
+
+def _missing(jobs: Sequence[Job], store: TrialStore) -> tuple[list[Job], int, int]:
+    """What is left of the jobs, how many trials are done, and how many there are in all."""
+    finished = store.finished()
+    wanted: set[TrialKey] = set()
+    missing = []
+    for job in jobs:
+        keys = {level: job.key(level) for level in job.noise}
+        # The same problem may be asked for under two names.
+        left = tuple(level for level, key in keys.items() if key not in finished and key not in wanted)
+        wanted.update(keys.values())
+        if left:
+            missing.append(replace(job, noise=left))
+    return missing, len(wanted) - sum(len(job.noise) for job in missing), len(wanted)
+
+
+def _run(
+    jobs: Sequence[Job], workers: int | None, ray: str | None, trial_timeout: float | None
+) -> Generator[list[Trial]]:
+    cores = available_cores()
+    size = min(workers or cores, max(len(jobs), 1))
+    if ray is None and size == 1 and trial_timeout is None:
+        return run_here(jobs)
+    for policy in {id(job.policy): job.policy for job in jobs}.values():
+        check_sendable(policy.source, f"policy {policy.label!r}")
+    pool: Pool = ProcessPool(size, threads=cores if size == 1 else 1) if ray is None else RayPool(ray, workers)
+    return run_jobs(jobs, pool, trial_timeout)
+
+
+def _store(running: Generator[list[Trial]], store: TrialStore, done: int, total: int, progress: Progress) -> None:
+    """Write down trials as they come, while the next ones run."""
+    progress("starting", done, total)
+    written: Future[int] | None = None
+    with closing(running), ThreadPoolExecutor(1) as writer:
+        for trials in running:
+            if written is not None:
+                written.result()
+            written = writer.submit(store.add, *trials)
+            done += len(trials)
+            last = trials[-1]
+            progress(f"{last.label}, {last.scenario}, {last.robots} robots", done, total)
+    if written is not None:
+        written.result()

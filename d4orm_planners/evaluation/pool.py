@@ -1,0 +1,276 @@
+"""Handing jobs to processes, of this machine or others, and what happens when one dies or a trial takes too long."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Generator, Iterable
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from itertools import count
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import NamedTuple, Protocol
+
+from d4orm_planners.evaluation.store import Trial
+from d4orm_planners.evaluation.trials import Job, run_job
+
+
+class Sign(Enum):
+    """What a process says about a job, apart from its trials."""
+
+    BEGUN = "begun"
+    ENDED = "ended"
+
+
+@dataclass(frozen=True)
+class Lost:
+    """The process that ran a job is gone.
+
+    Attributes:
+        reason: Kind of error and message.
+    """
+
+    reason: str
+
+
+class Message(NamedTuple):
+    """News of a job.
+
+    Attributes:
+        ticket: Of the job.
+        content: A finished trial, a sign, or that the job is lost.
+    """
+
+    ticket: int
+    content: Trial | Sign | Lost
+
+
+class Pool(Protocol):
+    """Processes that run jobs."""
+
+    def free(self) -> bool:
+        """Whether it takes another job now."""
+
+    def start(self, job: Job) -> int:
+        """Hand a job over; returns a ticket for it."""
+
+    def wait(self, timeout: float | None) -> list[Message]:
+        """Wait for news, at most so long [s]."""
+
+    def stop(self, ticket: int) -> None:
+        """End the process that runs this job; no more news of it come."""
+
+    def close(self) -> None:
+        """End all processes."""
+
+
+@dataclass
+class _Running:
+    """A job under way: how many of its trials are done, and since when the present one runs."""
+
+    job: Job
+    done: int = 0
+    since: float | None = None
+
+
+@dataclass
+class _Schedule:
+    pool: Pool
+    trial_timeout: float | None
+    waiting: deque[Job]
+    running: dict[int, _Running] = field(default_factory=dict)
+
+    def hand_out(self) -> None:
+        while self.waiting and self.pool.free():
+            job = self.waiting.popleft()
+            self.running[self.pool.start(job)] = _Running(job)
+
+    def collect(self) -> list[Trial]:
+        """Wait for news; the trials that have ended."""
+        trials = []
+        for ticket, content in self.pool.wait(self._patience()):
+            run = self.running[ticket]
+            if isinstance(content, Lost):
+                trials += self._give_up(ticket, content.reason)
+            elif content is Sign.ENDED:
+                del self.running[ticket]
+            else:
+                run.since = time.monotonic()
+                if isinstance(content, Trial):
+                    run.done += 1
+                    trials.append(content)
+        for ticket in [ticket for ticket, run in self.running.items() if self._left(run) <= 0]:
+            self.pool.stop(ticket)
+            trials += self._give_up(ticket, f"TimeoutError: took longer than {self.trial_timeout:g} s")
+        return trials
+
+    def _give_up(self, ticket: int, reason: str) -> list[Trial]:
+        """The trials that a job fails in without its process; the others of the job are put back."""
+        run = self.running.pop(ticket)
+        left = run.job.noise[run.done :]
+        # Without a plan there is nothing to execute, at any level of noise.
+        lost = len(left) if run.done == 0 and run.job.policy.planned else 1
+        if left[lost:]:
+            self.waiting.appendleft(replace(run.job, noise=left[lost:]))
+        return [run.job.failed(noise, reason) for noise in left[:lost]]
+
+    def _left(self, run: _Running) -> float:
+        if self.trial_timeout is None or run.since is None or run.done == len(run.job.noise):
+            return float("inf")
+        return run.since + self.trial_timeout - time.monotonic()
+
+    def _patience(self) -> float | None:
+        shortest = min(map(self._left, self.running.values()), default=float("inf"))
+        return None if shortest == float("inf") else max(shortest, 0.0)
+
+
+def run_jobs(jobs: Iterable[Job], pool: Pool, trial_timeout: float | None = None) -> Generator[list[Trial]]:
+    """Run jobs and yield trials as they end. A trial whose process dies, or which takes too long, ends with an error.
+
+    Args:
+        jobs: What to run.
+        pool: Who runs it; closed at the end, also when the iteration is broken off.
+        trial_timeout: Seconds that a trial may take, that of the plan included; ``None`` is no limit.
+
+    Raises:
+        OSError: If no process can be started.
+    """
+    schedule = _Schedule(pool, trial_timeout, deque(jobs))
+    ended: list[Trial] = []
+    try:
+        while schedule.waiting or schedule.running or ended:
+            # Nobody waits for work while somebody writes down what is done.
+            schedule.hand_out()
+            if ended:
+                yield ended
+            ended = schedule.collect() if schedule.running else []
+    finally:
+        pool.close()
+
+
+def run_here(jobs: Iterable[Job]) -> Generator[list[Trial]]:
+    """Run jobs in this process, on all its cores, and yield trials as they end."""
+    for job in jobs:
+        for trial in run_job(job):
+            yield [trial]
+
+
+@dataclass
+class _Worker:
+    """A process, this end of the pipe to it, its present job, and whether it has ever begun one."""
+
+    process: BaseProcess
+    pipe: Connection
+    ticket: int | None = None
+    proven: bool = False
+
+
+class ProcessPool:
+    """Worker processes. They stop at once when the pool is closed, or when this process dies.
+
+    Args:
+        size: Processes.
+        threads: Threads of each.
+    """
+
+    def __init__(self, size: int, threads: int = 1) -> None:
+        self._size, self._threads = size, threads
+        self._context = multiprocessing.get_context("spawn")
+        # Nobody else holds the sending end: when this process dies, the workers notice.
+        self._receiver, self._sender = self._context.Pipe(duplex=False)
+        self._workers: list[_Worker] = []
+        self._tickets = count()
+
+    def free(self) -> bool:
+        return len(self._workers) < self._size or any(worker.ticket is None for worker in self._workers)
+
+    def start(self, job: Job) -> int:
+        idle = (worker for worker in self._workers if worker.ticket is None)
+        worker = next(idle, None) or self._new()
+        worker.ticket = next(self._tickets)
+        with suppress(OSError):  # it died idle; wait() finds the pipe closed and says so
+            worker.pipe.send(job)
+        return worker.ticket
+
+    def wait(self, timeout: float | None) -> list[Message]:
+        busy = {worker.pipe: worker for worker in self._workers if worker.ticket is not None}
+        messages = []
+        for pipe in wait(list(busy), timeout):
+            worker = busy[pipe]  # type: ignore[index]
+            assert worker.ticket is not None
+            ticket = worker.ticket
+            try:
+                content = worker.pipe.recv()
+            except (EOFError, OSError):
+                content = self._bury(worker)
+            worker.proven = True
+            if content is Sign.ENDED:
+                worker.ticket = None
+            messages.append(Message(ticket, content))
+        return messages
+
+    def stop(self, ticket: int) -> None:
+        self._remove(next(worker for worker in self._workers if worker.ticket == ticket))
+
+    def close(self) -> None:
+        self._sender.close()
+        self._receiver.close()
+        for worker in list(self._workers):
+            self._remove(worker)
+
+    def _new(self) -> _Worker:
+        ours, theirs = self._context.Pipe()
+        process = self._context.Process(target=_work, args=(theirs, self._receiver, self._threads), daemon=True)
+        process.start()
+        theirs.close()  # or a dead worker would not close the pipe
+        worker = _Worker(process, ours)
+        self._workers.append(worker)
+        return worker
+
+    def _remove(self, worker: _Worker) -> None:
+        worker.process.kill()
+        worker.process.join()
+        worker.pipe.close()
+        self._workers.remove(worker)
+
+    def _bury(self, worker: _Worker) -> Lost:
+        """Say what a worker died of.
+
+        Raises:
+            ChildProcessError: If it died before its first job, as all others would.
+        """
+        worker.process.join()
+        code = worker.process.exitcode or 0
+        self._remove(worker)
+        how = f"exit status {code}" if code >= 0 else f"{signal.Signals(-code).name}, perhaps for lack of memory"
+        if not worker.proven:
+            raise ChildProcessError(
+                f"a worker process died at its start ({how}); a program that evaluates must do so under "
+                '`if __name__ == "__main__":`, because workers import it; or run with one worker'
+            )
+        return Lost(f"ChildProcessError: the worker process died ({how})")
+
+
+def _work(pipe: Connection, parent: Connection, threads: int) -> None:
+    """Run jobs until the parent is gone; Ctrl-C is for the parent, who decides."""
+    os.environ.update(D4ORM_NUM_THREADS=str(threads), OMP_NUM_THREADS=str(threads))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def follow_parent() -> None:
+        parent.poll(None)
+        os._exit(1)
+
+    threading.Thread(target=follow_parent, daemon=True).start()
+    with suppress(EOFError, BrokenPipeError):  # the parent is gone
+        while True:
+            job = pipe.recv()
+            pipe.send(Sign.BEGUN)
+            for trial in run_job(job):
+                pipe.send(trial)
+            pipe.send(Sign.ENDED)

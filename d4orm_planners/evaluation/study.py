@@ -1,0 +1,169 @@
+"""What to compare: policies with their settings, on problems by scenario, team size and seed, at levels of noise."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from d4orm_env.core.arrays import duration, positive_number, shown, whole_number
+from d4orm_env.core.problem import Problem
+from d4orm_env.scenarios import load_problem, make_problem
+from d4orm_env.scenarios.problems import is_scenario_file
+from d4orm_planners.evaluation.store import LARGEST_NUMBER
+from d4orm_planners.evaluation.trials import Configuration, Job
+from d4orm_planners.registry import PolicyLike, is_brought, list_policies, make_policy, origin
+
+Policies: TypeAlias = PolicyLike | Iterable[PolicyLike] | Mapping[str, PolicyLike | Mapping[str, Any]]
+Scenario: TypeAlias = str | os.PathLike[str] | Problem | Callable[..., Problem]
+Scenarios: TypeAlias = Scenario | Iterable[Scenario]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """Every policy on every scenario and team size, with every seed at every level of noise.
+
+    The attributes are the arguments of the same names of :func:`~d4orm_planners.evaluation.evaluate.evaluate`. Scenario
+    files and problems have a team of their own, and are the same for all seeds.
+    """
+
+    policies: Policies
+    scenarios: Scenarios = ("circle",)
+    seeds: Iterable[int] = range(50)
+    control_noise_std: float | Iterable[float] = 0.0
+    num_robots: int | Iterable[int | None] | None = None
+    model: str | None = None
+    time_limit: float | None = None
+
+    def groups(self) -> list[list[Job]]:
+        """A list of jobs per scenario, team size and policy, in that order, with one for every seed.
+
+        Raises:
+            ValueError: For an unknown name or setting, a number that makes no sense, or nothing to do.
+            ImportError: If a policy needs a library that is not installed.
+        """
+        given = (positive_number(level, "noise", zero_allowed=True) for level in _several(self.control_noise_std))
+        levels = tuple(dict.fromkeys(given))
+        if not levels:
+            raise ValueError("noise is empty; give at least one level")
+        policies, seeds = self.configurations(), _checked_seeds(self.seeds)
+        return [
+            [Job(policy, problem, seed, levels) for seed, problem in zip(seeds, problems)]
+            for problems in self._problems(seeds)
+            for policy in policies
+        ]
+
+    def configurations(self) -> list[Configuration]:
+        """The policies with their settings.
+
+        Raises:
+            ValueError: For an unknown name or setting, no policy, or a time limit that concerns none of them.
+            ImportError: If a policy needs a library that is not installed.
+        """
+        chosen = [self._configuration(label, *given) for label, given in _labelled(self.policies).items()]
+        if not chosen:
+            raise ValueError("policies is empty; give at least one")
+        if self.time_limit is not None and not any(choice.planned for choice in chosen):
+            raise ValueError(
+                f"time_limit {self.time_limit:g} is for planners, and none of the policies is one; leave it out"
+            )
+        _check_distinct(chosen)
+        return chosen
+
+    def _configuration(self, label: str, policy: Any, settings: dict[str, Any]) -> Configuration:
+        named = isinstance(policy, str)
+        choice = Configuration(label, policy if named else label, settings, origin(policy))
+        if self.time_limit is not None and choice.planned:
+            settings.setdefault("time_limit", duration(self.time_limit, "time_limit"))
+        make_policy(policy, **settings)
+        if not named and label in list_policies():
+            raise ValueError(f"policies[{label!r}] has the name of another policy; give it another label")
+        return choice
+
+    def _problems(self, seeds: Sequence[int]) -> list[list[Problem]]:
+        """One list per scenario and team size, with a problem for every seed."""
+        sizes = tuple(dict.fromkeys(_several(self.num_robots)))
+        cells = []
+        named = False
+        for scenario in dict.fromkeys(_several(self.scenarios)):
+            if isinstance(scenario, Problem):
+                cells.append([scenario] * len(seeds))
+            elif is_scenario_file(scenario):
+                cells.append([_load(Path(scenario))] * len(seeds))
+            else:
+                named = True
+                make = partial(make_problem, scenario, model=self.model)
+                cells += [[make(num_robots=size, seed=seed) for seed in seeds] for size in sizes]
+        if not cells:
+            raise ValueError("scenarios or num_robots is empty; give at least one of each")
+        if not named and (self.model is not None or any(size is not None for size in sizes)):
+            raise ValueError("num_robots and model do not go with scenario files; change them in the files")
+        return cells
+
+
+def _labelled(policies: Policies) -> dict[str, tuple[Any, dict[str, Any]]]:
+    """Policies and their settings by label."""
+    if isinstance(policies, Mapping):
+        return {_checked_label(label): _checked(label, given) for label, given in policies.items()}
+    labelled: dict[str, tuple[Any, dict[str, Any]]] = {}
+    for policy in _several(policies):
+        label = policy if isinstance(policy, str) else getattr(policy, "__name__", type(policy).__name__)
+        if not (isinstance(policy, str) or is_brought(policy)):
+            _checked_label(policy)
+        if labelled.setdefault(label, (policy, {}))[0] is not policy and not isinstance(policy, str):
+            raise ValueError(f"two policies are called {label!r}; give a mapping that has a label for each")
+    return labelled
+
+
+def _checked_label(label: Any) -> str:
+    if not isinstance(label, str):
+        raise ValueError(f"policy {shown(label)} is no name; give one of {', '.join(list_policies())}")
+    return label
+
+
+def _checked(label: str, given: Any) -> tuple[Any, dict[str, Any]]:
+    """A policy and its settings."""
+    if isinstance(given, Mapping):
+        settings = dict(given)
+        return settings.pop("policy", label), settings
+    if is_brought(given) or (isinstance(given, str) and ":" in given):
+        return given, {}
+    raise ValueError(
+        f"policies[{label!r}] is {shown(given)}; give the settings of a policy, as {{}} or "
+        "{'policy': 'd4orm', 'num_samples': 128}, or a policy or function of your own"
+    )
+
+
+def _check_distinct(chosen: Sequence[Configuration]) -> None:
+    labels: dict[tuple[str, str], str] = {}
+    for choice in chosen:
+        other = labels.setdefault((choice.policy, choice.config), choice.label)
+        if other != choice.label:
+            raise ValueError(f"{other!r} and {choice.label!r} are one policy with the same settings; leave one out")
+
+
+def _load(path: Path) -> Problem:
+    problem = load_problem(path)
+    # Two files that give no name are still told apart.
+    return problem.replace(name=path.stem) if problem.name == "custom" else problem
+
+
+def _checked_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
+    """Seeds, each once."""
+    if not isinstance(seeds, Iterable):
+        raise ValueError(f"seeds is {seeds!r}; give the seeds themselves, as range(50)")
+    checked = tuple(dict.fromkeys(whole_number(seed, "seed", 0) for seed in seeds))
+    if not checked:
+        raise ValueError("seeds is empty; give at least one")
+    if (largest := max(checked)) > LARGEST_NUMBER:
+        raise ValueError(f"seed is {largest}; a store of trials has room for seeds up to {LARGEST_NUMBER}")
+    return checked
+
+
+def _several(values: Any) -> tuple[Any, ...]:
+    """One value, or several."""
+    alone = isinstance(values, str | os.PathLike) or not isinstance(values, Iterable)
+    return (values,) if alone else tuple(values)

@@ -1,0 +1,44 @@
+"""The machine and the versions of libraries, for the record of what was measured."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+
+def describe_machine() -> dict[str, Any]:
+    """Processor, its cores and how many of them are used, system, and version of Python."""
+    from d4orm_env.engine.threads import available_cores
+
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "cores_used": available_cores(),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+    }
+
+
+def versions(names: Iterable[str]) -> dict[str, str]:
+    """Versions of those of these distributions that are installed."""
+    installed = {}
+    for name in names:
+        try:
+            installed[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return installed
+
+
+def _processor() -> str:
+    """The model name, which :func:`platform.processor` does not tell on Linux."""
+    listing = Path("/proc/cpuinfo")
+    if listing.is_file():
+        for line in listing.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()

@@ -1,0 +1,202 @@
+"""A figure or table of the paper: what it compares, as studies, and running them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Any, Literal
+
+from d4orm_env.core.arrays import whole_number
+from d4orm_planners.evaluation.evaluate import Progress, run_study
+from d4orm_planners.evaluation.store import Trial
+from d4orm_planners.evaluation.study import Study
+
+PaperNumbers = Mapping[tuple[str, str, str], Mapping[str, str]]
+"""By section, label and metric: what the paper says, by column."""
+Across = Literal["robots", "nodes", "scenario", "noise", "policy"]
+
+_FEW: dict[str, Any] = {"num_samples": 64, "num_steps": 10, "max_iterations": 3}
+QUICK_SETTINGS: Mapping[str, Mapping[str, Any]] = MappingProxyType({
+    "d4orm": _FEW,
+    "d4orm-d": {**_FEW, "repair_samples": 64, "repair_steps": 10},
+    "d4orm-c2f": {"coarse_samples": 64, "coarse_steps": 15, "coarse_repair_steps": 5, "coarse_iterations": 3,
+                  "num_samples": 32, "num_steps": 5},
+    "mppi": _FEW,
+    "cem": _FEW,
+    "d-d4orm": _FEW,
+    "i-mbd": _FEW,
+    "mbd": {"num_samples": 64, "num_steps": 30},
+})  # fmt: skip
+"""Settings of the quick version by policy: enough to go through every step, not to solve much."""
+QUICK_TIME_LIMIT = 5.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """Policies that meet the same problems: a panel of a figure, or a table.
+
+    Attributes:
+        title: The paper's name of it.
+        policies: Settings by label, see :func:`~d4orm_planners.evaluation.evaluate.evaluate`.
+        scenarios: Scenario names.
+        robots: Team sizes; ``None`` is the scenario's own.
+        quick_robots: Those of the quick version.
+        model: Robot model; ``None`` is the scenario's own.
+        nodes: Numbers of nodes that every policy is run with; none leaves it to their other settings.
+        noise: Standard deviations of the execution noise, in the controls' units.
+        time_limit: Seconds after which planners begin no further iteration; ``None`` leaves it to their other settings.
+    """
+
+    title: str
+    policies: Mapping[str, Mapping[str, Any]]
+    scenarios: tuple[str, ...]
+    robots: tuple[int | None, ...] = (None,)
+    quick_robots: tuple[int | None, ...] = (2,)
+    model: str | None = None
+    nodes: tuple[int, ...] = ()
+    noise: tuple[float, ...] = (0.0,)
+    time_limit: float | None = None
+
+    def studies(self, seeds: int) -> list[Study]:
+        """One study with the policies, or one for every number of nodes."""
+        return [
+            Study(
+                policies={label: {**settings, **nodes} for label, settings in self.policies.items()},
+                scenarios=self.scenarios,
+                seeds=range(seeds),
+                control_noise_std=self.noise,
+                num_robots=self.robots,
+                model=self.model,
+                time_limit=self.time_limit,
+            )
+            for nodes in ([{"nodes": number} for number in self.nodes] or [{}])
+        ]
+
+    def quick(self) -> Section:
+        """The same in a few seconds: tiny teams, few samples; of scenarios, nodes and levels of noise two at most."""
+        policies = {
+            label: {**settings, **QUICK_SETTINGS.get(settings.get("policy", label), {})}
+            for label, settings in self.policies.items()
+        }
+        return replace(
+            self,
+            policies=policies,
+            scenarios=self.scenarios[:2],
+            robots=self.quick_robots,
+            nodes=self.nodes[:2],
+            noise=tuple(dict.fromkeys((self.noise[0], self.noise[-1]))),
+            time_limit=None if self.time_limit is None else min(self.time_limit, QUICK_TIME_LIMIT),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figure:
+    """A figure or table of the paper.
+
+    Attributes:
+        name: What to call it on the command line.
+        title: What it shows.
+        source: Where it stands in the paper.
+        sections: Its panels.
+        across: What varies from left to right.
+        metrics: What is tabulated, see :data:`~d4orm_planners.reproduction.numbers.METRICS`.
+        plots: What is drawn, see :data:`~d4orm_planners.reproduction.plots.PLOTS`.
+        seeds: Trials per policy, problem and level of noise; the paper's number.
+        deadlines: Seconds for planning, for tables of success within them.
+        paper: The numbers that the paper gives.
+        remarks: What differs from the paper's set-up, one sentence or two each.
+    """
+
+    name: str
+    title: str
+    source: str
+    sections: tuple[Section, ...]
+    across: Across
+    metrics: tuple[str, ...]
+    plots: tuple[str, ...]
+    seeds: int = 50
+    deadlines: tuple[float, ...] = ()
+    paper: PaperNumbers = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+
+    def quick(self) -> Figure:
+        """The version that takes seconds and shows that everything works."""
+        remarks = ("Quick version: tiny teams and few samples, whose numbers say nothing.", *self.remarks)
+        return replace(self, sections=tuple(section.quick() for section in self.sections), seeds=1, remarks=remarks)
+
+    def only(self, titles: Sequence[str] = (), labels: Sequence[str] = ()) -> Figure:
+        """A part of the figure.
+
+        Args:
+            titles: The sections to keep; all if empty.
+            labels: The policies to keep; all if empty.
+
+        Raises:
+            ValueError: For a title or label that it does not have.
+        """
+        known = [section.title for section in self.sections]
+        policies = list(dict.fromkeys(label for section in self.sections for label in section.policies))
+        for what, wanted, there in (("section", titles, known), ("policy", labels, policies)):
+            for name in wanted:
+                if name not in there:
+                    raise ValueError(f"{self.name} has no {what} {name!r}; choose of {'; '.join(there)}")
+        kept = []
+        for section in self.sections:
+            chosen = {label: section.policies[label] for label in section.policies if label in labels or not labels}
+            if chosen and (section.title in titles or not titles):
+                kept.append(replace(section, policies=chosen))
+        return replace(self, sections=tuple(kept))
+
+
+@dataclass(frozen=True)
+class Group:
+    """Trials of one policy on one scenario, team size and level of noise.
+
+    Attributes:
+        section: Title of the section.
+        label: What the policy with its settings is called there.
+        trials: One per seed.
+    """
+
+    section: str
+    label: str
+    trials: Sequence[Trial]
+
+
+def reproduce(
+    figure: Figure,
+    out: str | os.PathLike[str],
+    *,
+    seeds: int | None = None,
+    workers: int | None = 1,
+    progress: Progress | None = None,
+) -> list[Group]:
+    """Run what a figure compares, as far as its trials are not stored yet.
+
+    Args:
+        figure: The figure, or its :meth:`Figure.quick` version.
+        out: Folder to keep the trials in; made if it does not exist.
+        seeds: How many, from 0 up; the figure's own number by default.
+        workers: Processes of one thread each; 1 plans one after another on all cores, as times should be measured.
+        progress: Called as ``progress(what, trials done, trials in all)`` for every section.
+
+    Returns:
+        The trials, section by section.
+
+    Raises:
+        ValueError: For a policy that does not exist, a number that makes no sense, or a store that is something else.
+            Nothing has run then.
+        ImportError: If a policy needs a library that is not installed.
+        OSError: If the folder or the store cannot be used, or workers do not start.
+    """
+    count = whole_number(figure.seeds if seeds is None else seeds, "seeds", 1)
+    studies = [(section.title, study) for section in figure.sections for study in section.studies(count)]
+    for _, study in studies:  # before the first of them runs for hours
+        study.configurations()
+    return [
+        Group(title, label, trials)
+        for title, study in studies
+        for label, trials in run_study(study, out, workers=workers, progress=progress)
+    ]

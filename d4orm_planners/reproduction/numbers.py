@@ -1,0 +1,218 @@
+"""What a reproduced figure found, in numbers: each policy on each problem, and how the tables write it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+from d4orm_planners.evaluation.store import Trial
+from d4orm_planners.evaluation.summary import wilson_interval
+from d4orm_planners.reproduction.figure import Figure, Group
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """One policy on one scenario, team size and level of noise. All but counts and reward is over the successes.
+
+    Attributes:
+        section: Title of the section.
+        label: What the policy is called.
+        policy: Registry name.
+        scenario: Scenario name.
+        robots: Team size.
+        model: Models of the team.
+        noise: Standard deviation of the execution noise, in the controls' units.
+        trials: Trials.
+        successes: See :func:`first_solution`; with noise, trials in which all arrived and none touched anything.
+        lower: Lower end of the 95% confidence interval of the success rate (Wilson).
+        upper: Upper end.
+        errors: Trials that raised an error; they count as failures.
+        runtime: Median seconds to the first solution; ``None`` without successes, as all below.
+        runtime_lower: Lower quartile.
+        runtime_upper: Upper quartile.
+        runtime_mean: Mean.
+        runtime_deviation: Standard deviation; 0 for one success.
+        iterations: Mean over the successes; ``None`` for policies that execute no plan.
+        reward: Mean over all trials of the last best plan's reward per step of the horizon and robot; ``None`` without
+            plans.
+        travel_time: Mean arrival time [s].
+        makespan: Mean of the latest arrival time [s].
+        jerk: Mean squared jerk [m^2/s^6].
+        nodes: Nodes that plan; 1 unless the planner is a distributed one.
+        messages: Mean number of candidates that nodes sent, each to all others; ``None`` for other planners, as below.
+        message_bytes: Mean of their length together.
+        waiting_share: Mean share of the nodes' time that they waited for each other.
+        step_time: Mean seconds of a control loop; ``None`` for policies that execute a plan.
+        error: The first error.
+    """
+
+    section: str
+    label: str
+    policy: str
+    scenario: str
+    robots: int
+    model: str
+    noise: float
+    trials: int
+    successes: int
+    lower: float
+    upper: float
+    errors: int
+    runtime: float | None
+    runtime_lower: float | None
+    runtime_upper: float | None
+    runtime_mean: float | None
+    runtime_deviation: float | None
+    iterations: float | None
+    reward: float | None
+    travel_time: float | None
+    makespan: float | None
+    jerk: float | None
+    nodes: int
+    messages: float | None
+    message_bytes: float | None
+    waiting_share: float | None
+    step_time: float | None
+    error: str
+
+    @property
+    def rate(self) -> float:
+        return self.successes / self.trials
+
+
+def first_solution(trial: Trial) -> float | None:
+    """Seconds until a trial was solved; ``None`` for one that failed.
+
+    A plan is a solution when everyone arrives and the margin is kept, as in the paper; its time is that of the first
+    one, also when planning went on. Under noise what counts is what happened, and the time is that of the plan, if
+    there was one. For a policy that plans under way the time is that before its first action.
+    """
+    moments = (seconds for seconds, solved, _ in json.loads(trial.history) if solved)
+    if trial.error or (not trial.success and (trial.noise > 0 or not trial.status)):
+        return None
+    if not trial.status:
+        return trial.preparation
+    return next(moments, trial.wall_time if trial.noise > 0 else None)
+
+
+def measured(group: Group) -> Measured:
+    """Sum a group up."""
+    trials, first = group.trials, group.trials[0]
+    solved = [(trial, seconds) for trial in trials if (seconds := first_solution(trial)) is not None]
+    lower, upper = wilson_interval(len(solved), len(trials))
+    rewards = [history[-1][2] for trial in trials if (history := json.loads(trial.history))]
+    errors = [trial.error for trial in trials if trial.error]
+
+    def mean(name: str) -> float | None:
+        values = [value for trial, _ in solved if (value := getattr(trial, name)) is not None]
+        return float(np.mean(values)) if values else None
+
+    return Measured(
+        section=group.section,
+        label=group.label,
+        policy=first.policy,
+        scenario=first.scenario,
+        robots=first.robots,
+        model=first.model,
+        noise=first.noise,
+        trials=len(trials),
+        successes=len(solved),
+        lower=lower,
+        upper=upper,
+        errors=len(errors),
+        **_runtimes([seconds for _, seconds in solved]),
+        iterations=mean("iterations"),
+        reward=float(np.mean(rewards)) if rewards else None,
+        travel_time=mean("travel_time"),
+        makespan=mean("makespan"),
+        jerk=mean("mean_squared_jerk"),
+        nodes=_nodes(first),
+        messages=mean("messages"),
+        message_bytes=mean("message_bytes"),
+        waiting_share=mean("waiting_share"),
+        step_time=_step_time([trial for trial, _ in solved]),
+        error=errors[0] if errors else "",
+    )
+
+
+def _runtimes(seconds: Sequence[float]) -> dict[str, float | None]:
+    """Median, quartiles, mean and standard deviation; ``None`` each where nothing was solved."""
+    names = ("runtime_lower", "runtime", "runtime_upper", "runtime_mean", "runtime_deviation")
+    if not seconds:
+        return dict.fromkeys(names)
+    deviation = np.std(seconds, ddof=min(len(seconds) - 1, 1))
+    return dict(zip(names, map(float, (*np.percentile(seconds, (25, 50, 75)), np.mean(seconds), deviation))))
+
+
+def _step_time(trials: Sequence[Trial]) -> float | None:
+    values = [
+        (trial.wall_time - trial.preparation) / trial.steps
+        for trial in trials
+        if not trial.status and trial.wall_time is not None and trial.preparation is not None and trial.steps
+    ]
+    return float(np.mean(values)) if values else None
+
+
+def _nodes(trial: Trial) -> int:
+    nodes = json.loads(trial.config).get("nodes", 1)
+    return trial.robots if nodes is None else int(nodes)
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A number in the tables.
+
+    Attributes:
+        title: With its unit.
+        text: Writes it.
+    """
+
+    title: str
+    text: Callable[[Measured], str]
+
+
+def _number(name: str, digits: int, scale: float = 1.0) -> Callable[[Measured], str]:
+    def text(row: Measured) -> str:
+        value = getattr(row, name)
+        return "-" if value is None else f"{value * scale:.{digits}f}"
+
+    return text
+
+
+def _success(row: Measured) -> str:
+    return f"{row.successes} of {row.trials} ({row.lower:.0%} to {row.upper:.0%})"
+
+
+def _runtime(row: Measured) -> str:
+    return "-" if row.runtime is None else f"{row.runtime:.2f} ({row.runtime_lower:.2f}-{row.runtime_upper:.2f})"
+
+
+def _mean_runtime(row: Measured) -> str:
+    return "-" if row.runtime_mean is None else f"{row.runtime_mean:.2f} ± {row.runtime_deviation:.3f}"
+
+
+METRICS: Mapping[str, Metric] = MappingProxyType({
+    "success": Metric("success", _success),
+    "runtime": Metric("runtime, s", _runtime),
+    "mean_runtime": Metric("runtime, s", _mean_runtime),
+    "iterations": Metric("iterations", _number("iterations", 1)),
+    "reward": Metric("reward", _number("reward", 3)),
+    "travel_time": Metric("travel time, s", _number("travel_time", 2)),
+    "makespan": Metric("makespan, s", _number("makespan", 2)),
+    "jerk": Metric("mean squared jerk", _number("jerk", 1)),
+    "messages": Metric("messages", _number("messages", 0)),
+    "message_bytes": Metric("messages, kB", _number("message_bytes", 1, 1e-3)),
+    "waiting_share": Metric("waiting, %", _number("waiting_share", 0, 100)),
+    "step_time": Metric("control loop, ms", _number("step_time", 0, 1000)),
+})  # fmt: skip
+"""What can be tabulated."""
+
+
+def column(figure: Figure, row: Measured) -> str:
+    """Which column of the figure's tables a row is in."""
+    value = row.label if figure.across == "policy" else getattr(row, figure.across)
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,299 @@
+"""The figures and tables of the paper that can be run again, with the numbers that the paper gives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any
+
+from d4orm_planners.distributed.selection import SELECTIONS
+from d4orm_planners.reproduction.figure import Figure, Section
+
+PAPER: dict[str, Any] = {"preset": "paper"}
+C2F: dict[str, Any] = {"policy": "d4orm-c2f", "refine": "sync"}
+"""Refinement in the background would make the result depend on how busy the machine is."""
+SIZES = (4, 8, 12, 16)
+Environment = tuple[str, str, str | None]
+"""Title, scenario, model."""
+DRIVES: Environment = ("Differential Drive", "circle", "differential_drive")
+PLANE: Environment = ("2D Holonomic", "circle", None)
+SPACE: Environment = ("3D Holonomic", "circle", "holonomic3d")
+OBSTACLES: Environment = ("2D Holo 4 Obs", "four_obstacles", None)
+ENVIRONMENTS = (DRIVES, PLANE, ("Heterogeneous", "heterogeneous", None), SPACE, OBSTACLES)
+"""The paper's, in its order."""
+D4ORM_SECONDS = {"4": "0.12", "8": "0.13", "12": "0.30", "16": "1.25"}
+"""Table II, means."""
+
+
+def _sections(
+    policies: Mapping[str, Mapping[str, Any]], *environments: Environment, **settings: Any
+) -> tuple[Section, ...]:
+    """The same policies in environments, of which the settings say more."""
+    return tuple(
+        Section(title=title, policies=policies, scenarios=(scenario,), model=model, **settings)
+        for title, scenario, model in environments
+    )
+
+
+def _team_size() -> Figure:
+    """Every method spends the same number of samples, and goes on improving after its first solution."""
+    longer = {**PAPER, "improve": True, "max_iterations": 20}
+    policies = {
+        "d4orm": longer,
+        "d4orm, defaults": {"policy": "d4orm", "improve": True, "max_iterations": 80},
+        "mppi": longer,
+        "i-mbd": longer,
+        "cem": longer,
+        "mbd": PAPER,
+    }
+    return Figure(
+        name="team-size",
+        title="D4orm, MPPI, i-MBD, CEM and MBD against team size",
+        source="section IV-B, figure of the baselines, and appendix B, figure of CEM and MBD",
+        sections=_sections(policies, *ENVIRONMENTS, robots=SIZES, quick_robots=(2, 3)),
+        across="robots",
+        metrics=("success", "runtime", "reward"),
+        plots=("runtime", "success", "anytime"),
+        deadlines=(0.5, 1, 3, 10),
+        paper={
+            ("2D Holonomic", "d4orm", "runtime"): D4ORM_SECONDS,
+            ("2D Holonomic", "d4orm", "success"): {"16": "100% within 3 s"},
+            ("2D Holonomic", "mppi", "runtime"): {"16": "nearly twice that of d4orm"},
+        },
+        remarks=(
+            "Methods have a budget of samples, 20 iterations of 100 steps of 1024 (the defaults of d4orm: 80, of 256 "
+            "and later 128), instead of a deadline; MBD has its 10,000 steps in one iteration, and is judged after the "
+            "last one only.",
+            "The anytime reward is drawn against seconds; the paper counts steps.",
+        ),
+    )
+
+
+def _ipopt() -> Figure:
+    policies = {"ipopt": {}, "d4orm": PAPER, "d4orm, defaults": {"policy": "d4orm"}}
+    paper = {
+        ("2D Holonomic", "ipopt", "mean_runtime"): {
+            "4": "1.12 ± 0.526", "8": "6.33 ± 2.284", "12": "35.32 ± 11.53", "16": "failed",
+        },
+        ("2D Holonomic", "d4orm", "mean_runtime"): {
+            "4": "0.12 ± 0.002", "8": "0.13 ± 0.002", "12": "0.30 ± 0.217", "16": "1.25 ± 1.016",
+        },
+    }  # fmt: skip
+    return Figure(
+        name="ipopt",
+        title="D4orm and direct collocation with IPOPT",
+        source="section IV-B, Table II",
+        sections=_sections(policies, PLANE, robots=SIZES, time_limit=120.0),
+        across="robots",
+        metrics=("mean_runtime", "success"),
+        plots=("runtime", "success"),
+        paper=paper,
+    )
+
+
+def _big_teams() -> Figure:
+    policies = {
+        "d4orm": PAPER,
+        "d4orm, defaults": {"policy": "d4orm"},
+        "d4orm-d": PAPER,
+        "d4orm-d, defaults": {"policy": "d4orm-d"},
+        "d4orm-c2f": C2F,
+    }
+    paper = {
+        ("2D Holonomic", "d4orm", "runtime"): D4ORM_SECONDS,
+        ("2D Holonomic", "d4orm-c2f", "runtime"): {"16": "about 0.2"},
+        ("2D Holonomic", "d4orm-c2f", "step_time"): {"16": "30"},
+        ("2D Holo Random", "d4orm-d", "runtime"): {"64": "within 2", "100": "within 30"},
+        ("2D Holo Random", "d4orm-c2f", "runtime"): {"64": "within 2"},
+    }
+    random: Environment = ("2D Holo Random", "random", None)
+    return Figure(
+        name="big-teams",
+        title="D4orm, D4orm-D and D4orm-C2F",
+        source="section VIII-A, figure of the variants",
+        sections=(
+            *_sections(policies, *ENVIRONMENTS, robots=SIZES, time_limit=30.0),
+            *_sections(policies, random, robots=(16, 32, 64, 100), quick_robots=(3,), time_limit=60.0),
+        ),
+        across="robots",
+        metrics=("success", "runtime", "travel_time", "step_time"),
+        plots=("runtime", "travel_time", "success"),
+        deadlines=(1, 2, 10, 30),
+        paper=paper,
+        remarks=(
+            "Runtime is that of the first solution, or of the coarse plan of d4orm-c2f. Within deadlines d4orm-c2f "
+            "counts with all its control loops.",
+            "The side of the random square is 5 m up to 16 robots and grows with the root of the team size from there; "
+            "the paper does not give it, nor where its four obstacles stand.",
+        ),
+    )
+
+
+def _robustness() -> Figure:
+    policies = {"d4orm-c2f": C2F, "d4orm-d": PAPER, "d4orm-d, defaults": {"policy": "d4orm-d"}}
+    levels = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0)
+    return Figure(
+        name="robustness",
+        title="Success under noise on the controls",
+        source="section VIII-B, figure of perturbations",
+        sections=_sections(policies, PLANE, DRIVES, robots=(8,), noise=levels, time_limit=30.0),
+        across="noise",
+        metrics=("success", "travel_time"),
+        plots=("success", "travel_time"),
+        remarks=("The paper gives no numbers in its text; its plots compare the same two methods.",),
+    )
+
+
+def _coarseness() -> Figure:
+    table = {
+        (1, 1): ("0.75", "6.23", "7.23"),
+        (2, 1): ("0.37", "6.27", "7.31"),
+        (3, 1): ("0.32", "6.35", "7.52"),
+        (4, 1): ("0.23", "6.42", "7.62"),
+        (1, 5): ("0.57", "6.31", "7.49"),
+        (1, 10): ("0.43", "6.36", "7.58"),
+    }
+    metrics = ("runtime", "travel_time", "makespan")
+    labels = {(f, o): f"f={f}, o={o}" for f, o in table}
+    policies = {label: {**C2F, "coarse_factor": f, "check_interval": o} for (f, o), label in labels.items()}
+    return Figure(
+        name="coarseness",
+        title="D4orm-C2F and the coarseness of its guidance",
+        source="appendix C-B, Table III",
+        sections=_sections(policies, OBSTACLES, robots=(16,)),
+        across="policy",
+        metrics=(*metrics, "success"),
+        plots=metrics,
+        paper={
+            (OBSTACLES[0], labels[key], metric): {labels[key]: value}
+            for key, values in table.items()
+            for metric, value in zip(metrics, values)
+        },
+        remarks=("f: how many times longer the coarse steps are; o: checked for violations at every o-th of them.",),
+    )
+
+
+def _noise_schedule() -> Figure:
+    policies = {
+        f"beta_1={first:g}, beta_T={last:g}": {"policy": "d4orm", **PAPER, "beta_start": first, "beta_end": last}
+        for first in (1e-5, 1e-4, 1e-3)
+        for last in (1e-2, 2e-2, 5e-2)
+    }
+    return Figure(
+        name="noise-schedule",
+        title="D4orm and its noise schedule",
+        source="appendix C-A, figure of the schedule",
+        sections=_sections(policies, DRIVES, PLANE, SPACE, robots=(8,), time_limit=20.0),
+        across="policy",
+        metrics=("success", "runtime", "iterations", "travel_time"),
+        plots=("runtime", "success"),
+        remarks=("The paper gives no numbers in its text: it finds little variation, most in differential drive.",),
+    )
+
+
+def _amswarm() -> Figure:
+    scenarios = tuple(f"amswarm_{number}" for number in range(1, 6))
+    numbers = {
+        "AMSwarm": (("0.83", "failed", "0.88", "0.81", "failed"), ("9.60", "failed", "9.10", "8.70", "failed"),
+                    ("10.43", "failed", "11.05", "10.08", "failed")),
+        "d4orm": (("0.17", "0.33", "0.76", "1.17", "1.31"), ("7.00", "7.25", "8.10", "8.36", "7.13"),
+                  ("46.62", "43.29", "44.62", "43.11", "43.08")),
+        "d4orm-d": (("0.19", "0.29", "0.33", "0.40", "0.35"), ("7.02", "7.11", "7.77", "8.04", "7.38"),
+                    ("46.58", "44.01", "43.57", "42.62", "42.33")),
+    }  # fmt: skip
+    metrics, title = ("runtime", "makespan", "jerk"), "Ten 3D holonomic robots"
+    return Figure(
+        name="amswarm",
+        title="D4orm and D4orm-D in the environments of AMSwarm",
+        source="section VIII-C, figure of AMSwarm",
+        sections=(
+            Section(
+                title=title,
+                policies={
+                    "d4orm": PAPER,
+                    "d4orm, defaults": {"policy": "d4orm"},
+                    "d4orm-d": PAPER,
+                    "d4orm-d, defaults": {"policy": "d4orm-d"},
+                },
+                scenarios=scenarios,
+                quick_robots=(None,),
+                time_limit=60.0,
+            ),
+        ),
+        across="scenario",
+        metrics=(*metrics, "success"),
+        plots=metrics,
+        paper={
+            (title, label, metric): dict(zip(scenarios, row))
+            for label, rows in numbers.items()
+            for metric, row in zip(metrics, rows)
+        },
+        remarks=("The paper shows one run each; ours are medians of runtime and means of the rest over seeds of the "
+                 "planner. AMSwarm itself is not run.",),
+    )  # fmt: skip
+
+
+def _distributed() -> tuple[Figure, Figure]:
+    """D-D4orm: its selections with a node per robot, and more and more nodes that share the same samples."""
+    samples = 2048  # of all nodes together
+    # A budget of iterations, not of seconds, so that what is solved does not depend on how busy the machine is.
+    paper = {**PAPER, "max_iterations": 20}
+    kinds: dict[str, dict[str, Any]] = {"": paper, ", defaults": {"num_samples": samples, "nodes": None}}
+    nodes: dict[str, dict[str, Any]] = {
+        f"{selection}{kind}": {"policy": "d-d4orm", **settings, "selection": selection}
+        for kind, settings in kinds.items()
+        for selection in SELECTIONS
+    }
+    alone = {"d4orm": {**paper, "num_samples": samples}, "d4orm, defaults": {"policy": "d4orm", "num_samples": samples}}
+    environments = (DRIVES, PLANE, ("2D Heterogeneous", "heterogeneous", None), SPACE)
+    selections = Figure(
+        name="selections",
+        title="D-D4orm with a node per robot",
+        source="section VIII-D, figure of D-D4orm, upper row",
+        sections=_sections({**alone, **nodes}, *environments, robots=SIZES, quick_robots=(2, 3)),
+        across="robots",
+        metrics=("success", "iterations", "runtime", "waiting_share", "messages", "message_bytes"),
+        plots=("iterations", "runtime", "success", "waiting_share"),
+        remarks=DISTRIBUTED_REMARKS,
+    )
+    numbers = replace(
+        selections,
+        name="nodes",
+        title="D-D4orm and the number of its nodes, 16 robots",
+        source="section VIII-D, figure of D-D4orm, lower row",
+        sections=_sections(nodes, *environments, robots=(16,), nodes=(1, 2, 4, 8, 16)),
+        across="nodes",
+        remarks=(*DISTRIBUTED_REMARKS, "With one node there is nothing to select: all are the planner without nodes."),
+    )
+    return selections, numbers
+
+
+DISTRIBUTED_REMARKS = (
+    "The paper shows iterations to the first solution, in a plot without numbers in its text. The policies without "
+    "`defaults` have its parameters, and 20 iterations.",
+    "Iterations are a mean over the successes: where trials failed it is too good.",
+    "All nodes are threads of one machine, and share its cores. On machines of their own they would be quicker.",
+    "Messages are those that nodes send; each goes to all others.",
+)
+
+
+FIGURES: Mapping[str, Figure] = MappingProxyType({
+    figure.name: figure
+    for figure in (
+        _team_size(), _ipopt(), _big_teams(), _robustness(), _coarseness(), _noise_schedule(), _amswarm(),
+        *_distributed(),
+    )
+})  # fmt: skip
+"""Every figure by its name."""
+
+
+def find_figure(name: str) -> Figure:
+    """A figure by name.
+
+    Raises:
+        ValueError: For an unknown name.
+    """
+    if name not in FIGURES:
+        raise ValueError(f"figure {name!r} is unknown; choose one of {', '.join(FIGURES)}")
+    return FIGURES[name]

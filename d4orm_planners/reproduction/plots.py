@@ -1,0 +1,158 @@
+"""A reproduced figure as a picture: one column per section, as in the paper."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from d4orm_planners.evaluation.store import Trial
+from d4orm_planners.reproduction.figure import Figure, Group
+from d4orm_planners.reproduction.numbers import Measured, column
+
+NUMERIC: Mapping[str, str] = MappingProxyType(
+    {"robots": "robots", "nodes": "nodes", "noise": "standard deviation of the noise"}
+)
+"""What may vary from left to right as a number, and what to write below."""
+INSTANTS = 200
+"""Points of an anytime curve."""
+
+
+def draw(path: Path, figure: Figure, groups: Sequence[Group], rows: Sequence[Measured]) -> None:
+    """Write the picture.
+
+    Args:
+        path: A PNG file.
+        figure: The figure, with at least one plot.
+        groups: Its trials.
+        rows: Their numbers, one per group.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    # Made without pyplot, which would keep state and want a display.
+    from matplotlib.figure import Figure as Canvas
+
+    titles = tuple(dict.fromkeys(row.section for row in rows))
+    wide = 2 if figure.across == "policy" else 1
+    size = (max(3.2 * wide * len(titles), 5.0), (3.4 if wide == 2 else 2.6) * len(figure.plots) + 0.8)
+    canvas = Canvas(figsize=size, layout="constrained")
+    # Only the anytime curves have time from left to right.
+    sharex: Any = False if "anytime" in figure.plots else "col"
+    axes = canvas.subplots(len(figure.plots), len(titles), squeeze=False, sharex=sharex, sharey="row")
+    for i, title in enumerate(titles):
+        axes[0, i].set_title(title)
+        shown = [(group, row) for group, row in zip(groups, rows) if row.section == title]
+        for ax, plot in zip(axes[:, i], figure.plots):
+            PLOTS[plot](ax, figure, shown)
+            ax.grid(alpha=0.3)
+            ax.yaxis.label.set_visible(i == 0)
+            if sharex:
+                ax.label_outer()
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    if len(labels) > 1:
+        canvas.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 2 + 2 * len(titles)))
+    canvas.savefig(path, dpi=130)
+
+
+Shown = Sequence[tuple[Group, Measured]]
+
+
+def _lines(figure: Figure, shown: Shown) -> dict[str, list[Measured]]:
+    """Rows by line of a plot: one per policy, or a single one where policies stand from left to right."""
+    lines: dict[str, list[Measured]] = {}
+    for _, row in shown:
+        lines.setdefault("" if figure.across == "policy" else row.label, []).append(row)
+    return lines
+
+
+def _metric(ax: Any, figure: Figure, shown: Shown, *, value: str, ends: tuple[str, str] | None, label: str,
+            log: bool = False) -> None:  # fmt: skip
+    """A number against what the figure varies, with a band; markers are crosses where trials failed."""
+    columns = list(dict.fromkeys(column(figure, row) for _, row in shown))
+    numeric = figure.across in NUMERIC
+    for i, (name, rows) in enumerate(_lines(figure, shown).items()):
+        known = [row for row in rows if getattr(row, value) is not None]
+        places = [float(column(figure, row)) if numeric else columns.index(column(figure, row)) for row in known]
+        style = {"linestyle": "-" if numeric else "none", "color": f"C{i}"}
+        ax.plot(places, [getattr(row, value) for row in known], label=name, marker="o", markersize=4, **style)
+        failed = [(place, getattr(row, value)) for place, row in zip(places, known) if row.successes < row.trials]
+        if failed and value != "rate":
+            ax.plot(*zip(*failed), marker="x", markersize=8, linestyle="none", color=f"C{i}")
+        if ends:
+            low, high = ([getattr(row, end) for row in known] for end in ends)
+            if numeric:
+                ax.fill_between(places, low, high, color=f"C{i}", alpha=0.1, linewidth=0)
+            else:
+                ax.vlines(places, low, high, color=f"C{i}", alpha=0.5)
+    if not numeric:
+        ax.set_xticks(range(len(columns)), columns, rotation=60 if figure.across == "policy" else 20, ha="right")
+    elif figure.across != "noise":
+        ax.set_xticks([int(name) for name in columns])
+    ax.set_xlabel(NUMERIC.get(figure.across, ""))
+    ax.set_ylabel(label)
+    if log:
+        ax.set_yscale("log")
+
+
+def _success(ax: Any, figure: Figure, shown: Shown) -> None:
+    """Success rates with their confidence bands."""
+    _metric(ax, figure, shown, value="rate", ends=("lower", "upper"), label="success rate")
+    ax.set_ylim(-0.03, 1.03)
+
+
+def best_reward(trial: Trial, seconds: np.ndarray) -> np.ndarray:
+    """Mean reward of the best plan so far.
+
+    Args:
+        trial: A trial of a planner.
+        seconds: ``(n,)`` moments since the start of the solve [s], in ascending order.
+
+    Returns:
+        ``(n,)`` rewards; NaN before the first plan.
+    """
+    history = json.loads(trial.history)
+    moments = np.array([moment for moment, _, _ in history])
+    rewards = np.array([np.nan, *(reward for _, _, reward in history)])
+    return rewards[np.searchsorted(moments, seconds, side="right")]
+
+
+def _anytime(ax: Any, figure: Figure, shown: Shown) -> None:
+    """Median best reward against time with quartiles, for the largest team; a dot where half of the trials are solved.
+
+    A curve begins when half of the trials have a plan.
+    """
+    largest = max(row.robots for _, row in shown)
+    for i, (group, row) in enumerate((group, row) for group, row in shown if row.robots == largest):
+        histories = [json.loads(trial.history) for trial in group.trials]
+        moments = [moment for history in histories for moment, _, _ in history]
+        if not moments:
+            continue  # every trial raised an error, or the policy makes no plan
+        seconds = np.geomspace(max(min(moments), 1e-3), 1.1 * max(*moments, 1e-3), INSTANTS)
+        rewards = np.array([best_reward(trial, seconds) for trial in group.trials])
+        seen = 2 * np.isfinite(rewards).sum(axis=0) >= len(rewards)
+        low, middle, high = np.nanpercentile(rewards[:, seen], (25, 50, 75), axis=0)
+        ax.plot(seconds[seen], middle, color=f"C{i}", label=row.label)
+        ax.fill_between(seconds[seen], low, high, color=f"C{i}", alpha=0.15, linewidth=0)
+        if row.runtime is not None and 2 * row.successes >= row.trials and seen.any():
+            ax.plot(row.runtime, np.interp(row.runtime, seconds[seen], middle), marker="o", color=f"C{i}")
+    ax.tick_params(axis="x", which="minor", labelbottom=False)
+    ax.set(xlabel=f"planning time, s ({largest} robots)", ylabel="best reward so far", xscale="log")
+
+
+PLOTS: Mapping[str, Callable[[Any, Figure, Shown], None]] = MappingProxyType({
+    "runtime": partial(_metric, value="runtime", ends=("runtime_lower", "runtime_upper"), label="runtime, s", log=True),
+    "success": _success,
+    "travel_time": partial(_metric, value="travel_time", ends=None, label="travel time, s"),
+    "makespan": partial(_metric, value="makespan", ends=None, label="makespan, s"),
+    "iterations": partial(_metric, value="iterations", ends=None, label="iterations", log=True),
+    "waiting_share": partial(_metric, value="waiting_share", ends=None, label="share of time spent waiting"),
+    "jerk": partial(_metric, value="jerk", ends=None, label="mean squared jerk"),
+    "anytime": _anytime,
+})  # fmt: skip
+"""What can be drawn."""

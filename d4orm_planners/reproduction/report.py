@@ -1,0 +1,110 @@
+"""What a reproduced figure found: numbers per policy and problem, as CSV and as tables beside the paper's."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from d4orm_planners.evaluation.leaderboard import origin
+from d4orm_planners.evaluation.report import deadline_table, errors, table, target, write_csv
+from d4orm_planners.evaluation.summary import success_by
+from d4orm_planners.reproduction.figure import Figure, Group
+from d4orm_planners.reproduction.numbers import METRICS, Measured, column, measured
+from d4orm_planners.reproduction.plots import draw
+
+INTRODUCTION = """\
+Success with its 95% interval (Wilson); runtime to the first solution, median and quartiles, or mean ± standard
+deviation. Runtime, travel time, makespan and jerk are over the successes; the reward is that of the best plan in the
+end, over all trials."""
+
+
+def markdown(figure: Figure, groups: Sequence[Group]) -> str:
+    """Title, one table per section with the paper's numbers below or beside ours, deadlines, remarks and origin."""
+    rows = [measured(group) for group in groups]
+    draw_table = _transposed if figure.across == "policy" else _across
+    blocks = [f"# {figure.title}", f"The paper: {figure.source}. {INTRODUCTION}"]
+    if figure.remarks:
+        blocks.append("\n".join(f"- {remark}" for remark in figure.remarks))
+    sections = tuple(dict.fromkeys(row.section for row in rows))
+    blocks += [draw_table(figure, title, [row for row in rows if row.section == title]) for title in sections]
+    if figure.deadlines:
+        blocks += _deadlines(figure, groups)
+    blocks += errors((row.label, row.error) for row in rows)
+    return "\n\n".join([*blocks, origin([trial for group in groups for trial in group.trials])]) + "\n"
+
+
+def _across(figure: Figure, title: str, rows: Sequence[Measured]) -> str:
+    """Policies and metrics from top to bottom, what the figure varies from left to right; the paper's rows below."""
+    columns = tuple(dict.fromkeys(column(figure, row) for row in rows))
+    ours = {(row.label, column(figure, row)): row for row in rows}
+    labels = dict.fromkeys(row.label for row in rows)
+    lines = []
+    for name in figure.metrics:
+        said = {label: values for (section, label, metric), values in figure.paper.items()
+                if (section, metric) == (title, name)}  # fmt: skip
+        for label in dict.fromkeys([*labels, *said]):
+            cells = [METRICS[name].text(ours[label, key]) if (label, key) in ours else "" for key in columns]
+            if label in labels and any(cell not in ("", "-") for cell in cells):
+                lines.append((METRICS[name].title, label, *cells))
+            if label in said and any(key in said[label] for key in columns):
+                lines.append(
+                    (METRICS[name].title, f"{label} (the paper)", *(said[label].get(key, "") for key in columns))
+                )
+    return table(title, ("", figure.across, *columns), lines)
+
+
+def _transposed(figure: Figure, title: str, rows: Sequence[Measured]) -> str:
+    """Policies from top to bottom, metrics from left to right, each with the paper's beside it if there is one."""
+    # One scenario and team size: every policy is a row.
+    known = {metric for section, _, metric in figure.paper if section == title}
+    header, lines = ["policy"], []
+    for name in figure.metrics:
+        header += [METRICS[name].title] + [f"{METRICS[name].title} (the paper)"] * (name in known)
+    for row in rows:
+        line = [row.label]
+        for name in figure.metrics:
+            line += [METRICS[name].text(row)] + [_said(figure, row, name)] * (name in known)
+        lines.append(line)
+    return table(f"{title}, {rows[0].robots} robots", header, lines)
+
+
+def _said(figure: Figure, row: Measured, metric: str) -> str:
+    """The paper's number, empty if it gives none."""
+    return figure.paper.get((row.section, row.label, metric), {}).get(column(figure, row), "")
+
+
+def _deadlines(figure: Figure, groups: Sequence[Group]) -> list[str]:
+    blocks: dict[str, list[tuple[str, Any]]] = {}
+    for group in groups:
+        first = group.trials[0]
+        title = f"{group.section}, {first.robots} robots: success within a deadline for planning"
+        blocks.setdefault(title, []).append((group.label, [success_by(group.trials, s) for s in figure.deadlines]))
+    return [deadline_table(title, lines) for title, lines in blocks.items()]
+
+
+def write_reproduction(folder: str | os.PathLike[str], figure: Figure, groups: Sequence[Group]) -> list[Path]:
+    """Write ``NAME.csv``, ``NAME.md`` and ``NAME.png`` for the figure, and its trials as ``trials.csv``.
+
+    Args:
+        folder: Where to.
+        figure: The figure.
+        groups: What :func:`~d4orm_planners.reproduction.figure.reproduce` returned for it.
+
+    Returns:
+        The paths.
+
+    Raises:
+        OSError: If the folder does not exist or cannot be written to.
+    """
+    rows = [measured(group) for group in groups]
+    paths = [Path(folder, name) for name in (*(f"{figure.name}.{kind}" for kind in ("csv", "md", "png")), "trials.csv")]
+    said = [{f"paper_{metric}": _said(figure, row, metric) for metric in figure.metrics} for row in rows]
+    write_csv(paths[0], [{**vars(row), **beside} for row, beside in zip(rows, said)])
+    with target(paths[1]) as temporary:
+        temporary.write_text(markdown(figure, groups), encoding="utf-8")
+    with target(paths[2]) as temporary:
+        draw(temporary, figure, groups, rows)
+    write_csv(paths[3], [vars(trial) for group in groups for trial in group.trials])
+    return paths

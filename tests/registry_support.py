@@ -1,0 +1,27 @@
+"""Registries for tests: what is registered in one is forgotten after it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from d4orm_env.core.dynamics import MODEL_CODES
+from d4orm_env.core.registry import Registry
+
+
+@contextmanager
+def forgetting(*tables: Registry) -> Iterator[None]:
+    """Forget what is registered meanwhile, and look things up anew."""
+    dictionaries = [MODEL_CODES, *(vars(table)[name] for table in tables for name in ("_registered", "_admitted"))]
+    before = [dict(each) for each in dictionaries]
+    for table in tables:
+        table._admitted.clear()
+        vars(table).pop("_entry_points", None)
+    try:
+        yield
+    finally:
+        for each, content in zip(dictionaries, before):
+            each.clear()
+            each.update(content)
+        for table in tables:
+            vars(table).pop("_entry_points", None)
