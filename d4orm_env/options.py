@@ -37,8 +37,8 @@ class EnvOptions:
             at random, that is, where another seed gives another problem; ``False`` keeps the one of ``seed=``.
         reward: ``"paper"``, ``"training"`` (:class:`~d4orm_env.rewards.TrainingReward`), or a function from a
             :class:`~d4orm_env.rewards.RewardInput` to the rewards ``(..., K)`` of all robots.
-        progress: What the distances of rewards are, the paper's among them: ``"straight"``, or the length of the shortest
-            free ``"way"``, see :mod:`d4orm_env.ways`, which is the same in a world without obstacles. Not for
+        progress: What the distances of rewards are, the paper's among them: ``"straight"``, or the length of the
+            shortest free ``"way"``, see :mod:`d4orm_env.ways`; the same in a world without obstacles. Not for
             ``lifelong``.
         observed_way: Whether an observation ends with direction and length of the shortest free way. Not for
             ``lifelong``.
