@@ -130,7 +130,7 @@ def shortest_ways(problem: Problem) -> Ways:
     if not problem.world.num_obstacles:
         return Ways(problem, np.linalg.norm(problem.goal - start, axis=1), ())
     # Here, because importing the compiler takes longer than importing all the rest of the package.
-    from d4orm_env.engine.wavefront import Front, make_space, spread
+    from d4orm_env.engine.wavefront import make_space, spread
 
     space = make_space(problem)
     length, fields = np.full(problem.num_robots, np.inf), []
@@ -141,7 +141,7 @@ def shortest_ways(problem: Problem) -> Ways:
             if (reach, refinement) not in lattices:
                 lattices[reach, refinement] = _lattice(problem, space, reach, STEP * reach / 2**refinement)
             lattice = lattices[reach, refinement]
-            field = _Field(space, lattice, reach, Front(*spread(space, lattice, reach, goal)))
+            field = _Field(space, lattice, reach, spread(space, lattice, reach, goal))
             length[robot] = field.look(start[robot : robot + 1])[1][0]
             if np.isfinite(length[robot]):
                 break

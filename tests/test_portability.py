@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from d4orm_env import make_problem, rollout
-from d4orm_env.engine import sampling, softmax, worlds
+from d4orm_env.engine import sampling, softmax, wavefront, worlds
 from d4orm_env.engine.softmax import softmax_weights
 from d4orm_env.engine.tiles import OPTIONS
 
@@ -45,10 +45,14 @@ def kernels() -> Iterator[tuple[str, Any]]:
     plans.digest(plans.CASES["mppi"])
     rollout(problem, np.zeros((problem.horizon, 2, 2), np.float32), engine="cpu")
     softmax_weights(np.zeros((1, 4)), 1.0, 0.0)
+    make_problem("four_obstacles").check_reachable()
     yield "score", sampling.score_kernel(("differential_drive",))
     yield "average", sampling.average_noise
     yield "project", sampling.project_noise
     yield "softmax", softmax._softmax
+    yield "spread", wavefront._spread
+    yield "look", wavefront.look
+    yield "settle", wavefront.settle_nodes
     yield "roll out", worlds.world_kernels(("holonomic2d",)).roll_out
 
 

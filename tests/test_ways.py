@@ -229,6 +229,15 @@ def test_stretch_among_obstacles_is_measured_by_the_way_round() -> None:
     assert plan.stretch < stretch(straight, plan.trajectory)[0]
 
 
+def test_shortest_ways_are_the_same_everywhere() -> None:
+    """To the bit, as computed on x86-64 with AVX-512 and without AVX."""
+    shapes = {"circles": [[1, 1, 0.3]], "polygons": [[[-1, -1], [-0.5, 0], [-1, 1]]]}
+    flat = problem_in(World(boxes=[[0, -1, 0.4, 1]], **shapes), [-1.5, 0.1], [1.5, 0.2])
+    assert flat.ways.length[0].hex() == "0x1.2ad66747603b8p+2"
+    spatial = World(3, boxes=[[0, -1, -1, 0.4, 1, 1]], spheres=[[1, 1, 0, 0.5]])
+    assert problem_in(spatial, [-1.5, 0.1, 0], [1.5, 0.2, 0.1]).ways.length[0].hex() == "0x1.f5b8178d42f7ep+1"
+
+
 def test_shortest_ways_are_the_same_each_time() -> None:
     problem = make_problem("four_obstacles")
     one, other = shortest_ways(problem), shortest_ways(problem.replace())

@@ -33,7 +33,7 @@ _PUSHES, _SPARE = 4, 0.03
 of it each time, so as to end in the middle of narrow gaps."""
 _TOLERANCE = 1e-6
 """Rounding of clearances [m]."""
-_NOBODY = -1
+_NOBODY = np.int32(-1)
 
 
 class Space(NamedTuple):
@@ -109,7 +109,7 @@ class Front(NamedTuple):
 def make_space(problem: Problem) -> Space:
     """The world of a problem; it must have obstacles."""
     world, d = problem.world, problem.dimension
-    shapes, index = world.shapes, problem.arrays.grid
+    shapes, index = world.shapes, world.index(float(problem.team.radius.max()) + problem.margin)
     cell = 1.0 / float(index.scale)
     lower, upper = shapes.extent()
     pad = 0.999 * float((lower - index.low).min())
@@ -362,121 +362,183 @@ def settle_nodes(space: Any, lattice: Any, reach: Any) -> None:
         lattice.places[n, 0], lattice.places[n, 1], lattice.places[n, 2] = place
 
 
+class _Nodes(NamedTuple):
+    """What is known of the nodes.
+
+    Attributes:
+        value: ``(N,)`` length of the way [m].
+        anchor: ``(N,)`` int32.
+        hidden: ``(N,)`` int32 the anchor last found to be hidden.
+        tested: ``(N,)`` bool, whether the anchor is known to be seen.
+        done: ``(N,)`` bool, whether the wavefront has passed.
+        tried: ``(M,)`` int32 scratch.
+    """
+
+    value: Any
+    anchor: Any
+    hidden: Any
+    tested: Any
+    done: Any
+    tried: Any
+
+
+@inlined
+def _kept(anchor: Any, own_goal: Any, reach: Any) -> Any:
+    """What is kept around an anchor: all but the goal are clear."""
+    return own_goal if anchor == 0 else reach
+
+
+@compiled
+def _seen_anchor(
+    space: Any,
+    lattice: Any,
+    reach: Any,
+    own_goal: Any,
+    nodes: Any,
+    points: Any,
+    values: Any,
+    n: Any,
+    q: Any,
+    tried: Any,
+) -> Any:
+    """The best anchor of the neighbours of a node that it sees, and the way by it; -1 for none."""
+    i, j, k = _indices(lattice, n)
+    best, chosen, count = np.inf, _NOBODY, 0
+    for move in range(lattice.moves.shape[0]):
+        p = _neighbour(lattice, move, i, j, k)
+        if p < 0 or not nodes.done[p]:
+            continue
+        a = nodes.anchor[p]
+        known = a == nodes.hidden[n]
+        for t in range(count):
+            known |= tried[t] == a
+        if known:
+            continue
+        tried[count] = a
+        count += 1
+        at = _place(points, a)
+        length = values[a] + _distance(at, q)
+        if length < best and _sees(space, reach, at, _kept(a, own_goal, reach), q, reach):
+            best, chosen = length, a
+    return chosen, best
+
+
+@compiled
+def _way_round(space: Any, lattice: Any, reach: Any, nodes: Any, n: Any, q: Any) -> Any:
+    """The best neighbour to go on from to a node at ``q``, -1 for none, the way by it, and where it bends.
+
+    In a narrow gap neighbours may see each other by way of a place between them only; elsewhere it is ``q``.
+    """
+    i, j, k = _indices(lattice, n)
+    best, through, bend = np.inf, np.int64(-1), q
+    for straight in (True, False):
+        for move in range(lattice.moves.shape[0]):
+            p = _neighbour(lattice, move, i, j, k)
+            if p < 0 or not nodes.done[p]:
+                continue
+            place, c, fits = _place(lattice.places, p), q, True
+            if not straight:
+                c, fits = _settled(space, lattice, reach, _between(place, q, 0.5))
+            length = nodes.value[p] + _distance(place, c) + _distance(c, q)
+            if not fits or length >= best or not _sees(space, reach, place, reach, c, reach):
+                continue
+            if straight or _sees(space, reach, c, reach, q, reach):
+                best, through, bend = length, p, c
+        if through >= 0:
+            break
+    return through, best, bend
+
+
+@compiled
+def _add_anchor(points: Any, values: Any, parents: Any, number: Any, place: Any, parent: Any) -> None:
+    points[number, 0], points[number, 1], points[number, 2] = place
+    values[number] = values[parent] + _distance(place, _place(points, parent))
+    parents[number] = parent
+
+
 @cached_kernel(SOURCES, variant="wave", **OPTIONS)
-def spread(space: Any, lattice: Any, reach: Any, goal: Any) -> Any:
-    """The wavefront of a body of this reach from its goal ``(3,)``, as the parts of a :class:`Front`."""
-    count = lattice.free.shape[0]
-    value, anchor = np.full(count, np.inf), np.full(count, np.int32(_NOBODY))
-    refused = np.full(count, np.int32(_NOBODY))
-    tested, done = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
-    num_moves = lattice.moves.shape[0]
-    tried = np.empty(num_moves, np.int32)
+def _spread(space: Any, lattice: Any, reach: Any, goal: Any, nodes: Any) -> Any:
+    """See :func:`spread`; anchors, their values and their parents."""
+    count, size = lattice.free.shape[0], lattice.size
+    value, anchor, hidden, tried = nodes.value, nodes.anchor, nodes.hidden, nodes.tried
     points, values, parents = np.empty((256, 3)), np.empty(256), np.empty(256, np.int32)
     points[0, 0], points[0, 1], points[0, 2] = goal[0], goal[1], goal[2]
     values[0], parents[0], used = 0.0, _NOBODY, 1
-    target = (goal[0], goal[1], goal[2])
-    own_goal = _clearance(space, goal[0], goal[1], goal[2])
+    at = _place(points, 0)
+    own_goal = _clearance(space, at[0], at[1], at[2])
     heap = [(0.0, np.int64(0)) for _ in range(0)]
     around = 2 + np.int64(2 * max(0.0, reach - own_goal) / lattice.step)
-    gi, gj, gk = _corner(lattice, target)
-    for i in range(max(0, gi - around), min(lattice.size[0], gi + around + 1)):
-        for j in range(max(0, gj - around), min(lattice.size[1], gj + around + 1)):
-            for k in range(max(0, gk - around), min(lattice.size[2], gk + around + 1)):
-                n = (i * lattice.size[1] + j) * lattice.size[2] + k
+    low_i, low_j, low_k = _corner(lattice, at)
+    for i in range(max(0, low_i - around), min(size[0], low_i + around + 1)):
+        for j in range(max(0, low_j - around), min(size[1], low_j + around + 1)):
+            for k in range(max(0, low_k - around), min(size[2], low_k + around + 1)):
+                n = (i * size[1] + j) * size[2] + k
                 if lattice.free[n]:
-                    value[n], anchor[n] = _distance(target, _place(lattice.places, n)), 0
+                    value[n], anchor[n] = _distance(at, _place(lattice.places, n)), 0
                     heapq.heappush(heap, (value[n], n))
     while len(heap) > 0:
-        reached, n = heapq.heappop(heap)
-        if done[n] or reached != value[n]:
+        length, n = heapq.heappop(heap)
+        if nodes.done[n] or length != value[n]:
             continue
-        q = _place(lattice.places, n)
-        i, j, k = _indices(lattice, n)
-        if not tested[n]:
-            a = anchor[n]
-            tested[n] = True
-            at = _place(points, a)
-            if not _sees(space, reach, at, own_goal if a == 0 else reach, q, reach):
-                # The anchors of its neighbours, and the neighbours themselves.
-                refused[n] = a
-                best, chosen, num_tried = np.inf, _NOBODY, 0
-                via, through = np.inf, np.int64(-1)
-                b, c, bend = q, q, q
-                for move in range(num_moves):
-                    p = _neighbour(lattice, move, i, j, k)
-                    if p < 0 or not done[p]:
-                        continue
-                    other, known = anchor[p], anchor[p] == a
-                    for t in range(num_tried):
-                        known |= tried[t] == other
-                    place = _place(lattice.places, p)
-                    if not known:
-                        tried[num_tried] = other
-                        num_tried += 1
-                        at = _place(points, other)
-                        length = values[other] + _distance(at, q)
-                        if length < best and _sees(space, reach, at, own_goal if other == 0 else reach, q, reach):
-                            best, chosen = length, other
-                    length = value[p] + _distance(place, q)
-                    if length < via and _sees(space, reach, place, reach, q, reach):
-                        via, through = length, p
-                if best == np.inf and via == np.inf:
-                    # In a narrow gap neighbours may see each other by way of a place between them only.
-                    for move in range(num_moves):
-                        p = _neighbour(lattice, move, i, j, k)
-                        if p < 0 or not done[p]:
-                            continue
-                        place = _place(lattice.places, p)
-                        c, fits = _settled(space, lattice, reach, _between(place, q, 0.5))
-                        length = value[p] + _distance(place, c) + _distance(c, q)
-                        if not fits or length >= best or not _sees(space, reach, place, reach, c, reach):
-                            continue
-                        if _sees(space, reach, c, reach, q, reach):
-                            best, through, bend = length, p, c
-                    if best < np.inf:
-                        b, c, a = _place(lattice.places, through), bend, anchor[through]
-                elif via < best:
-                    a, p = anchor[through], _place(lattice.places, through)
-                    b, c = _turned(space, reach, _place(points, a), own_goal if a == 0 else reach, p, q)
-                if min(best, via) < np.inf and (chosen < 0 or via < best):
-                    if used + 2 > len(values):
-                        points = np.concatenate((points, np.empty((used, 3))))
-                        values = np.concatenate((values, np.empty(used)))
-                        parents = np.concatenate((parents, np.empty(used, np.int32)))
-                    points[used, 0], points[used, 1], points[used, 2] = b
-                    points[used + 1, 0], points[used + 1, 1], points[used + 1, 2] = c
-                    values[used], parents[used] = values[a] + _distance(_place(points, a), b), a
-                    values[used + 1], parents[used + 1] = values[used] + _distance(b, c), used
-                    best, chosen, used = values[used + 1] + _distance(c, q), used + 1, used + 2
-                value[n], anchor[n] = best, chosen
-                if chosen < 0:
-                    tested[n] = False
-                    continue
-                if best > reached:
-                    heapq.heappush(heap, (best, n))
-                    continue
-        done[n] = True
-        a = anchor[n]
-        at = _place(points, a)
-        for move in range(num_moves):
-            p = _neighbour(lattice, move, i, j, k)
-            if p < 0 or done[p] or not lattice.free[p]:
+        q, a = _place(lattice.places, n), anchor[n]
+        if not nodes.tested[n] and not _sees(space, reach, _place(points, a), _kept(a, own_goal, reach), q, reach):
+            hidden[n] = a
+            a, value[n] = _seen_anchor(space, lattice, reach, own_goal, nodes, points, values, n, q, tried)
+            p, via, bend = _way_round(space, lattice, reach, nodes, n, q)
+            if via < value[n]:
+                b, c, parent = _place(lattice.places, p), bend, anchor[p]
+                if c == q:
+                    at = _place(points, parent)
+                    b, c = _turned(space, reach, at, _kept(parent, own_goal, reach), b, q)
+                if used + 2 > len(values):
+                    points = np.concatenate((points, np.empty((used, 3))))
+                    values = np.concatenate((values, np.empty(used)))
+                    parents = np.concatenate((parents, np.empty(used, np.int32)))
+                _add_anchor(points, values, parents, used, b, parent)
+                _add_anchor(points, values, parents, used + 1, c, used)
+                a, used = np.int32(used + 1), used + 2
+                value[n] = values[a] + _distance(c, q)
+            anchor[n], nodes.tested[n] = a, a >= 0
+            if a < 0:
                 continue
-            if refused[p] == a and value[p] < np.inf:
+            if value[n] > length:
+                heapq.heappush(heap, (value[n], n))
+                continue
+        nodes.done[n] = True
+        at, own = _place(points, a), _kept(a, own_goal, reach)
+        i, j, k = _indices(lattice, n)
+        for move in range(lattice.moves.shape[0]):
+            p = _neighbour(lattice, move, i, j, k)
+            if p < 0 or nodes.done[p] or not lattice.free[p]:
                 continue
             place = _place(lattice.places, p)
             length = values[a] + _distance(at, place)
-            if length >= value[p]:
+            # What is hidden from one that has no way yet may still be reached by going round.
+            if length >= value[p] or (hidden[p] == a and value[p] < np.inf):
                 continue
-            if tested[p] and not _sees(space, reach, at, own_goal if a == 0 else reach, place, reach):
-                refused[p] = a
+            if nodes.tested[p] and not _sees(space, reach, at, own, place, reach):
+                hidden[p] = a
                 continue
             value[p], anchor[p] = length, a
             heapq.heappush(heap, (length, p))
     for n in range(count):
-        if not done[n]:
+        if not nodes.done[n]:
             anchor[n] = _NOBODY
-    return anchor, points[:used].copy(), values[:used].copy(), parents[:used].copy()
+    return points[:used].copy(), values[:used].copy(), parents[:used].copy()
+
+
+def spread(space: Space, lattice: Lattice, reach: float, goal: Any) -> Front:
+    """The wavefront of a body of this reach from its goal ``(3,)``."""
+    count = len(lattice.free)
+    nodes = _Nodes(
+        value=np.full(count, np.inf),
+        anchor=np.full(count, _NOBODY),
+        hidden=np.full(count, _NOBODY),
+        tested=np.zeros(count, np.bool_),
+        done=np.zeros(count, np.bool_),
+        tried=np.empty(len(lattice.moves), np.int32),
+    )
+    return Front(nodes.anchor, *_spread(space, lattice, reach, goal, nodes))
 
 
 @cached_kernel(SOURCES, variant="look", **OPTIONS)
@@ -506,10 +568,11 @@ def look(space: Any, lattice: Any, reach: Any, front: Any, places: Any, target: 
             target[b] = points[0]
             continue
         i, j, k = _corner(lattice, q)
-        rings = 2 + np.int64(2 * max(0.0, reach - own) / step)
+        # From deep inside an obstacle there may be none.
+        rings = 2 + np.int64(2 * min(max(0.0, reach - own), 2 * reach) / step)
         ring = 0
         while ring < rings and anchor[b] < 0:
-            last = np.int32(_NOBODY)
+            last = _NOBODY
             for ni in range(max(0, i - ring), min(size[0], i + ring + 2)):
                 for nj in range(max(0, j - ring), min(size[1], j + ring + 2)):
                     for nk in range(max(0, k - ring), min(size[2], k + ring + 2)):
