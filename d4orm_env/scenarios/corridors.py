@@ -7,9 +7,9 @@ import numpy as np
 from d4orm_env.core.arrays import whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.free_space import lattice_step, populate, reach_of
 from d4orm_env.scenarios.placement import Points, round_up
 from d4orm_env.scenarios.settings import MAX_COUNT, Settings, bounded, require_plane
+from d4orm_env.scenarios.well_formed import lattice_step, populate, reach_of
 
 DOOR_DEPTH = 0.2
 """Thickness of the wall that the door is in [m]."""

@@ -8,8 +8,8 @@ from d4orm_env.core.arrays import positive_number
 from d4orm_env.core.portable import root
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.free_space import lattice_step, populate
 from d4orm_env.scenarios.settings import MAX_COUNT, WALLS, Settings, bounded
+from d4orm_env.scenarios.well_formed import lattice_step, populate
 
 
 def forest(settings: Settings, *, size: float | None = None, density: float = 0.25) -> Problem:

@@ -9,8 +9,9 @@ from functools import cached_property
 import numpy as np
 
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.free_space import RESERVE, Mask
+from d4orm_env.scenarios.free_space import Mask
 from d4orm_env.scenarios.placement import Points
+from d4orm_env.scenarios.well_formed import RESERVE
 
 MAX_CELLS = 2**24
 """Cells of a map at most."""

@@ -15,12 +15,13 @@ import numpy as np
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.free_space import FreeSpace, free_space, populate, reach_of, with_obstacles
+from d4orm_env.scenarios.free_space import FreeSpace, free_space
 from d4orm_env.scenarios.grid_map import MAX_CELLS, GridMap
 from d4orm_env.scenarios.layout import Layout, build
 from d4orm_env.scenarios.movingai import parse_map, parse_scenario
 from d4orm_env.scenarios.placement import Points
 from d4orm_env.scenarios.settings import Settings, bounded, require_plane
+from d4orm_env.scenarios.well_formed import populate, reach_of, with_obstacles
 
 PathLike: TypeAlias = str | os.PathLike[str]
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from d4orm_env.core.arrays import positive_number
 from d4orm_env.core.problem import Problem
-from d4orm_env.scenarios.free_space import lattice_step, populate
 from d4orm_env.scenarios.settings import WALLS, Settings, bounded, grid_size, require_plane
 from d4orm_env.scenarios.wall_grid import WALL, default_squares, draw_openings, wall_world
+from d4orm_env.scenarios.well_formed import lattice_step, populate
 
 
 def rooms(

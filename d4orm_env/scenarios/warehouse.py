@@ -8,8 +8,8 @@ import numpy as np
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.free_space import lattice_step, populate
 from d4orm_env.scenarios.settings import Settings, bounded, grid_size, require_plane
+from d4orm_env.scenarios.well_formed import lattice_step, populate
 
 
 def warehouse(
