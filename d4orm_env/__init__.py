@@ -12,7 +12,7 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
 from d4orm_env.joint_env import register_environments
 from d4orm_env.rollout import rollout
-from d4orm_env.scenarios import list_scenarios, make_problem, register_scenario
+from d4orm_env.scenarios import list_scenarios, load_map, make_problem, register_scenario
 from d4orm_env.verify import VerificationReport, verify
 
 if TYPE_CHECKING:
@@ -22,8 +22,9 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
-    "Problem", "Team", "Trajectory", "VerificationReport", "World", "functional", "list_scenarios", "load_problem",
-    "make_problem", "navigation_v0", "register_model", "register_scenario", "rollout", "save_problem", "verify",
+    "Problem", "Team", "Trajectory", "VerificationReport", "World", "functional", "list_scenarios", "load_map",
+    "load_problem", "make_problem", "navigation_v0", "register_model", "register_scenario", "rollout", "save_problem",
+    "verify",
 ]  # fmt: skip
 
 register_environments()

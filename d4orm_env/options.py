@@ -38,8 +38,8 @@ class EnvOptions:
         reward: ``"paper"``, ``"training"`` (:class:`~d4orm_env.rewards.TrainingReward`), or a function from a
             :class:`~d4orm_env.rewards.RewardInput` to the rewards ``(..., K)`` of all robots.
         progress: What the distances of rewards are, the paper's among them: ``"straight"``, or the length of the
-            shortest free ``"way"``, see :mod:`d4orm_env.ways`; the same in a world without obstacles. Not for
-            ``lifelong``.
+            shortest free ``"way"``, see :mod:`d4orm_env.ways`, which is the same in a world without obstacles. Not
+            for ``lifelong``.
         observed_way: Whether an observation ends with direction and length of the shortest free way. Not for
             ``lifelong``.
         observed_robots: Nearest robots in an observation; missing ones are marked absent.

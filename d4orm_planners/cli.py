@@ -30,6 +30,7 @@ from d4orm_planners.commands.options import (
     Quiet,
     Robots,
     Scenario,
+    ScenarioSettings,
     Seed,
     Settings,
     TimeLimit,
@@ -86,7 +87,7 @@ def demo(
     from d4orm_env.render import save_animation, save_picture
 
     make_folder(out)
-    problem = _problem("circle", robots, None, None, seed)
+    problem = _problem("circle", robots, None, None, None, seed)
     plan = _solve(problem, "d4orm", {"engine": engine}, seed, None, None, quiet=False)
     print_plan(plan)
     require_solved(plan)
@@ -109,6 +110,7 @@ def plan_command(
     robots: Robots = None,
     model: Model = None,
     obstacles: Obstacles = None,
+    scenario_settings: ScenarioSettings = None,
     seed: Seed = 0,
     planner: PlannerName = "d4orm",
     preset: Preset = None,
@@ -128,7 +130,7 @@ def plan_command(
     for name in {"engine", "preset", "max_iterations"}.intersection(chosen):
         refuse_options(context, (name,), f"and --set {name} say the same; give one of them")
     chosen = {"engine": engine, "preset": preset, **chosen}
-    problem = _problem(scenario, robots, model, obstacles, seed)
+    problem = _problem(scenario, robots, model, obstacles, scenario_settings, seed)
     plan = _solve(problem, planner, chosen, seed, time_limit, max_iterations, quiet)
     if not quiet:
         print_plan(plan)
@@ -149,6 +151,7 @@ def run(
     robots: Robots = None,
     model: Model = None,
     obstacles: Obstacles = None,
+    scenario_settings: ScenarioSettings = None,
     seed: Seed = 0,
     policy: Annotated[
         str, typer.Option("--policy", "-p", help="Planner, policy or package.module:Name to run.")
@@ -170,14 +173,14 @@ def run(
     if plan_file is not None:
         refuse_options(
             context,
-            ("scenario", "robots", "model", "obstacles", "policy"),
+            ("scenario", "robots", "model", "obstacles", "scenario_settings", "policy"),
             f"does not go with a plan file; {plan_file} has a problem and controls of its own",
         )
         plan = Plan.load(plan_file)
         problem: Problem = plan.problem
         actor: Policy = OpenLoop(plan=plan)
     else:
-        problem, actor = _problem(scenario, robots, model, obstacles, seed), make_policy(policy)
+        problem, actor = _problem(scenario, robots, model, obstacles, scenario_settings, seed), make_policy(policy)
     env = navigation_v0.parallel_env(problem=problem, control_noise_std=noise)
     episode = run_episode(env, actor, seed=seed)
     env.close()
@@ -242,17 +245,34 @@ def _or_error(describe: Callable[[str], str], name: str) -> str:
         return f"unusable: {error}"
 
 
-def _problem(scenario: str, robots: int | None, model: str | None, obstacles: int | None, seed: int) -> Problem:
+def _problem(
+    scenario: str,
+    robots: int | None,
+    model: str | None,
+    obstacles: int | None,
+    settings: list[str] | None,
+    seed: int,
+) -> Problem:
     from d4orm_env.scenarios import load_problem, make_problem
     from d4orm_env.scenarios.problems import is_scenario_file
 
     if is_scenario_file(scenario):
-        given = {"--robots": robots, "--model": model, "--obstacles": obstacles}
+        given = {"--robots": robots, "--model": model, "--obstacles": obstacles, "--scenario-set": settings}
         for option, value in given.items():
             if value is not None:
-                raise ValueError(f"{option} {value} does not go with a scenario file; change it in {scenario}")
+                shown = " ".join(value) if isinstance(value, list) else value
+                raise ValueError(f"{option} {shown} does not go with a scenario file; change it in {scenario}")
         return load_problem(scenario)
-    return make_problem(scenario, num_robots=robots, seed=seed, model=model, num_obstacles=obstacles)
+    own = parse_settings(settings, "--scenario-set")
+    for name, option in (
+        ("num_robots", "robots"),
+        ("seed", "seed"),
+        ("model", "model"),
+        ("num_obstacles", "obstacles"),
+    ):
+        if name in own:
+            raise ValueError(f"--scenario-set {name} is said by --{option}; use that")
+    return make_problem(scenario, num_robots=robots, seed=seed, model=model, num_obstacles=obstacles, **own)
 
 
 def _solve(

@@ -5,33 +5,23 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scenario_support import needed, scenario_models
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
-from d4orm_env.scenarios import list_scenarios
-
-MODELS_2D = ("holonomic2d", "velocity2d", "differential_drive")
-SPATIAL_ONLY = ("sphere", "amswarm_1", "amswarm_2", "amswarm_3", "amswarm_4", "amswarm_5")
 
 
 def scenario_cases(num_robots: int) -> list[dict[str, Any]]:
     """Arguments of every scenario with every model that it takes."""
     cases: list[dict[str, Any]] = []
-    for scenario in list_scenarios():
-        if scenario == "heterogeneous":
-            cases.append({"scenario": scenario, "num_robots": num_robots})
-        elif scenario.startswith("amswarm"):
-            cases.append({"scenario": scenario})
-        elif scenario in SPATIAL_ONLY:
-            cases.append({"scenario": scenario, "num_robots": num_robots})
-        else:
-            models = (*MODELS_2D, "holonomic3d")
-            cases += [{"scenario": scenario, "num_robots": num_robots, "model": model} for model in models]
+    for scenario, model in scenario_models():
+        size = {} if scenario.startswith("amswarm") else {"num_robots": num_robots}
+        cases.append({"scenario": scenario, **size, **({} if model is None else {"model": model}), **needed(scenario)})
     return cases
 
 
 def case_name(case: dict[str, Any]) -> str:
-    return "-".join(str(value) for key, value in case.items() if key != "num_robots")
+    return "-".join(str(value) for key, value in case.items() if key in ("scenario", "model"))
 
 
 def line_problem(distances: list[float], model: str = "velocity2d", **changes: Any) -> Problem:

@@ -32,6 +32,9 @@ TINY: dict[str, Any] = {
     "seeds": 2,
     "plan_time_limit": 5.0,
     "memory_robots": 2,
+    "obstacles": (3,),
+    "far_obstacles": (5,),
+    "map_cells": (4,),
 }
 
 
@@ -83,7 +86,7 @@ def test_every_engine_rule_and_size_is_measured(results: dict[str, list[Any]]) -
         ("cpu", "default", 2), ("cpu", "paper", 2), ("jax", "paper", 2), ("plain", "paper", 2),
         ("cpu", "default", 3), ("cpu", "paper", 3),
     }  # fmt: skip
-    assert set(results) == {"denoising", "environments", "memory", "plans"}
+    assert set(results) == {"denoising", "environments", "obstacles", "index", "memory", "plans"}
 
 
 def test_the_numbers_hang_together(results: dict[str, list[Any]]) -> None:
@@ -92,6 +95,12 @@ def test_the_numbers_hang_together(results: dict[str, list[Any]]) -> None:
         assert 0 < row["step"].smallest <= row["step"].median <= row["step"].largest
     for row in results["environments"]:
         assert row["steps_per_second"] == pytest.approx(1 / row["seconds_per_step"].median)
+    for row in results["obstacles"]:
+        assert row["ratio"].count == row["iteration"].count >= 1
+    assert [row["obstacles"] for row in results["environments"]] == [0, 0, 5, 5]
+    assert [(row["obstacles"], row["where"]) for row in results["obstacles"]] == [(3, "near"), (5, "far")]
+    (index,) = results["index"]
+    assert 0 < index["bytes"] < 2**20
     (memory,) = results["memory"]
     assert 30 * 2**20 < memory["imported"] <= memory["peak"] < 2**32
     default, paper = results["plans"]

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from d4orm_env import make_problem
 from d4orm_planners import cli
 from d4orm_planners.plan import Plan
 
@@ -88,6 +89,12 @@ def test_scenario_file(d4orm, tmp_path: Path) -> None:
     assert d4orm("plan", "--scenario", "mine.yaml", "--quiet").status == 0
 
 
+def test_arguments_of_a_scenario(d4orm) -> None:
+    settings = ("--scenario-set", "diameter=2e0", "--scenario-set", "margin=0.1")
+    assert d4orm("plan", "--robots", "2", *settings, *QUICK, "--out", "plan.npz", "--quiet").status in (0, 1)
+    assert Plan.load(Path("plan.npz")).problem == make_problem("circle", 2, diameter=2.0, margin=0.1)
+
+
 @pytest.mark.parametrize("command", ["scenarios", "planners"])
 def test_lists(d4orm, command: str) -> None:
     outcome = d4orm(command)
@@ -117,6 +124,13 @@ BAD = [
     (("plan", "--planner", "nope"), "planner 'nope' is unknown; choose one of d4orm"),
     (("plan", "--preset", "nope"), "preset 'nope'"),
     (("plan", "--scenario", "nope"), "scenario 'nope' is unknown"),
+    (("plan", "--scenario", "map"), "scenario 'map' needs map=, the path of a .map file"),
+    (("plan", "--scenario", "map", "--scenario-set", "map=missing.map"), "missing.map: cannot be read"),
+    (("run", "--scenario", "map", "--scenario-set", "map=nan.yaml"), "nan.yaml: has no field 'image'"),
+    (("plan", "--scenario", "maze", "--scenario-set", "loops"), "--scenario-set 'loops' is not of the form name=value"),
+    (("plan", "--scenario", "maze", "--scenario-set", "loop=1"), "takes no argument 'loop'"),
+    (("plan", "--scenario-set", "num_robots=3"), "--scenario-set num_robots is said by --robots; use that"),
+    (("plan", "--scenario", "good.yaml", "--scenario-set", "dt=1"), "--scenario-set dt=1 does not go with a scenario"),
     (("plan", "--scenario", "missing.yaml"), "missing.yaml"),
     (("plan", "--scenario", "nan.yaml"), "finite"),
     (("plan", "--scenario", "overlap.yaml"), "overlap"),
@@ -154,7 +168,7 @@ BAD = [
         (("run", "whole.npz", option, value), f"{option} does not go with a plan file; whole.npz has a problem")
         for option, value in (
             ("--scenario", "circle"), ("--robots", "2"), ("--model", "velocity2d"), ("--obstacles", "0"),
-            ("--policy", "d4orm"),
+            ("--policy", "d4orm"), ("--scenario-set", "diameter=6"),
         )
     ),
     (("reproduce", "--list", "circle"), "figure does not go with the list of figures"),

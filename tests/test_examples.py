@@ -139,6 +139,13 @@ def test_mixed_team_example_solves_a_scenario_and_draws_it(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
+def test_walled_worlds_are_drawn(tmp_path: Path) -> None:
+    completed("walled_worlds", tmp_path / "out")
+    pictures = sorted((tmp_path / "out").iterdir())
+    assert [path.name for path in pictures] == ["scenario_maze.png", "scenario_rooms.png"]
+    assert all(path.read_bytes().startswith(PNG) for path in pictures)
+
+
 def test_gradient_ascent_through_the_dynamics_raises_the_reward(tmp_path: Path) -> None:
     out = tmp_path / "out"
     completed("jax_functional", out)

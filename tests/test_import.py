@@ -16,6 +16,7 @@ CONTRACT = (
     "load_problem",
     "save_problem",
     "list_scenarios",
+    "load_map",
     "Problem",
     "Team",
     "World",

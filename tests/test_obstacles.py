@@ -18,7 +18,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.core.world_index import MAX_BYTES, build_index
-from d4orm_env.engine.base import get_engine
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.verify.geometry import polygon_approach
 from d4orm_planners import make_planner
 from d4orm_planners.steering import straight_drives

@@ -11,6 +11,7 @@ import pytest
 from engine_support import ENGINE_NAMES, RecordedRules, cpu_rewards, engine_noise, toward_goals
 from env_support import mixed_problem
 from reference import ROUNDOFF, judge, position_error
+from scenario_support import needed
 
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
@@ -236,7 +237,7 @@ def test_so_it_is_for_robots_that_stand_in_all_samples(engine: str) -> None:
 @pytest.mark.parametrize("scenario", list_scenarios())
 def test_so_it_is_in_every_scenario(scenario: str, engine: str) -> None:
     size = {} if scenario.startswith("amswarm") else {"num_robots": 4}
-    problem = make_problem(scenario, **size, horizon=20, dt=0.25)
+    problem = make_problem(scenario, **size, **needed(scenario), horizon=20, dt=0.25)
     task = SamplingTask(problem, 0.3 * toward_goals(problem), credit="robot")
     step_by_step(ENGINES[engine], task, sigma=(0.6, 0.2))
 

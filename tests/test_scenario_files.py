@@ -11,6 +11,7 @@ import pytest
 import yaml
 from hypothesis import example, given
 from hypothesis import strategies as st
+from scenario_support import WALLED, needed
 
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
@@ -24,6 +25,7 @@ CASES: list[tuple[str, str | None]] = [
     (name, model) for name in ("circle", "random", "four_obstacles", "swap") for model in MODELS
 ]
 CASES += [("sphere", None), ("heterogeneous", None), *((f"amswarm_{index}", None) for index in range(1, 6))]
+CASES += [(name, model) for name, models in WALLED.items() for model in models]
 
 ROBOT = "{model: holonomic2d, start: [0, 0], goal: [1, 0]}"
 MINIMAL = f"version: 1\nrobots: [{ROBOT}]\n"
@@ -49,7 +51,7 @@ def test_the_cases_cover_every_scenario() -> None:
 
 @pytest.mark.parametrize(("name", "model"), CASES)
 def test_scenarios_come_back_to_the_bit(name: str, model: str | None) -> None:
-    problem = make_problem(name, model=model, seed=3, num_obstacles=2, margin=0.07, goal_speed=1 / 3)
+    problem = make_problem(name, model=model, seed=3, num_obstacles=2, margin=0.07, goal_speed=1 / 3, **needed(name))
     again = saved_and_loaded(problem)
     assert again == problem
     assert again.name == name

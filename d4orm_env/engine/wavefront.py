@@ -109,7 +109,7 @@ class Front(NamedTuple):
 def make_space(problem: Problem) -> Space:
     """The world of a problem; it must have obstacles."""
     world, d = problem.world, problem.dimension
-    shapes, index = world.shapes, world.index(float(problem.team.radius.max()) + problem.margin)
+    shapes, index = world.shapes, problem.arrays.grid
     cell = 1.0 / float(index.scale)
     lower, upper = shapes.extent()
     pad = 0.999 * float((lower - index.low).min())

@@ -5,6 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from d4orm_env.scenarios.maps import load_map
 from d4orm_env.scenarios.problems import make_problem
 from d4orm_env.scenarios.registry import describe_scenario, list_scenarios, register_scenario
 
@@ -12,7 +13,8 @@ if TYPE_CHECKING:
     from d4orm_env.scenarios.files import load_problem, save_problem
 
 __all__ = [
-    "describe_scenario", "list_scenarios", "load_problem", "make_problem", "register_scenario", "save_problem",
+    "describe_scenario", "list_scenarios", "load_map", "load_problem", "make_problem", "register_scenario",
+    "save_problem",
 ]  # fmt: skip
 
 

@@ -61,7 +61,13 @@ def size_for(count: int, spacing: float, dimension: int) -> float:
 
 
 def with_random_obstacles(
-    settings: Settings, world: World, places: Points, half_extent: Points, *, is_round: bool
+    settings: Settings,
+    world: World,
+    places: Points,
+    half_extent: Points,
+    *,
+    is_round: bool,
+    centre: Points | float = 0.0,
 ) -> World:
     """The world and ``settings.num_obstacles`` random circles, or spheres in space.
 
@@ -71,9 +77,10 @@ def with_random_obstacles(
     Args:
         settings: Number and radius of obstacles, team, seed.
         world: The world they are added to.
-        places: ``(2 K, d)`` starts, then goals [m].
-        half_extent: ``(d,)`` half the sides of the box around the origin that centres are drawn from [m].
-        is_round: Whether centres keep to the ellipse inside that box.
+        places: ``(., d)`` starts, then goals, or none where these are drawn later [m].
+        half_extent: ``(d,)`` half the sides of the box that they are drawn from [m].
+        is_round: Whether they keep to the ellipse inside that box.
+        centre: ``(d,)`` centre of that box [m].
 
     Raises:
         ValueError: If so many do not fit; the message says how many do.
@@ -88,13 +95,13 @@ def with_random_obstacles(
     balls: Points = np.empty((0, world.dimension))
 
     def is_free(centres: Points) -> NDArray[np.bool_]:
-        inside = ((centres / extent) ** 2).sum(axis=1) <= 1 if is_round else np.full(len(centres), True)
+        inside = (((centres - centre) / extent) ** 2).sum(axis=1) <= 1 if is_round else np.full(len(centres), True)
         apart = _gaps(centres, places, reach) > 0
         passable = (world.clearance(centres) > size + passage) & (_gaps(centres, balls, 2 * size + passage) > 0)
         return np.asarray(inside & apart & passable)
 
     for index in range(settings.num_obstacles):
-        ball = _first(random, half_extent, is_free)
+        ball = _first(random, half_extent, is_free, centre)
         if ball is None:
             raise _too_many(settings, index, size)
         balls = np.vstack([balls, ball])
@@ -132,11 +139,14 @@ def _with_another(
 
 
 def _first(
-    random: np.random.Generator, half_extent: Points, is_free: Callable[[Points], NDArray[np.bool_]]
+    random: np.random.Generator,
+    half_extent: Points,
+    is_free: Callable[[Points], NDArray[np.bool_]],
+    centre: Points | float = 0.0,
 ) -> Points | None:
     """The first uniform random point that is free, or ``None`` if none of many was."""
     for attempt in range(ROUNDS):
-        points = random.uniform(-half_extent, half_extent, (min(FEW << attempt, MANY), len(half_extent)))
+        points = centre + random.uniform(-half_extent, half_extent, (min(FEW << attempt, MANY), len(half_extent)))
         # Rounded as the problem will hold them, so that what is checked is what is used.
         points = points.astype(np.float32).astype(np.float64)
         free = is_free(points)

@@ -76,8 +76,8 @@ def make_problem(
     ``num_obstacles`` (0), ``obstacle_radius``, ``radius``, ``margin``, ``dt``, ``horizon``, ``goal_radius``,
     ``goal_speed``, ``arrival``, ``max_speed``, ``max_acceleration`` and ``max_turn_rate``; see
     :class:`~d4orm_env.scenarios.settings.Settings` for units and defaults, which are the paper's, and
-    :mod:`~d4orm_env.scenarios.generators` for each scenario's own arguments. An argument that is ``None`` takes its
-    default. Robots start at rest; those with a heading face their goals.
+    :mod:`~d4orm_env.scenarios.generators` and the modules beside it for each scenario's own arguments. An argument that
+    is ``None`` takes its default. Robots start at rest; those with a heading face their goals.
 
     Without ``horizon`` the problem has 100 steps (the paper's), and more where robots have further to go than those
     allow for: see :func:`~d4orm_env.scenarios.layout.default_horizon`.

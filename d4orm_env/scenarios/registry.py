@@ -8,7 +8,7 @@ from typing import Any
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.registry import Registry
-from d4orm_env.scenarios import generators
+from d4orm_env.scenarios import corridors, forest, generators, maps, maze, rooms, warehouse
 from d4orm_env.scenarios.scenario import BuiltIn, Scenario
 
 FILE_SUFFIXES = (".yaml", ".yml")
@@ -51,6 +51,13 @@ for _scenario in (
     BuiltIn(generators.amswarm_3, **_AMSWARM),
     BuiltIn(generators.amswarm_4, **_AMSWARM),
     BuiltIn(generators.amswarm_5, **_AMSWARM),
+    BuiltIn(rooms.rooms, draws=True),
+    BuiltIn(maze.maze, draws=True),
+    BuiltIn(warehouse.warehouse, draws=True),
+    BuiltIn(forest.forest, draws=True),
+    BuiltIn(corridors.corridor, draws=True),
+    BuiltIn(corridors.doorway, draws=True),
+    BuiltIn(maps.map),
 ):
     register_scenario(_scenario.__name__, _scenario)
 

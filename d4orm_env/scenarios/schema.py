@@ -221,6 +221,8 @@ class ScenarioFile(BaseModel):
         complaint = scenario.complaint(arguments)
         if complaint:
             raise ValueError(complaint)
+        if scenario.name == "map":
+            raise ValueError("scenario 'map' reads another file, as none does; write its problem with save_problem()")
         problem = scenario.problem(**arguments)
         return problem if self.name is None else problem.replace(name=self.name)
 

@@ -29,7 +29,7 @@ class Settings:
     Attributes:
         scenario: Name of the scenario.
         num_robots: ``K``.
-        seed: Seeds whatever the scenario draws: random starts and goals, random obstacles, jitter.
+        seed: Seeds whatever the scenario draws: walls, random starts and goals, random obstacles, jitter.
         model: One model name for all robots, or ``K`` names.
         num_obstacles: Random circles (spheres in space) placed inside the scenario.
         obstacle_radius: Radius of circular obstacles [m].
@@ -111,7 +111,7 @@ class Settings:
         return np.random.default_rng([self.seed, purpose])
 
 
-STARTS_AND_GOALS, OBSTACLES, JITTER = range(3)
+STARTS_AND_GOALS, OBSTACLES, JITTER, WALLS = range(4)
 """Purposes of :meth:`Settings.generator`."""
 
 
@@ -125,3 +125,30 @@ def bounded(value: SupportsFloat, name: str, *, zero_allowed: bool = False) -> f
     if number > LARGEST:
         raise ValueError(f"{name} is {number:g}; scenarios take at most {LARGEST:g}")
     return number
+
+
+def require_plane(settings: Settings) -> None:
+    """Check that a scenario of the plane is asked for robots of the plane.
+
+    Raises:
+        ValueError: If not.
+    """
+    if settings.team.dimension != 2:
+        raise ValueError(
+            f"scenario {settings.scenario!r} is planar and model {settings.model!r} is not; "
+            f"use model='holonomic2d', or scenario 'forest'"
+        )
+
+
+def grid_size(value: object, name: str) -> tuple[int, int]:
+    """Columns and rows from what was given for them.
+
+    Raises:
+        ValueError: If it is not two whole numbers, or too many squares.
+    """
+    if not isinstance(value, tuple | list) or len(value) != 2:
+        raise ValueError(f"{name} must be two whole numbers, columns and rows, not {value!r}")
+    columns, rows = (whole_number(count, name, 1, MAX_COUNT) for count in value)
+    if columns * rows > MAX_COUNT:
+        raise ValueError(f"{name} is {columns} x {rows}; scenarios make at most {MAX_COUNT} in all")
+    return columns, rows

@@ -137,7 +137,8 @@ def parts(settings: BenchmarkSettings) -> Iterator[Part]:
         among = f" among {num_boxes} boxes" if num_boxes else ""
         yield "environments", f"one environment{among}", partial(_measure_env, settings, num_boxes)
         yield "environments", f"{settings.num_worlds} worlds{among}", partial(_measure_worlds, settings, num_boxes)
-    for where, counts in (("near", settings.obstacles), ("far", settings.far_obstacles)):
+    surroundings: dict[Where, tuple[int, ...]] = {"near": settings.obstacles, "far": settings.far_obstacles}
+    for where, counts in surroundings.items():
         for count in counts:
             yield "obstacles", f"{count} boxes {where}", partial(_measure_obstacles, settings, count, where)
     for cells in settings.map_cells:

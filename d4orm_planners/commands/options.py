@@ -15,6 +15,10 @@ Scenario = Annotated[
 Robots = Annotated[int | None, typer.Option("--robots", "-k", help="Number of robots; the scenario's own by default.")]
 Model = Annotated[str | None, typer.Option("--model", "-m", help="Robot model; the scenario's own by default.")]
 Obstacles = Annotated[int | None, typer.Option("--obstacles", help="Random obstacles to add.")]
+ScenarioSettings = Annotated[
+    list[str] | None,
+    typer.Option("--scenario-set", help="An argument of the scenario, as diameter=8; repeatable."),
+]
 Seed = Annotated[int, typer.Option("--seed", help="Seed of the scenario and of the planner.")]
 PlannerName = Annotated[
     str, typer.Option("--planner", "-p", help="Planner (see `d4orm planners`), or package.module:Name.")

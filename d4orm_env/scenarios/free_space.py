@@ -1,0 +1,303 @@
+"""Starts and goals among walls, such that everybody gets by: a robot never has to wait for one that stands.
+
+Such an instance is called well-formed (Cap, Novak, Kleiner and Selecky, 2015): each robot has a way from its start to
+its goal that keeps clear of all other starts and goals. One after another, in any order, all of them arrive, and none
+that has docked closes the way of another.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.core.portable import root
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.world import World
+from d4orm_env.scenarios.layout import Layout, build
+from d4orm_env.scenarios.placement import Points, round_up, with_random_obstacles
+from d4orm_env.scenarios.settings import STARTS_AND_GOALS, Settings
+
+Mask = NDArray[np.bool_]
+
+RESERVE = 1e-3
+"""More than float32 rounds away over a map, and left free beside the margin [m]."""
+
+MAX_POINTS = 2**23
+"""Lattice points of a world at most: what a map of two million cells needs."""
+
+ENOUGH_POINTS = 2**18
+"""Lattice points that do where nothing is narrow."""
+
+WINDOW = {2: 32, 3: 8}
+"""How many lattice points away a way round a place is looked for at least."""
+
+TRIES, ROUNDS = 200, 3
+"""Places looked at for each start or goal in one attempt to find all of them, and attempts."""
+
+
+@dataclass(frozen=True, eq=False)
+class FreeSpace:
+    """The largest connected region in which a robot can drive clear of obstacles, as points of a lattice.
+
+    Attributes:
+        low: ``(d,)`` the first lattice point [m].
+        step: Distance of neighbouring lattice points [m].
+        inside: ``(n_1, ..., n_d)`` which points belong to the region. A robot can go straight from each to its
+            neighbours along the axes.
+    """
+
+    low: Points
+    step: float
+    inside: Mask
+
+    def points(self, indices: NDArray[np.int64]) -> Points:
+        """``(..., d)`` places of the lattice points of these indices, as float32 holds them [m]."""
+        places: Points = (self.low + self.step * indices).astype(np.float32).astype(np.float64)
+        return places
+
+    def contains(self, place: Points) -> bool:
+        """Whether the lattice point nearest to a place belongs to the region."""
+        index = np.round((place - self.low) / self.step).astype(int)
+        within = ((index >= 0) & (index < self.inside.shape)).all()
+        return bool(within and self.inside[tuple(index)])
+
+    @cached_property
+    def longest_way(self) -> float:
+        """About the longest of all shortest ways within the region [m], to some 10%."""
+        inside = np.pad(self.inside, 1)
+        steps = np.array(list(product((-1, 0, 1), repeat=inside.ndim)))
+        around = steps @ (np.array(inside.strides) // inside.itemsize)
+        # Straight steps and any steps in turn go about as far in all directions.
+        kinds = (around[np.abs(steps).sum(axis=1) == 1], around)
+        end, _ = _last_reached(inside.ravel(), np.flatnonzero(inside)[:1], kinds)
+        return _last_reached(inside.ravel(), end, kinds)[1] * self.step
+
+    def draw(self, random: np.random.Generator, groups: Sequence[tuple[Mask | None, int]], separation: float) -> Points:
+        """Random places, far enough apart that a robot gets from each to each while robots stand on all others.
+
+        Args:
+            random: Where the draws come from.
+            groups: Of each group of places the part of the region that they are drawn from, or ``None`` for all of it,
+                and their number.
+            separation: Distance that robots which pass by keep to a place [m].
+
+        Returns:
+            ``(P, d)`` group by group; fewer than asked for if there is no room.
+        """
+        placing = _Placing(self.inside, separation / self.step, sum(number for _, number in groups))
+        for part, number in groups:
+            candidates = np.flatnonzero(self.inside if part is None else self.inside & part)
+            some = random.choice(candidates, min(len(candidates), TRIES * max(number, 100)), replace=False)
+            wanted = placing.count + number
+            for index in zip(*np.unravel_index(some, self.inside.shape), strict=True):
+                if placing.count == wanted:
+                    break
+                placing.add(np.array(index))
+            if placing.count < wanted:
+                break
+        return self.points(placing.places[: placing.count])
+
+
+def _last_reached(
+    inside: Mask, begin: NDArray[np.int64], kinds: Sequence[NDArray[np.int64]]
+) -> tuple[NDArray[np.int64], int]:
+    """One of the points reached last from another, and after how many steps, of these kinds in turn."""
+    unseen, front, steps = inside.copy(), begin, 0
+    while True:
+        unseen[front] = False
+        near = (front[:, None] + kinds[steps % len(kinds)]).ravel()
+        reached = np.unique(near[unseen[near]])
+        if not len(reached):
+            return front[:1], steps
+        front, steps = reached, steps + 1
+
+
+@lru_cache(maxsize=4)
+def free_space(world: World, reach: float, step: float) -> FreeSpace:
+    """The free space of a world with bounds.
+
+    Args:
+        world: Obstacles and bounds.
+        reach: Distance that a robot's centre keeps to them [m].
+        step: Of the lattice, which begins at the lower bounds [m].
+
+    Raises:
+        ValueError: If the lattice gets too large.
+    """
+    from scipy.ndimage import label
+
+    low, high = world.bounds.astype(np.float64)
+    shape = ((high - low) / step + 1).astype(int)
+    if np.prod(shape, dtype=np.float64) > MAX_POINTS:
+        raise ValueError(
+            f"a world of {' x '.join(f'{side:g}' for side in high - low)} m takes more than {MAX_POINTS} points "
+            f"{step:.2g} m apart to find free places in; use a smaller world or larger robots"
+        )
+    space = FreeSpace(low, step, np.zeros(shape, np.bool_))
+    # A robot keeps its reach between two neighbours that are further from everything than this.
+    needed = math.sqrt(reach * reach + step * step / 4)
+    free = world.clearance(space.points(np.moveaxis(np.indices(shape), 0, -1))) > needed
+    regions, count = label(free)
+    return replace(space, inside=regions == 1 + np.argmax(np.bincount(regions.ravel())[1:])) if count else space
+
+
+class _Placing:
+    """Places taken one by one from a region, the rest of which stays connected and in touch with each of them.
+
+    Args:
+        inside: The region.
+        separation: How far those who pass by stay away from a place, in steps of the lattice.
+        most: How many places there will be.
+    """
+
+    def __init__(self, inside: Mask, separation: float, most: int) -> None:
+        from scipy.ndimage import binary_dilation, label
+
+        self._label, self._dilation = label, binary_dilation
+        self.places, self.count = np.empty((most, inside.ndim), np.int64), 0
+        # Whoever goes round a place finds a way within the wide window about it, or is held to find none.
+        self._narrow = 2 * int(separation) + 1
+        self._wide = max(self._narrow, WINDOW[inside.ndim])
+        self._free = np.pad(inside, self._wide)
+        self._taken = np.zeros(self._free.shape, np.int32)
+        offsets = np.indices((2 * self._wide + 1,) * inside.ndim) - self._wide
+        self._wide_disc = (offsets * offsets).sum(axis=0) <= separation * separation
+        self._disc = self._wide_disc[self._about(np.zeros(inside.ndim, np.int64), self._narrow)]
+
+    def add(self, place: NDArray[np.int64]) -> bool:
+        """Take a place if that leaves everybody a way."""
+        if self._taken[tuple(place + self._wide)] or not self._goes_round(place):
+            return False
+        taken = self._taken[self._about(place, self._narrow)]
+        taken += self._disc
+        self.places[self.count] = place
+        others = self.places[: self.count + 1]
+        if all(self._in_touch(other) for other in others[np.abs(others - place).max(axis=1) <= self._narrow]):
+            self.count += 1
+            return True
+        taken -= self._disc
+        return False
+
+    def _about(self, place: NDArray[np.int64], window: int) -> tuple[slice, ...]:
+        return tuple(slice(index + self._wide - window, index + self._wide + window + 1) for index in place)
+
+    def _goes_round(self, place: NDArray[np.int64]) -> bool:
+        """Whether all that a new disc touches of the untaken region is connected around it."""
+        about = self._about(place, self._wide)
+        untaken = self._free[about] & (self._taken[about] == 0)
+        regions, _ = self._label(untaken & ~self._wide_disc)
+        touched = regions[self._dilation(untaken & self._wide_disc)]
+        return len(np.unique(touched[touched > 0])) == 1
+
+    def _in_touch(self, place: NDArray[np.int64]) -> bool:
+        """Whether a robot gets from a place to the untaken region through no disc but its own."""
+        about = self._about(place, self._narrow)
+        free, taken = self._free[about], self._taken[about]
+        untaken = free & (taken == 0)
+        regions, _ = self._label(untaken | (free & (taken == 1) & self._disc))
+        return bool((regions[untaken] == regions[(self._narrow,) * place.size]).any())
+
+
+def reach_of(settings: Settings) -> float:
+    """Distance that the centre of the largest robot keeps to obstacles [m]."""
+    return float(np.max(settings.team.radius)) + settings.margin + RESERVE
+
+
+def lattice_step(settings: Settings, sides: Any, passage: tuple[str, float] | None = None) -> float:
+    """Step of a lattice that is fine enough for the robots, and for the narrowest passage wherever it is [m].
+
+    Args:
+        settings: The robots.
+        sides: ``(d,)`` of the world [m].
+        passage: Name and width of the narrowest passage [m].
+
+    Raises:
+        ValueError: If the passage is too narrow; the message says what would do.
+    """
+    step = max(settings.spacing / 4, root(float(np.prod(sides)) / ENOUGH_POINTS, len(sides)))
+    if passage is None:
+        return step
+    (name, width), reach = passage, reach_of(settings)
+    if width < 2.2 * reach:
+        raise ValueError(
+            f"scenario {settings.scenario!r}: robots of radius {np.max(settings.team.radius):g} m with margin "
+            f"{settings.margin:g} m do not fit through a {name} of {width:g} m; use {name}={round_up(2.2 * reach)}"
+        )
+    return min(step, 0.99 * (width / 2 - reach))
+
+
+def populate(
+    settings: Settings,
+    world: World,
+    step: float,
+    travel: float,
+    remedy: str,
+    exchange: tuple[float, float] | None = None,
+) -> Problem:
+    """The problem of a team at random places of a world with walls, all of which are free for all others to pass.
+
+    Args:
+        settings: The common arguments; random obstacles are placed before the robots.
+        world: Walls and bounds.
+        step: Of the lattice that places are drawn from [m].
+        travel: The distance the horizon is made for [m].
+        remedy: What to change where the robots do not fit.
+        exchange: Half of the robots start at an x below the first of them and end above the second [m], the others the
+            other way round; everywhere by default.
+
+    Raises:
+        ValueError: If robots or obstacles do not fit.
+    """
+    world = with_obstacles(settings, world)
+    starts, goals = draw_team(settings, free_space(world, reach_of(settings), step), remedy, exchange)
+    return build(replace(settings, num_obstacles=0), Layout(starts, goals, world, travel, np.zeros(world.dimension)))
+
+
+def with_obstacles(settings: Settings, world: World, places: Points | None = None) -> World:
+    """A world with bounds and the random obstacles asked for, clear of starts and goals if they are known."""
+    low, high = world.bounds.astype(np.float64)
+    places = np.empty((0, world.dimension)) if places is None else places
+    return with_random_obstacles(settings, world, places, (high - low) / 2, is_round=False, centre=(low + high) / 2)
+
+
+def draw_team(
+    settings: Settings, space: FreeSpace, remedy: str, exchange: tuple[float, float] | None = None
+) -> tuple[Points, Points]:
+    """``(K, d)`` random starts and goals; see :func:`populate`.
+
+    Raises:
+        ValueError: If they do not fit.
+    """
+    random = settings.generator(STARTS_AND_GOALS)
+    count = settings.num_robots
+    # A robot may dock anywhere within the goal radius.
+    apart = settings.spacing + settings.goal_radius + RESERVE
+    separation = math.sqrt(apart * apart + space.step * space.step / 4)
+    number = np.arange(2 * count)
+    groups: list[tuple[Mask | None, int]] = [(None, 2 * count)]
+    if exchange is not None:
+        x = space.low[0] + space.step * np.arange(len(space.inside))[:, None]
+        groups = [(x < exchange[0], count), (x > exchange[1], count)]
+        # On either side the starts of one half and the goals of the other.
+        half = (count + 1) // 2
+        number = np.concatenate(
+            [number[:half], number[count + half :], number[count : count + half], number[half:count]]
+        )
+    most = 0
+    for _ in range(ROUNDS):
+        places = space.draw(random, groups, separation)
+        most = max(most, len(places))
+        if len(places) == 2 * count:
+            return places[number[:count]], places[number[count:]]
+    raise ValueError(
+        f"scenario {settings.scenario!r}: only {most} of {2 * count} starts and goals of robots of radius "
+        f"{np.max(settings.team.radius):g} m with margin {settings.margin:g} m fit in such that all robots get by; "
+        f"use fewer robots, {remedy}"
+    )

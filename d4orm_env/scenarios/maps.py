@@ -1,0 +1,132 @@
+"""Maps from files, as worlds and as a scenario."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from d4orm_env.core.arrays import shown
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.world import World
+from d4orm_env.scenarios.free_space import FreeSpace, free_space, populate, reach_of, with_obstacles
+from d4orm_env.scenarios.grid_map import MAX_CELLS, GridMap
+from d4orm_env.scenarios.layout import Layout, build
+from d4orm_env.scenarios.movingai import parse_map, parse_scenario
+from d4orm_env.scenarios.placement import Points
+from d4orm_env.scenarios.settings import Settings, bounded, require_plane
+
+PathLike: TypeAlias = str | os.PathLike[str]
+
+MAX_BYTES = 2 * MAX_CELLS
+
+
+def load_map(path: PathLike, cell: float = 0.6) -> World:
+    """The world of a map: its blocked cells, merged into few boxes, and bounds around it; y goes up.
+
+    Args:
+        path: A ``.map`` file in the format of the Moving AI Lab, whose lower left corner is at the origin: ``.``, ``G``
+            and ``S`` are free, ``@``, ``O``, ``T`` and ``W`` are blocked. Or the YAML file of ROS's map_server, with
+            its ``.png`` or ``.pgm`` image beside it: what is not known to be free is blocked.
+        cell: Side of a cell of a ``.map`` file [m]; a map_server file has a resolution of its own.
+
+    Raises:
+        ValueError: If the file cannot be read or is no map, one line that names it.
+    """
+    return read_map(path, cell).world
+
+
+def read_map(path: PathLike, cell: float = 0.6) -> GridMap:
+    """As :func:`load_map`; the same object for the same content."""
+    cell = bounded(cell, "cell")
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"the path of a map must be text or a path, not {shown(path)}")
+    file = Path(path)
+    with _named(file):
+        if file.suffix in (".yaml", ".yml"):
+            from d4orm_env.scenarios.occupancy_image import read_occupancy_image
+
+            return read_occupancy_image(file)
+        return _parse(_content(file), cell)
+
+
+_parse = lru_cache(maxsize=4)(parse_map)
+
+
+def map(
+    settings: Settings, *, map: PathLike | None = None, cell: float = 0.6, scenario_file: PathLike | None = None
+) -> Problem:
+    """A map from a file; starts and goals anywhere on it, or those of a Moving AI scenario.
+
+    Places are drawn from the largest connected region that is wide enough for the largest robot, and set by the seed.
+
+    Args:
+        settings: The common arguments.
+        map: A Moving AI ``.map`` file, or the YAML file of ROS's map_server; see :func:`load_map`.
+        cell: Side of a cell of a ``.map`` file [m].
+        scenario_file: A Moving AI ``.scen`` file, whose first ``num_robots`` rows say from where to where robots go.
+    """
+    if map is None:
+        raise ValueError(
+            f"scenario {settings.scenario!r} needs map=, the path of a .map file or a map_server .yaml file"
+        )
+    require_plane(settings)
+    grid, reach = read_map(map, cell), reach_of(settings)
+    step = grid.lattice_step(reach)
+    space = free_space(grid.world, reach, step)
+    if scenario_file is None:
+        remedy = "a larger map, larger cells or smaller robots"
+        return populate(settings, grid.world, step, space.longest_way, remedy)
+    starts, goals, travel = _listed_places(settings, grid, space, Path(scenario_file))
+    world = with_obstacles(settings, grid.world, np.vstack([starts, goals]))
+    return build(replace(settings, num_obstacles=0), Layout(starts, goals, world, travel, np.zeros(2)))
+
+
+def _listed_places(settings: Settings, grid: GridMap, space: FreeSpace, path: Path) -> tuple[Points, Points, float]:
+    """Starts and goals of a Moving AI scenario, and the longest way [m].
+
+    Raises:
+        ValueError: If the file is bad, or a robot does not fit where it begins or ends; the message names the line.
+    """
+    with _named(path):
+        tasks = parse_scenario(_content(path), grid.blocked.shape, settings.num_robots)
+        for task in tasks:
+            for what, cell in (("start", task.start), ("goal", task.goal)):
+                if grid.blocked[cell[::-1]]:
+                    raise ValueError(f"has a {what} at ({cell[0]}, {cell[1]}) in line {task.line}, a blocked cell")
+                if not space.contains(grid.centres(np.array([cell]))[0]):
+                    raise ValueError(
+                        f"has a {what} at ({cell[0]}, {cell[1]}) in line {task.line}, which robots of radius "
+                        f"{np.max(settings.team.radius):g} m with margin {settings.margin:g} m do not get to; "
+                        f"use larger cells or smaller robots"
+                    )
+    starts, goals = (grid.centres(np.array([getattr(task, what) for task in tasks])) for what in ("start", "goal"))
+    straight = np.linalg.norm(goals - starts, axis=1)
+    return starts, goals, float(max(straight.max(), grid.cell * max(task.way for task in tasks)))
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Errors as one line that begins with the file."""
+    try:
+        yield
+    except OSError as error:
+        raise ValueError(f"{error.filename or path}: cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
+
+
+def _content(path: Path) -> bytes:
+    if path.exists() and not path.is_file():
+        raise ValueError("is not a file; give the path of a map")
+    with path.open("rb") as file:
+        content = file.read(MAX_BYTES + 1)
+    if len(content) > MAX_BYTES:
+        raise ValueError(f"is larger than {MAX_BYTES // 1_000_000} MB; maps of at most {MAX_CELLS} cells are read")
+    return content

@@ -1,0 +1,111 @@
+"""Squares side by side, with walls between some of them: what rooms and mazes are made of."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from d4orm_env.core.world import World
+from d4orm_env.scenarios.free_space import Mask
+
+WALL = 0.1
+"""Thickness of a wall [m]."""
+
+SAMPLES, TRIES = 16, 1000
+"""Drawings that say how long ways usually get, and drawings until one is no longer than these."""
+
+
+class Openings(NamedTuple):
+    """Which walls between ``columns`` times ``rows`` squares are open; all squares are connected.
+
+    Attributes:
+        right: ``(rows, columns - 1)`` between a square and the next to its right.
+        above: ``(rows - 1, columns)`` between a square and the next above.
+        longest: About the most walls on the shortest way from a square to another.
+    """
+
+    right: Mask
+    above: Mask
+    longest: int
+
+
+def draw_openings(random: np.random.Generator, columns: int, rows: int, share: float) -> Openings:
+    """Random openings: a spanning tree, and that share of all other walls.
+
+    Ways are no longer than in half of some other drawings, so that one horizon suits every seed.
+
+    Raises:
+        ValueError: If they do all the same, however often they are drawn.
+    """
+    longest = _usual_longest(columns, rows, share)
+    for _ in range(TRIES):
+        openings = _draw(random, columns, rows, share)
+        if openings.longest <= longest:
+            return openings._replace(longest=longest)
+    raise ValueError(
+        f"{TRIES} drawings of {columns} x {rows} squares have ways of more than {longest}; try another seed"
+    )
+
+
+@lru_cache(maxsize=64)
+def _usual_longest(columns: int, rows: int, share: float) -> int:
+    lengths = [_draw(np.random.default_rng(seed), columns, rows, share).longest for seed in range(SAMPLES)]
+    return sorted(lengths)[SAMPLES // 2]
+
+
+def _draw(random: np.random.Generator, columns: int, rows: int, share: float) -> Openings:
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import minimum_spanning_tree, shortest_path
+
+    squares = np.arange(rows * columns).reshape(rows, columns)
+    first = np.concatenate([squares[:, :-1].ravel(), squares[:-1].ravel()])
+    second = np.concatenate([squares[:, 1:].ravel(), squares[1:].ravel()])
+    # The tree takes what is smallest, and the extra openings are the smallest of what is left.
+    weight = 1 + random.random(len(first))
+    graph = coo_array((weight, (first, second)), shape=(squares.size, squares.size))
+    is_open = np.isin(weight, minimum_spanning_tree(graph.tocsr()).data)
+    others = np.sort(weight[~is_open])
+    extra = round(share * len(others))
+    if extra:
+        is_open |= weight <= others[extra - 1]
+    opened = coo_array((np.ones(is_open.sum()), (first[is_open], second[is_open])), shape=graph.shape).tocsr()
+    longest, begin = 0, 0
+    for _ in range(2):  # from anywhere to the square furthest off, and from there to the one furthest off
+        hops = shortest_path(opened, directed=False, unweighted=True, indices=begin)
+        longest, begin = int(hops.max()), int(np.argmax(hops))
+    right, above = np.split(is_open, [rows * (columns - 1)])
+    return Openings(right.reshape(rows, columns - 1), above.reshape(rows - 1, columns), longest)
+
+
+def wall_world(openings: Openings, side: float, width: float, random: np.random.Generator) -> World:
+    """The world of that plan, centred on the origin.
+
+    Args:
+        openings: Which walls are open.
+        side: Of a square, from wall to wall [m].
+        width: Of an opening, somewhere along the square's side; the whole side if it is as wide [m].
+        random: Where along.
+    """
+    columns, rows = openings.above.shape[1], openings.right.shape[0]
+    pitch = side + WALL
+    half = np.array([columns * pitch - WALL, rows * pitch - WALL]) / 2
+    boxes = []
+    for axis, is_open in ((0, openings.right.T), (1, openings.above)):
+        gaps = random.uniform(0, 1, is_open.shape) * (side - width) - half[1 - axis]
+        for line, own in enumerate(is_open):
+            begin = gaps[line, own] + pitch * np.flatnonzero(own)
+            pieces = np.column_stack([np.r_[-half[1 - axis], begin + width], np.r_[begin, half[1 - axis]]])
+            # What is no longer than thick belongs to the walls across, if any ends there.
+            pieces = pieces[pieces[:, 1] - pieces[:, 0] > 1.01 * WALL]
+            across = np.full((len(pieces), 1), (line + 1) * pitch - WALL - half[axis])
+            low, high = np.hstack([across, pieces[:, :1]]), np.hstack([across + WALL, pieces[:, 1:]])
+            boxes.append(np.hstack([low, high] if axis == 0 else [low[:, ::-1], high[:, ::-1]]))
+    return World(2, boxes=np.vstack(boxes) if boxes else (), lower=-half, upper=half)
+
+
+def default_squares(number: float, least: int) -> tuple[int, int]:
+    """Columns and rows of the smallest square plan of at least that many squares."""
+    side = max(least, int(np.ceil(np.sqrt(number))))
+    return side, side
