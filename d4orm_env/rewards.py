@@ -22,7 +22,7 @@ class RewardInput:
 
     Every array is a read-only copy with the leading axes ``...``: none in the PettingZoo and the joint environment, so
     that ``(..., K)`` is ``(K,)``, and ``(B,)`` in the batched one, so that it is ``(B, K)``. All robots are there,
-    docked ones too.
+    docked ones too. Distances are straight, or along the shortest free ways where the environment says so.
 
     Attributes:
         previous_states: ``(..., K, n)`` before the step.

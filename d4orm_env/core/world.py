@@ -164,7 +164,7 @@ class World:
         key = (reach, nearest)
         if key not in self._indices:
             # Cells of half a reach leave few points undecided; more of the nearest are found in larger ones.
-            self._indices[key] = build_index(self.shapes, reach / 4 * nearest, reach, nearest)
+            self._indices[key] = build_index(self.shapes, reach / 4 * math.sqrt(nearest), reach, nearest)
         return self._indices[key]
 
     def clearance(self, positions: Any) -> np.ndarray:

@@ -26,7 +26,7 @@ def _steps_along(x: Any, low: Any, scale: Any, count: Any) -> Any:
     return np.int64(np.int32(place if place < last else last))
 
 
-@compiled
+@inlined
 def _cell(index: Any, x: Any, y: Any, z: Any) -> Any:
     """Number of the cell that holds a point; ``z`` is not looked at in the plane."""
     low, scale, size = index.low, index.scale, index.size
@@ -50,7 +50,7 @@ def _touches_box(box: Any, i: Any, reach: Any, x: Any, y: Any, z: Any) -> Any:
     return gap2 <= total * total
 
 
-@compiled
+@inlined
 def _touches(index: Any, boxes: Any, triangles: Any, reach: Any, x: Any, y: Any, z: Any) -> Any:
     """Whether a body of this reach touches one of the obstacles that its cell knows."""
     cell = _cell(index, x, y, z)
