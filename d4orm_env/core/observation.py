@@ -131,6 +131,8 @@ def _find_nearest_robots(k: int, position: FloatArray, nearest: FloatArray) -> N
 
 def _find_nearest_obstacles(place: FloatArray, arrays: ProblemArrays, nearest: FloatArray) -> None:
     d = place.shape[0]
+    if nearest.shape[0] == 0:
+        return
     nearest[:, 0] = np.inf
     index, count = arrays.grid, arrays.boxes.shape[0] + arrays.triangles.shape[0]
     begin, end, cell, listed = 0, count, 0, (count > 0) & (index.nearest >= nearest.shape[0])
@@ -163,7 +165,10 @@ def _insert_box(place: FloatArray, box: FloatArray, nearest: FloatArray) -> None
     for axis in range(1, d):
         gap = min(max(place[axis], box[axis]), box[d + axis]) - place[axis]
         distance2 += gap * gap
-    distance, radius = np.sqrt(distance2), box[2 * d]
+    radius, farthest = box[2 * d], nearest[nearest.shape[0] - 1, 0]
+    if distance2 > (farthest + radius) * (farthest + radius) and farthest > 0:
+        return  # for less than a square root
+    distance = np.sqrt(distance2)
     row = insert_nearest(distance - radius, nearest)
     if row >= 0:
         # Inside a box, whose radius is zero, the vector is too.

@@ -201,7 +201,8 @@ class Problem:
 
     def arrays_to_observe(self, num_obstacles: int) -> ProblemArrays:
         """:attr:`arrays` with an index that finds so many of the nearest obstacles of any place."""
-        grid = self.world.index(float(np.max(self.team.radius)) + self.margin, max(num_obstacles, 1))
+        places = np.concatenate([self.start[:, : self.dimension], self.goal])
+        grid = self.world.index(float(np.max(self.team.radius)) + self.margin, max(num_obstacles, 1), places)
         return self.arrays._replace(grid=grid)
 
     @cached_property

@@ -150,21 +150,25 @@ class World:
         return Shapes(boxes, angular)
 
     @cached_property
-    def _indices(self) -> dict[tuple[float, int], WorldIndex]:
+    def _indices(self) -> dict[tuple[float, int, float], WorldIndex]:
         return {}
 
-    def index(self, reach: float, nearest: int = 1) -> WorldIndex:
+    def index(self, reach: float, nearest: int = 1, places: FloatArray | None = None) -> WorldIndex:
         """The grid that finds obstacles, made once for distances of about the same size.
 
         Args:
-            reach: The largest distance from an obstacle that is asked about [m].
+            reach: The largest distance from an obstacle at which it counts [m].
             nearest: How many of the nearest obstacles it is to find.
+            places: ``(N, dimension)`` places round which it is to find them, however far from obstacles [m].
         """
-        reach = 2.0 ** math.ceil(math.log2(max(reach, 1e-3)))
-        key = (reach, nearest)
+        reach = margin = _rounded_up(reach)
+        if places is not None and self.shapes.count:
+            lower, upper = self.shapes.extent()
+            margin = _rounded_up(max(reach, 2 * float(np.max([lower - places, places - upper]))))
+        key = (reach, nearest, margin)
         if key not in self._indices:
-            # Cells of half a reach leave few points undecided; more of the nearest are found in larger ones.
-            self._indices[key] = build_index(self.shapes, reach / 4 * math.sqrt(nearest), reach, nearest)
+            # Cells of a quarter of a reach leave few points undecided.
+            self._indices[key] = build_index(self.shapes, reach / 4, margin, nearest)
         return self._indices[key]
 
     def clearance(self, positions: Any) -> np.ndarray:
@@ -186,3 +190,8 @@ class World:
         index = next(iter(self._indices.values()), None) or self.index(0.25)
         flat = points.reshape(-1, self.dimension)
         return np.minimum(nearest_distance(self.shapes, index, flat).reshape(to_bounds.shape), to_bounds)
+
+
+def _rounded_up(distance: float) -> float:
+    """The next power of two, so that distances of about the same size share an index."""
+    return 2.0 ** math.ceil(math.log2(max(distance, 1e-3)))

@@ -83,7 +83,7 @@ def build_index(shapes: Shapes, cell: float, reach: float, nearest: int = 1) -> 
     Args:
         shapes: The obstacles.
         cell: Size of a cell [m]; larger where there would be more cells than is worthwhile.
-        reach: Clearance up to which the grid reaches round the obstacles [m].
+        reach: How far round the obstacles the grid reaches [m]; at least to where none of them counts.
         nearest: How many of the nearest obstacles of any point a cell's list is sure to hold.
     """
     if not shapes.count:
