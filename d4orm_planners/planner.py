@@ -25,7 +25,7 @@ class PlannerConfig(CheckedSettings):
 
     Attributes:
         engine: ``"auto"``, ``"cpu"`` or ``"jax"``.
-        max_iterations: Iterations after which :meth:`Planner.solve` gives up, unless told otherwise in the call.
+        max_iterations: Iterations after which :meth:`Planner.solve` gives up, unless the call says otherwise.
         improve: Go on improving after the first solution, until the time or iteration budget is used up. By default the
             first solution ends the search.
     """

@@ -226,7 +226,7 @@ def _as_policy(thing: Any, owner: str) -> Policy:
     if count not in (1, 2):
         raise ValueError(
             f"{owner} is {shown(thing)}, which does not act; it must have reset and act, or be a function of "
-            "(observations, state) or of one robot's observation, told apart by their required positional parameters"
+            "(observations, state) or of one robot's observation, distinguished by their required positional parameters"
         )
     return TeamFunction(thing) if count == 2 else RobotFunction(thing)
 

@@ -266,8 +266,8 @@ class Problem:
         """A copy with some attributes changed, checked again."""
         return Problem(**{attribute.name: getattr(self, attribute.name) for attribute in fields(self)} | changes)
 
-    def moment(self, start: ArrayLike, goal: ArrayLike, **changes: Any) -> Problem:
-        """The same team in the same world at another moment, for planning on from there.
+    def resumed_at(self, start: ArrayLike, goal: ArrayLike, **changes: Any) -> Problem:
+        """The same team in the same world in other states, for planning on from there.
 
         Unlike :meth:`replace` it does not check what is changed: under way robots may touch, be faster than they
         should, or head for places that they cannot all be at.

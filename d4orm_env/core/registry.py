@@ -192,6 +192,6 @@ def _load_file(path: Path) -> ModuleType:
 
 
 def _place(thing: object) -> object:
-    """Where a class or function is defined; anything else is told from others by what it is."""
+    """Where a class or function is defined; anything else is identified by what it is."""
     name = getattr(thing, "__qualname__", "<")
     return thing if "<" in name else (thing.__module__, name)

@@ -22,7 +22,7 @@ class NetworkCrew(SyncCrew):
         transport: Its access to the others.
         patience: See :class:`~d4orm_planners.distributed.crew.Crew`.
         judge: See :class:`~d4orm_planners.distributed.crew.Crew`.
-        linger: Seconds that a solution is told to the others in the end, see :meth:`Node.settle`.
+        linger: Seconds that a solution is sent to the others in the end, see :meth:`Node.settle`.
     """
 
     def __init__(self, node: Node, transport: Transport, patience: float, judge: Judge, linger: float) -> None:
@@ -31,7 +31,7 @@ class NetworkCrew(SyncCrew):
         self._met: set[int] = set()
 
     def close(self) -> Candidate:
-        """See :meth:`Crew.close`; before it, the others are told of a solution."""
+        """See :meth:`Crew.close`; before it, a solution is sent to the others."""
         self._judge.stop.set()
         try:
             for job in self._jobs:

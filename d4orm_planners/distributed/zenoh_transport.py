@@ -21,7 +21,7 @@ from d4orm_planners.distributed.transport import WAITING, Mailbox
 logger = logging.getLogger(__name__)
 
 LOOPBACK = ("tcp/127.0.0.1:0",)
-"""Where nodes listen unless told otherwise: at a free port that only this machine reaches."""
+"""Where nodes listen unless configured otherwise: at a free port that only this machine reaches."""
 
 PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws")
 
@@ -61,7 +61,7 @@ class ZenohSettings:
             the key ``NAMESPACE/candidates``.
         listen: Endpoints to listen at, as ``tcp/192.168.1.10:7447``; port 0 for any free one.
         connect: Endpoints of other nodes or of a zenoh router; who is away is tried again and again. One is enough, as
-            connected nodes tell each other of the rest.
+            connected nodes let each other know of the rest.
         multicast: Whether to find others by UDP multicast: on the network, or on this machine where the node listens
             on loopback only.
         config_file: A zenoh configuration in JSON5, for TLS, access control and whatever else zenoh has; the settings
@@ -113,14 +113,14 @@ class ZenohSettings:
 
 
 class ZenohTransport:
-    """One end of a network of zenoh peers. The environment variable ``RUST_LOG`` makes zenoh tell what it does.
+    """One end of a network of zenoh peers. The environment variable ``RUST_LOG`` makes zenoh log what it does.
 
     Args:
         settings: Where the others are.
 
     Raises:
         ImportError: If zenoh is not installed.
-        ValueError: If zenoh refuses the settings or its configuration file, or cannot listen where it is told to.
+        ValueError: If zenoh refuses the settings or its configuration file, or cannot listen where it is asked to.
     """
 
     def __init__(self, settings: ZenohSettings) -> None:

@@ -147,7 +147,7 @@ def _check_distinct(chosen: Sequence[Configuration]) -> None:
 
 def _load(path: Path) -> Problem:
     problem = load_problem(path)
-    # Two files that give no name are still told apart.
+    # Two files that give no name still differ.
     return problem.replace(name=path.stem) if problem.name == "custom" else problem
 
 

@@ -155,12 +155,12 @@ def _outcome(policy: _TimedPolicy, job: Job, noise: float) -> dict[str, Any]:
 
 def compact_history(history: tuple[IterationRecord, ...]) -> str:
     """The iterations of a solve after which the best plan was another, as :attr:`Trial.history` keeps them."""
-    moments: list[list[float]] = []
+    points: list[list[float]] = []
     for record in history:
-        moment = [round(record.wall_time, 6), int(record.best_solved), float(f"{record.best_reward:.6g}")]
-        if not moments or moments[-1][1:] != moment[1:]:
-            moments.append(moment)
-    return json.dumps(moments, separators=(",", ":"))
+        point = [round(record.wall_time, 6), int(record.best_solved), float(f"{record.best_reward:.6g}")]
+        if not points or points[-1][1:] != point[1:]:
+            points.append(point)
+    return json.dumps(points, separators=(",", ":"))
 
 
 class _TimedPolicy(Policy):

@@ -111,15 +111,15 @@ def best_reward(trial: Trial, seconds: np.ndarray) -> np.ndarray:
 
     Args:
         trial: A trial of a planner.
-        seconds: ``(n,)`` moments since the start of the solve [s], in ascending order.
+        seconds: ``(n,)`` times since the start of the solve [s], in ascending order.
 
     Returns:
         ``(n,)`` rewards; NaN before the first plan.
     """
     history = json.loads(trial.history)
-    moments = np.array([moment for moment, _, _ in history])
+    times = np.array([time for time, _, _ in history])
     rewards = np.array([np.nan, *(reward for _, _, reward in history)])
-    return rewards[np.searchsorted(moments, seconds, side="right")]
+    return rewards[np.searchsorted(times, seconds, side="right")]
 
 
 def _anytime(ax: Any, figure: Figure, shown: Shown) -> None:
@@ -130,10 +130,10 @@ def _anytime(ax: Any, figure: Figure, shown: Shown) -> None:
     largest = max(row.robots for _, row in shown)
     for i, (group, row) in enumerate((group, row) for group, row in shown if row.robots == largest):
         histories = [json.loads(trial.history) for trial in group.trials]
-        moments = [moment for history in histories for moment, _, _ in history]
-        if not moments:
+        times = [time for history in histories for time, _, _ in history]
+        if not times:
             continue  # every trial raised an error, or the policy makes no plan
-        seconds = np.geomspace(max(min(moments), 1e-3), 1.1 * max(*moments, 1e-3), INSTANTS)
+        seconds = np.geomspace(max(min(times), 1e-3), 1.1 * max(*times, 1e-3), INSTANTS)
         rewards = np.array([best_reward(trial, seconds) for trial in group.trials])
         seen = 2 * np.isfinite(rewards).sum(axis=0) >= len(rewards)
         low, middle, high = np.nanpercentile(rewards[:, seen], (25, 50, 75), axis=0)

@@ -21,7 +21,7 @@ class Algorithm:
     """One of Stable-Baselines3's algorithms.
 
     Attributes:
-        num_envs: Robots that act at once, unless told otherwise.
+        num_envs: Robots that act at once, unless configured otherwise.
         steps_per_update: Steps that each of them takes between two updates.
         learning_rate: At the beginning; it falls linearly to a tenth.
         gamma: Discount per step.
