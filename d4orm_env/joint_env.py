@@ -42,7 +42,7 @@ class JointNavigationEnv(EnvironmentShell, gymnasium.Env[FloatArray, FloatArray]
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012
 
-    def __init__(self, scenario: ScenarioLike | None = None, num_robots: int | None = None, **options: Any) -> None:
+    def __init__(self, scenario: ScenarioLike | None = None, num_robots: int | None = None, **options: object) -> None:
         self._begin(EnvOptions.of(scenario=scenario, num_robots=num_robots, **options))
         self._agents = [f"robot_{robot}" for robot in range(self.problem.num_robots)]
         self.observation_space, self.action_space = joint_spaces(self._simulation)

@@ -87,7 +87,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         copy: bool = True,
         num_threads: int | None = None,
-        **options: Any,
+        **options: object,
     ) -> None:
         chosen = EnvOptions.of(scenario=scenario, num_robots=num_robots, **options)
         if chosen.render_mode is not None:

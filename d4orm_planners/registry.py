@@ -39,7 +39,7 @@ def describe_policy(name: str) -> str:
     return _summary(find_policy(name))
 
 
-def make_planner(name: str | type[Planner], *, preset: str | None = None, **config: Any) -> Planner:
+def make_planner(name: str | type[Planner], *, preset: str | None = None, **config: object) -> Planner:
     """A planner by name.
 
     Args:

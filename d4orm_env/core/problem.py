@@ -262,11 +262,11 @@ class Problem:
     def __hash__(self) -> int:
         return hash(self.digest)
 
-    def replace(self, **changes: Any) -> Problem:
+    def replace(self, **changes: object) -> Problem:
         """A copy with some attributes changed, checked again."""
         return Problem(**{attribute.name: getattr(self, attribute.name) for attribute in fields(self)} | changes)
 
-    def resumed_at(self, start: ArrayLike, goal: ArrayLike, **changes: Any) -> Problem:
+    def resumed_at(self, start: ArrayLike, goal: ArrayLike, **changes: object) -> Problem:
         """The same team in the same world in other states, for planning on from there.
 
         Unlike :meth:`replace` it does not check what is changed: under way robots may touch, be faster than they

@@ -44,7 +44,7 @@ class Registry(Mapping[str, T]):
         self._registered: dict[str, Any] = {}
         self._admitted: dict[str, T] = {}
 
-    def add(self, name: str, thing: Any) -> None:
+    def add(self, name: str, thing: object) -> None:
         """Register a thing, or the text ``"package.module:Name"`` of one; again if defined anew.
 
         Raises:

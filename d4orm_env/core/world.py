@@ -167,7 +167,7 @@ class World:
             self._indices[key] = build_index(self.shapes, reach / 4 * nearest, reach, nearest)
         return self._indices[key]
 
-    def clearance(self, positions: Any) -> np.ndarray:
+    def clearance(self, positions: ArrayLike) -> np.ndarray:
         """Distance from points to the nearest obstacle surface or bound, negative inside [m], in float64.
 
         Inside a polygon it is the distance to the nearest edge of one of the triangles that it is made of.

@@ -75,7 +75,7 @@ def _blocked_cells(content: bytes, negate: bool, free_thresh: float) -> Mask:
     return blocked
 
 
-def _share(value: Any, name: str) -> float:
+def _share(value: object, name: str) -> float:
     return positive_number(value, name, zero_allowed=True, most=1.0)
 
 

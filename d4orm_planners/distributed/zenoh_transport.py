@@ -90,7 +90,7 @@ class ZenohSettings:
         object.__setattr__(self, "linger", duration(self.linger, "linger", zero_allowed=True))
 
     @classmethod
-    def of(cls, settings: Any) -> ZenohSettings:
+    def of(cls, settings: object) -> ZenohSettings:
         """Settings from a mapping; those that are such already stay.
 
         Raises:
@@ -218,7 +218,7 @@ def _config(zenoh: Any, settings: ZenohSettings) -> Any:
     return config
 
 
-def _endpoints(name: str, endpoints: Any) -> tuple[str, ...]:
+def _endpoints(name: str, endpoints: object) -> tuple[str, ...]:
     if isinstance(endpoints, str) or not isinstance(endpoints, (list, tuple)):
         raise ValueError(f"{name} must be a list of endpoints, as [tcp/192.168.1.10:7447], not {endpoints!r}")
     for endpoint in endpoints:

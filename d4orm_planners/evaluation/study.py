@@ -118,13 +118,13 @@ def _labelled(policies: Policies) -> dict[str, tuple[Any, dict[str, Any]]]:
     return labelled
 
 
-def _checked_label(label: Any) -> str:
+def _checked_label(label: object) -> str:
     if not isinstance(label, str):
         raise ValueError(f"policy {shown(label)} is no name; give one of {', '.join(list_policies())}")
     return label
 
 
-def _checked(label: str, given: Any) -> tuple[Any, dict[str, Any]]:
+def _checked(label: str, given: object) -> tuple[Any, dict[str, Any]]:
     """A policy and its settings."""
     if isinstance(given, Mapping):
         settings = dict(given)

@@ -152,7 +152,7 @@ def _header(path: Path, text: str) -> Header:
     return header
 
 
-def _checked(path: Path, header: Header, arrays: dict[str, Any]) -> dict[str, FloatArray]:
+def _checked(path: Path, header: Header, arrays: dict[str, np.ndarray]) -> dict[str, FloatArray]:
     """The arrays, if they are those of the header's network."""
     size = Network(header, {}).features.size
     shapes: dict[str, tuple[int | None, ...]] = {
