@@ -21,7 +21,7 @@ def _admit_planner(name: str, thing: Any) -> type[Planner]:
     return planner_class
 
 
-def _admit_policy(name: str, thing: object) -> Any:
+def _admit_policy(name: str, thing: object) -> object:
     if not (callable(thing) or hasattr(thing, "act")):
         raise ValueError(f"policy {name!r} is {shown(thing)}; give a Policy, or a function that is or makes one")
     return thing

@@ -233,7 +233,7 @@ def _npz_path(path: str | os.PathLike[str]) -> Path:
     return target
 
 
-def _checked(header: dict[str, Any]) -> dict[str, Any]:
+def _checked(header: dict[str, Any]) -> dict[str, object]:
     kinds = {"planner": str, "seed": int, "solved": bool, "status": str, "iterations": int, "denoising_steps": int}
     for name, kind in {**kinds, "wall_time": (int, float), "metrics": dict}.items():
         if not isinstance(header[name], kind):  # type: ignore[arg-type]

@@ -37,11 +37,15 @@ class Registry(Mapping[str, T]):
     """
 
     def __init__(
-        self, what: str, group: str, admit: Callable[[str, Any], T], identity: Callable[[Any], object] | None = None
+        self,
+        what: str,
+        group: str,
+        admit: Callable[[str, object], T],
+        identity: Callable[[object], object] | None = None,
     ) -> None:
         self.what, self.group = what, group
         self._admit, self._identity = admit, identity or _place
-        self._registered: dict[str, Any] = {}
+        self._registered: dict[str, object] = {}
         self._admitted: dict[str, T] = {}
 
     def add(self, name: str, thing: object) -> None:
@@ -82,7 +86,7 @@ class Registry(Mapping[str, T]):
             raise ValueError(f"{self.what} name {name!r} is claimed by {owners}; uninstall one of them")
         return claims[0]
 
-    def _same(self, claims: list[Any]) -> bool:
+    def _same(self, claims: list[object]) -> bool:
         """Whether all are the same thing, such as one that its module registers and its package offers too."""
         try:
             first, *others = (self._identity(load_reference(one) if isinstance(one, str) else one) for one in claims)
@@ -151,7 +155,7 @@ def load_reference(text: str) -> Any:
     if not place or not all(part.isidentifier() for part in name.split(".")):
         raise ValueError(f"{text!r} is no import path; give {FORMS}")
     try:
-        found: Any = _load_file(Path(place)) if place.endswith(".py") else _import(place)
+        found: object = _load_file(Path(place)) if place.endswith(".py") else _import(place)
     except Exception as error:  # whatever foreign code raises when it is imported
         raise ValueError(
             f"{text!r} cannot be imported ({describe(error)}); give {FORMS}, of a module that Python finds and that "

@@ -101,7 +101,7 @@ class World:
         # What is cached is made anew in a copy.
         return {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: dict[str, object]) -> None:
         restore_frozen(self, state)
         for corners in self.polygons:
             corners.setflags(write=False)

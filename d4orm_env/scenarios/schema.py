@@ -286,11 +286,11 @@ def describe(problem: Problem) -> dict[str, Any]:
     }
 
 
-def _describe_robot(problem: Problem, robot: int) -> dict[str, Any]:
+def _describe_robot(problem: Problem, robot: int) -> dict[str, object]:
     team, dimension = problem.team, problem.dimension
     model = team.robot_models[robot]
     state = _decimals(problem.start[robot, : model.state_size])
-    entry: dict[str, Any] = {"model": model.name, "start": state[:dimension], "goal": _decimals(problem.goal[robot])}
+    entry: dict[str, object] = {"model": model.name, "start": state[:dimension], "goal": _decimals(problem.goal[robot])}
     if "velocity" in start_fields(model):
         entry["velocity"] = state[dimension:]
     elif "state" in start_fields(model):
@@ -306,9 +306,9 @@ def _describe_robot(problem: Problem, robot: int) -> dict[str, Any]:
     return entry
 
 
-def _describe_world(problem: Problem) -> dict[str, Any]:
+def _describe_world(problem: Problem) -> dict[str, object]:
     world, dimension = problem.world, problem.dimension
-    content: dict[str, Any] = {}
+    content: dict[str, object] = {}
     if world.lower is not None:
         lower, upper = map(_decimals, world.bounds)
         content["bounds"] = {"lower": lower, "upper": upper}

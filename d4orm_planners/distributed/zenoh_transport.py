@@ -36,7 +36,7 @@ RESERVED = {
 }
 """What a zenoh configuration file leaves to the settings, and the setting."""
 
-DEFAULTS: Mapping[str, Any] = {
+DEFAULTS: Mapping[str, object] = {
     "mode": "peer",
     # The queues of a slow link hold a megabyte, so that a candidate that is cut into pieces is not lost halfway.
     "transport/link/tx/queue/size/data": 16,
@@ -206,7 +206,7 @@ def _config(zenoh: Any, settings: ZenohSettings) -> Any:
             if config.get_json(key) != plain.get_json(key):
                 raise ValueError(f"config_file {settings.config_file} has {key}; leave it to the setting {name}")
     unset = {key: value for key, value in DEFAULTS.items() if config.get_json(key) == plain.get_json(key)}
-    given: dict[str, Any] = {
+    given: dict[str, object] = {
         "listen/endpoints": settings.listen,
         "connect/endpoints": settings.connect,
         "scouting/multicast/enabled": settings.multicast,

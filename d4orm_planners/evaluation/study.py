@@ -104,11 +104,11 @@ class Study:
         return cells
 
 
-def _labelled(policies: Policies) -> dict[str, tuple[Any, dict[str, Any]]]:
+def _labelled(policies: Policies) -> dict[str, tuple[object, dict[str, object]]]:
     """Policies and their settings by label."""
     if isinstance(policies, Mapping):
         return {_checked_label(label): _checked(label, given) for label, given in policies.items()}
-    labelled: dict[str, tuple[Any, dict[str, Any]]] = {}
+    labelled: dict[str, tuple[object, dict[str, object]]] = {}
     for policy in _several(policies):
         label = policy if isinstance(policy, str) else getattr(policy, "__name__", type(policy).__name__)
         if not (isinstance(policy, str) or is_brought(policy)):
@@ -124,7 +124,7 @@ def _checked_label(label: object) -> str:
     return label
 
 
-def _checked(label: str, given: object) -> tuple[Any, dict[str, Any]]:
+def _checked(label: str, given: object) -> tuple[object, dict[str, object]]:
     """A policy and its settings."""
     if isinstance(given, Mapping):
         settings = dict(given)
