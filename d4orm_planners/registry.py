@@ -15,7 +15,7 @@ from d4orm_planners.policy import OpenLoop, Policy, RobotFunction, TeamFunction,
 from d4orm_planners.references import source_digest, written
 from d4orm_planners.settings import NOTHING
 
-PolicyLike: TypeAlias = str | Policy | Planner | type[Any] | Callable[..., Any]
+PolicyLike: TypeAlias = str | Policy | Planner | type[object] | Callable[..., object]
 """What :func:`make_policy` takes; other objects with ``reset`` and ``act`` as well."""
 
 

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -97,7 +96,7 @@ class World:
         if self.lower is not None and self.upper is not None and (self.lower >= self.upper).any():
             raise ValueError(f"bounds lower {self.lower.tolist()} must lie below upper {self.upper.tolist()}")
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         # What is cached is made anew in a copy.
         return {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
 

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -210,7 +209,9 @@ def reach_of(settings: Settings) -> float:
     return float(np.max(settings.team.radius)) + settings.margin + RESERVE
 
 
-def lattice_step(settings: Settings, sides: Any, passage: tuple[str, float] | None = None) -> float:
+def lattice_step(
+    settings: Settings, sides: Sequence[float] | NDArray[np.float64], passage: tuple[str, float] | None = None
+) -> float:
     """Step of a lattice that is fine enough for the robots, and for the narrowest passage wherever it is [m].
 
     Args:

@@ -6,7 +6,7 @@ The public description is the documented example ``examples/scenarios/mixed_team
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -271,7 +271,7 @@ def parse(data: object) -> Problem:
         return content.build()
 
 
-def describe(problem: Problem) -> dict[str, Any]:
+def describe(problem: Problem) -> dict[str, object]:
     """The content of a file that means that problem, to the bit: the inverse of :func:`parse`."""
     settings = {name: getattr(problem, name) for name in ("dt", "horizon", "margin", "goal_radius", "goal_speed")}
     if not problem.docks:

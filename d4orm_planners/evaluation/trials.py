@@ -43,7 +43,7 @@ class Configuration:
 
     label: str
     policy: str
-    settings: Mapping[str, Any]
+    settings: Mapping[str, object]
     given: Any = None
 
     @property
