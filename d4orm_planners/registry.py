@@ -231,7 +231,7 @@ def _as_policy(thing: Any, owner: str) -> Policy:
     return TeamFunction(thing) if count == 2 else RobotFunction(thing)
 
 
-def _required(function: Any) -> int | None:
+def _required(function: Callable[..., object]) -> int | None:
     """How many positional parameters a function requires; ``None`` if that says nothing about it."""
     try:
         parameters = inspect.signature(function).parameters.values()

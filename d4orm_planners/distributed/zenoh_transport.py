@@ -194,7 +194,7 @@ def _import_zenoh() -> ModuleType:
     return zenoh
 
 
-def _config(zenoh: Any, settings: ZenohSettings) -> Any:
+def _config(zenoh: ModuleType, settings: ZenohSettings) -> Any:
     """Zenoh's own configuration."""
     config = plain = zenoh.Config()
     if settings.config_file is not None:

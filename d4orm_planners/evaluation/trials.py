@@ -44,7 +44,7 @@ class Configuration:
     label: str
     policy: str
     settings: Mapping[str, object]
-    given: Any = None
+    given: object = None
 
     @property
     def source(self) -> Any:

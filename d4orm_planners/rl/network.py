@@ -27,7 +27,7 @@ CLIP = 10.0
 """Of normalised features."""
 MAX_BYTES = 64 * 2**20
 SUFFIX = ".safetensors"
-_ACTIVATIONS: Mapping[str, Callable[[Any], Any]] = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, 0)}
+_ACTIVATIONS: Mapping[str, Callable[[FloatArray], FloatArray]] = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, 0)}
 
 
 class Header(BaseModel):
