@@ -47,7 +47,7 @@ class parallel_env(EnvironmentShell, ParallelEnv[str, FloatArray, FloatArray]):
         ValueError: For a bad argument, or when both a problem and a scenario's arguments are given.
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 - declared mutable by PettingZoo
+    metadata: dict[str, object] = {  # noqa: RUF012 - declared mutable by PettingZoo
         "name": "d4orm_navigation_v0",
         "render_modes": list(RENDER_MODES),
         "render_fps": 10,

@@ -256,7 +256,7 @@ def _checked_trajectory(problem: Problem, archive: ArrayArchive) -> Trajectory:
     }
     content = {}
     for name, shape in shapes.items():
-        kind: np.dtype[Any] = np.dtype(np.float32 if name in _NUMBERS else np.bool_)
+        kind: np.dtype = np.dtype(np.float32 if name in _NUMBERS else np.bool_)
         array = archive.array(name, prod(shape) * kind.itemsize)
         if array.shape != shape or array.dtype != kind or not np.isfinite(array).all():
             raise ValueError(f"{name} does not fit the problem")

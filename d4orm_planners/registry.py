@@ -117,7 +117,7 @@ def is_brought(policy: object) -> bool:
     return callable(policy) or isinstance(policy, Planner) or _acts(policy)
 
 
-def origin(policy: object) -> Any:
+def origin(policy: object) -> object:
     """What :func:`make_policy` takes for a policy in any process, whatever was registered there."""
     for table in (PLANNERS, POLICIES):
         if isinstance(policy, str) and policy in table:

@@ -6,10 +6,10 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import (
     LARGEST,
@@ -241,7 +241,7 @@ class Problem:
         world = self.world
         obstacles = (world.balls, world.cylinders, world.boxes, *world.polygons)
         for value in (*arrays[:6], *obstacles, *arrays[9:14]):
-            array: NDArray[Any] = np.ascontiguousarray(value)
+            array: np.ndarray = np.ascontiguousarray(value)
             sha.update(f"{array.shape}{array.dtype}".encode())
             sha.update(array.tobytes())
         sha.update(f"{self.dt!r} {self.horizon} {self.margin!r} {self.goal_radius!r} {self.goal_speed!r}".encode())

@@ -40,7 +40,7 @@ class Registry(Mapping[str, T]):
         self,
         what: str,
         group: str,
-        admit: Callable[[str, object], T],
+        admit: Callable[[str, Any], T],
         identity: Callable[[object], object] | None = None,
     ) -> None:
         self.what, self.group = what, group
@@ -70,7 +70,7 @@ class Registry(Mapping[str, T]):
         """Names registered in this process, in order."""
         return tuple(self._registered)
 
-    def origin(self, name: str) -> Any:
+    def origin(self, name: str) -> object:
         """What was registered under a name, or its import path.
 
         Raises:

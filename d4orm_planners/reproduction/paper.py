@@ -10,7 +10,7 @@ from typing import Any
 from d4orm_planners.distributed.selection import SELECTIONS
 from d4orm_planners.reproduction.figure import Figure, Section
 
-PAPER: dict[str, Any] = {"preset": "paper"}
+PAPER: Mapping[str, object] = {"preset": "paper"}
 C2F: dict[str, object] = {"policy": "d4orm-c2f", "refine": "sync"}
 """Refinement in the background would make the result depend on how busy the machine is."""
 SIZES = (4, 8, 12, 16)
