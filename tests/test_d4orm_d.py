@@ -174,7 +174,7 @@ def test_robots_that_were_repaired_in_vain_are_repaired_jointly_and_every_other_
     for _ in range(7):
         search.advance()
         assert search.current.failed.all()
-    # Six repairs, one robot at a time: before the fourth, one of them had been repaired in vain only once.
+    # Six repairs, one robot at a time: before the fourth, one of them had failed only once.
     assert [task.credit for task in engine.tasks] == ["robot"] * 6 + ["team"]
     assert [task.problem.num_robots for task in engine.tasks] == [1] * 6 + [2]
     assert search.state.failures.min() >= 3

@@ -21,7 +21,7 @@ from onboard.mission import Mission
 PATIENCE = 0.25
 """Seconds that a node waits for the others after each of its iterations."""
 
-RETELL = 0.2
+RESEND = 0.2
 """Seconds between two looks at whether everybody has the best candidate, once all had it."""
 
 LOOK = 0.02
@@ -115,9 +115,9 @@ class Round:
             if iterations == self._mission.iterations:
                 self._iterated.set()
         while not self._over.is_set():
-            if all_have := node.settle(RETELL):
+            if all_have := node.settle(RESEND):
                 self._settled.set()
-            self._over.wait(RETELL if all_have else LOOK)
+            self._over.wait(RESEND if all_have else LOOK)
 
     def enough(self, timeout: float) -> None:
         """Begin no further iteration, if the least number is done or the seconds are over: tell the best candidate."""
