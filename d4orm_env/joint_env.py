@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,9 +38,9 @@ class JointNavigationEnv(EnvironmentShell, gymnasium.Env[FloatArray, FloatArray]
         ValueError: For a bad argument, or when both a problem and a scenario's arguments are given.
     """
 
-    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012
+    metadata: dict[str, object] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012
 
-    def __init__(self, scenario: ScenarioLike | None = None, num_robots: int | None = None, **options: Any) -> None:
+    def __init__(self, scenario: ScenarioLike | None = None, num_robots: int | None = None, **options: object) -> None:
         self._begin(EnvOptions.of(scenario=scenario, num_robots=num_robots, **options))
         self._agents = [f"robot_{robot}" for robot in range(self.problem.num_robots)]
         self.observation_space, self.action_space = joint_spaces(self._simulation)

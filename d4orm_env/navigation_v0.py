@@ -47,14 +47,14 @@ class parallel_env(EnvironmentShell, ParallelEnv[str, FloatArray, FloatArray]):
         ValueError: For a bad argument, or when both a problem and a scenario's arguments are given.
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 - declared mutable by PettingZoo
+    metadata: dict[str, object] = {  # noqa: RUF012 - declared mutable by PettingZoo
         "name": "d4orm_navigation_v0",
         "render_modes": list(RENDER_MODES),
         "render_fps": 10,
         "is_parallelizable": True,
     }
 
-    def __init__(self, scenario: ScenarioLike | None = None, num_robots: int | None = None, **options: Any) -> None:
+    def __init__(self, scenario: ScenarioLike | None = None, num_robots: int | None = None, **options: object) -> None:
         self._begin(EnvOptions.of(scenario=scenario, num_robots=num_robots, **options))
         self.possible_agents = [f"robot_{robot}" for robot in range(self.problem.num_robots)]
         self.agents: list[str] = []
@@ -263,6 +263,6 @@ def raw_env(*args: Any, **kwargs: Any) -> AECEnv[str, FloatArray, FloatArray | N
     return _TurnByTurn(parallel_env(*args, **kwargs))
 
 
-def env(*args: Any, **kwargs: Any) -> AECEnv[str, FloatArray, FloatArray | None]:
+def env(*args: object, **kwargs: object) -> AECEnv[str, FloatArray, FloatArray | None]:
     """:func:`raw_env`, with calls in the wrong order caught; arguments of :class:`parallel_env`."""
     return OrderEnforcingWrapper(raw_env(*args, **kwargs))

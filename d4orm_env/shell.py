@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.options import EnvOptions
@@ -14,7 +12,7 @@ from d4orm_env.viewer import Frame, Viewer
 class EnvironmentShell:
     """A simulation, read and drawn; how it is reset and stepped is up to the environment."""
 
-    metadata: dict[str, Any]
+    metadata: dict[str, object]
     render_mode: str | None
 
     def _begin(self, options: EnvOptions) -> None:

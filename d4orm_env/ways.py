@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,7 +35,7 @@ class _Field(NamedTuple):
     reach: float
     front: Front
 
-    def look(self, places: Floats) -> tuple[Floats, Floats, Any]:
+    def look(self, places: Floats) -> tuple[Floats, Floats, NDArray[np.int32]]:
         """``(Q, d)`` where to go first from places ``(Q, d)``, ``(Q,)`` the length of the way, ``(Q,)`` its anchor."""
         from d4orm_env.engine.wavefront import look
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,6 +21,12 @@ if TYPE_CHECKING:
 
 __all__ = ["SharedPolicy", "from_rllib", "from_sb3", "from_torchrl"]
 
+Key: TypeAlias = str | tuple[str, ...]
+"""Of a ``TensorDict``."""
+
+Model: TypeAlias = Any
+"""Of a library that need not be installed."""
+
 
 class SharedPolicy(Policy):
     """Every robot by itself maps what it observes to its control, all by one function of stacked observations.
@@ -31,7 +37,7 @@ class SharedPolicy(Policy):
         normalized: Whether actions are in ``[-1, 1]``, which stand for the lowest and the highest of the environment.
     """
 
-    def __init__(self, predict: Callable[[FloatArray], ArrayLike], weights: Any, normalized: bool = False) -> None:
+    def __init__(self, predict: Callable[[FloatArray], ArrayLike], weights: Model, normalized: bool = False) -> None:
         self._predict, self._weights, self._normalized = predict, weights, normalized
 
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:
@@ -57,7 +63,7 @@ class SharedPolicy(Policy):
         return {"weights": digest.hexdigest()}
 
 
-def from_sb3(model: Any, deterministic: bool = True) -> SharedPolicy:
+def from_sb3(model: Model, deterministic: bool = True) -> SharedPolicy:
     """A model of Stable-Baselines3, trained on the environment's own observations and actions, as through SuperSuit.
 
     Args:
@@ -67,7 +73,7 @@ def from_sb3(model: Any, deterministic: bool = True) -> SharedPolicy:
     return SharedPolicy(partial(_ask_sb3, model, deterministic), model.policy)
 
 
-def from_torchrl(module: Any, observation_key: Any = "observation", action_key: Any = "action") -> SharedPolicy:
+def from_torchrl(module: Model, observation_key: Key = "observation", action_key: Key = "action") -> SharedPolicy:
     """A module of TorchRL (or TensorDict), which is asked for its deterministic action, without gradients.
 
     Args:
@@ -78,7 +84,7 @@ def from_torchrl(module: Any, observation_key: Any = "observation", action_key: 
     return SharedPolicy(partial(_ask_torchrl, module, observation_key, action_key), module)
 
 
-def from_rllib(module: Any, normalized: bool = True) -> SharedPolicy:
+def from_rllib(module: Model, normalized: bool = True) -> SharedPolicy:
     """An ``RLModule`` of RLlib on torch, asked by ``forward_inference``.
 
     Args:
@@ -88,11 +94,11 @@ def from_rllib(module: Any, normalized: bool = True) -> SharedPolicy:
     return SharedPolicy(partial(_ask_rllib, module), module, normalized)
 
 
-def _ask_sb3(model: Any, deterministic: bool, observations: FloatArray) -> ArrayLike:
+def _ask_sb3(model: Model, deterministic: bool, observations: FloatArray) -> ArrayLike:
     return model.predict(observations, deterministic=deterministic)[0]
 
 
-def _ask_torchrl(module: Any, observation_key: Any, action_key: Any, observations: FloatArray) -> ArrayLike:
+def _ask_torchrl(module: Model, observation_key: Key, action_key: Key, observations: FloatArray) -> ArrayLike:
     import torch
     from tensordict import TensorDict
     from tensordict.nn import InteractionType, set_interaction_type
@@ -102,7 +108,7 @@ def _ask_torchrl(module: Any, observation_key: Any, action_key: Any, observation
         return module(asked)[action_key].cpu().numpy()
 
 
-def _ask_rllib(module: Any, observations: FloatArray) -> ArrayLike:
+def _ask_rllib(module: Model, observations: FloatArray) -> ArrayLike:
     import torch
 
     with torch.no_grad():

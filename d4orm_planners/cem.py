@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from types import ModuleType
+from typing import ClassVar
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from d4orm_env.engine.base import SamplingRules
 from d4orm_planners.sampling.optimizer import SamplingPlanner
 from d4orm_planners.sampling.schedule import constant
 from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, SamplingConfig
-from d4orm_planners.sampling.weights import EliteWeights
+from d4orm_planners.sampling.weights import Array, EliteWeights
 from d4orm_planners.search import Search
 from d4orm_planners.settings import Positive, Share
 
@@ -41,7 +42,7 @@ class EliteDeviation:
     sigma: float
     floor: float
 
-    def __call__(self, mean_square_deviation: Any, xp: Any) -> Any:
+    def __call__(self, mean_square_deviation: Array, xp: ModuleType) -> Array:
         """``(H, K, m)`` factors on the schedule."""
         return xp.maximum(xp.sqrt(xp.maximum(mean_square_deviation, 0)), self.floor) / self.sigma
 

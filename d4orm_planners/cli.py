@@ -42,6 +42,7 @@ from d4orm_planners.commands.train import train
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
+    from d4orm_planners.episode import Episode
     from d4orm_planners.plan import Plan
 
 # Typer carries its own copy of click, whose base class it does not export.
@@ -297,7 +298,7 @@ def _solve(
         return chosen.solve(problem, seed=seed, time_limit=time_limit, max_iterations=max_iterations, callback=progress)
 
 
-def _execute(plan: Plan, seed: int) -> Any:
+def _execute(plan: Plan, seed: int) -> Episode:
     from d4orm_env import navigation_v0, verify
     from d4orm_planners.episode import run_episode
     from d4orm_planners.policy import OpenLoop

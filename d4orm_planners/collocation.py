@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from itertools import chain
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +44,10 @@ Floats = NDArray[np.float64]
 Contacts = dict[tuple[int, int], NDArray[np.int64]]
 """Steps at which robot ``k`` is kept clear of body ``b``: robot ``b``, or from ``K`` on obstacle ``b - K``."""
 
-Rows = tuple[Any, float, float]
+Expression: TypeAlias = Any
+"""CasADi's matrices, symbolic or of numbers; the library carries no types."""
+
+Rows = tuple[Expression, float, float]
 """A matrix of expressions with their lower and their upper bound."""
 
 
@@ -107,7 +111,7 @@ class TeamProgram:
         """
         reached = self._packed(guess)
 
-        def keep(values: Any) -> None:
+        def keep(values: Expression) -> None:
             nonlocal reached
             reached = values
 
@@ -123,7 +127,7 @@ class TeamProgram:
         contacts: Contacts,
         docks: IntArray,
         options: Options,
-        keep: Callable[[Any], None],
+        keep: Callable[[Expression], None],
         ends: Callable[[], bool],
     ) -> str:
         """Hand IPOPT's variables to ``keep`` after every iteration and at the end; return how it ended."""
@@ -162,13 +166,13 @@ class TeamProgram:
         bodies = self.problem.num_robots + len(self.obstacles)
         return ((robot, body) for robot in range(self.problem.num_robots) for body in range(robot + 1, bodies))
 
-    def _gap(self, robot: int, body: int, places: Any) -> Any:
+    def _gap(self, robot: int, body: int, places: Expression) -> Expression:
         """Distance from a robot's centre to another's, or to an obstacle's surface [m], at every column of places."""
         if body >= self.problem.num_robots:
             return self.obstacles[body - self.problem.num_robots](places[robot])
         return self._norm(places[robot] - places[body])
 
-    def _norm(self, vectors: Any) -> Any:
+    def _norm(self, vectors: Expression) -> Expression:
         """Norm of every column; nowhere without a derivative."""
         return self.casadi.sqrt(self.casadi.sum1(vectors**2) + TINY)
 
@@ -182,7 +186,7 @@ class TeamProgram:
         radius, chord = self.radius[robots].sum(), self.limits[robots, SPEED].sum() * self.problem.dt
         return float(max(radius + self.problem.margin, np.hypot(radius, chord / 2)) + self.clearance)
 
-    def _obstacles(self) -> Iterator[Any]:
+    def _obstacles(self) -> Iterator[Expression]:
         """For each obstacle the distance to its surface, negative inside, as a function of columns of points."""
         ca, world = self.casadi, self.problem.world
         dimension = world.dimension
@@ -196,7 +200,7 @@ class TeamProgram:
         for corners in world.shapes.triangles.astype(float).reshape(-1, 3, 2):
             yield lambda p, corners=corners: self._triangle_gap(p, corners)
 
-    def _triangle_gap(self, points: Any, corners: Floats) -> Any:
+    def _triangle_gap(self, points: Expression, corners: Floats) -> Expression:
         ca = self.casadi
         deepest, nearest = [], []
         for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
@@ -207,7 +211,7 @@ class TeamProgram:
         depth = ca.fmax(ca.fmax(*deepest[:2]), deepest[2])
         return ca.if_else(depth < 0, depth, ca.fmin(ca.fmin(*nearest[:2]), nearest[2]))
 
-    def _box_gap(self, points: Any, lower: Floats, upper: Floats) -> Any:
+    def _box_gap(self, points: Expression, lower: Floats, upper: Floats) -> Expression:
         ca = self.casadi
         rows = [points[axis, :] for axis in range(len(lower))]
         outside = [axis_gap(row, low, high, 0.0, self.ops) for row, low, high in zip(rows, lower, upper)]
@@ -217,7 +221,7 @@ class TeamProgram:
             depth = ca.fmax(depth, axis)
         return self._norm(ca.vertcat(*outside)) + ca.fmin(depth, 0.0)
 
-    def _cost(self) -> Any:
+    def _cost(self) -> Expression:
         """The mean of distance over initial distance, one minus the reward of a motion without violations.
 
         Distances are smoothed within the goal radius, where a robot has docked anyway.
@@ -230,7 +234,7 @@ class TeamProgram:
         )
         return OBJECTIVE_SCALE * sum(distances) / (problem.num_robots * problem.horizon)
 
-    def _squared_goal_distance(self, robot: int) -> Any:
+    def _squared_goal_distance(self, robot: int) -> Expression:
         goal = self.casadi.DM(self.problem.goal[robot].astype(float))
         return self.casadi.sum1((self.states[robot][: self.problem.dimension, :] - goal) ** 2)
 
@@ -248,7 +252,7 @@ class TeamProgram:
                 if len(components) > 1:
                     yield ca.sum1(values[components, :] ** 2), -np.inf, limit**2
 
-    def _limited(self, robot: int) -> Iterator[tuple[Any, list[int], float]]:
+    def _limited(self, robot: int) -> Iterator[tuple[Expression, list[int], float]]:
         """Variables, the components of theirs that share a limit, and that limit on their norm."""
         model, limits = self.models[robot], self.limits[robot]
         if model.speed_indices:
@@ -318,7 +322,7 @@ class TeamProgram:
         return Motion(states, controls)
 
 
-def _stopper(casadi: Any, sizes: dict[str, int], keep: Callable[[Any], None], ends: Callable[[], bool]) -> Any:
+def _stopper(casadi: Any, sizes: dict[str, int], keep: Callable[[Expression], None], ends: Callable[[], bool]) -> Any:
     """What IPOPT calls after every iteration of a program of these sizes, and what ends it once ``ends()`` is true."""
 
     class Stopper(casadi.Callback):
@@ -329,18 +333,18 @@ def _stopper(casadi: Any, sizes: dict[str, int], keep: Callable[[Any], None], en
         def get_n_in(self) -> int:
             return casadi.nlpsol_n_out()
 
-        def get_sparsity_in(self, index: int) -> Any:
+        def get_sparsity_in(self, index: int) -> Expression:
             size = sizes.get(casadi.nlpsol_out(index).removeprefix("lam_"), 0)
             return casadi.Sparsity.dense(size, min(size, 1))
 
-        def eval(self, arguments: Any) -> list[int]:
+        def eval(self, arguments: Expression) -> list[int]:
             keep(arguments[0])
             return [int(ends())]
 
     return Stopper()
 
 
-def load_casadi() -> Any:
+def load_casadi() -> ModuleType:
     """The library, or an ``ImportError`` that says how to install it."""
     try:
         import casadi

@@ -30,7 +30,7 @@ class Guidance:
 
 def coarse_problem(problem: Problem, factor: int) -> Problem:
     """The problem with steps ``factor`` times as long and as many fewer of them (paper, Algorithm 4, line 1)."""
-    return problem.moment(
+    return problem.resumed_at(
         problem.start, problem.goal, horizon=max(-(-problem.horizon // factor), 1), dt=problem.dt * factor
     )
 
@@ -96,5 +96,5 @@ def rest_of(guidance: Guidance, index: int, factor: int) -> tuple[Problem, Float
     """The coarse problem that is left from a waypoint on, and the controls of the coarse plan for it."""
     step = min(-(-index // factor), len(guidance.controls) - 1)
     coarse = guidance.problem
-    left = coarse.moment(guidance.states[step], coarse.goal, horizon=coarse.horizon - step)
+    left = coarse.resumed_at(guidance.states[step], coarse.goal, horizon=coarse.horizon - step)
     return left, guidance.controls[step:]

@@ -7,10 +7,9 @@ import os
 import platform
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 
-def describe_machine() -> dict[str, Any]:
+def describe_machine() -> dict[str, object]:
     """Processor, its cores and how many of them are used, system, and version of Python."""
     from d4orm_env.engine.threads import available_cores
 

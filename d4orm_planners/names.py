@@ -9,7 +9,7 @@ from d4orm_env.core.registry import Registry
 from d4orm_planners.planner import Planner
 
 
-def is_planner_class(thing: Any) -> bool:
+def is_planner_class(thing: object) -> bool:
     """Whether a thing is a subclass of Planner."""
     return isinstance(thing, type) and issubclass(thing, Planner)
 
@@ -21,7 +21,7 @@ def _admit_planner(name: str, thing: Any) -> type[Planner]:
     return planner_class
 
 
-def _admit_policy(name: str, thing: Any) -> Any:
+def _admit_policy(name: str, thing: object) -> object:
     if not (callable(thing) or hasattr(thing, "act")):
         raise ValueError(f"policy {name!r} is {shown(thing)}; give a Policy, or a function that is or makes one")
     return thing
@@ -48,7 +48,7 @@ def register_planner(name: str, planner_class: type[Planner] | str) -> None:
     PLANNERS.add(name, planner_class)
 
 
-def register_policy(name: str, factory: Any) -> None:
+def register_policy(name: str, factory: object) -> None:
     """Let :func:`~d4orm_planners.make_policy` and whatever takes a policy's name know a policy of your own.
 
     Args:
@@ -63,7 +63,7 @@ def register_policy(name: str, factory: Any) -> None:
     POLICIES.add(name, factory)
 
 
-def _refuse_name_of(other: Registry[Any], name: Any) -> None:
+def _refuse_name_of(other: Registry[Any], name: object) -> None:
     if name in other.own():
         raise ValueError(f"{other.what} {name!r} has that name already; register yours under another")
 

@@ -133,7 +133,7 @@ def _load_pyrvo() -> ModuleType:
 
 
 def _velocities(problem: Problem, joint: JointState) -> FloatArray:
-    """``(K, 2)`` present velocities [m/s]; that of a first-order robot is the one it was last told."""
+    """``(K, 2)`` present velocities [m/s]; that of a first-order robot is its last command."""
     velocities = [
         model.functions.velocity(state, control, limits, NUMPY_OPS)
         for model, state, control, limits in zip(

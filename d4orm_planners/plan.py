@@ -233,7 +233,7 @@ def _npz_path(path: str | os.PathLike[str]) -> Path:
     return target
 
 
-def _checked(header: dict[str, Any]) -> dict[str, Any]:
+def _checked(header: dict[str, Any]) -> dict[str, object]:
     kinds = {"planner": str, "seed": int, "solved": bool, "status": str, "iterations": int, "denoising_steps": int}
     for name, kind in {**kinds, "wall_time": (int, float), "metrics": dict}.items():
         if not isinstance(header[name], kind):  # type: ignore[arg-type]
@@ -256,7 +256,7 @@ def _checked_trajectory(problem: Problem, archive: ArrayArchive) -> Trajectory:
     }
     content = {}
     for name, shape in shapes.items():
-        kind: np.dtype[Any] = np.dtype(np.float32 if name in _NUMBERS else np.bool_)
+        kind: np.dtype = np.dtype(np.float32 if name in _NUMBERS else np.bool_)
         array = archive.array(name, prod(shape) * kind.itemsize)
         if array.shape != shape or array.dtype != kind or not np.isfinite(array).all():
             raise ValueError(f"{name} does not fit the problem")

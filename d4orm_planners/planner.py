@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 from numpy.typing import ArrayLike
 
@@ -18,6 +18,9 @@ from d4orm_planners.settings import CheckedSettings, Count, EngineName
 
 Callback = Callable[[IterationRecord], object]
 
+State: TypeAlias = Any
+"""What a planner keeps from one iteration to the next: a type of its own."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class PlannerConfig(CheckedSettings):
@@ -25,7 +28,7 @@ class PlannerConfig(CheckedSettings):
 
     Attributes:
         engine: ``"auto"``, ``"cpu"`` or ``"jax"``.
-        max_iterations: Iterations after which :meth:`Planner.solve` gives up, unless told otherwise in the call.
+        max_iterations: Iterations after which :meth:`Planner.solve` gives up, unless the call says otherwise.
         improve: Go on improving after the first solution, until the time or iteration budget is used up. By default the
             first solution ends the search.
     """
@@ -77,15 +80,15 @@ class Planner(ABC):
     def __init__(self, config: PlannerConfig) -> None:
         self.config = config
 
-    def init(self, search: Search) -> Any:
+    def init(self, search: Search) -> State:
         """The state that the first iteration begins with."""
         del search
 
     @abstractmethod
-    def iterate(self, search: Search, state: Any) -> tuple[Any, Iteration]:
+    def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
         """One iteration from the search's current candidate to the next: the new state, and what came of it."""
 
-    def finish(self, search: Search, state: Any) -> None:  # noqa: B027 - a hook that most planners need not fill
+    def finish(self, search: Search, state: State) -> None:  # noqa: B027 - a hook that most planners need not fill
         """Let go of what the state holds open; called once after :meth:`init`, however the solve ends."""
 
     def solve(

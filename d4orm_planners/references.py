@@ -13,7 +13,7 @@ from typing import Any
 from d4orm_env.core.errors import describe
 
 
-def source_digest(thing: Any) -> str:
+def source_digest(thing: object) -> str:
     """SHA-256 of the file in which a class, a function or an instance's class is written.
 
     Raises:
@@ -31,14 +31,14 @@ def source_digest(thing: Any) -> str:
     return hashlib.sha256(source).hexdigest()
 
 
-def written(thing: Any) -> Any:
+def written(thing: object) -> Any:
     """The class or function whose source makes a thing what it is."""
     while isinstance(thing, functools.partial):
         thing = thing.func
     return thing if inspect.isclass(thing) or inspect.isroutine(thing) else type(thing)
 
 
-def check_sendable(thing: Any, owner: str) -> None:
+def check_sendable(thing: object, owner: str) -> None:
     """Find out whether other processes can import what a thing is made of.
 
     Raises:

@@ -15,7 +15,7 @@ from d4orm_planners.policy import OpenLoop, Policy, RobotFunction, TeamFunction,
 from d4orm_planners.references import source_digest, written
 from d4orm_planners.settings import NOTHING
 
-PolicyLike: TypeAlias = str | Policy | Planner | type[Any] | Callable[..., Any]
+PolicyLike: TypeAlias = str | Policy | Planner | type[object] | Callable[..., object]
 """What :func:`make_policy` takes; other objects with ``reset`` and ``act`` as well."""
 
 
@@ -39,7 +39,7 @@ def describe_policy(name: str) -> str:
     return _summary(find_policy(name))
 
 
-def make_planner(name: str | type[Planner], *, preset: str | None = None, **config: Any) -> Planner:
+def make_planner(name: str | type[Planner], *, preset: str | None = None, **config: object) -> Planner:
     """A planner by name.
 
     Args:
@@ -117,7 +117,7 @@ def is_brought(policy: object) -> bool:
     return callable(policy) or isinstance(policy, Planner) or _acts(policy)
 
 
-def origin(policy: object) -> Any:
+def origin(policy: object) -> object:
     """What :func:`make_policy` takes for a policy in any process, whatever was registered there."""
     for table in (PLANNERS, POLICIES):
         if isinstance(policy, str) and policy in table:
@@ -226,12 +226,12 @@ def _as_policy(thing: Any, owner: str) -> Policy:
     if count not in (1, 2):
         raise ValueError(
             f"{owner} is {shown(thing)}, which does not act; it must have reset and act, or be a function of "
-            "(observations, state) or of one robot's observation, told apart by their required positional parameters"
+            "(observations, state) or of one robot's observation, distinguished by their required positional parameters"
         )
     return TeamFunction(thing) if count == 2 else RobotFunction(thing)
 
 
-def _required(function: Any) -> int | None:
+def _required(function: Callable[..., object]) -> int | None:
     """How many positional parameters a function requires; ``None`` if that says nothing about it."""
     try:
         parameters = inspect.signature(function).parameters.values()

@@ -153,7 +153,7 @@ class Search:
 
     def plan(self, status: Status) -> Plan:
         """The best candidate as a plan."""
-        # Nodes may have told of a solution while they were closed.
+        # Nodes may have reported a solution while they were closed.
         if self.is_over and status in ("iteration_limit", "time_limit"):
             status = "solved"
         return Plan(

@@ -125,7 +125,7 @@ class CheckedSettings:
         return cls._made_of(given)
 
     @classmethod
-    def _made_of(cls, given: Mapping[str, Any]) -> Self:
+    def _made_of(cls, given: Mapping[str, object]) -> Self:
         return cls(**given)
 
     def keywords(self) -> dict[str, object]:

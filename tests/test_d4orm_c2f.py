@@ -331,7 +331,7 @@ def replanned(
 
 
 def straight(problem: Problem, joint: JointState, factor: int) -> Any:
-    return straight_drives(coarse_problem(problem.moment(joint.states, joint.goals), factor)).controls[:, :, 0]
+    return straight_drives(coarse_problem(problem.resumed_at(joint.states, joint.goals), factor)).controls[:, :, 0]
 
 
 def test_who_lost_the_guidance_begins_anew_straight_to_the_goals(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -174,10 +174,10 @@ def test_robots_that_were_repaired_in_vain_are_repaired_jointly_and_every_other_
     for _ in range(7):
         search.advance()
         assert search.current.failed.all()
-    # Six repairs, one robot at a time: before the fourth, one of them had been repaired in vain only once.
+    # Six repairs, one robot at a time: before the fourth, one of them had failed only once.
     assert [task.credit for task in engine.tasks] == ["robot"] * 6 + ["team"]
     assert [task.problem.num_robots for task in engine.tasks] == [1] * 6 + [2]
-    assert search.state.vain.min() >= 3
+    assert search.state.failures.min() >= 3
     np.testing.assert_allclose(np.divide(engine.scales, engine.scales[0]), [1, 2, 1, 2, 1, 2, 1], rtol=1e-6)
 
 
@@ -185,7 +185,7 @@ def test_who_arrives_without_conflict_was_not_repaired_in_vain() -> None:
     """Few samples end somewhere; from there everybody turns straight home."""
     search = search_of(hop_problem(2), 1, start="team", **FEW)
     assert not search.current.failed.any()
-    assert search.state.vain.tolist() == [0, 0]
+    assert search.state.failures.tolist() == [0, 0]
 
 
 def test_teams_of_more_than_32_are_sampled_half_as_often() -> None:

@@ -13,7 +13,7 @@ from env_support import mixed_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from d4orm_env.core.observation import Eyes, insert_nearest, observe_robot
+from d4orm_env.core.observation import Sensed, insert_nearest, observe_robot
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
@@ -251,9 +251,9 @@ def test_the_plain_function_and_the_compiled_one_agree() -> None:
     velocity = np.array([controls[0], [0, 0], problem.start[2, 2:]], np.float32)
     heading = np.array([[0, 0], [math.cos(0.5), math.sin(0.5)], [0, 0]], np.float32)
     plain = np.empty_like(compiled)
-    eyes = Eyes(position, velocity, heading, np.zeros(3), np.empty((3, 2)), np.empty((3, 3)))
+    sensed = Sensed(position, velocity, heading, np.zeros(3), np.empty((3, 2)), np.empty((3, 3)))
     for k in range(3):
-        observe_robot(k, problem.arrays, problem.goal, eyes, 0.5, plain[k])
+        observe_robot(k, problem.arrays, problem.goal, sensed, 0.5, plain[k])
     np.testing.assert_allclose(np.clip(plain, layout.low, layout.high), compiled, atol=1e-6)
 
 

@@ -119,7 +119,7 @@ def unchecked(team: Team, start: Any, world: World) -> Problem:
     far = Problem(
         team, np.concatenate([apart, apart * 0], axis=1), apart, World(team.dimension), goal_radius=0.2, horizon=40
     )
-    return far.moment(states, apart, world=world)
+    return far.resumed_at(states, apart, world=world)
 
 
 def near_each_other(positions: Any, reach: float) -> Any:

@@ -235,7 +235,7 @@ def test_headings_of_many_turns_are_refused() -> None:
 
 def test_what_is_under_way_is_not_checked() -> None:
     problem = drive()
-    coarse = problem.moment(problem.start, problem.goal, dt=2.0, horizon=5)
+    coarse = problem.resumed_at(problem.start, problem.goal, dt=2.0, horizon=5)
     assert (coarse.dt, coarse.horizon) == (2.0, 5)
 
 
@@ -302,13 +302,15 @@ def test_the_arrays_that_engines_read() -> None:
     assert arrays.model_codes.tolist() == [0, 2]
     np.testing.assert_allclose(arrays.time_step, [0.6, 0.3, 0.2, 0.1], rtol=1e-6)
     assert arrays.inverse_initial_distance.tolist() == [0.5, 0.5]
-    assert arrays.balls.tolist() == [[0, 1, 0.25]]
+    assert arrays.boxes[0].tolist() == [0, 1, 0, 1, 0.25]
+    assert arrays.docks
     assert arrays.bounds.tolist() == [[-4, -4], [4, 4]]
     assert (arrays.margin, arrays.squared_goal_radius, arrays.squared_goal_speed) == (0.125, 0.25, 0.0625)
     assert two_robots().arrays.squared_goal_speed == np.inf
     open_world = two_robots(world=None).arrays
     assert open_world.bounds.tolist() == [[-np.inf] * 2, [np.inf] * 2]
-    assert spatial().arrays.balls.tolist() == [[0, 0, 1, 0.5]]
+    assert spatial().arrays.boxes[0].tolist() == [0, 0, 1, 0, 0, 1, 0.5]
+    assert not two_robots(arrival="stay").arrays.docks
 
 
 CHANGES: list[dict[str, Any]] = [

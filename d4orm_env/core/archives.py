@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Collection
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 
@@ -30,7 +30,7 @@ class ArrayArchive(zipfile.ZipFile):
         if found != sorted(f"{name}.npy" for name in names):
             raise ValueError(f"it holds {', '.join(found[:20])}; expected {', '.join(sorted(names))}")
 
-    def array(self, name: str, max_bytes: int) -> Any:
+    def array(self, name: str, max_bytes: int) -> np.ndarray:
         """An array of at most so many bytes.
 
         Raises:

@@ -6,22 +6,20 @@ Two bodies touch when the distance between their surfaces is zero or less, so ev
 
 from __future__ import annotations
 
-from typing import Any
-
-from d4orm_env.core.robot_model import Ops
+from d4orm_env.core.robot_model import Number, Ops, Truth, Vector
 
 
-def axis_gap(x: Any, lower: Any, upper: Any, zero: Any, ops: Ops) -> Any:
+def axis_gap(x: Number, lower: Number, upper: Number, zero: Number, ops: Ops) -> Number:
     """How far ``x`` lies outside the interval from ``lower`` to ``upper``; zero inside it."""
     return ops.maximum(ops.maximum(lower - x, x - upper), zero)
 
 
-def leaves(x: Any, reach: Any, lower: Any, upper: Any) -> Any:
+def leaves(x: Number, reach: Number, lower: Number, upper: Number) -> Truth:
     """Whether a body of that reach at ``x`` touches or leaves the interval from ``lower`` to ``upper``."""
     return (x - reach <= lower) | (x + reach >= upper)
 
 
-def meets_edge(x: Any, y: Any, along_x: Any, along_y: Any, reach: Any, zero: Any, ops: Ops) -> Any:
+def meets_edge(x: Number, y: Number, along_x: Number, along_y: Number, reach: Number, zero: Number, ops: Ops) -> Truth:
     """Whether a disc of that reach at ``(x, y)`` touches the edge from the origin to ``(along_x, along_y)``."""
     square = along_x * along_x + along_y * along_y
     share = ops.minimum(ops.maximum(x * along_x + y * along_y, zero), square) / square
@@ -29,12 +27,12 @@ def meets_edge(x: Any, y: Any, along_x: Any, along_y: Any, reach: Any, zero: Any
     return gap_x * gap_x + gap_y * gap_y <= reach * reach
 
 
-def lies_left(x: Any, y: Any, along_x: Any, along_y: Any, zero: Any) -> Any:
+def lies_left(x: Number, y: Number, along_x: Number, along_y: Number, zero: Number) -> Truth:
     """Whether ``(x, y)`` lies on the line from the origin to ``(along_x, along_y)`` or to the left of it."""
     return along_x * y - along_y * x >= zero
 
 
-def meets_triangle(corners: Any, x: Any, y: Any, reach: Any, zero: Any, ops: Ops) -> Any:
+def meets_triangle(corners: Vector, x: Number, y: Number, reach: Number, zero: Number, ops: Ops) -> Truth:
     """Whether a disc of that reach at ``(x, y)`` touches a triangle, ``corners`` being ``x, y`` of each in turn."""
     ax, ay, bx, by, cx, cy = corners
     edges = (

@@ -14,7 +14,7 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem_arrays import ProblemArrays
 
 
-class Eyes(NamedTuple):
+class Sensed(NamedTuple):
     """What there is to see of the robots, and scratch for what one of them sees.
 
     Attributes:
@@ -35,7 +35,7 @@ class Eyes(NamedTuple):
 
 
 def observe_robot(
-    k: int, arrays: ProblemArrays, goal: FloatArray, eyes: Eyes, time_left: float, out: FloatArray
+    k: int, arrays: ProblemArrays, goal: FloatArray, sensed: Sensed, time_left: float, out: FloatArray
 ) -> None:
     """Fill one robot's observation.
 
@@ -43,48 +43,48 @@ def observe_robot(
         k: Robot.
         arrays: The problem.
         goal: ``(K, d)``.
-        eyes: What there is to see.
+        sensed: What there is to see.
         time_left: Share of the time left, 1 to 0.
         out: ``(D,)``, filled as :class:`~d4orm_env.core.observation_layout.ObservationSlices` says.
     """
     d = goal.shape[1]
     neighbors = 2 * d + 8
-    obstacles = neighbors + (2 + 2 * d) * eyes.nearest_robots.shape[0]
-    _see_itself(k, arrays, goal, eyes, out)
+    obstacles = neighbors + (2 + 2 * d) * sensed.nearest_robots.shape[0]
+    _see_itself(k, arrays, goal, sensed, out)
     out[2 * d + 3] = time_left
-    _find_nearest_robots(k, eyes.position, eyes.nearest_robots)
-    _see_robots(k, arrays.radius, eyes, neighbors, out)
-    _find_nearest_obstacles(eyes.position[k], arrays, eyes.nearest_obstacles)
-    _see_obstacles(arrays.radius[k], eyes.nearest_obstacles, obstacles, out)
+    _find_nearest_robots(k, sensed.position, sensed.nearest_robots)
+    _see_robots(k, arrays.radius, sensed, neighbors, out)
+    _find_nearest_obstacles(sensed.position[k], arrays, sensed.nearest_obstacles)
+    _see_obstacles(arrays.radius[k], sensed.nearest_obstacles, obstacles, out)
 
 
-def _see_itself(k: int, arrays: ProblemArrays, goal: FloatArray, eyes: Eyes, out: FloatArray) -> None:
+def _see_itself(k: int, arrays: ProblemArrays, goal: FloatArray, sensed: Sensed, out: FloatArray) -> None:
     d = goal.shape[1]
-    speed2 = eyes.velocity[k, 0] * eyes.velocity[k, 0]
+    speed2 = sensed.velocity[k, 0] * sensed.velocity[k, 0]
     for axis in range(1, d):
-        speed2 += eyes.velocity[k, axis] * eyes.velocity[k, axis]
+        speed2 += sensed.velocity[k, axis] * sensed.velocity[k, axis]
     for axis in range(d):
-        out[axis] = eyes.velocity[k, axis]
-        out[d + 3 + axis] = goal[k, axis] - eyes.position[k, axis]
-    out[d] = eyes.heading[k, 0]
-    out[d + 1] = eyes.heading[k, 1]
+        out[axis] = sensed.velocity[k, axis]
+        out[d + 3 + axis] = goal[k, axis] - sensed.position[k, axis]
+    out[d] = sensed.heading[k, 0]
+    out[d + 1] = sensed.heading[k, 1]
     out[d + 2] = np.sqrt(speed2)
-    out[2 * d + 4] = eyes.arrived[k]
+    out[2 * d + 4] = sensed.arrived[k]
     out[2 * d + 5] = arrays.radius[k]
     out[2 * d + 6] = arrays.limits[k, 0]
     out[2 * d + 7] = arrays.limits[k, 1]
 
 
-def _see_robots(k: int, radius: FloatArray, eyes: Eyes, i: int, out: FloatArray) -> None:
+def _see_robots(k: int, radius: FloatArray, sensed: Sensed, i: int, out: FloatArray) -> None:
     """Fill the rows of neighbours, from component ``i`` on."""
-    d = eyes.position.shape[1]
-    for row in range(eyes.nearest_robots.shape[0]):
-        present = eyes.nearest_robots[row, 0] < np.inf
-        other = int(eyes.nearest_robots[row, 1]) if present else k
+    d = sensed.position.shape[1]
+    for row in range(sensed.nearest_robots.shape[0]):
+        present = sensed.nearest_robots[row, 0] < np.inf
+        other = int(sensed.nearest_robots[row, 1]) if present else k
         out[i] = 1 if present else 0
         for axis in range(d):
-            out[i + 1 + axis] = eyes.position[other, axis] - eyes.position[k, axis]
-            out[i + 1 + d + axis] = eyes.velocity[other, axis] - eyes.velocity[k, axis]
+            out[i + 1 + axis] = sensed.position[other, axis] - sensed.position[k, axis]
+            out[i + 1 + d + axis] = sensed.velocity[other, axis] - sensed.velocity[k, axis]
         out[i + 1 + 2 * d] = radius[other] if present else 0
         i += 2 + 2 * d
 

@@ -6,10 +6,10 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import (
     LARGEST,
@@ -242,7 +242,7 @@ class Problem:
         world = self.world
         obstacles = (world.balls, world.cylinders, world.boxes, *world.polygons)
         for value in (*arrays[:6], *obstacles, *arrays[9:14]):
-            array: NDArray[Any] = np.ascontiguousarray(value)
+            array: np.ndarray = np.ascontiguousarray(value)
             sha.update(f"{array.shape}{array.dtype}".encode())
             sha.update(array.tobytes())
         sha.update(f"{self.dt!r} {self.horizon} {self.margin!r} {self.goal_radius!r} {self.goal_speed!r}".encode())
@@ -263,12 +263,12 @@ class Problem:
     def __hash__(self) -> int:
         return hash(self.digest)
 
-    def replace(self, **changes: Any) -> Problem:
+    def replace(self, **changes: object) -> Problem:
         """A copy with some attributes changed, checked again."""
         return Problem(**{attribute.name: getattr(self, attribute.name) for attribute in fields(self)} | changes)
 
-    def moment(self, start: ArrayLike, goal: ArrayLike, **changes: Any) -> Problem:
-        """The same team in the same world at another moment, for planning on from there.
+    def resumed_at(self, start: ArrayLike, goal: ArrayLike, **changes: object) -> Problem:
+        """The same team in the same world in other states, for planning on from there.
 
         Unlike :meth:`replace` it does not check what is changed: under way robots may touch, be faster than they
         should, or head for places that they cannot all be at.

@@ -37,14 +37,18 @@ class Registry(Mapping[str, T]):
     """
 
     def __init__(
-        self, what: str, group: str, admit: Callable[[str, Any], T], identity: Callable[[Any], object] | None = None
+        self,
+        what: str,
+        group: str,
+        admit: Callable[[str, Any], T],
+        identity: Callable[[object], object] | None = None,
     ) -> None:
         self.what, self.group = what, group
         self._admit, self._identity = admit, identity or _place
-        self._registered: dict[str, Any] = {}
+        self._registered: dict[str, object] = {}
         self._admitted: dict[str, T] = {}
 
-    def add(self, name: str, thing: Any) -> None:
+    def add(self, name: str, thing: object) -> None:
         """Register a thing, or the text ``"package.module:Name"`` of one; again if defined anew.
 
         Raises:
@@ -66,7 +70,7 @@ class Registry(Mapping[str, T]):
         """Names registered in this process, in order."""
         return tuple(self._registered)
 
-    def origin(self, name: str) -> Any:
+    def origin(self, name: str) -> object:
         """What was registered under a name, or its import path.
 
         Raises:
@@ -82,7 +86,7 @@ class Registry(Mapping[str, T]):
             raise ValueError(f"{self.what} name {name!r} is claimed by {owners}; uninstall one of them")
         return claims[0]
 
-    def _same(self, claims: list[Any]) -> bool:
+    def _same(self, claims: list[object]) -> bool:
         """Whether all are the same thing, such as one that its module registers and its package offers too."""
         try:
             first, *others = (self._identity(load_reference(one) if isinstance(one, str) else one) for one in claims)
@@ -151,7 +155,7 @@ def load_reference(text: str) -> Any:
     if not place or not all(part.isidentifier() for part in name.split(".")):
         raise ValueError(f"{text!r} is no import path; give {FORMS}")
     try:
-        found: Any = _load_file(Path(place)) if place.endswith(".py") else _import(place)
+        found: object = _load_file(Path(place)) if place.endswith(".py") else _import(place)
     except Exception as error:  # whatever foreign code raises when it is imported
         raise ValueError(
             f"{text!r} cannot be imported ({describe(error)}); give {FORMS}, of a module that Python finds and that "
@@ -192,6 +196,6 @@ def _load_file(path: Path) -> ModuleType:
 
 
 def _place(thing: object) -> object:
-    """Where a class or function is defined; anything else is told from others by what it is."""
+    """Where a class or function is defined; anything else is identified by what it is."""
     name = getattr(thing, "__qualname__", "<")
     return thing if "<" in name else (thing.__module__, name)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from d4orm_env.core.robot_model import ModelFunctions, Number, Ops, TimeStep, Vector
+from d4orm_env.core.robot_model import ModelFunctions, Number, Ops, TimeStep, Truth, Vector
 
 __all__ = ["TimeStep", "advance", "arrives"]
 
@@ -27,6 +27,6 @@ def arrives(
     return (squared_distance <= squared_goal_radius) & (squared_speed <= squared_goal_speed)
 
 
-def stands(arrived: Any, docks: Any) -> Any:
+def stands(arrived: Truth, docks: Truth) -> Any:
     """Whether a robot that has arrived stays where it is, whatever its control; ``docks`` says whether any does."""
     return arrived & docks

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -97,11 +96,11 @@ class World:
         if self.lower is not None and self.upper is not None and (self.lower >= self.upper).any():
             raise ValueError(f"bounds lower {self.lower.tolist()} must lie below upper {self.upper.tolist()}")
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         # What is cached is made anew in a copy.
         return {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: dict[str, object]) -> None:
         restore_frozen(self, state)
         for corners in self.polygons:
             corners.setflags(write=False)
@@ -171,7 +170,7 @@ class World:
             self._indices[key] = build_index(self.shapes, reach / 4, margin, nearest)
         return self._indices[key]
 
-    def clearance(self, positions: Any) -> np.ndarray:
+    def clearance(self, positions: ArrayLike) -> np.ndarray:
         """Distance from points to the nearest obstacle surface or bound, negative inside [m], in float64.
 
         Inside a polygon it is the distance to the nearest edge of one of the triangles that it is made of.

@@ -112,7 +112,7 @@ def moving_contacts(arrays: ProblemArrays, place: Any, obstacle: Any, radius: An
 def obstacle_contacts(arrays: ProblemArrays, place: Any, extra: Any) -> Any:
     """``(K, S)`` bool: the same towards static obstacles and bounds."""
     reach = (arrays.radius + extra)[:, None]
-    hit = jnp.zeros((place.shape[0], place.shape[2]), bool)
+    hit: Any = jnp.zeros((place.shape[0], place.shape[2]), bool)
     for axis in range(place.shape[1]):
         hit |= collision.leaves(place[:, axis], reach, arrays.bounds[0, axis], arrays.bounds[1, axis])
     if len(arrays.boxes) + len(arrays.triangles) > FEW and arrays.grid is not None:

@@ -185,7 +185,7 @@ def roll_out_kernel(names: tuple[str, ...]) -> Any:
     """A kernel that steps a single world through ``controls`` ``(H+1, K, m)``, keeping every step.
 
     The first row of the controls is unused. Every output has ``H+1`` rows too, the first for the start. The motion
-    comes first; then 64 moments at a time are judged, as if they were worlds.
+    comes first; then 64 time steps at a time are judged, as if they were worlds.
     """
     move_robot = robot_mover(names)
 
@@ -226,8 +226,8 @@ def judge_worlds(
 
 
 @numba.njit(nogil=True, **OPTIONS)
-def _open_eyes(num_robots: Any, dimension: Any, num_neighbors: Any, num_obstacles: Any) -> Any:
-    return observation.Eyes(
+def _allocate_sensed(num_robots: Any, dimension: Any, num_neighbors: Any, num_obstacles: Any) -> Any:
+    return observation.Sensed(
         np.empty((num_robots, dimension), np.float32), np.empty((num_robots, dimension), np.float32),
         np.empty((num_robots, 2), np.float32), np.empty(num_robots, np.float32),
         np.empty((num_neighbors, 2), np.float32), np.empty((num_obstacles, 1 + dimension), np.float32),
@@ -236,22 +236,22 @@ def _open_eyes(num_robots: Any, dimension: Any, num_neighbors: Any, num_obstacle
 
 @inlined
 def _observe(
-    read_motion: Any, arrays: Any, goal: Any, docked: Any, time_left: Any, s: Any, w: Any, bounds: Any, eyes: Any,
+    read_motion: Any, arrays: Any, goal: Any, docked: Any, time_left: Any, s: Any, w: Any, bounds: Any, sensed: Any,
     out: Any,
 ) -> None:  # fmt: skip
     """Fill ``out`` ``(K, D)`` with what the robots of the world in lane ``s`` see, inside ``bounds`` ``(2, D)``."""
     num_robots, dimension = goal.shape
     for k in range(num_robots):
         for axis in range(dimension):
-            eyes.position[k, axis] = w[k * STRIDE + (STATE + axis) * TILE + s]
-        read_motion(arrays, k, s, w, eyes.velocity[k], eyes.heading[k])
-        eyes.arrived[k] = ONE if docked[k] else ZERO
+            sensed.position[k, axis] = w[k * STRIDE + (STATE + axis) * TILE + s]
+        read_motion(arrays, k, s, w, sensed.velocity[k], sensed.heading[k])
+        sensed.arrived[k] = ONE if docked[k] else ZERO
         for axis in range(dimension):
             if transition.stands(docked[k], arrays.docks):
-                eyes.velocity[k, axis] = ZERO
+                sensed.velocity[k, axis] = ZERO
     for k in range(num_robots):
         row = out[k]
-        observation.observe_robot(k, arrays, goal, eyes, time_left, row)
+        observation.observe_robot(k, arrays, goal, sensed, time_left, row)
         for i in range(row.shape[0]):
             value = row[i]
             value = value if value > bounds[0, i] else bounds[0, i]
@@ -271,8 +271,8 @@ def observe_world_kernel(names: tuple[str, ...]) -> Any:
         num_robots, dimension = arrays.goal.shape
         w = tiles.aligned_zeros(num_robots * STRIDE)
         _load_world(goal, state, control, docked, 0, 0, w)
-        eyes = _open_eyes(num_robots, dimension, num_neighbors, num_obstacles)
-        _observe(read_motion, arrays, goal[0], docked[0], np.float32(time_left), 0, w, bounds, eyes, out[0])
+        sensed = _allocate_sensed(num_robots, dimension, num_neighbors, num_obstacles)
+        _observe(read_motion, arrays, goal[0], docked[0], np.float32(time_left), 0, w, bounds, sensed, out[0])
 
     return observe_world
 
@@ -432,7 +432,7 @@ def advance_worlds_kernel(names: tuple[str, ...]) -> Any:
         num_robots, dimension = arrays.goal.shape
         w = tiles.aligned_zeros(num_robots * STRIDE)
         near = np.empty((num_robots, 2), np.uint64)
-        eyes = _open_eyes(num_robots, dimension, num_neighbors, num_obstacles)
+        sensed = _allocate_sensed(num_robots, dimension, num_neighbors, num_obstacles)
         for index in range(tile_range[0], tile_range[1]):
             first = index * TILE
             count = min(TILE, orders.shape[0] - first)
@@ -458,7 +458,9 @@ def advance_worlds_kernel(names: tuple[str, ...]) -> Any:
                     for k in range(num_robots):
                         batch.distance[b, k] = np.sqrt(w[k * STRIDE + DISTANCE2 * TILE + s])
                     time_left = np.float32(max(0.0, 1.0 - batch.steps[b] / max_cycles))
-                    _observe(read_motion, arrays, batch.goal[b], batch.docked[b], time_left, s, w, bounds, eyes, out[b])
+                    _observe(
+                        read_motion, arrays, batch.goal[b], batch.docked[b], time_left, s, w, bounds, sensed, out[b]
+                    )
 
     return advance_worlds
 

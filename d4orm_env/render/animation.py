@@ -7,7 +7,6 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,7 +149,7 @@ def _write_mp4(path: Path, frames: _Frames, fps: float) -> None:
     width, height = frames.renderer.size
     raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
     coded = ["-an", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-movflags", "+faststart", "-f", "mp4"]
-    command: list[Any] = ["ffmpeg", "-y", "-loglevel", "error", *raw, *coded, path]
+    command: list[str | Path] = ["ffmpeg", "-y", "-loglevel", "error", *raw, *coded, path]
     with TemporaryFile() as log:
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log) as ffmpeg:
             assert ffmpeg.stdin is not None

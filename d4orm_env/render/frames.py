@@ -19,7 +19,7 @@ __all__ = ["FrameRenderer", "WindowRenderer"]
 
 
 class FrameRenderer:
-    """Draws one moment after another into an image: the environment's ``rgb_array`` mode, and animations.
+    """Draws one state after another into an image: the environment's ``rgb_array`` mode, and animations.
 
     The world is drawn once and kept; a frame redraws only what moves.
 
@@ -80,7 +80,7 @@ class FrameRenderer:
         contacts: ArrayLike = (),
         caption: str | None = None,
     ) -> NDArray[np.uint8]:
-        """Draw one moment.
+        """Draw one state.
 
         Args:
             states: ``(K, n)``.
@@ -188,9 +188,9 @@ class WindowRenderer:
     def _forget_window(self, event: object) -> None:
         self._manager = None
 
-    def draw(self, *moment: ArrayLike, **marks: Any) -> NDArray[np.uint8]:
-        """Draw one moment as :meth:`FrameRenderer.draw` does, show it, and wait until it is time for the next."""
-        frame = self._frames.draw(*moment, **marks)
+    def draw(self, *state: ArrayLike, **marks: Any) -> NDArray[np.uint8]:
+        """Draw one state as :meth:`FrameRenderer.draw` does, show it, and wait until it is time for the next."""
+        frame = self._frames.draw(*state, **marks)
         if self._manager is not None:
             canvas = self._manager.canvas
             self._image.set_data(frame)

@@ -17,7 +17,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from d4orm_env.core.problem import Problem
 
@@ -33,7 +33,7 @@ _STAR[1::2] *= 0.5
 ARRIVED_SHADE = 0.45
 _AZIMUTH, _SPATIAL_ELEVATION, _FLAT_ELEVATION = -60.0, 25.0, 45.0
 
-Array = NDArray[Any]
+Array = np.ndarray
 
 
 def robot_colors(num_robots: int) -> Array:

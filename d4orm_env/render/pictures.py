@@ -112,7 +112,7 @@ def _draw_history(layer: TeamLayer, trajectory: Trajectory) -> None:
 
 def _number_robots(layer: TeamLayer, trajectory: Trajectory, points_per_metre: float) -> None:
     """Write the robots' numbers into their discs where they fit; a heading line needs the room itself."""
-    style: dict[str, Any] = {"color": INK, "ha": "center", "va": "center_baseline", "zorder": 6.5}
+    style: dict[str, object] = {"color": INK, "ha": "center", "va": "center_baseline", "zorder": 6.5}
     for robot, (x, y) in enumerate(layer.panel.flatten(trajectory.positions[-1])):
         fontsize = min(9.0, points_per_metre * layer.radius[robot])
         if robot not in layer.drives and fontsize >= 4.5:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -214,7 +213,7 @@ def _antipodal(points: Points) -> tuple[Points, Points]:
     return starts, 0.0 - starts
 
 
-def _amswarm(settings: Settings, jitter: Any, centres: Sequence[tuple[float, float]]) -> Problem:
+def _amswarm(settings: Settings, jitter: float, centres: Sequence[tuple[float, float]]) -> Problem:
     _require_space(settings)
     if settings.num_robots != 10:
         raise ValueError(

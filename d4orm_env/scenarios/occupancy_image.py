@@ -6,7 +6,6 @@ import io
 import warnings
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -75,16 +74,16 @@ def _blocked_cells(content: bytes, negate: bool, free_thresh: float) -> Mask:
     return blocked
 
 
-def _share(value: Any, name: str) -> float:
+def _share(value: object, name: str) -> float:
     return positive_number(value, name, zero_allowed=True, most=1.0)
 
 
-def _corner(origin: Any) -> tuple[float, float]:
-    numbers = isinstance(origin, list) and all(isinstance(value, int | float) for value in origin)
-    if not numbers or len(origin) != 3 or not np.isfinite(origin).all():
+def _corner(origin: object) -> tuple[float, float]:
+    numbers = origin if isinstance(origin, list) and all(isinstance(value, int | float) for value in origin) else []
+    if len(numbers) != 3 or not np.isfinite(numbers).all():
         raise ValueError(f"origin is {origin!r}; it must be three numbers, x, y and yaw")
-    if origin[2] != 0:
+    if numbers[2] != 0:
         raise ValueError(
-            f"origin has a yaw of {origin[2]:g} rad; only maps with a yaw of 0 can be read, so turn the image"
+            f"origin has a yaw of {numbers[2]:g} rad; only maps with a yaw of 0 can be read, so turn the image"
         )
-    return float(origin[0]), float(origin[1])
+    return float(numbers[0]), float(numbers[1])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, TypeAlias, TypeGuard
+from typing import TypeAlias, TypeGuard
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios.registry import FILE_SUFFIXES, SCENARIOS
@@ -67,7 +67,7 @@ def unknown_argument(scenario: ScenarioLike | None, names: Iterable[str], others
 
 
 def make_problem(
-    scenario: ScenarioLike, num_robots: int | None = None, seed: int | None = None, **arguments: Any
+    scenario: ScenarioLike, num_robots: int | None = None, seed: int | None = None, **arguments: object
 ) -> Problem:
     """A problem of a scenario. The same arguments give the same problem, to the bit.
 

@@ -31,7 +31,7 @@ class BuiltIn:
         **defaults: Where its defaults differ from those of :class:`~d4orm_env.scenarios.settings.Settings`.
     """
 
-    def __init__(self, function: Callable[..., Problem], *, draws: bool = False, **defaults: Any) -> None:
+    def __init__(self, function: Callable[..., Problem], *, draws: bool = False, **defaults: object) -> None:
         self.__name__, self.__doc__ = function.__name__, function.__doc__
         self._function, self._defaults = function, defaults
         self.draws = draws
@@ -118,7 +118,7 @@ class Scenario:
         """
         return "" if self.takes_any else complain(f"scenario {self.name!r}", {*others, *self.arguments}, names)
 
-    def problem(self, num_robots: int | None = None, seed: int | None = None, **arguments: Any) -> Problem:
+    def problem(self, num_robots: int | None = None, seed: int | None = None, **arguments: object) -> Problem:
         """See :func:`~d4orm_env.scenarios.problems.make_problem`."""
         given = {name: value for name, value in arguments.items() if value is not None}
         # Whatever the scenario, leaving a common argument out is no mistake.
@@ -127,7 +127,7 @@ class Scenario:
             raise UnknownKeywordError(complaint)
         return self._make(num_robots, seed, given)
 
-    def _make(self, num_robots: int | None, seed: int | None, settings: Mapping[str, Any]) -> Problem:
+    def _make(self, num_robots: int | None, seed: int | None, settings: Mapping[str, object]) -> Problem:
         """The problem for that seed, checked to be one and to have that many robots."""
         seed = 0 if seed is None else whole_number(seed, "seed", 0)
         if num_robots is None and not self.has_own_size:

@@ -6,7 +6,7 @@ The public description is the documented example ``examples/scenarios/mixed_team
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -271,7 +271,7 @@ def parse(data: object) -> Problem:
         return content.build()
 
 
-def describe(problem: Problem) -> dict[str, Any]:
+def describe(problem: Problem) -> dict[str, object]:
     """The content of a file that means that problem, to the bit: the inverse of :func:`parse`."""
     settings = {name: getattr(problem, name) for name in ("dt", "horizon", "margin", "goal_radius", "goal_speed")}
     if not problem.docks:
@@ -286,11 +286,11 @@ def describe(problem: Problem) -> dict[str, Any]:
     }
 
 
-def _describe_robot(problem: Problem, robot: int) -> dict[str, Any]:
+def _describe_robot(problem: Problem, robot: int) -> dict[str, object]:
     team, dimension = problem.team, problem.dimension
     model = team.robot_models[robot]
     state = _decimals(problem.start[robot, : model.state_size])
-    entry: dict[str, Any] = {"model": model.name, "start": state[:dimension], "goal": _decimals(problem.goal[robot])}
+    entry: dict[str, object] = {"model": model.name, "start": state[:dimension], "goal": _decimals(problem.goal[robot])}
     if "velocity" in start_fields(model):
         entry["velocity"] = state[dimension:]
     elif "state" in start_fields(model):
@@ -306,9 +306,9 @@ def _describe_robot(problem: Problem, robot: int) -> dict[str, Any]:
     return entry
 
 
-def _describe_world(problem: Problem) -> dict[str, Any]:
+def _describe_world(problem: Problem) -> dict[str, object]:
     world, dimension = problem.world, problem.dimension
-    content: dict[str, Any] = {}
+    content: dict[str, object] = {}
     if world.lower is not None:
         lower, upper = map(_decimals, world.bounds)
         content["bounds"] = {"lower": lower, "upper": upper}

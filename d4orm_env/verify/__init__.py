@@ -39,7 +39,7 @@ LIMIT_TOLERANCE = 1e-5
 def verify(problem: Problem, controls: ArrayLike) -> VerificationReport:
     """Judge a plan: do all robots arrive by the horizon, within their limits, touching nothing at any time?
 
-    Contact is judged, not the safety margin: it is a gap of zero or less at any moment, also between steps, known to
+    Contact is judged, not the safety margin: it is a gap of zero or less at any time, also between steps, known to
     ``CHORD_ERROR`` for each moving robot. Controls above the limits are reported, and clipped before they are executed,
     as the robot would.
 

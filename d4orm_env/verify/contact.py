@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,8 @@ from d4orm_env.verify.report import Violation
 
 if TYPE_CHECKING:
     from d4orm_env.core.world import World
+
+Indices = NDArray[np.intp]
 
 MAX_NUMBERS = 2**18
 """Numbers in the largest arrays that are worked on at once, but for those of a single step."""
@@ -48,11 +50,11 @@ class Stretch:
     start: float
     dt: float
 
-    def of(self, steps: Any, bodies: Any) -> Floats:
+    def of(self, steps: Indices, bodies: Indices) -> Floats:
         """``(N, S+1, d)`` the path of one body in one step each."""
         return self.path[steps, :, bodies]
 
-    def times(self, steps: Any, sub_steps: Any, fraction: Any) -> Floats:
+    def times(self, steps: Indices, sub_steps: Indices, fraction: Floats) -> Floats:
         """When that fraction of that sub-step of that step has passed [s]."""
         sub_step = self.dt / (self.path.shape[1] - 1)
         times: Floats = self.start + steps * self.dt + (sub_steps + fraction) * sub_step
@@ -66,7 +68,7 @@ class Watch(ABC):
     gap between any two [m].
     """
 
-    def __init__(self, kind: str, robot: NDArray[np.intp], names: Sequence[str], rows: Any, columns: Any) -> None:
+    def __init__(self, kind: str, robot: Indices, names: Sequence[str], rows: Indices, columns: Indices) -> None:
         self.kind, self.names, self.rows, self.columns = kind, names, rows, columns
         self.minimum = np.inf
         self._robot = robot
@@ -78,11 +80,11 @@ class Watch(ABC):
         """``(T, P)`` gaps at the beginning of each step, and by how much they may shrink during it."""
 
     @abstractmethod
-    def approach(self, stretch: Stretch, steps: Any, pairs: Any) -> tuple[Floats, Floats]:
+    def approach(self, stretch: Stretch, steps: Indices, pairs: Indices) -> tuple[Floats, Floats]:
         """``(N, S)`` smallest gap in every sub-step of that step and pair, and at what fraction of the sub-step."""
 
     @abstractmethod
-    def thing(self, column: Any) -> Any:
+    def thing(self, column: Indices) -> Indices:
         """Index into ``names`` of what the column stands for."""
 
     def observe(self, stretch: Stretch) -> None:
@@ -99,7 +101,7 @@ class Watch(ABC):
                 break
             self._look(stretch, steps[some], pairs[some])
 
-    def _look(self, stretch: Stretch, steps: Any, pairs: Any) -> None:
+    def _look(self, stretch: Stretch, steps: Indices, pairs: Indices) -> None:
         gap, fraction = self.approach(stretch, steps, pairs)
         self.minimum = min(self.minimum, float(gap.min()))
         touching = gap <= 0
@@ -128,7 +130,7 @@ class Watch(ABC):
 class Pairs(Watch):
     """Robots against each other."""
 
-    def __init__(self, robot: NDArray[np.intp], radius: Floats) -> None:
+    def __init__(self, robot: Indices, radius: Floats) -> None:
         rows, columns = np.triu_indices(len(robot), 1)
         others = robot[rows] != robot[columns]  # two readings of one robot do not meet
         names = [f"robot_{index}" for index in range(len(radius))]
@@ -140,19 +142,19 @@ class Pairs(Watch):
         gap = norm(place[:, self.rows] - place[:, self.columns]) - self._size
         return gap, stretch.reach[:, self.rows] + stretch.reach[:, self.columns]
 
-    def approach(self, stretch: Stretch, steps: Any, pairs: Any) -> tuple[Floats, Floats]:
+    def approach(self, stretch: Stretch, steps: Indices, pairs: Indices) -> tuple[Floats, Floats]:
         offset = stretch.of(steps, self.rows[pairs]) - stretch.of(steps, self.columns[pairs])
         distance, fraction = closest_approach(offset[:, :-1], offset[:, 1:])
         return distance - self._size[pairs][:, None], fraction
 
-    def thing(self, column: Any) -> Any:
+    def thing(self, column: Indices) -> Indices:
         return self._robot[column]
 
 
 class Static(Watch):
     """Robots against things that stand, one column each."""
 
-    def __init__(self, kind: str, robot: NDArray[np.intp], radius: Floats, names: Sequence[str]) -> None:
+    def __init__(self, kind: str, robot: Indices, radius: Floats, names: Sequence[str]) -> None:
         rows, columns = (index.ravel() for index in np.indices((len(robot), len(names))))
         super().__init__(kind, robot, names, rows, columns)
         self._radius = radius[robot[rows]]
@@ -161,38 +163,38 @@ class Static(Watch):
         gap = self.distance(stretch.path[:, 0][:, self.rows], self.columns) - self._radius
         return gap, stretch.reach[:, self.rows]
 
-    def approach(self, stretch: Stretch, steps: Any, pairs: Any) -> tuple[Floats, Floats]:
+    def approach(self, stretch: Stretch, steps: Indices, pairs: Indices) -> tuple[Floats, Floats]:
         path = stretch.of(steps, self.rows[pairs])
         distance, fraction = self.pass_by(path[:, :-1], path[:, 1:], self.columns[pairs][:, None])
         return distance - self._radius[pairs][:, None], fraction
 
-    def thing(self, column: Any) -> Any:
+    def thing(self, column: Indices) -> Indices:
         return column
 
     @abstractmethod
-    def distance(self, places: Floats, columns: Any) -> Floats:
+    def distance(self, places: Floats, columns: Indices) -> Floats:
         """Signed distance from places to the surface of the things in ``columns`` [m]."""
 
     @abstractmethod
-    def pass_by(self, start: Floats, end: Floats, columns: Any) -> tuple[Floats, Floats]:
+    def pass_by(self, start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
         """Smallest distance on the chords from ``start`` to ``end``, and at what fraction of them."""
 
 
 class Round(Static):
     """Robots against circles, spheres or vertical cylinders."""
 
-    def __init__(self, robot: NDArray[np.intp], radius: Floats, obstacles: Floats, shape: str) -> None:
+    def __init__(self, robot: Indices, radius: Floats, obstacles: Floats, shape: str) -> None:
         super().__init__("obstacle contact", robot, radius, [f"{shape}[{index}]" for index in range(len(obstacles))])
         self._centres, self._sizes = obstacles[:, :-1], obstacles[:, -1]
 
-    def distance(self, places: Floats, columns: Any) -> Floats:
+    def distance(self, places: Floats, columns: Indices) -> Floats:
         return norm(self._offset(places, columns)) - self._sizes[columns]
 
-    def pass_by(self, start: Floats, end: Floats, columns: Any) -> tuple[Floats, Floats]:
+    def pass_by(self, start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
         distance, fraction = closest_approach(self._offset(start, columns), self._offset(end, columns))
         return distance - self._sizes[columns], fraction
 
-    def _offset(self, places: Floats, columns: Any) -> Floats:
+    def _offset(self, places: Floats, columns: Indices) -> Floats:
         # A cylinder is a circle seen from above.
         offset: Floats = places[..., : self._centres.shape[1]] - self._centres[columns]
         return offset
@@ -201,53 +203,53 @@ class Round(Static):
 class Boxes(Static):
     """Robots against axis-aligned boxes."""
 
-    def __init__(self, robot: NDArray[np.intp], radius: Floats, boxes: Floats) -> None:
+    def __init__(self, robot: Indices, radius: Floats, boxes: Floats) -> None:
         super().__init__("obstacle contact", robot, radius, [f"boxes[{index}]" for index in range(len(boxes))])
         self._boxes = boxes
 
-    def distance(self, places: Floats, columns: Any) -> Floats:
+    def distance(self, places: Floats, columns: Indices) -> Floats:
         return box_distance(places, self._boxes[columns])
 
-    def pass_by(self, start: Floats, end: Floats, columns: Any) -> tuple[Floats, Floats]:
+    def pass_by(self, start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
         return box_approach(start, end, self._boxes[columns])
 
 
 class Polygon(Static):
     """Robots against one polygon."""
 
-    def __init__(self, robot: NDArray[np.intp], radius: Floats, corners: Floats, name: str) -> None:
+    def __init__(self, robot: Indices, radius: Floats, corners: Floats, name: str) -> None:
         super().__init__("obstacle contact", robot, radius, [name])
         self._corners = corners
 
-    def distance(self, places: Floats, columns: Any) -> Floats:
+    def distance(self, places: Floats, columns: Indices) -> Floats:
         return polygon_distance(places, self._corners)
 
-    def pass_by(self, start: Floats, end: Floats, columns: Any) -> tuple[Floats, Floats]:
+    def pass_by(self, start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
         return polygon_approach(start, end, self._corners)
 
 
 class Bounds(Static):
     """Robots against the sides of the world."""
 
-    def __init__(self, robot: NDArray[np.intp], radius: Floats, lower: Floats, upper: Floats) -> None:
+    def __init__(self, robot: Indices, radius: Floats, lower: Floats, upper: Floats) -> None:
         axes = "xyz"[: len(lower)]
         names = [f"the {side} bound of {axis}" for side in ("lower", "upper") for axis in axes]
         super().__init__("bounds contact", robot, radius, names)
         self._axis, self._sign = np.tile(np.arange(len(lower)), 2), np.repeat([1.0, -1.0], len(lower))
         self._place = np.concatenate([lower, -upper])
 
-    def distance(self, places: Floats, columns: Any) -> Floats:
+    def distance(self, places: Floats, columns: Indices) -> Floats:
         axis = np.broadcast_to(self._axis[columns], places.shape[:-1])
         value = np.take_along_axis(places, axis[..., None], axis=-1)[..., 0]
         distance: Floats = self._sign[columns] * value - self._place[columns]
         return distance
 
-    def pass_by(self, start: Floats, end: Floats, columns: Any) -> tuple[Floats, Floats]:
+    def pass_by(self, start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
         before, after = self.distance(start, columns), self.distance(end, columns)
         return np.minimum(before, after), (after < before).astype(np.float64)
 
 
-def surroundings(world: World, robot: NDArray[np.intp], radius: Floats) -> list[Watch]:
+def surroundings(world: World, robot: Indices, radius: Floats) -> list[Watch]:
     """What watches for each kind of obstacle there is, and for the bounds."""
     watches: list[Watch] = []
     for shape in ("circles", "spheres", "cylinders"):

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, TypeAlias
 
 import numpy as np
 from pydantic import Field
 
+from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.dynamics import get_model
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.base import SamplingTask
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.benchmark.probes import measure_memory, measure_startup
-from d4orm_planners.benchmark.timing import Spread, measure
+from d4orm_planners.benchmark.timing import Row, Spread, measure
 from d4orm_planners.benchmark.walls import Where, boxed_problem, measure_index, measure_obstacles
+from d4orm_planners.d4orm import D4orm
 from d4orm_planners.registry import make_planner
 from d4orm_planners.settings import CheckedSettings, Count, Positive, Samples, Steps, Whole
 
@@ -87,7 +89,7 @@ class BenchmarkSettings(CheckedSettings):
                 raise ValueError(f"engine {engine!r} is no engine of the benchmark; choose from {', '.join(ENGINES)}")
 
 
-QUICK: dict[str, Any] = {
+QUICK: Mapping[str, object] = {
     "robots": (4, 8),
     "models": ("holonomic2d", "differential_drive"),
     "num_steps": 20,
@@ -109,7 +111,10 @@ QUICK: dict[str, Any] = {
 FIRST_STEPS = 5
 """Steps at the largest noise that are run together to time one."""
 
-Part = tuple[str, str, Callable[[], Any]]
+Run: TypeAlias = Callable[[FloatArray, bool], object]
+"""``(noise_scale, collisions)`` to what is timed."""
+
+Part = tuple[str, str, Callable[[], Row]]
 
 
 def circle(num_robots: int, model: str, horizon: int) -> Problem:
@@ -152,9 +157,9 @@ def parts(settings: BenchmarkSettings) -> Iterator[Part]:
             yield "plans", f"first plans of {num_robots} robots", partial(_measure_plans, settings, preset, num_robots)
 
 
-def run_parts(todo: Sequence[Part], progress: Callable[[str, int, int], Any]) -> dict[str, list[Any]]:
+def run_parts(todo: Sequence[Part], progress: Callable[[str, int, int], object]) -> dict[str, list[Row]]:
     """Measurements by section; ``progress(what, number done, number in all)`` is called before each."""
-    results: dict[str, list[Any]] = {section: [] for section, _, _ in todo}
+    results: dict[str, list[Row]] = {section: [] for section, _, _ in todo}
     for done, (section, what, work) in enumerate(todo):
         progress(what, done, len(todo))
         results[section].append(work())
@@ -162,12 +167,18 @@ def run_parts(todo: Sequence[Part], progress: Callable[[str, int, int], Any]) ->
     return results
 
 
+def _d4orm(preset: str | None = None, **settings: object) -> D4orm:
+    planner = make_planner("d4orm", preset=preset, **settings)
+    assert isinstance(planner, D4orm)
+    return planner
+
+
 def _measure_denoising(
     settings: BenchmarkSettings, engine: str, preset: str | None, num_robots: int, model: str
-) -> dict[str, Any]:
+) -> Row:
     problem = circle(num_robots, model, settings.horizon)
     run = _plain_run(problem, settings) if engine == "plain" else _engine_run(problem, settings, engine, preset)
-    planner: Any = make_planner("d4orm", num_steps=settings.num_steps)
+    planner = _d4orm(num_steps=settings.num_steps)
     noise_scale = planner.noise_scale()
     timed = partial(measure, repetitions=settings.repetitions, time_limit=settings.time_limit)
     # Steps in a row, because what a run begins with is no part of a step.
@@ -192,31 +203,31 @@ def _measure_denoising(
     }
 
 
-def _engine_run(problem: Problem, settings: BenchmarkSettings, name: str, preset: str | None) -> Callable[..., Any]:
-    planner: Any = make_planner("d4orm", preset=preset, num_samples=settings.num_samples)
+def _engine_run(problem: Problem, settings: BenchmarkSettings, name: str, preset: str | None) -> Run:
+    planner = _d4orm(preset=preset, num_samples=settings.num_samples)
     engine, rules = get_engine(name), planner.rules()
     base = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
 
-    def run(noise_scale: Any, collisions: bool) -> None:
+    def run(noise_scale: FloatArray, collisions: bool) -> None:
         task = SamplingTask(problem, base, collisions=collisions, credit=planner.config.credit)
         engine.denoise(task, rules, base, noise_scale, settings.num_samples, 0)
 
     return run
 
 
-def _plain_run(problem: Problem, settings: BenchmarkSettings) -> Callable[..., Any]:
+def _plain_run(problem: Problem, settings: BenchmarkSettings) -> Run:
     from d4orm_planners.benchmark import plain
 
-    planner: Any = make_planner("d4orm", preset="paper")
+    planner = _d4orm(preset="paper")
     temperature = float(planner.config.temperature)
     return lambda noise_scale, collisions: plain.denoise_around_rest(
         problem, noise_scale, settings.num_samples, temperature, 0, collisions
     )
 
 
-def _measure_obstacles(settings: BenchmarkSettings, num_boxes: int, where: Where) -> dict[str, Any]:
+def _measure_obstacles(settings: BenchmarkSettings, num_boxes: int, where: Where) -> Row:
     """An iteration of the paper's planner among boxes, beside one in the open."""
-    planner: Any = make_planner("d4orm", preset="paper", num_steps=settings.num_steps)
+    planner = _d4orm(preset="paper", num_steps=settings.num_steps)
     noise_scale = planner.noise_scale()
 
     def iterate(problem: Problem) -> None:
@@ -225,7 +236,7 @@ def _measure_obstacles(settings: BenchmarkSettings, num_boxes: int, where: Where
     return measure_obstacles(iterate, num_boxes, where, settings.repetitions, settings.time_limit)
 
 
-def _measure_env(settings: BenchmarkSettings, num_boxes: int) -> dict[str, Any]:
+def _measure_env(settings: BenchmarkSettings, num_boxes: int) -> Row:
     """One PettingZoo environment of 8 robots under random controls, resets included."""
     from d4orm_env import navigation_v0
 
@@ -250,7 +261,7 @@ def _measure_env(settings: BenchmarkSettings, num_boxes: int) -> dict[str, Any]:
     return {**row, **_rate(spread, settings.env_steps)}
 
 
-def _measure_worlds(settings: BenchmarkSettings, num_boxes: int) -> dict[str, Any]:
+def _measure_worlds(settings: BenchmarkSettings, num_boxes: int) -> Row:
     """The batched environment of 8 robots per world under random controls, auto-reset included."""
     import gymnasium
 
@@ -262,7 +273,8 @@ def _measure_worlds(settings: BenchmarkSettings, num_boxes: int) -> dict[str, An
         problem=boxed_problem(num_boxes, "near"),
     )
     env.reset(seed=0)
-    space: Any = env.single_action_space
+    space = env.single_action_space
+    assert isinstance(space, gymnasium.spaces.Box)
     low, high = space.low, space.high
     random = np.random.default_rng(0)
     table = [random.uniform(low, high, (size, *low.shape)).astype(np.float32) for _ in range(16)]
@@ -278,12 +290,12 @@ def _measure_worlds(settings: BenchmarkSettings, num_boxes: int) -> dict[str, An
     return {**row, **_rate(spread, calls * size)}
 
 
-def _rate(seconds: Spread, steps: int) -> dict[str, Any]:
+def _rate(seconds: Spread, steps: int) -> Row:
     """Seconds per environment step, and steps per second at the median."""
     return {"seconds_per_step": seconds.times(1 / steps), "steps_per_second": steps / seconds.median}
 
 
-def _measure_plans(settings: BenchmarkSettings, preset: str | None, num_robots: int) -> dict[str, Any]:
+def _measure_plans(settings: BenchmarkSettings, preset: str | None, num_robots: int) -> Row:
     """Planning time to the first feasible plan; a seed without one counts with the time it took to give up."""
     planner = make_planner("d4orm", preset=preset)
     problem = make_problem("circle", num_robots=num_robots)

@@ -8,11 +8,10 @@ from collections.abc import Callable
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.benchmark.benchmark import BenchmarkSettings
-from d4orm_planners.benchmark.timing import Spread
+from d4orm_planners.benchmark.timing import Row, Spread
 from d4orm_planners.evaluation.report import table
 from d4orm_planners.machine import describe_machine, versions
 
@@ -20,7 +19,7 @@ FORMAT = "d4orm-bench-1"
 LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "gymnasium", "pettingzoo")
 
 
-def circumstances(command: str) -> dict[str, Any]:
+def circumstances(command: str) -> Row:
     """Under which a benchmark runs that begins now: date, command, machine with its load, and libraries."""
     load = list(os.getloadavg()) if hasattr(os, "getloadavg") else None
     machine = {**describe_machine(), "load_average": load, "libraries": versions(LIBRARIES)}
@@ -28,7 +27,7 @@ def circumstances(command: str) -> dict[str, Any]:
 
 
 def write_report(
-    folder: Path, settings: BenchmarkSettings, begun: dict[str, Any], results: dict[str, list[Any]]
+    folder: Path, settings: BenchmarkSettings, begun: Row, results: dict[str, list[Row]]
 ) -> tuple[Path, Path]:
     """Write ``bench.json`` and ``bench.md``.
 
@@ -52,7 +51,7 @@ def write_report(
     return folder / "bench.json", folder / "bench.md"
 
 
-def markdown(settings: BenchmarkSettings, begun: dict[str, Any], results: dict[str, list[Any]]) -> str:
+def markdown(settings: BenchmarkSettings, begun: Row, results: dict[str, list[Row]]) -> str:
     """The results as Markdown tables. Times are medians, with quartiles in brackets."""
     machine = begun["machine"]
     libraries = ", ".join(f"{name} {version}" for name, version in machine["libraries"].items())
@@ -80,7 +79,7 @@ def seconds(spread: Spread) -> str:
     return f"{spread.median:.2f} ({spread.lower_quartile:.2f}-{spread.upper_quartile:.2f})"
 
 
-def _denoising(rows: list[dict[str, Any]]) -> str:
+def _denoising(rows: list[Row]) -> str:
     plain = {(row["model"], row["num_robots"]): row["step"].median for row in rows if row["engine"] == "plain"}
     lines = []
     for row in rows:
@@ -102,7 +101,7 @@ def _denoising(rows: list[dict[str, Any]]) -> str:
     return table("Denoising", header, lines)
 
 
-def _environments(rows: list[dict[str, Any]]) -> str:
+def _environments(rows: list[Row]) -> str:
     lines = [
         (
             row["environment"],
@@ -116,7 +115,7 @@ def _environments(rows: list[dict[str, Any]]) -> str:
     return table("Environment steps", ("environment", "worlds", "robots", "boxes", "env-steps per second"), lines)
 
 
-def _obstacles(rows: list[dict[str, Any]]) -> str:
+def _obstacles(rows: list[Row]) -> str:
     lines = [
         (
             f"{row['obstacles']} {row['where']}",
@@ -130,7 +129,7 @@ def _obstacles(rows: list[dict[str, Any]]) -> str:
     return table("Obstacles, 8 robots, preset paper", header, lines)
 
 
-def _index(rows: list[dict[str, Any]]) -> str:
+def _index(rows: list[Row]) -> str:
     lines = [
         (
             f"{row['cells']} x {row['cells']}",
@@ -143,19 +142,19 @@ def _index(rows: list[dict[str, Any]]) -> str:
     return table("Index of a map's obstacles", ("cells", "boxes", "s", "MiB"), lines)
 
 
-def _startup(rows: list[dict[str, Any]]) -> str:
+def _startup(rows: list[Row]) -> str:
     lines = [(str(row["num_robots"]), f"{row['compiling']:.1f}", f"{row['cold']:.1f}", seconds(row["warm"]))
              for row in rows]  # fmt: skip
     header = ("robots", "compiling, s", "process with an empty cache, s", "process with a full cache, s")
     return table("From the start of a process to its first plan", header, lines)
 
 
-def _memory(rows: list[dict[str, Any]]) -> str:
+def _memory(rows: list[Row]) -> str:
     lines = [(str(row["num_robots"]), f"{row['imported'] / 2**20:.0f}", f"{row['peak'] / 2**20:.0f}") for row in rows]
     return table("Memory", ("robots", "after importing, MiB", "peak while planning, MiB"), lines)
 
 
-def _plans(rows: list[dict[str, Any]]) -> str:
+def _plans(rows: list[Row]) -> str:
     lines = [
         (
             str(row["num_robots"]),
@@ -172,7 +171,7 @@ def _plans(rows: list[dict[str, Any]]) -> str:
     return table("First feasible verified plan, circle of 5 m", header, lines)
 
 
-_SECTIONS: dict[str, Callable[[list[dict[str, Any]]], str]] = {
+_SECTIONS: dict[str, Callable[[list[Row]], str]] = {
     "denoising": _denoising,
     "environments": _environments,
     "obstacles": _obstacles,

@@ -5,9 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+
+Row: TypeAlias = dict[str, Any]
+"""What was measured in one case, by column: numbers, texts and :class:`Spread`."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,7 @@ class Spread:
         return replace(self, **{name: value * factor for name, value in vars(self).items() if name != "count"})
 
 
-def measure(work: Callable[[], Any], repetitions: int, time_limit: float) -> Spread:
+def measure(work: Callable[[], object], repetitions: int, time_limit: float) -> Spread:
     """Seconds that ``work`` takes, after one call that does not count.
 
     Args:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.core.world_index import build_index
 from d4orm_env.scenarios import make_problem
-from d4orm_planners.benchmark.timing import Spread
+from d4orm_planners.benchmark.timing import Row, Spread
 
 Where = Literal["near", "far"]
 
@@ -38,8 +38,8 @@ def boxed_problem(num_boxes: int, where: Where, horizon: int = 100) -> Problem:
 
 
 def measure_obstacles(
-    iterate: Callable[[Problem], Any], num_boxes: int, where: Where, repetitions: int, time_limit: float
-) -> dict[str, Any]:
+    iterate: Callable[[Problem], object], num_boxes: int, where: Where, repetitions: int, time_limit: float
+) -> Row:
     """Seconds of an iteration among boxes and in the open, in turn, and of verify().
 
     Args:
@@ -65,7 +65,7 @@ def measure_obstacles(
     }
 
 
-def measure_index(cells: int) -> dict[str, Any]:
+def measure_index(cells: int) -> Row:
     """Seconds and bytes of the index of a square map of so many cells along a side."""
     blocked = np.argwhere(np.random.default_rng(0).random((cells, cells)) < BLOCKED) * CELL
     shapes = World(boxes=np.hstack([blocked, blocked + CELL])).shapes
@@ -75,7 +75,7 @@ def measure_index(cells: int) -> dict[str, Any]:
 
 
 def _in_turn(
-    first: Callable[[], Any], second: Callable[[], Any], repetitions: int, time_limit: float
+    first: Callable[[], object], second: Callable[[], object], repetitions: int, time_limit: float
 ) -> tuple[list[float], list[float]]:
     """Seconds of each of two things, done in turn after once that does not count."""
     first()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, TypeVar, get_type_hints
+from typing import TypeVar, get_type_hints
 
 T = TypeVar("T")
 
@@ -19,7 +19,7 @@ def takes(options: type[T]) -> Callable[[Callable[[T], None]], Callable[..., Non
 
     def decorate(function: Callable[[T], None]) -> Callable[..., None]:
         @wraps(function)
-        def command(**given: Any) -> None:
+        def command(**given: object) -> None:
             function(options(**given))
 
         hints = get_type_hints(options, include_extras=True)

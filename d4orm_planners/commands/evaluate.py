@@ -122,11 +122,11 @@ def require_trials(rates: list[SuccessRate]) -> None:
         raise typer.Exit(1)
 
 
-def _policies(texts: list[str]) -> dict[str, dict[str, Any]]:
+def _policies(texts: list[str]) -> dict[str, dict[str, object]]:
     """Settings by label: a name stands for itself, and a configuration is called what was typed."""
     from d4orm_planners.registry import list_policies
 
-    chosen: dict[str, dict[str, Any]] = {}
+    chosen: dict[str, dict[str, object]] = {}
     for text in texts:
         # The name ends where the first setting begins, for an import path has a colon too.
         policy, colon, _ = text.partition("=")[0].rpartition(":")
@@ -139,7 +139,7 @@ def _policies(texts: list[str]) -> dict[str, dict[str, Any]]:
     return chosen
 
 
-def _with_settings(chosen: dict[str, dict[str, Any]], settings: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def _with_settings(chosen: dict[str, dict[str, Any]], settings: dict[str, Any]) -> dict[str, dict[str, object]]:
     """Add what ``--set`` says: ``orca.time_horizon`` to one policy, ``num_samples`` to all that have it."""
     from d4orm_planners.registry import setting_names
 

@@ -55,7 +55,7 @@ def load_node(path: str | os.PathLike[str]) -> NodeTask:
         raise ValueError(f"{path}: {error}") from error
 
 
-def _task(content: Any, folder: Path) -> NodeTask:
+def _task(content: object, folder: Path) -> NodeTask:
     from d4orm_env.core.arrays import duration, whole_number
     from d4orm_planners.registry import make_planner
 
@@ -93,7 +93,7 @@ def _task(content: Any, folder: Path) -> NodeTask:
     )
 
 
-def _problem(content: Any, folder: Path) -> Problem:
+def _problem(content: object, folder: Path) -> Problem:
     from d4orm_env.scenarios import load_problem
     from d4orm_env.scenarios.schema import VERSION, parse
 
@@ -107,7 +107,7 @@ def _problem(content: Any, folder: Path) -> Problem:
         raise ValueError(f"problem: {error}") from error
 
 
-def _mapping(name: str, content: Any) -> Mapping[str, Any]:
+def _mapping(name: str, content: object) -> Mapping[str, Any]:
     if not isinstance(content, dict):
         raise ValueError(f"{name} must be a mapping of fields, not {content!r}")
     return content

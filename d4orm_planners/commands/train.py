@@ -7,7 +7,8 @@ import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from types import ModuleType
+from typing import Annotated
 
 import typer
 
@@ -69,7 +70,7 @@ def train(options: TrainOptions) -> None:
         typer.echo(f"use it: make_policy({options.algorithm!r}, path={str(result.policy_path)!r})")
 
 
-def _training() -> Any:
+def _training() -> ModuleType:
     try:
         from d4orm_planners.rl import training
     except ModuleNotFoundError as error:

@@ -46,7 +46,7 @@ class Guide:
     Attributes:
         guidance: What is followed at present.
         index: Waypoint at which the team is.
-        anew: ``(K,)`` robots that are sent another way than before, until :meth:`fresh_start` has told so.
+        anew: ``(K,)`` robots that are sent another way than before, until :meth:`fresh_start` has reported it.
     """
 
     guidance: Guidance
@@ -83,7 +83,7 @@ class Guide:
 
     def plan(self, joint: JointState, initial: FloatArray | None, iterations: int) -> Guidance:
         """Plan for the whole team from where it is, until a plan passes the checks (Algorithm 4, lines 1 to 3)."""
-        present = self._problem.moment(joint.states, joint.goals)
+        present = self._problem.resumed_at(joint.states, joint.goals)
         coarse = coarse_problem(present, self._config.coarse_factor)
         search = Search(self._planner, coarse, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps), initial)
         chosen = search.current
@@ -127,7 +127,7 @@ class Guide:
         lost = self._is_lost(joint, moving)
         if not changed.any() and not lost:
             return False
-        present = coarse_problem(self._problem.moment(joint.states, joint.goals), self._config.coarse_factor)
+        present = coarse_problem(self._problem.resumed_at(joint.states, joint.goals), self._config.coarse_factor)
         initial = straight_drives(present).controls[:, :, 0]
         keep = moving & ~changed
         if not lost and keep.any():

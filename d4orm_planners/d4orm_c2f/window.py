@@ -51,7 +51,7 @@ class Window:
 
     def prepare(self, joint: JointState) -> None:
         """Compile, so that the first control loop is as quick as the others."""
-        window = self._problem.moment(joint.states, joint.goals, horizon=self._config.predict_horizon)
+        window = self._problem.resumed_at(joint.states, joint.goals, horizon=self._config.predict_horizon)
         task = SamplingTask(window, self.no_controls(), arrived=joint.arrived)
         self._engine.prepare(task, self._rules, self._noise_scale, self._config.num_samples)
 
@@ -87,7 +87,7 @@ class Window:
         limit = problem.team.control_limits
         controls = np.clip(base + result.mean, -limit, limit).astype(np.float32)
         radius = problem.goal_radius if self._docks else NOT_AT_SUBGOALS
-        truth = problem.moment(joint.states, joint.goals, horizon=config.predict_horizon, goal_radius=radius)
+        truth = problem.resumed_at(joint.states, joint.goals, horizon=config.predict_horizon, goal_radius=radius)
         return self._safe_mix(truth, controls, before, docked)
 
     def _task(self, joint: JointState, docked: BoolArray, subgoals: FloatArray, base: FloatArray) -> SamplingTask:
@@ -95,7 +95,7 @@ class Window:
         problem, config = self._problem, self._config
         near = np.linalg.norm(subgoals - joint.goals, axis=1) <= problem.goal_radius
         goals = np.where((near | docked)[:, None], joint.goals, subgoals)
-        window = problem.moment(
+        window = problem.resumed_at(
             joint.states,
             goals,
             horizon=config.predict_horizon,
@@ -132,7 +132,7 @@ class Window:
         before = np.zeros((horizon + self._stop_steps, *fresh.shape[1:]), np.float32)
         before[: len(left)] = left
         controls = self._with_stop(window, fresh, horizon, docked)
-        window_to_rest = window.moment(window.start, window.goal, horizon=len(controls))
+        window_to_rest = window.resumed_at(window.start, window.goal, horizon=len(controls))
         # After how many fresh steps each robot stops.
         steps = np.full(window.num_robots, horizon)
         trajectory = self._engine.rollout(window_to_rest, controls)
@@ -148,7 +148,7 @@ class Window:
 
 
 def least_gap(problem: Problem, positions: FloatArray) -> float:
-    """Least gap between the surfaces of any two robots on ``(T, K, d)`` after the first moment [m]."""
+    """Least gap between the surfaces of any two robots on ``(T, K, d)`` after the first time step [m]."""
     radius = np.asarray(problem.team.radius)
     first, second = np.triu_indices(problem.num_robots, 1)
     if not len(first):

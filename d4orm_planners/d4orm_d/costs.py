@@ -36,8 +36,10 @@ def way_costs(problem: Problem, robot: int, ways: Drives, paths: FloatArray) -> 
     moves = (ways.positions[1:] != ways.positions[:-1]).any(axis=2)
     last_move = problem.horizon - moves[::-1].argmax(axis=0)
     blocked = _touches_obstacle(problem, [robot], ways.positions[:, None])[0]
-    met = _met(problem, robot, ways.positions, paths)
-    costs: Costs = met + RULES.missing_cost * (~ways.arrived | blocked) + RULES.time_cost * last_move / problem.horizon
+    conflicts = _num_conflicts(problem, robot, ways.positions, paths)
+    costs: Costs = (
+        conflicts + RULES.missing_cost * (~ways.arrived | blocked) + RULES.time_cost * last_move / problem.horizon
+    )
     return costs
 
 
@@ -49,8 +51,8 @@ def _touches_obstacle(problem: Problem, robots: Sequence[int], paths: FloatArray
     return touching.reshape(paths.shape[1:-1])
 
 
-def _met(problem: Problem, robot: int, ways: FloatArray, paths: FloatArray) -> IntArray:
-    """``(V,)`` robots on ``paths`` ``(H+1, K, d)`` that a robot meets on each of its ``ways`` ``(H+1, V, d)``."""
+def _num_conflicts(problem: Problem, robot: int, ways: FloatArray, paths: FloatArray) -> IntArray:
+    """``(V,)`` robots on ``paths`` ``(H+1, K, d)`` in conflict with each of a robot's ``ways`` ``(H+1, V, d)``."""
     radius = np.asarray(problem.team.radius, np.float32)
     reach2 = (radius + radius[robot] + np.float32(problem.margin)) ** 2
     gap2 = sum((paths[1:, :, None, axis] - ways[1:, None, :, axis]) ** 2 for axis in range(paths.shape[2]))

@@ -81,7 +81,9 @@ class D4ormD(D4orm):
             return None
         drives = straight_drives(problem)
         if self.config.start == "auto":
-            met = conflicts(drives.positions[1:, :, 0], problem.team.radius, problem.margin).sum(axis=1).mean()
-            if met >= problem.num_robots / 2:
+            mean_conflicts = (
+                conflicts(drives.positions[1:, :, 0], problem.team.radius, problem.margin).sum(axis=1).mean()
+            )
+            if mean_conflicts >= problem.num_robots / 2:
                 return None
         return drives.controls[:, :, 0]

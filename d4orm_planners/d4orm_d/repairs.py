@@ -26,12 +26,12 @@ class Repairs:
     """The state of the search by independent repairs.
 
     Attributes:
-        vain: ``(K,)`` times in a row that each robot was repaired in vain.
-        weary: ``(K,)`` how often each was repaired, and how lately.
+        failures: ``(K,)`` failed repairs in a row of each robot.
+        recency: ``(K,)`` how often each was repaired, decaying with every iteration.
     """
 
-    vain: IntArray
-    weary: NDArray[np.float64]
+    failures: IntArray
+    recency: NDArray[np.float64]
 
     @classmethod
     def of(cls, num_robots: int) -> Repairs:
@@ -42,13 +42,13 @@ class Repairs:
         """Deform some of the failed robots' controls, and take over what is no worse."""
         repair = _Repair(team, self)
         repair.run(config)
-        return Repairs(repair.vain, repair.weary)
+        return Repairs(repair.failures, repair.recency)
 
     def shorten(self, team: TeamMotion) -> Repairs:
         """Let everybody turn home as soon as that is no worse."""
         repair = _Repair(team, self)
         repair.shorten()
-        return Repairs(repair.vain, repair.weary)
+        return Repairs(repair.failures, repair.recency)
 
 
 class _Repair:
@@ -56,7 +56,7 @@ class _Repair:
 
     def __init__(self, team: TeamMotion, before: Repairs) -> None:
         self.team, self.search, self.problem = team, team.search, team.problem
-        self.vain, self.weary = before.vain.copy(), before.weary
+        self.failures, self.recency = before.failures.copy(), before.recency
         self.detours = 0
 
     def run(self, config: D4ormDConfig) -> None:
@@ -97,20 +97,20 @@ class _Repair:
         Now and then a few robots that only together can get out of each other's way, by their team's.
         """
         search, graph = self.search, self.team.graph
-        random = np.random.default_rng(search.iteration_seed(Stream.REPAIR_ORDER)).random(len(self.weary))
-        order = np.argsort(self.weary + random - RULES.crowding * graph.sum(axis=1), kind="stable")
+        random = np.random.default_rng(search.iteration_seed(Stream.REPAIR_ORDER)).random(len(self.recency))
+        order = np.argsort(self.recency + random - RULES.crowding * graph.sum(axis=1), kind="stable")
         if search.iteration % RULES.joint_interval == 0:
             stuck = [
                 group
                 for group in components(graph)
-                if 1 < len(group) <= RULES.joint_robots and self.vain[list(group)].min() >= RULES.joint_vain
+                if 1 < len(group) <= RULES.joint_robots and self.failures[list(group)].min() >= RULES.joint_failures
             ]
             if stuck:
                 return stuck[search.iteration // RULES.joint_interval % len(stuck)], "team"
         robots = independent_robots([k for k in order if search.current.failed[k]], graph)
-        self.weary = self.weary.copy()
-        self.weary[list(robots)] += RULES.tiring
-        self.weary *= RULES.rest
+        self.recency = self.recency.copy()
+        self.recency[list(robots)] += RULES.recency_gain
+        self.recency *= RULES.recency_decay
         return robots, "robot"
 
     def take_over(self, robots: Sequence[int], part: Problem, trajectory: Trajectory) -> None:
@@ -128,7 +128,7 @@ class _Repair:
             team.positions[:, robot] = positions[:, i]
             team.arrived[robot] = arrived[i]
         team.graph = team.conflicts(team.positions)
-        self.vain[index] = np.where(self.costs_of(index) > 0, self.vain[index] + 1, 0)
+        self.failures[index] = np.where(self.costs_of(index) > 0, self.failures[index] + 1, 0)
 
     def costs_of(self, robots: list[int]) -> NDArray[np.float64]:
         """``(R,)`` costs of what robots do at present."""
@@ -141,7 +141,7 @@ class _Repair:
         """The trajectory's ``(controls, positions, arrived)``, with robots turning straight to their goals if better.
 
         A deformation ends metres from where it was aimed at after a long way: arriving is what sampling does worst, and
-        steering does at once. A robot that was repaired in vain some times may take a random detour instead.
+        steering does at once. After some failed repairs a robot may take a random detour instead.
         """
         arrived = trajectory.arrived[-1].copy()
         gap = np.linalg.norm(trajectory.positions - part.goal, axis=2)
@@ -158,7 +158,7 @@ class _Repair:
             robot = robots[int(i)]
             own = ways.of(int(i))
             cost = way_costs(self.problem, robot, own, paths)
-            if self.vain[robot] >= RULES.detour_vain and cost.min() >= 1:
+            if self.failures[robot] >= RULES.detour_failures and cost.min() >= 1:
                 own = self.with_detours(part.select([int(i)]), own)
                 cost = way_costs(self.problem, robot, own, paths)
             best = int(np.argmin(cost))

@@ -51,15 +51,15 @@ class RepairRules:
         noise_factors: On the noise of successive repairs: what ordinary noise does not get around, wider noise may.
         slack: Steps beyond the latest arrival of the robots repaired that their repair looks at. Farther on there is
             nothing to search, and what happens there would dilute the rewards.
-        tiring: What a repair adds to a robot's weariness. The least weary go first, so that all get their turn.
-        rest: Share of it that is left after an iteration.
+        recency_gain: What a repair adds to a robot's recency. The least recently repaired go first.
+        recency_decay: Share of it that is left after an iteration.
         crowding: How much earlier a robot's turn is for every robot that it meets: it blocks the most.
         joint_interval: Every so many iterations robots may be repaired jointly, each by their team's reward, ...
-        joint_vain: ... if all of them were repaired in vain so often ...
+        joint_failures: ... if so many repairs in a row failed for each of them ...
         joint_robots: ... and they are so few: robots that only together can get out of each other's way.
         shortenings: How many times in turn robots look for shorter ways home.
         earlier: Steps before a robot's arrival, or its nearest approach, at which it may turn straight to its goal.
-        detour_vain: Repairs in vain after which a robot may take a detour.
+        detour_failures: Failed repairs in a row after which a robot may take a detour.
         detours: Random detours that it chooses from.
         missing_cost: Conflicts that a robot may get into instead of never arriving, or of touching an obstacle.
         time_cost: Conflicts that a robot may get into instead of using the whole horizon: of two ways as good, the
@@ -68,15 +68,15 @@ class RepairRules:
 
     noise_factors: tuple[float, ...] = (1.0, 2.0)
     slack: int = 40
-    tiring: float = 0.3
-    rest: float = 0.7
+    recency_gain: float = 0.3
+    recency_decay: float = 0.7
     crowding: float = 0.2
     joint_interval: int = 3
-    joint_vain: int = 2
+    joint_failures: int = 2
     joint_robots: int = 3
     shortenings: int = 2
     earlier: tuple[int, ...] = (0, 8, 16, 32, 64)
-    detour_vain: int = 2
+    detour_failures: int = 2
     detours: int = 32
     missing_cost: float = 5.0
     time_cost: float = 0.1

@@ -61,7 +61,7 @@ class TeamMotion:
             radius = np.asarray(problem.team.radius)[others]
             moving = MovingObstacles(self.positions[1 : horizon + 1, others], radius)
         base = np.ascontiguousarray(self.controls[:horizon, robots, : part.control_size])
-        task = SamplingTask(part.moment(part.start, part.goal, horizon=horizon), base, moving=moving, **scoring)
+        task = SamplingTask(part.resumed_at(part.start, part.goal, horizon=horizon), base, moving=moving, **scoring)
         self._runs += 1
         start, seed = planner.start(search, base, self._runs), search.iteration_seed(Stream.REPAIR, self._runs)
         result = search.denoise(task, planner.rules(), start, noise_scale, num_samples, seed)

@@ -90,8 +90,8 @@ class DD4orm(Planner):
         planner = config.node_planners(task.num_nodes)[config.node]
         transport = ZenohTransport(zenoh)
         judge = Judge(get_engine(config.engine), search.problem)
-        # Numbered by the clock, what a node tells that was started again is newer than what it told before.
-        node = Node(config.node, task, planner, transport, judge, told=time.time_ns())
+        # Numbered by the clock, what a restarted node sends is newer than what it sent before.
+        node = Node(config.node, task, planner, transport, judge, sequence=time.time_ns())
         return NetworkCrew(node, transport, config.patience, judge, zenoh.linger)
 
     def _local_crew(self, search: Search, task: Task, opened: ExitStack) -> Crew:

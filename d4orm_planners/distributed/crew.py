@@ -83,7 +83,7 @@ class Crew(ABC):
         self._notes: list[str] = []
         self._losses: list[str] = []
         self._error: Exception | None = None
-        self._told: Counter[str] = Counter()
+        self._reported: Counter[str] = Counter()
         self._spent = self._excluded = 0
         self._read: Counter[Node] = Counter()
         self._seconds = self._waited = 0.0
@@ -150,7 +150,7 @@ class Crew(ABC):
         """New candidates of the nodes.
 
         Args:
-            time_left: Tells the seconds left, below zero when overdue.
+            time_left: Returns the seconds left, below zero when overdue.
             improve: Whether nodes go on once there is a solution.
         """
 
@@ -179,10 +179,10 @@ class Crew(ABC):
         for node in self._nodes:
             faults += node.inbox.dropped
             faults["false claim"] += node.inbox.false_claims
-        new = faults - self._told
+        new = faults - self._reported
         notes = self._notes + self._node_notes() + [f"received {count} x {kind}" for kind, count in sorted(new.items())]
         iteration = Iteration(best.controls, steps - self._spent, excluded - self._excluded, "; ".join(notes), best)
-        self._spent, self._excluded, self._told, self._notes = steps, excluded, faults, []
+        self._spent, self._excluded, self._reported, self._notes = steps, excluded, faults, []
         return iteration
 
     def _node_notes(self) -> list[str]:

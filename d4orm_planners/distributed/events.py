@@ -1,4 +1,4 @@
-"""What a node of D-D4orm tells an observer of its work, for timelines (paper, section VIII-D)."""
+"""What a node of D-D4orm reports to an observer of its work, for timelines (paper, section VIII-D)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from d4orm_planners.candidate import Candidate
 
 KINDS = ("computed", "sent", "received", "selected")
-"""A node has made a candidate, told it, got one, or chosen it to go on from."""
+"""A node has made a candidate, sent it, got one, or chosen it to go on from."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +21,7 @@ class Event:
         begin: When it began to, by :func:`time.perf_counter` [s].
         end: When it was done, likewise. Messages take no time here.
         of: The node that the candidate came from.
-        sequence: Which of that node's messages it is, from 1; 0 for one that was not told yet.
+        sequence: Which of that node's messages it is, from 1; 0 for one that was not sent yet.
         candidate: The candidate, as judged by ``node``.
         size: Bytes of the message that was sent, else 0.
     """

@@ -48,7 +48,7 @@ class Inbox:
         newest: The newest report of every node heard from, by node.
         dropped: How many messages were dropped, by :data:`~d4orm_planners.distributed.messages.KINDS`.
         false_claims: Candidates that were not what their sender claimed. They count for what they are.
-        namesake: The number of the last candidate that another node told under this one's own number, or ``None``.
+        namesake: The number of the last candidate that another node sent under this one's own number, or ``None``.
     """
 
     def __init__(self, judge: Judge, transport: Transport, num_nodes: int, own: int | None = None) -> None:
@@ -87,7 +87,7 @@ class Inbox:
         return message
 
     def _judged(self, message: Message) -> Report:
-        # What is told again, by the same node or another, need not be verified again, which takes its time.
+        # What is sent again, by the same node or another, need not be verified again, which takes its time.
         known = (report.candidate for report in self.newest.values())
         same = (candidate for candidate in known if np.array_equal(candidate.planned, message.controls))
         candidate = next(same, None) or self._judge.received(message.controls)

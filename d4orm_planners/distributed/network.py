@@ -22,22 +22,22 @@ class NetworkCrew(SyncCrew):
         transport: Its access to the others.
         patience: See :class:`~d4orm_planners.distributed.crew.Crew`.
         judge: See :class:`~d4orm_planners.distributed.crew.Crew`.
-        linger: Seconds that a solution is told to the others in the end, see :meth:`Node.settle`.
+        linger: Seconds that a solution is sent to the others in the end, see :meth:`Node.settle`.
     """
 
     def __init__(self, node: Node, transport: Transport, patience: float, judge: Judge, linger: float) -> None:
         super().__init__([node], [transport], patience, judge)
         self._node, self._linger = node, linger
-        self._met: set[int] = set()
+        self._seen: set[int] = set()
 
     def close(self) -> Candidate:
-        """See :meth:`Crew.close`; before it, the others are told of a solution."""
+        """See :meth:`Crew.close`; before it, a solution is sent to the others."""
         self._judge.stop.set()
         try:
             for job in self._jobs:
                 job.thread.join(self.patience)
             self._node.settle(self._linger)
-            self._tell_whom_it_met()
+            self._report_new_nodes()
         except KeyboardInterrupt:
             logger.info("interrupted while telling the others")
         finally:
@@ -57,10 +57,10 @@ class NetworkCrew(SyncCrew):
             self._node.settle(0.0)
             best = self._node.search.best
             return [best] if best.solved and not improve else []
-        self._tell_whom_it_met()
+        self._report_new_nodes()
         return [self._node.candidate, *(report.candidate for report in self._node.inbox.newest.values())]
 
-    def _tell_whom_it_met(self) -> None:
-        for number in sorted(set(self._node.inbox.newest) - self._met):
+    def _report_new_nodes(self) -> None:
+        for number in sorted(set(self._node.inbox.newest) - self._seen):
             logger.info("heard from node %d", number)
-            self._met.add(number)
+            self._seen.add(number)

@@ -21,8 +21,8 @@ from d4orm_planners.distributed.transport import Transport
 from d4orm_planners.planner import Planner
 from d4orm_planners.search import Search
 
-RETELL = 0.2
-"""Seconds after which a candidate is told again, as messages may get lost."""
+RESEND = 0.2
+"""Seconds after which a candidate is sent again, as messages may get lost."""
 
 
 def node_seed(seed: int, node: int) -> int:
@@ -58,8 +58,8 @@ class Node:
         planner: What it refines its candidate with.
         transport: Its access to the others.
         judge: What rolls out and judges, in common with other nodes of this process.
-        told: What it begins to number its messages after; more than it had told before, if it did, and on a network the
-            time at which it began, by which two nodes of one number tell who was first.
+        sequence: The number before that of its first message; more than any that it sent before, if it did, and on a
+            network the time at which it began, by which two nodes of one number know who was first.
         observer: Called with every :class:`~d4orm_planners.distributed.events.Event`, in the node's own thread.
 
     Attributes:
@@ -78,7 +78,7 @@ class Node:
         planner: Planner,
         transport: Transport,
         judge: Judge,
-        told: int = 0,
+        sequence: int = 0,
         observer: Observer | None = None,
     ) -> None:
         self.number = number
@@ -90,7 +90,7 @@ class Node:
         self.inbox = Inbox(judge, self.transport, task.num_nodes, number)
         self.excluded = 0
         self._task = task
-        self._told = self._began = told
+        self._sequence = self._began = sequence
         self._observer = observer
         self._others = set(range(task.num_nodes)) - {number}
         self._awaited = self._others
@@ -101,7 +101,7 @@ class Node:
         self.excluded += self.search.advance().excluded
         self.candidate = self.search.current
         self._note("computed", self.number, 0, self.candidate, begin)
-        self._tell(self.candidate)
+        self._publish(self.candidate)
 
     def exchange(self) -> None:
         """Take what has arrived and choose what to go on from."""
@@ -109,7 +109,7 @@ class Node:
         self._choose()
 
     def run(self, stop: threading.Event, patience: float, improve: bool) -> None:
-        """Refine and exchange until told to stop, or until there is a solution unless it is to be improved.
+        """Refine and exchange until asked to stop, or until there is a solution unless it is to be improved.
 
         It waits for the others no longer than ``patience`` [s].
         """
@@ -138,37 +138,37 @@ class Node:
             )
 
     def settle(self, seconds: float) -> bool:
-        """Tell the best candidate again and again, until all others have one as good or the seconds are over.
+        """Send the best candidate again and again, until all others have one as good or the seconds are over.
 
         Without a solution it only takes what has arrived.
 
         Returns:
-            Whether all others have told a solution as good as the best one here.
+            Whether all others have sent a solution as good as the best one here.
         """
         self._gather()
         deadline = time.perf_counter() + seconds
-        told, again = None, 0.0
+        sent, again = None, 0.0
         while self.search.best.solved:
             now = time.perf_counter()
-            if told is not self.search.best or now >= again:
-                told, again = self.search.best, now + RETELL
-                self._tell(told)
-            if self._all_have(told):
+            if sent is not self.search.best or now >= again:
+                sent, again = self.search.best, now + RESEND
+                self._publish(sent)
+            if self._all_have(sent):
                 return True
             if now >= deadline:
                 break
             self._gather(min(again, deadline) - now)
         return False
 
-    def _tell(self, candidate: Candidate) -> None:
-        self._told += 1
-        message = Message(self.number, self._told, candidate.planned, candidate.reward, bool(candidate.solved))
+    def _publish(self, candidate: Candidate) -> None:
+        self._sequence += 1
+        message = Message(self.number, self._sequence, candidate.planned, candidate.reward, bool(candidate.solved))
         data = encode(message, self.search.problem)
         self.transport.publish(data)
-        self._note("sent", self.number, self._told, candidate, size=len(data))
+        self._note("sent", self.number, self._sequence, candidate, size=len(data))
 
     def _all_have(self, candidate: Candidate) -> bool:
-        """Whether each of the others has told a solution as good as this one."""
+        """Whether each of the others has sent a solution as good as this one."""
         reward = candidate.trajectory.rewards.mean() - TOLERANCE
         reports = self.inbox.newest
         return all(
@@ -206,7 +206,7 @@ class Node:
     def _choose(self) -> None:
         reports = self.inbox.newest
         received = {node: (report.sequence, report.candidate) for node, report in reports.items()}
-        received[self.number] = (self._told, self.candidate)
+        received[self.number] = (self._sequence, self.candidate)
         nodes = sorted(received)
         candidates = [received[node][1] for node in nodes]
         chosen = choose(

@@ -6,6 +6,7 @@ import os
 import threading
 from dataclasses import replace
 from math import ceil
+from types import ModuleType
 from typing import Any, NamedTuple
 
 from d4orm_env.core.problem import Problem
@@ -102,7 +103,7 @@ class RayPlanner(Planner):
         process: Number of the actor's process.
     """
 
-    def __init__(self, planner: Planner, node: int, num_nodes: int, ray: Any, actor: Any) -> None:
+    def __init__(self, planner: Planner, node: int, num_nodes: int, ray: ModuleType, actor: Any) -> None:
         super().__init__(planner.config)
         self.process = 0
         self._node, self._num_nodes = node, num_nodes

@@ -21,7 +21,7 @@ from d4orm_planners.distributed.transport import WAITING, Mailbox
 logger = logging.getLogger(__name__)
 
 LOOPBACK = ("tcp/127.0.0.1:0",)
-"""Where nodes listen unless told otherwise: at a free port that only this machine reaches."""
+"""Where nodes listen unless configured otherwise: at a free port that only this machine reaches."""
 
 PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws")
 
@@ -36,7 +36,7 @@ RESERVED = {
 }
 """What a zenoh configuration file leaves to the settings, and the setting."""
 
-DEFAULTS: Mapping[str, Any] = {
+DEFAULTS: Mapping[str, object] = {
     "mode": "peer",
     # The queues of a slow link hold a megabyte, so that a candidate that is cut into pieces is not lost halfway.
     "transport/link/tx/queue/size/data": 16,
@@ -61,7 +61,7 @@ class ZenohSettings:
             the key ``NAMESPACE/candidates``.
         listen: Endpoints to listen at, as ``tcp/192.168.1.10:7447``; port 0 for any free one.
         connect: Endpoints of other nodes or of a zenoh router; who is away is tried again and again. One is enough, as
-            connected nodes tell each other of the rest.
+            connected nodes let each other know of the rest.
         multicast: Whether to find others by UDP multicast: on the network, or on this machine where the node listens
             on loopback only.
         config_file: A zenoh configuration in JSON5, for TLS, access control and whatever else zenoh has; the settings
@@ -90,7 +90,7 @@ class ZenohSettings:
         object.__setattr__(self, "linger", duration(self.linger, "linger", zero_allowed=True))
 
     @classmethod
-    def of(cls, settings: Any) -> ZenohSettings:
+    def of(cls, settings: object) -> ZenohSettings:
         """Settings from a mapping; those that are such already stay.
 
         Raises:
@@ -113,14 +113,14 @@ class ZenohSettings:
 
 
 class ZenohTransport:
-    """One end of a network of zenoh peers. The environment variable ``RUST_LOG`` makes zenoh tell what it does.
+    """One end of a network of zenoh peers. The environment variable ``RUST_LOG`` makes zenoh log what it does.
 
     Args:
         settings: Where the others are.
 
     Raises:
         ImportError: If zenoh is not installed.
-        ValueError: If zenoh refuses the settings or its configuration file, or cannot listen where it is told to.
+        ValueError: If zenoh refuses the settings or its configuration file, or cannot listen where it is asked to.
     """
 
     def __init__(self, settings: ZenohSettings) -> None:
@@ -194,7 +194,7 @@ def _import_zenoh() -> ModuleType:
     return zenoh
 
 
-def _config(zenoh: Any, settings: ZenohSettings) -> Any:
+def _config(zenoh: ModuleType, settings: ZenohSettings) -> Any:
     """Zenoh's own configuration."""
     config = plain = zenoh.Config()
     if settings.config_file is not None:
@@ -206,7 +206,7 @@ def _config(zenoh: Any, settings: ZenohSettings) -> Any:
             if config.get_json(key) != plain.get_json(key):
                 raise ValueError(f"config_file {settings.config_file} has {key}; leave it to the setting {name}")
     unset = {key: value for key, value in DEFAULTS.items() if config.get_json(key) == plain.get_json(key)}
-    given: dict[str, Any] = {
+    given: dict[str, object] = {
         "listen/endpoints": settings.listen,
         "connect/endpoints": settings.connect,
         "scouting/multicast/enabled": settings.multicast,
@@ -218,7 +218,7 @@ def _config(zenoh: Any, settings: ZenohSettings) -> Any:
     return config
 
 
-def _endpoints(name: str, endpoints: Any) -> tuple[str, ...]:
+def _endpoints(name: str, endpoints: object) -> tuple[str, ...]:
     if isinstance(endpoints, str) or not isinstance(endpoints, (list, tuple)):
         raise ValueError(f"{name} must be a list of endpoints, as [tcp/192.168.1.10:7447], not {endpoints!r}")
     for endpoint in endpoints:

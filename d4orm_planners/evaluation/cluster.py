@@ -38,7 +38,7 @@ class RayPool:
         self._size = size or QUEUED * max(cores, 1)
         # A generator's results come back one by one, so that what is done is not lost with the process.
         self._task = self._ray.remote(num_cpus=1, max_retries=0)(_work)
-        self._jobs: dict[Any, int] = {}
+        self._jobs: dict[object, int] = {}
         self._tickets = count()
 
     def free(self) -> bool:

@@ -9,7 +9,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from d4orm_env.core.arrays import duration, whole_number
 from d4orm_env.engine.threads import available_cores
@@ -22,7 +21,7 @@ from d4orm_planners.evaluation.summary import SuccessRate, success_rates
 from d4orm_planners.evaluation.trials import Job
 from d4orm_planners.references import check_sendable
 
-Progress = Callable[[str, int, int], Any]
+Progress = Callable[[str, int, int], object]
 
 
 def evaluate(

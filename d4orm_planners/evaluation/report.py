@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
@@ -68,7 +67,7 @@ def _write_rates(path: Path, rates: Sequence[SuccessRate]) -> None:
     write_csv(path, [{"rate": rate.rate, **vars(rate)} for rate in rates])
 
 
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
     """Write at least one row, all with the same columns, as CSV; what is ``None`` is empty.
 
     Raises:

@@ -73,7 +73,7 @@ class Trial:
         preparation: Those of ``wall_time`` before the first action: the whole solve of a plan, the coarse plan of a
             controller; ``None`` in rows that older versions wrote.
         elapsed: Seconds that the trial took, with the environment and the judge.
-        history: Moments of the solve at which the best plan so far changed, as JSON: a list of
+        history: Times of the solve at which the best plan so far changed, as JSON: a list of
             ``[seconds, solved (0 or 1), mean reward]``; empty for a policy that executes no plan.
         messages: Candidates that the nodes of a distributed planner sent, each to all others; ``None`` for others.
         message_bytes: Their length together.

@@ -17,7 +17,7 @@ from d4orm_planners.evaluation.store import LARGEST_NUMBER
 from d4orm_planners.evaluation.trials import Configuration, Job
 from d4orm_planners.registry import PolicyLike, is_brought, list_policies, make_policy, origin
 
-Policies: TypeAlias = PolicyLike | Iterable[PolicyLike] | Mapping[str, PolicyLike | Mapping[str, Any]]
+Policies: TypeAlias = PolicyLike | Iterable[PolicyLike] | Mapping[str, PolicyLike | Mapping[str, object]]
 Scenario: TypeAlias = str | os.PathLike[str] | Problem | Callable[..., Problem]
 Scenarios: TypeAlias = Scenario | Iterable[Scenario]
 
@@ -73,9 +73,9 @@ class Study:
         _check_distinct(chosen)
         return chosen
 
-    def _configuration(self, label: str, policy: Any, settings: dict[str, Any]) -> Configuration:
+    def _configuration(self, label: str, policy: PolicyLike, settings: dict[str, object]) -> Configuration:
         named = isinstance(policy, str)
-        choice = Configuration(label, policy if named else label, settings, origin(policy))
+        choice = Configuration(label, policy if isinstance(policy, str) else label, settings, origin(policy))
         if self.time_limit is not None and choice.planned:
             settings.setdefault("time_limit", duration(self.time_limit, "time_limit"))
         make_policy(policy, **settings)
@@ -104,11 +104,11 @@ class Study:
         return cells
 
 
-def _labelled(policies: Policies) -> dict[str, tuple[Any, dict[str, Any]]]:
+def _labelled(policies: Policies) -> dict[str, tuple[PolicyLike, dict[str, object]]]:
     """Policies and their settings by label."""
     if isinstance(policies, Mapping):
         return {_checked_label(label): _checked(label, given) for label, given in policies.items()}
-    labelled: dict[str, tuple[Any, dict[str, Any]]] = {}
+    labelled: dict[str, tuple[PolicyLike, dict[str, object]]] = {}
     for policy in _several(policies):
         label = policy if isinstance(policy, str) else getattr(policy, "__name__", type(policy).__name__)
         if not (isinstance(policy, str) or is_brought(policy)):
@@ -118,13 +118,13 @@ def _labelled(policies: Policies) -> dict[str, tuple[Any, dict[str, Any]]]:
     return labelled
 
 
-def _checked_label(label: Any) -> str:
+def _checked_label(label: object) -> str:
     if not isinstance(label, str):
         raise ValueError(f"policy {shown(label)} is no name; give one of {', '.join(list_policies())}")
     return label
 
 
-def _checked(label: str, given: Any) -> tuple[Any, dict[str, Any]]:
+def _checked(label: str, given: Any) -> tuple[PolicyLike, dict[str, object]]:
     """A policy and its settings."""
     if isinstance(given, Mapping):
         settings = dict(given)
@@ -147,7 +147,7 @@ def _check_distinct(chosen: Sequence[Configuration]) -> None:
 
 def _load(path: Path) -> Problem:
     problem = load_problem(path)
-    # Two files that give no name are still told apart.
+    # Two files that give no name still differ.
     return problem.replace(name=path.stem) if problem.name == "custom" else problem
 
 

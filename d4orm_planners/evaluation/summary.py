@@ -175,7 +175,7 @@ def success_rate(trials: Sequence[Trial], label: str | None = None) -> SuccessRa
 def solved_after(trial: Trial) -> float | None:
     """Seconds of planning after which the success of a trial was certain; ``None`` for a trial that failed.
 
-    For a plan that is the moment of the first solution. A policy that plans under way, and a plan that succeeded
+    For a plan that is the time of the first solution. A policy that plans under way, and a plan that succeeded
     although it was no solution (it came within the margin and touched nothing), need all the time that they took.
     """
     if not trial.success:
@@ -188,7 +188,7 @@ def success_by(trials: Iterable[Trial], deadline: float) -> SuccessWithin:
     """How many trials would have succeeded, had planning been cut short; computed, not run again.
 
     A trial with execution noise counts by the plan that was executed: exact unless the planner went on improving
-    (``improve=True``) after its first solution, which might have met the noise otherwise.
+    (``improve=True``) after its first solution, which might have fared otherwise under the noise.
 
     Args:
         trials: Trials of one policy; those with an error count as failures.
@@ -198,8 +198,8 @@ def success_by(trials: Iterable[Trial], deadline: float) -> SuccessWithin:
         ValueError: If there are no trials, or the deadline is not positive.
     """
     deadline = positive_number(deadline, "deadline")
-    moments = [solved_after(trial) for trial in trials]
-    if not moments:
+    times = [solved_after(trial) for trial in trials]
+    if not times:
         raise ValueError("there are no trials; run some with evaluate()")
-    successes = sum(moment is not None and moment <= deadline for moment in moments)
-    return SuccessWithin(deadline, len(moments), successes, *wilson_interval(successes, len(moments)))
+    successes = sum(time is not None and time <= deadline for time in times)
+    return SuccessWithin(deadline, len(times), successes, *wilson_interval(successes, len(times)))

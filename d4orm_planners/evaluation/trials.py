@@ -9,19 +9,23 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache, cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from d4orm_env import navigation_v0, verify
+from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.errors import UnknownKeywordError, describe
 from d4orm_env.core.problem import Problem
 from d4orm_planners.episode import run_episode
 from d4orm_planners.evaluation.store import Trial, TrialKey
 from d4orm_planners.machine import describe_machine, versions
 from d4orm_planners.plan import IterationRecord, Plan
-from d4orm_planners.policy import Actions, OpenLoop, Policy
+from d4orm_planners.policy import Actions, Observations, OpenLoop, Policy
 from d4orm_planners.registry import is_planned, make_policy, policy_settings
+
+if TYPE_CHECKING:
+    from pettingzoo import ParallelEnv
 
 LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "pyrvo", "casadi")
 
@@ -39,8 +43,8 @@ class Configuration:
 
     label: str
     policy: str
-    settings: Mapping[str, Any]
-    given: Any = None
+    settings: Mapping[str, object]
+    given: object = None
 
     @property
     def source(self) -> Any:
@@ -155,12 +159,12 @@ def _outcome(policy: _TimedPolicy, job: Job, noise: float) -> dict[str, Any]:
 
 def compact_history(history: tuple[IterationRecord, ...]) -> str:
     """The iterations of a solve after which the best plan was another, as :attr:`Trial.history` keeps them."""
-    moments: list[list[float]] = []
+    points: list[list[float]] = []
     for record in history:
-        moment = [round(record.wall_time, 6), int(record.best_solved), float(f"{record.best_reward:.6g}")]
-        if not moments or moments[-1][1:] != moment[1:]:
-            moments.append(moment)
-    return json.dumps(moments, separators=(",", ":"))
+        point = [round(record.wall_time, 6), int(record.best_solved), float(f"{record.best_reward:.6g}")]
+        if not points or points[-1][1:] != point[1:]:
+            points.append(point)
+    return json.dumps(points, separators=(",", ":"))
 
 
 class _TimedPolicy(Policy):
@@ -172,7 +176,7 @@ class _TimedPolicy(Policy):
         self.preparation = 0.0
         self.plan: Plan | None = None
 
-    def reset(self, env: Any, seed: int = 0) -> None:
+    def reset(self, env: ParallelEnv, seed: int = 0) -> None:
         begin = time.perf_counter()
         self._policy.reset(env, seed)
         self.wall_time = self.preparation = time.perf_counter() - begin
@@ -183,7 +187,7 @@ class _TimedPolicy(Policy):
             self.plan, self.wall_time = plan, plan.wall_time
             self.preparation = plan.wall_time
 
-    def act(self, observations: dict[str, Any], state: Any) -> Actions:
+    def act(self, observations: Observations, state: FloatArray) -> Actions:
         begin = time.perf_counter()
         actions = self._policy.act(observations, state)
         if self.plan is None:

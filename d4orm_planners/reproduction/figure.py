@@ -17,8 +17,8 @@ PaperNumbers = Mapping[tuple[str, str, str], Mapping[str, str]]
 """By section, label and metric: what the paper says, by column."""
 Across = Literal["robots", "nodes", "scenario", "noise", "policy"]
 
-_FEW: dict[str, Any] = {"num_samples": 64, "num_steps": 10, "max_iterations": 3}
-QUICK_SETTINGS: Mapping[str, Mapping[str, Any]] = MappingProxyType({
+_FEW: dict[str, object] = {"num_samples": 64, "num_steps": 10, "max_iterations": 3}
+QUICK_SETTINGS: Mapping[str, Mapping[str, object]] = MappingProxyType({
     "d4orm": _FEW,
     "d4orm-d": {**_FEW, "repair_samples": 64, "repair_steps": 10},
     "d4orm-c2f": {"coarse_samples": 64, "coarse_steps": 15, "coarse_repair_steps": 5, "coarse_iterations": 3,

@@ -91,12 +91,12 @@ def first_solution(trial: Trial) -> float | None:
     one, also when planning went on. Under noise what counts is what happened, and the time is that of the plan, if
     there was one. For a policy that plans under way the time is that before its first action.
     """
-    moments = (seconds for seconds, solved, _ in json.loads(trial.history) if solved)
+    times = (seconds for seconds, solved, _ in json.loads(trial.history) if solved)
     if trial.error or (not trial.success and (trial.noise > 0 or not trial.status)):
         return None
     if not trial.status:
         return trial.preparation
-    return next(moments, trial.wall_time if trial.noise > 0 else None)
+    return next(times, trial.wall_time if trial.noise > 0 else None)
 
 
 def measured(group: Group) -> Measured:

@@ -10,8 +10,8 @@ from typing import Any
 from d4orm_planners.distributed.selection import SELECTIONS
 from d4orm_planners.reproduction.figure import Figure, Section
 
-PAPER: dict[str, Any] = {"preset": "paper"}
-C2F: dict[str, Any] = {"policy": "d4orm-c2f", "refine": "sync"}
+PAPER: Mapping[str, object] = {"preset": "paper"}
+C2F: dict[str, object] = {"policy": "d4orm-c2f", "refine": "sync"}
 """Refinement in the background would make the result depend on how busy the machine is."""
 SIZES = (4, 8, 12, 16)
 Environment = tuple[str, str, str | None]
@@ -27,7 +27,7 @@ D4ORM_SECONDS = {"4": "0.12", "8": "0.13", "12": "0.30", "16": "1.25"}
 
 
 def _sections(
-    policies: Mapping[str, Mapping[str, Any]], *environments: Environment, **settings: Any
+    policies: Mapping[str, Mapping[str, object]], *environments: Environment, **settings: Any
 ) -> tuple[Section, ...]:
     """The same policies in environments, of which the settings say more."""
     return tuple(
@@ -239,8 +239,8 @@ def _distributed() -> tuple[Figure, Figure]:
     samples = 2048  # of all nodes together
     # A budget of iterations, not of seconds, so that what is solved does not depend on how busy the machine is.
     paper = {**PAPER, "max_iterations": 20}
-    kinds: dict[str, dict[str, Any]] = {"": paper, ", defaults": {"num_samples": samples, "nodes": None}}
-    nodes: dict[str, dict[str, Any]] = {
+    kinds: dict[str, dict[str, object]] = {"": paper, ", defaults": {"num_samples": samples, "nodes": None}}
+    nodes: dict[str, dict[str, object]] = {
         f"{selection}{kind}": {"policy": "d-d4orm", **settings, "selection": selection}
         for kind, settings in kinds.items()
         for selection in SELECTIONS

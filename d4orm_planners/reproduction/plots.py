@@ -7,13 +7,16 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.reproduction.figure import Figure, Group
 from d4orm_planners.reproduction.numbers import Measured, column
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 NUMERIC: Mapping[str, str] = MappingProxyType(
     {"robots": "robots", "nodes": "nodes", "noise": "standard deviation of the noise"}
@@ -43,7 +46,7 @@ def draw(path: Path, figure: Figure, groups: Sequence[Group], rows: Sequence[Mea
     size = (max(3.2 * wide * len(titles), 5.0), (3.4 if wide == 2 else 2.6) * len(figure.plots) + 0.8)
     canvas = Canvas(figsize=size, layout="constrained")
     # Only the anytime curves have time from left to right.
-    sharex: Any = False if "anytime" in figure.plots else "col"
+    sharex: Literal["col"] | bool = False if "anytime" in figure.plots else "col"
     axes = canvas.subplots(len(figure.plots), len(titles), squeeze=False, sharex=sharex, sharey="row")
     for i, title in enumerate(titles):
         axes[0, i].set_title(title)
@@ -71,7 +74,7 @@ def _lines(figure: Figure, shown: Shown) -> dict[str, list[Measured]]:
     return lines
 
 
-def _metric(ax: Any, figure: Figure, shown: Shown, *, value: str, ends: tuple[str, str] | None, label: str,
+def _metric(ax: Axes, figure: Figure, shown: Shown, *, value: str, ends: tuple[str, str] | None, label: str,
             log: bool = False) -> None:  # fmt: skip
     """A number against what the figure varies, with a band; markers are crosses where trials failed."""
     columns = list(dict.fromkeys(column(figure, row) for _, row in shown))
@@ -79,8 +82,8 @@ def _metric(ax: Any, figure: Figure, shown: Shown, *, value: str, ends: tuple[st
     for i, (name, rows) in enumerate(_lines(figure, shown).items()):
         known = [row for row in rows if getattr(row, value) is not None]
         places = [float(column(figure, row)) if numeric else columns.index(column(figure, row)) for row in known]
-        style = {"linestyle": "-" if numeric else "none", "color": f"C{i}"}
-        ax.plot(places, [getattr(row, value) for row in known], label=name, marker="o", markersize=4, **style)
+        values, line = [getattr(row, value) for row in known], "-" if numeric else "none"
+        ax.plot(places, values, label=name, marker="o", markersize=4, linestyle=line, color=f"C{i}")
         failed = [(place, getattr(row, value)) for place, row in zip(places, known) if row.successes < row.trials]
         if failed and value != "rate":
             ax.plot(*zip(*failed), marker="x", markersize=8, linestyle="none", color=f"C{i}")
@@ -100,7 +103,7 @@ def _metric(ax: Any, figure: Figure, shown: Shown, *, value: str, ends: tuple[st
         ax.set_yscale("log")
 
 
-def _success(ax: Any, figure: Figure, shown: Shown) -> None:
+def _success(ax: Axes, figure: Figure, shown: Shown) -> None:
     """Success rates with their confidence bands."""
     _metric(ax, figure, shown, value="rate", ends=("lower", "upper"), label="success rate")
     ax.set_ylim(-0.03, 1.03)
@@ -111,18 +114,18 @@ def best_reward(trial: Trial, seconds: np.ndarray) -> np.ndarray:
 
     Args:
         trial: A trial of a planner.
-        seconds: ``(n,)`` moments since the start of the solve [s], in ascending order.
+        seconds: ``(n,)`` times since the start of the solve [s], in ascending order.
 
     Returns:
         ``(n,)`` rewards; NaN before the first plan.
     """
     history = json.loads(trial.history)
-    moments = np.array([moment for moment, _, _ in history])
+    times = np.array([time for time, _, _ in history])
     rewards = np.array([np.nan, *(reward for _, _, reward in history)])
-    return rewards[np.searchsorted(moments, seconds, side="right")]
+    return rewards[np.searchsorted(times, seconds, side="right")]
 
 
-def _anytime(ax: Any, figure: Figure, shown: Shown) -> None:
+def _anytime(ax: Axes, figure: Figure, shown: Shown) -> None:
     """Median best reward against time with quartiles, for the largest team; a dot where half of the trials are solved.
 
     A curve begins when half of the trials have a plan.
@@ -130,10 +133,10 @@ def _anytime(ax: Any, figure: Figure, shown: Shown) -> None:
     largest = max(row.robots for _, row in shown)
     for i, (group, row) in enumerate((group, row) for group, row in shown if row.robots == largest):
         histories = [json.loads(trial.history) for trial in group.trials]
-        moments = [moment for history in histories for moment, _, _ in history]
-        if not moments:
+        times = [time for history in histories for time, _, _ in history]
+        if not times:
             continue  # every trial raised an error, or the policy makes no plan
-        seconds = np.geomspace(max(min(moments), 1e-3), 1.1 * max(*moments, 1e-3), INSTANTS)
+        seconds = np.geomspace(max(min(times), 1e-3), 1.1 * max(*times, 1e-3), INSTANTS)
         rewards = np.array([best_reward(trial, seconds) for trial in group.trials])
         seen = 2 * np.isfinite(rewards).sum(axis=0) >= len(rewards)
         low, middle, high = np.nanpercentile(rewards[:, seen], (25, 50, 75), axis=0)
@@ -145,7 +148,7 @@ def _anytime(ax: Any, figure: Figure, shown: Shown) -> None:
     ax.set(xlabel=f"planning time, s ({largest} robots)", ylabel="best reward so far", xscale="log")
 
 
-PLOTS: Mapping[str, Callable[[Any, Figure, Shown], None]] = MappingProxyType({
+PLOTS: Mapping[str, Callable[[Axes, Figure, Shown], None]] = MappingProxyType({
     "runtime": partial(_metric, value="runtime", ends=("runtime_lower", "runtime_upper"), label="runtime, s", log=True),
     "success": _success,
     "travel_time": partial(_metric, value="travel_time", ends=None, label="travel time, s"),

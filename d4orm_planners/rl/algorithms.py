@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import stable_baselines3
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import FloatSchedule, set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -21,7 +22,7 @@ class Algorithm:
     """One of Stable-Baselines3's algorithms.
 
     Attributes:
-        num_envs: Robots that act at once, unless told otherwise.
+        num_envs: Robots that act at once, unless configured otherwise.
         steps_per_update: Steps that each of them takes between two updates.
         learning_rate: At the beginning; it falls linearly to a tenth.
         gamma: Discount per step.
@@ -32,22 +33,22 @@ class Algorithm:
     learning_rate: ClassVar[float] = 3e-4
     gamma: ClassVar[float] = 0.99
 
-    def make(self, env: VecNormalize) -> Any:
+    def make(self, env: VecNormalize) -> BaseAlgorithm:
         """A new model, whose first weights are drawn from the global random state."""
         raise NotImplementedError
 
-    def buffer(self, model: Any) -> Any:
+    def buffer(self, model: Any) -> MaskedRolloutBuffer | MaskedReplayBuffer:
         """Where a model keeps what it learns from."""
         raise NotImplementedError
 
-    def prepare(self, model: Any, robots: RobotVecEnv, seed: int) -> None:
+    def prepare(self, model: BaseAlgorithm, robots: RobotVecEnv, seed: int) -> None:
         """Tell the model's buffer which robots act, and seed whatever the model draws."""
         set_random_seed(seed)
         model.action_space.seed(seed)
         buffer = self.buffer(model)
         buffer.source, buffer.random = robots, np.random.default_rng(seed)
 
-    def set_learning_rate(self, model: Any, remaining: float) -> None:
+    def set_learning_rate(self, model: BaseAlgorithm, remaining: float) -> None:
         """For the share of the training that remains, 1 to 0."""
         model.lr_schedule = FloatSchedule(self.learning_rate * (0.1 + 0.9 * remaining))
 
@@ -56,7 +57,7 @@ class _PPO(Algorithm):
     num_envs = 1024
     steps_per_update = 32
 
-    def make(self, env: VecNormalize) -> Any:
+    def make(self, env: VecNormalize) -> BaseAlgorithm:
         return stable_baselines3.PPO(
             "MlpPolicy",
             env,
@@ -71,7 +72,7 @@ class _PPO(Algorithm):
             device="cpu",
         )
 
-    def buffer(self, model: Any) -> Any:
+    def buffer(self, model: Any) -> MaskedRolloutBuffer:
         return model.rollout_buffer
 
 
@@ -80,7 +81,7 @@ class _SAC(Algorithm):
     steps_per_update = 1
     learning_rate = 1e-3
 
-    def make(self, env: VecNormalize) -> Any:
+    def make(self, env: VecNormalize) -> BaseAlgorithm:
         return stable_baselines3.SAC(
             "MlpPolicy",
             env,
@@ -99,7 +100,7 @@ class _SAC(Algorithm):
             device="cpu",
         )
 
-    def buffer(self, model: Any) -> Any:
+    def buffer(self, model: Any) -> MaskedReplayBuffer:
         return model.replay_buffer
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file, recursive_setattr
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -36,14 +37,14 @@ class Checkpoints:
         OSError: If it cannot be used.
     """
 
-    def __init__(self, out: Path, settings: Mapping[str, Any]) -> None:
+    def __init__(self, out: Path, settings: Mapping[str, object]) -> None:
         self.policy_path = out / f"policy{SUFFIX}"
         self._folder = out / "checkpoints"
         self._folder.mkdir(parents=True, exist_ok=True)
         self._check_settings(out / "settings.json", json.loads(json.dumps(settings)))
 
     @staticmethod
-    def _check_settings(path: Path, settings: dict[str, Any]) -> None:
+    def _check_settings(path: Path, settings: dict[str, object]) -> None:
         if not path.exists():
             with replaced_when_done(path) as temporary:
                 temporary.write_text(json.dumps(settings, indent=2) + "\n")
@@ -69,7 +70,9 @@ class Checkpoints:
         complete = self._complete()
         return Checkpoint.read(complete[-1]) if complete else None
 
-    def save(self, index: int, model: Any, env: VecNormalize, evaluations: Sequence[Evaluation]) -> Checkpoint:
+    def save(
+        self, index: int, model: BaseAlgorithm, env: VecNormalize, evaluations: Sequence[Evaluation]
+    ) -> Checkpoint:
         """Write the checkpoint of lesson ``index``, and remove the oldest."""
         final = self._folder / f"{index + 1:06d}"
         temporary = final.with_suffix(".partial")
@@ -112,7 +115,7 @@ class Checkpoint:
             state = json.loads((folder / "state.json").read_text())
             return cls(folder, [Evaluation(**evaluation) for evaluation in state["evaluations"]])
 
-    def restore(self, env: VecNormalize, model: Any, fresh: bool) -> None:
+    def restore(self, env: VecNormalize, model: BaseAlgorithm, fresh: bool) -> None:
         """Put a new environment, and the model if it is fresh, into the checkpoint's state.
 
         Raises:
@@ -136,7 +139,7 @@ class Checkpoint:
         with _readable(self.folder):
             self._set_parameters(model)
 
-    def _numbers(self, model: Any, env: VecNormalize, fresh: bool) -> dict[str, Any]:
+    def _numbers(self, model: BaseAlgorithm, env: VecNormalize, fresh: bool) -> dict[str, np.ndarray]:
         """The arrays of ``state.npz`` that are wanted, none larger than the model and the environment have room for."""
         room = _room(model, env)
         numbers = {}
@@ -150,7 +153,7 @@ class Checkpoint:
                     raise ValueError(f"{name} is {array.dtype} {array.shape}, not {place.dtype} {place.shape}")
         return numbers
 
-    def _set_parameters(self, model: Any) -> None:
+    def _set_parameters(self, model: BaseAlgorithm) -> None:
         _, parameters, variables = load_from_zip_file(self.folder / "model.zip", device="cpu", load_data=False)
         model.set_parameters(parameters, device="cpu")
         for name, value in (variables or {}).items():
@@ -174,14 +177,14 @@ def _readable(folder: Path) -> Iterator[None]:
         ) from error
 
 
-def _room(model: Any, env: VecNormalize) -> dict[str, Any]:
+def _room(model: BaseAlgorithm, env: VecNormalize) -> dict[str, np.ndarray]:
     """Arrays like those of :func:`_numbers`, those of the replay buffer as when it is full."""
     room = _numbers(model, env)
     buffer = getattr(model, "replay_buffer", None)
     return room if buffer is None else room | {f"replay_{name}": getattr(buffer, name) for name in _REPLAY}
 
 
-def _numbers(model: Any, env: VecNormalize) -> dict[str, Any]:
+def _numbers(model: BaseAlgorithm, env: VecNormalize) -> dict[str, Any]:
     """What Stable-Baselines3 does not keep in its zip, or keeps pickled."""
     numbers = {name: np.array(getattr(model, name)) for name in _COUNTERS}
     for name, running in _running(env).items():

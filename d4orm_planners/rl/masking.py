@@ -70,8 +70,9 @@ class MaskedReplayBuffer(ReplayBuffer):
             self.to_torch(rewards),
         )
 
-    def _seen(self, observations: Any, env: VecNormalize | None) -> torch.Tensor:
-        normalized: Any = self._normalize_obs(observations, env)
+    def _seen(self, observations: np.ndarray, env: VecNormalize | None) -> torch.Tensor:
+        normalized = self._normalize_obs(observations, env)
+        assert isinstance(normalized, np.ndarray)
         return self.to_torch(normalized)
 
     def _acted_steps(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -27,7 +27,7 @@ CLIP = 10.0
 """Of normalised features."""
 MAX_BYTES = 64 * 2**20
 SUFFIX = ".safetensors"
-_ACTIVATIONS: Mapping[str, Callable[[Any], Any]] = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, 0)}
+_ACTIVATIONS: Mapping[str, Callable[[FloatArray], FloatArray]] = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, 0)}
 
 
 class Header(BaseModel):
@@ -152,7 +152,7 @@ def _header(path: Path, text: str) -> Header:
     return header
 
 
-def _checked(path: Path, header: Header, arrays: dict[str, Any]) -> dict[str, FloatArray]:
+def _checked(path: Path, header: Header, arrays: dict[str, np.ndarray]) -> dict[str, FloatArray]:
     """The arrays, if they are those of the header's network."""
     size = Network(header, {}).features.size
     shapes: dict[str, tuple[int | None, ...]] = {

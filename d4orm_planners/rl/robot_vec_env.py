@@ -6,12 +6,15 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.rewards import RewardFunction
+from d4orm_env.team_step import Info
 from d4orm_env.vector_env import NavigationVectorEnv
 from d4orm_planners.rl.features import Features
 
@@ -95,7 +98,7 @@ class RobotVecEnv(VecEnv):
     def step_async(self, actions: FloatArray) -> None:
         self._actions = np.asarray(actions, np.float32)
 
-    def step_wait(self) -> tuple[FloatArray, FloatArray, BoolArray, list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[FloatArray, FloatArray, BoolArray, list[Info]]:
         begin = time.perf_counter()
         controls = self.features.decode(self._actions, self._frames, self._limits)
         observations, _, terminated, truncated, infos = self._env.step(controls.reshape(self._shape[0], -1))
@@ -134,7 +137,7 @@ class RobotVecEnv(VecEnv):
         features[:count][~self._acting.ravel()] = 0
         return features[:count], features[count:]
 
-    def _finish_worlds(self, ended: BoolArray, infos: dict[str, Any]) -> None:
+    def _finish_worlds(self, ended: BoolArray, infos: Info) -> None:
         self.finished = []
         if ended.any():
             metrics = infos["final_info"]["metrics"]
@@ -143,9 +146,9 @@ class RobotVecEnv(VecEnv):
                 for world in np.flatnonzero(ended)
             ]
 
-    def _robot_infos(self, finishing: Any, terminal: FloatArray, arrived: BoolArray) -> list[dict[str, Any]]:
+    def _robot_infos(self, finishing: IntArray, terminal: FloatArray, arrived: BoolArray) -> list[Info]:
         """Empty but for robots whose episode has just ended, ``(N, 2)`` world and robot."""
-        robot_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        robot_infos: list[Info] = [{} for _ in range(self.num_envs)]
         for (b, k), features in zip(finishing, terminal):
             robot_infos[b * self._shape[1] + k] = {
                 "terminal_observation": features,
@@ -163,14 +166,16 @@ class RobotVecEnv(VecEnv):
         self._seed = seed
         return [seed] * self.num_envs
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[object]:
         return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+    def set_attr(self, attr_name: str, value: object, indices: VecEnvIndices = None) -> None:
         raise AttributeError(f"{attr_name!r} cannot be set: the robots of all worlds share one environment")
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *args: object, indices: VecEnvIndices = None, **kwargs: object
+    ) -> list[object]:
         raise AttributeError(f"{method_name!r} cannot be called: the robots of all worlds share one environment")
 
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         return [False] * len(list(self._get_indices(indices)))

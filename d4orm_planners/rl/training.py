@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import set_random_seed
@@ -31,7 +32,7 @@ from d4orm_planners.rl.network import CLIP, EPSILON, Network, network_of
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 from d4orm_planners.settings import CheckedSettings, Count, Whole, one_of
 
-Progress = Callable[[str, int, int], Any]
+Progress = Callable[[str, int, int], object]
 _VALIDATION_SEED = 0
 """Worlds are seeded one by one from here in validation, and in training from numbers of 64 random bits."""
 _INSTANCES = 256
@@ -143,7 +144,7 @@ class _Run:
             settings.robots, settings.scenario, settings.steps, unit, settings.lessons, settings.curriculum
         )
         self._total = sum(lesson.steps for lesson in self.lessons)
-        self._model: Any = None
+        self._model: BaseAlgorithm | None = None
         # First of all, because it refuses what cannot be learned, and nothing is to be written then.
         self._validation = self._worlds(
             Lesson(settings.robots, settings.scenario, 0), _VALIDATION_SEED, validation=True
@@ -159,13 +160,13 @@ class _Run:
         self._progress(_describe(lesson, self.evaluations), done, self._total)
         robots = self._worlds(lesson, derived_seed(self.settings.seed, Stream.TRAINING_WORLDS, index))
         normalized = VecNormalize(robots, clip_obs=CLIP, gamma=self._algorithm.gamma, epsilon=EPSILON)
-        self._model = self._restored(normalized)
-        self._algorithm.prepare(self._model, robots, self._training_seed(index + 1))
-        self._algorithm.set_learning_rate(self._model, 1 - done / self._total)
+        model = self._model = self._restored(normalized)
+        self._algorithm.prepare(model, robots, self._training_seed(index + 1))
+        self._algorithm.set_learning_rate(model, 1 - done / self._total)
         watch = _Watch(lambda steps: self._progress(_describe(lesson, self.evaluations), done + steps, self._total))
-        self._model.learn(lesson.steps, callback=watch, reset_num_timesteps=False)
+        model.learn(lesson.steps, callback=watch, reset_num_timesteps=False)
         seconds = time.perf_counter() - begin
-        network = network_of(self._header(index), self._model, normalized)
+        network = network_of(self._header(index), model, normalized)
         evaluation = Evaluation(
             done + lesson.steps, lesson.robots, lesson.scenario,
             *evaluate_network(network, self._validation, _VALIDATION_SEED), seconds, robots.seconds / seconds,
@@ -174,7 +175,7 @@ class _Run:
         if best is None or evaluation.rank >= best.rank:
             network.save(self.checkpoints.policy_path)
         self.evaluations = [*self.evaluations, evaluation]
-        self._checkpoint = self.checkpoints.save(index, self._model, normalized, self.evaluations)
+        self._checkpoint = self.checkpoints.save(index, model, normalized, self.evaluations)
         write_curve(self._out, self.evaluations)
         robots.close()
 
@@ -189,15 +190,14 @@ class _Run:
             kwargs |= {"randomize_instance": True, "num_instances": pool}
         return RobotVecEnv(worlds, lesson.robots, lesson.scenario, seed=seed, model=settings.model, **kwargs)
 
-    def _restored(self, env: VecNormalize) -> Any:
+    def _restored(self, env: VecNormalize) -> BaseAlgorithm:
         """The model with the state of the last checkpoint, in a new environment."""
-        fresh = self._model is None
-        if fresh:
+        model, fresh = self._model, self._model is None
+        if model is None:
             set_random_seed(self._training_seed(0))
             model = self._algorithm.make(env)
             model.set_logger(configure(str(self._out / "tensorboard"), ["tensorboard"]))
         else:
-            model = self._model
             model.set_env(env, force_reset=True)
         if self._checkpoint is not None:
             self._checkpoint.restore(env, model, fresh)
@@ -207,7 +207,7 @@ class _Run:
         """A seed for the libraries' own random states, which take 32 bits."""
         return derived_seed(self.settings.seed, Stream.TRAINING, number) % 2**32
 
-    def _header(self, index: int) -> dict[str, Any]:
+    def _header(self, index: int) -> dict[str, object]:
         features, problem = self._validation.features, self._validation.problem
         return {
             "algorithm": self.settings.algorithm,
@@ -222,7 +222,7 @@ class _Run:
 class _Watch(BaseCallback):
     """Reports progress, and notes how the worlds end."""
 
-    def __init__(self, report: Callable[[int], Any]) -> None:
+    def __init__(self, report: Callable[[int], object]) -> None:
         super().__init__()
         self._report = report
 
@@ -248,7 +248,7 @@ def _describe(lesson: Lesson, evaluations: list[Evaluation]) -> str:
     return f"{lesson.scenario}, {lesson.robots} robots{last}"
 
 
-def _differs(lesson: Lesson, model: str | None, kwargs: Mapping[str, Any]) -> bool:
+def _differs(lesson: Lesson, model: str | None, kwargs: Mapping[str, object]) -> bool:
     """Whether instances of the scenario differ."""
     first, second = (
         make_problem(lesson.scenario, num_robots=lesson.robots, seed=seed, model=model, **kwargs) for seed in (0, 1)

@@ -9,7 +9,6 @@ standard deviations, a rule for the weights, and where an iteration starts.
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.seeds import Stream
 from d4orm_env.engine.base import SamplingRules, SamplingTask
-from d4orm_planners.planner import Iteration, Planner
+from d4orm_planners.planner import Iteration, Planner, State
 from d4orm_planners.sampling.schedule import alpha_bar
 from d4orm_planners.sampling.settings import DenoisingConfig, SamplingConfig
 from d4orm_planners.search import Search
@@ -56,7 +55,7 @@ class SamplingPlanner(Planner):
         """The steps of an iteration, in parts that each have their number of samples: ``(noise scale, M)``."""
         return [(self.noise_scale(), self.num_samples(search))]
 
-    def iterate(self, search: Search, state: Any) -> tuple[Any, Iteration]:
+    def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
         """See :meth:`Planner.iterate`."""
         return state, self.run(search)
 

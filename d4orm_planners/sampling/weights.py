@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from types import ModuleType
+from typing import Any, TypeAlias
 
 import numpy as np
+
+Array: TypeAlias = Any
+"""An array of NumPy or JAX, whichever ``xp`` is; the two have no common type."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +27,7 @@ class SoftmaxWeights:
     temperature: float
     cutoff: float = 0.0
 
-    def __call__(self, rewards: Any, xp: Any, log_ratio: Any = None) -> Any:
+    def __call__(self, rewards: Array, xp: ModuleType, log_ratio: Array | None = None) -> Array:
         """Weights of ``rewards`` ``(..., M)``, times ``exp(log_ratio)`` where given; a sample at minus infinity gets
         none.
         """
@@ -60,7 +64,7 @@ class EliteWeights:
 
     fraction: float
 
-    def __call__(self, rewards: Any, xp: Any) -> Any:
+    def __call__(self, rewards: Array, xp: ModuleType) -> Array:
         """Weights of ``rewards`` ``(..., M)``; a sample at minus infinity is never elite."""
         count = max(1, round(self.fraction * rewards.shape[-1]))
         threshold = xp.sort(rewards, axis=-1)[..., -count][..., None]

@@ -161,7 +161,7 @@ def present_problem(problem: Problem, states: Any, goals: Any, lost: Collection[
     speed = np.array(problem.team.max_speed)
     speed[list(lost)] = STANDSTILL
     team = Team(problem.team.models, problem.team.radius, speed)
-    return problem.moment(states, goals, margin=margin, team=team)
+    return problem.resumed_at(states, goals, margin=margin, team=team)
 
 
 def first_guess(course: Course, problem: Problem, tick: int) -> Any:

@@ -21,13 +21,13 @@ from onboard.mission import Mission
 PATIENCE = 0.25
 """Seconds that a node waits for the others after each of its iterations."""
 
-RETELL = 0.2
+RESEND = 0.2
 """Seconds between two looks at whether everybody has the best candidate, once all had it."""
 
 LOOK = 0.02
 """Seconds between two looks at what has arrived, before that."""
 
-TOLD = 10_000
+SEQUENCE = 10_000
 """More messages than a node sends in a round; a later round's are numbered on from there."""
 
 
@@ -59,7 +59,7 @@ class Round:
         robot: Whose node it is.
         engine: What rolls out and samples.
         team: Where candidates are exchanged.
-        observer: Is told what the node does, and the digest of the plan that it is about.
+        observer: Called with what the node does, and the digest of the plan that it is about.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class Round:
         seed = derived_seed(self._mission.seed, Stream.TAKEOVER, agenda.takeover)
         task = Task(nodes, seed, agenda.guess, planning.selection, planning.k)
         planner, judge = planning.node_planners(nodes)[own], Judge(self._engine, agenda.problem)
-        return Node(own, task, planner, self._team, judge, told=TOLD * agenda.number, observer=self._observe)
+        return Node(own, task, planner, self._team, judge, sequence=SEQUENCE * agenda.number, observer=self._observe)
 
     def _observe(self, event: Event) -> None:
         plan = digest(self._engine, self.agenda.problem, event.candidate)
@@ -115,9 +115,9 @@ class Round:
             if iterations == self._mission.iterations:
                 self._iterated.set()
         while not self._over.is_set():
-            if all_have := node.settle(RETELL):
+            if all_have := node.settle(RESEND):
                 self._settled.set()
-            self._over.wait(RETELL if all_have else LOOK)
+            self._over.wait(RESEND if all_have else LOOK)
 
     def enough(self, timeout: float) -> None:
         """Begin no further iteration, if the least number is done or the seconds are over: tell the best candidate."""
@@ -125,7 +125,7 @@ class Round:
         self._enough.set()
 
     def settle(self, timeout: float) -> None:
-        """Wait until every robot has told a candidate as good as the best one here, or the seconds are over."""
+        """Wait until every robot has sent a candidate as good as the best one here, or the seconds are over."""
         self._settled.wait(timeout)
 
     def best(self) -> Course | None:
