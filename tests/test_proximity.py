@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from d4orm_env import World, make_problem
 from d4orm_env.engine import proximity
 from d4orm_env.engine.lanes import BLOCK, TILE
-from d4orm_env.engine.proximity import body_boxes, make_scratch, static_boxes
+from d4orm_env.engine.proximity import body_boxes, bound_boxes, make_scratch
 from d4orm_env.engine.tiles import aligned_zeros
 
 
@@ -25,8 +25,8 @@ def _mark(radius, margin, moving, moving_radius, boxes, first, count, places, sc
 
 
 @numba.njit
-def _near_static(k, dimension, static, scratch):
-    return proximity.near_static(k, dimension, static, scratch.boxes)
+def _near_static(arrays, k, bounds, scratch):
+    return proximity.near_static(arrays, k, bounds, scratch.boxes)
 
 
 def places_of(positions):
@@ -101,9 +101,10 @@ def test_obstacles_and_bounds_are_looked_at_where_a_sample_is_near(dimension, se
         **{"circles" if dimension == 2 else "spheres": [[*far[0], 0.5]]},
     )  # fmt: skip
     problem = make_problem("circle", num_robots=2, model=model).replace(world=world)
-    scratch, static = make_scratch(2, dimension), static_boxes(problem.arrays)
+    arrays = problem.arrays
+    scratch, bounds = make_scratch(2, dimension), bound_boxes(arrays)
     place = random.uniform(-8, 10, (2, 1, 1, dimension)) + 0.1 * random.normal(size=(2, BLOCK, TILE, dimension))
-    _enclose(problem.arrays.radius, problem.arrays.margin, dimension, places_of(place.astype(np.float32)), scratch)
+    _enclose(arrays.radius, arrays.margin, dimension, places_of(place.astype(np.float32)), scratch)
     for k in range(2):
         reach = problem.team.radius[k] + problem.margin
         gaps = [np.linalg.norm(place[k] - far[0], axis=-1) - 0.5]
@@ -112,6 +113,6 @@ def test_obstacles_and_bounds_are_looked_at_where_a_sample_is_near(dimension, se
         if dimension == 3:
             gaps.append(np.linalg.norm(place[k][..., :2] - far[2, :2], axis=-1) - 0.4)
         if min(gap.min() for gap in gaps) < reach - 1e-5:
-            assert _near_static(k, dimension, static, scratch)
+            assert _near_static(arrays, k, bounds, scratch)
         if min(gap.min() for gap in gaps) > 1.5 + reach:
-            assert not _near_static(k, dimension, static, scratch)
+            assert not _near_static(arrays, k, bounds, scratch)

@@ -207,7 +207,7 @@ def test_other_settings_in_the_same_folder_are_refused(trained: tuple[TrainingSe
         ({"algorithm": "dqn"}, "algorithm 'dqn' is unknown; choose one of ppo, sac"),
         ({"robots": 0}, "robots"),
         ({"steps": 0}, "steps"),
-        ({"scenario": "maze"}, "maze"),
+        ({"scenario": "labyrinth"}, "labyrinth"),
         ({"num_envs": -1}, "num_envs"),
         ({"num_envs": 99_999_999_999}, "num_envs is 99999999999; it must be at most 100000"),
         ({"steps": 10**400}, "steps is about 1e400; it must be at most"),
