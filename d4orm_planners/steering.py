@@ -143,7 +143,7 @@ def _drive_teams(
 ) -> Drives:
     """Every robot on each of its ways: as controlled until ``switch`` ``(R, V)``, then by ``vias`` ``(R, V, d)``."""
     # Here, because importing numba takes long.
-    from d4orm_env.engine.drives import DriveRules, Ways, drive_kernel
+    from d4orm_env.engine.drives import DrivenWays, DriveRules, drive_kernel
 
     num_ways, arrays = switch.shape[1], problem.arrays
     u = np.repeat(np.asarray(controls, np.float32)[:, :, None], num_ways, axis=2)
@@ -157,7 +157,7 @@ def _drive_teams(
         limits, goals = (np.repeat(rows[robots], num_ways, axis=0) for rows in (arrays.limits, problem.goal))
         targets = np.ascontiguousarray(vias[robots], np.float32).reshape(goals.shape)
         lanes_arrived = np.empty(len(goals), bool)
-        ways = Ways(limits, goals, targets, switch[robots].ravel())
+        ways = DrivenWays(limits, goals, targets, switch[robots].ravel())
         drive_kernel(model.name)(rules, ways, lanes_x, lanes_u, lanes_arrived)
         x[:, robots] = lanes_x.reshape(len(x), len(robots), num_ways, -1)
         u[:, robots] = lanes_u.reshape(len(u), len(robots), num_ways, -1)

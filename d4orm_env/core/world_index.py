@@ -43,6 +43,7 @@ class WorldIndex(NamedTuple):
     Attributes:
         low: ``(d,)`` float32 lowest corner [m].
         scale: ``()`` float32 one over the size of a cell [1/m].
+        ends: ``(2, d)`` float32 lowest and highest corner, infinite along an axis on which an obstacle has no end.
         size: ``(d,)`` int32 cells along each axis; all zero in a world without obstacles.
         slack: ``()`` float32 by how much the clearance at the centre of its cell and that at a point may differ [m],
             rounding included.
@@ -55,6 +56,7 @@ class WorldIndex(NamedTuple):
 
     low: FloatArray
     scale: np.float32
+    ends: FloatArray
     size: Ints
     slack: np.float32
     clearance: FloatArray
@@ -89,7 +91,7 @@ def build_index(shapes: Shapes, cell: float, reach: float, nearest: int = 1) -> 
     if not shapes.count:
         nothing = np.zeros(0)
         corner = np.zeros(shapes.dimension)
-        return _frozen(corner, 1.0, corner, 0.0, nothing, nothing, nothing, nearest)
+        return _frozen(corner, 1.0, np.stack([corner, corner]), corner, 0.0, nothing, nothing, nothing, nearest)
     while True:
         low, size, cell = _layout(shapes, cell, reach)
         index = _filled(shapes, low, size, cell, nearest)
@@ -150,7 +152,10 @@ def _filled(shapes: Shapes, low: Floats, size: NDArray[np.int64], cell: float, n
     for own, (part, _) in zip(number, leaves, strict=True):
         before = np.arange(len(part.cell)) - np.searchsorted(part.cell, part.cell)
         items[first[own[part.cell]] + before] = part.item
-    return _frozen(low, 1 / cell, size, slack, clearance, first, items, nearest)
+    ends = np.stack([low, low + size * cell])
+    endless = ~np.isfinite(shapes.boxes[:, : len(low)]).all(axis=0)
+    ends[:, endless] = [[-np.inf], [np.inf]]
+    return _frozen(low, 1 / cell, ends, size, slack, clearance, first, items, nearest)
 
 
 def _refined(
@@ -218,6 +223,7 @@ def _split(cells: _Cells, size: Floats) -> _Cells:
 def _frozen(
     low: Floats,
     scale: float,
+    ends: Floats,
     size: Floats | NDArray[np.int64],
     slack: float,
     clearance: Floats,
@@ -226,8 +232,8 @@ def _frozen(
     nearest: int,
 ) -> WorldIndex:
     index = WorldIndex(
-        low.astype(np.float32), np.float32(scale), size.astype(np.int32), np.float32(slack),
-        clearance.astype(np.float32), first.astype(np.int32), items.astype(np.int32),
+        low.astype(np.float32), np.float32(scale), ends.astype(np.float32), size.astype(np.int32),
+        np.float32(slack), clearance.astype(np.float32), first.astype(np.int32), items.astype(np.int32),
         np.int32(np.diff(first).max(initial=0)), np.int32(nearest),
     )  # fmt: skip
     for array in index:

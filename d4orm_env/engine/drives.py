@@ -43,7 +43,7 @@ class DriveRules(NamedTuple):
     near2: np.float32
 
 
-class Ways(NamedTuple):
+class DrivenWays(NamedTuple):
     """``B`` ways, each straight towards a point until it has come near to that, and then to the goal.
 
     Attributes:
@@ -73,7 +73,7 @@ def drive_kernel(name: str) -> Any:
     n, m, d, num_limits = robot.state_size, robot.control_size, robot.dimension, len(robot.limit_names)
 
     @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
-    def drive(rules: DriveRules, ways: Ways, x: FloatArray, u: FloatArray, arrived: BoolArray) -> None:
+    def drive(rules: DriveRules, ways: DrivenWays, x: FloatArray, u: FloatArray, arrived: BoolArray) -> None:
         dt, docking = rules.time_step, (rules.docking[0], rules.docking[1], rules.docks)
         h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])
         for b in range(ways.switch.shape[0]):

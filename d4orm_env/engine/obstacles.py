@@ -118,13 +118,19 @@ def may_touch(index: Any, reach: Any, widening: Any, boxes: Any, begin: Any, axi
     d, unclear = index.low.shape[0], False
     third = 2 * axis_step if d == 3 else 0
     for lane in range(begin, begin + CHUNK):
-        room = reach + index.slack
-        square = ZERO
+        square, beyond = ZERO, ZERO
         for axis in range(d):
-            half = _HALF * (boxes[lane + axis * axis_step + CHUNK] - boxes[lane + axis * axis_step]) - widening
+            low, high = boxes[lane + axis * axis_step], boxes[lane + axis * axis_step + CHUNK]
+            half, middle = _HALF * (high - low) - widening, _HALF * (high + low)
             square += half * half
+            outside: Any = collision.axis_gap(middle, index.ends[0, axis], index.ends[1, axis], ZERO, OPS)
+            beyond += outside * outside
         x = _HALF * (boxes[lane] + boxes[lane + CHUNK])
         y = _HALF * (boxes[lane + axis_step] + boxes[lane + axis_step + CHUNK])
         z = _HALF * (boxes[lane + third] + boxes[lane + third + CHUNK])
-        unclear |= not index.clearance[_cell(index, x, y, z)] > room + np.sqrt(square)
+        clearance = index.clearance[_cell(index, x, y, z)]
+        # Seen from beyond the grid all obstacles lie behind its nearest point, at no less than a right angle; but not
+        # along an axis on which some have no end.
+        clearance = np.sqrt(beyond + clearance * clearance) if beyond > ZERO else clearance
+        unclear |= not clearance > reach + index.slack + np.sqrt(square)
     return unclear

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from d4orm_env.core.arrays import BoolArray
-from d4orm_planners.d4orm_d.team import TeamMotion
+from d4orm_planners.d4orm_d.team import TeamPaths
 from d4orm_planners.grouping import failure_groups, reconnected
 
 
@@ -19,7 +19,7 @@ class Groups:
 
     graph: BoolArray | None = None
 
-    def replan(self, team: TeamMotion) -> Groups:
+    def replan(self, team: TeamPaths) -> Groups:
         """Replan every group with a failed robot in turn, the robots outside it as moving obstacles."""
         planner, search = team.planner, team.search
         team.controls = planner.config.continued(search.current).copy()

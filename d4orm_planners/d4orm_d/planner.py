@@ -12,7 +12,7 @@ from d4orm_planners.d4orm import D4orm
 from d4orm_planners.d4orm_d.groups import Groups
 from d4orm_planners.d4orm_d.repairs import Repairs
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
-from d4orm_planners.d4orm_d.team import TeamMotion
+from d4orm_planners.d4orm_d.team import TeamPaths
 from d4orm_planners.grouping import conflicts
 from d4orm_planners.planner import Iteration
 from d4orm_planners.search import Search
@@ -53,7 +53,7 @@ class D4ormD(D4orm):
             return self.whole_team(search, state) if drives is None else (state, Iteration(drives))
         if not search.current.failed.any() or (isinstance(state, Groups) and search.best.solved):
             return self.whole_team(search, state)
-        team = TeamMotion(self, search, search.current.trajectory)
+        team = TeamPaths(self, search, search.current.trajectory)
         state = state.replan(team) if isinstance(state, Groups) else state.repair(team, self.config)
         return state, team.iteration()
 
@@ -62,7 +62,7 @@ class D4ormD(D4orm):
         iteration = self.run(search)
         if isinstance(state, Groups):
             return state, iteration
-        team = TeamMotion(self, search, search.engine.rollout(search.problem, iteration.controls))
+        team = TeamPaths(self, search, search.engine.rollout(search.problem, iteration.controls))
         return state.shorten(team), replace(iteration, controls=team.controls)
 
     def num_samples(self, search: Search) -> int:

@@ -16,7 +16,7 @@ from d4orm_env.core.seeds import Stream
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_planners.d4orm_d.costs import path_costs, way_costs
 from d4orm_planners.d4orm_d.settings import RULES, D4ormDConfig
-from d4orm_planners.d4orm_d.team import TeamMotion
+from d4orm_planners.d4orm_d.team import TeamPaths
 from d4orm_planners.grouping import components, independent_robots
 from d4orm_planners.steering import Drives, closing_stretches, detours
 
@@ -38,13 +38,13 @@ class Repairs:
         """The state before the first repair."""
         return cls(np.zeros(num_robots, int), np.zeros(num_robots))
 
-    def repair(self, team: TeamMotion, config: D4ormDConfig) -> Repairs:
+    def repair(self, team: TeamPaths, config: D4ormDConfig) -> Repairs:
         """Deform some of the failed robots' controls, and take over what is no worse."""
         repair = _Repair(team, self)
         repair.run(config)
         return Repairs(repair.failures, repair.recency)
 
-    def shorten(self, team: TeamMotion) -> Repairs:
+    def shorten(self, team: TeamPaths) -> Repairs:
         """Let everybody turn home as soon as that is no worse."""
         repair = _Repair(team, self)
         repair.shorten()
@@ -54,7 +54,7 @@ class Repairs:
 class _Repair:
     """One iteration of repairs."""
 
-    def __init__(self, team: TeamMotion, before: Repairs) -> None:
+    def __init__(self, team: TeamPaths, before: Repairs) -> None:
         self.team, self.search, self.problem = team, team.search, team.problem
         self.failures, self.recency = before.failures.copy(), before.recency
         self.detours = 0

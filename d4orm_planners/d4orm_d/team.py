@@ -18,7 +18,7 @@ from d4orm_planners.planner import Iteration
 from d4orm_planners.search import Search
 
 
-class TeamMotion:
+class TeamPaths:
     """What the team does, to be changed for some robots around all others.
 
     Args:
