@@ -292,7 +292,11 @@ def _solve(
 
     chosen = make_planner(planner, **settings)
     if get_engine(chosen.config.engine).name == "cpu":
-        compile_for_planning(problem.team.models, lambda: typer.echo("compiling, once per installation ...", err=True))
+        compile_for_planning(
+            problem.team.models,
+            lambda: typer.echo("compiling, once per installation ...", err=True),
+            drives=chosen.drives_straight,
+        )
     limit = max_iterations if max_iterations is not None else chosen.config.max_iterations
     with solve_progress(planner, problem.num_robots, limit, enabled=not quiet) as progress:
         return chosen.solve(problem, seed=seed, time_limit=time_limit, max_iterations=max_iterations, callback=progress)

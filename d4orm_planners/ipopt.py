@@ -84,6 +84,7 @@ class Ipopt(Planner):
 
     name: ClassVar[str] = "ipopt"
     config_class = IpoptConfig
+    drives_straight: ClassVar[bool] = True
     presets: ClassVar = {"paper": {"lookout": None, "rounds": 1}}
     config: IpoptConfig
 

@@ -67,11 +67,13 @@ class Planner(ABC):
     Attributes:
         name: What its plans say they are by; that of the class unless it gives another.
         config: The settings.
+        drives_straight: Whether it begins with straight drives, whose kernels the command line then compiles ahead.
         presets: By name, settings for :func:`~d4orm_planners.make_planner`, which leaves out those that do not apply.
     """
 
     name: ClassVar[str]
     config_class: ClassVar[type[PlannerConfig]] = PlannerConfig
+    drives_straight: ClassVar[bool] = False
     presets: ClassVar[Mapping[str, Mapping[str, object]]] = {}
 
     def __init_subclass__(cls) -> None:

@@ -50,12 +50,15 @@ TEAMS = (*((model, model) for model in COMMON), ("holonomic2d", "differential_dr
 """The smallest teams of common models that have a sampling kernel of their own."""
 
 
-def compile_for_planning(models: tuple[str, ...], announce: Callable[[], None] = lambda: None) -> None:
+def compile_for_planning(
+    models: tuple[str, ...], announce: Callable[[], None] = lambda: None, *, drives: bool = False
+) -> None:
     """Compile what planning on the CPU needs, in this process and another, unless it is on disk already.
 
     Args:
         models: The team's.
         announce: Called before it begins, if there is anything to do.
+        drives: Whether straight drives are needed too.
     """
     from d4orm_env.engine.sampling import score_kernel
     from d4orm_env.engine.worlds import world_kernels
@@ -63,7 +66,7 @@ def compile_for_planning(models: tuple[str, ...], announce: Callable[[], None] =
     if has_to_be_compiled(score_kernel(models)) and has_to_be_compiled(world_kernels(models).roll_out):
         announce()
         # Should it fail, the kernel is compiled when it is needed, like any other.
-        other = _in_another_process(f"roll_out_once({models!r})")
+        other = _in_another_process(f"roll_out_once({models!r}, drives={drives})")
         sample_once((models,))
         other.wait()
 
@@ -72,11 +75,16 @@ def _in_another_process(call: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-c", f"from {__name__} import roll_out_once, sample_once; {call}"])
 
 
-def roll_out_once(models: tuple[str, ...]) -> None:
-    """Drive straight and roll out a plan of the smallest problem of a team of these models on the CPU."""
+def roll_out_once(models: tuple[str, ...], *, drives: bool = True) -> None:
+    """Roll out a plan of the smallest problem of a team of these models on the CPU, and drive straight.
+
+    Samples are weighed here too, and first: the process that samples needs that last, and has more to do.
+    """
+    SoftmaxWeights(1.0)(np.zeros((1, 2), np.float32), np)
     problem = _smallest_problem(models)
-    prepare_drives(problem)
     get_engine("cpu").rollout(problem, _no_controls(problem))
+    if drives:
+        prepare_drives(problem)
 
 
 def sample_once(teams: tuple[tuple[str, ...], ...]) -> None:

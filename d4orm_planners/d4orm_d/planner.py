@@ -27,6 +27,7 @@ class D4ormD(D4orm):
 
     name: ClassVar[str] = "d4orm-d"
     config_class = D4ormDConfig
+    drives_straight: ClassVar[bool] = True
     presets: ClassVar = {
         "paper": {
             **D4orm.presets["paper"],
