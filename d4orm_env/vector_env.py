@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import gymnasium
 import numpy as np
@@ -38,7 +38,7 @@ _READ_BEFORE = ("state", "distance", "docked", "total_reward")
 """What rewards are computed from that a step overwrites."""
 
 
-class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
+class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray[np.generic]]):
     """``num_envs`` worlds at once, ``gymnasium.make_vec("d4orm/Navigation-v0", num_envs=..., ...)``.
 
     World for world it is :class:`d4orm_env.joint_env.JointNavigationEnv`: observations ``(B, K * D)``, actions

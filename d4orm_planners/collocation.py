@@ -322,7 +322,9 @@ class TeamProgram:
         return Motion(states, controls)
 
 
-def _stopper(casadi: Any, sizes: dict[str, int], keep: Callable[[Expression], None], ends: Callable[[], bool]) -> Any:
+def _stopper(
+    casadi: Any, sizes: dict[str, int], keep: Callable[[Expression], None], ends: Callable[[], bool]
+) -> Expression:
     """What IPOPT calls after every iteration of a program of these sizes, and what ends it once ``ends()`` is true."""
 
     class Stopper(casadi.Callback):

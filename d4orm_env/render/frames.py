@@ -7,6 +7,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.backend_bases import FigureManagerBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.registry import backend_registry
 from matplotlib.figure import Figure
@@ -162,8 +163,7 @@ class WindowRenderer:
     def __init__(self, problem: Problem, size: tuple[int, int] = (480, 480)) -> None:
         self._frames = FrameRenderer(problem, size)
         self._period = problem.dt
-        self._manager: Any = None
-        self._image: Any = None
+        self._manager: FigureManagerBase | None = None
         self._last = -np.inf
         self._open_window(problem, size)
 
@@ -179,7 +179,7 @@ class WindowRenderer:
         figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100)
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
         axes.set_axis_off()
-        self._image = axes.imshow(np.full((size[1], size[0], 3), 255, np.uint8))
+        axes.imshow(np.full((size[1], size[0], 3), 255, np.uint8))
         self._manager = canvas_class.new_manager(figure, 1)
         self._manager.set_window_title(f"d4orm: {problem.name}")
         self._manager.canvas.mpl_connect("close_event", self._forget_window)
@@ -193,7 +193,7 @@ class WindowRenderer:
         frame = self._frames.draw(*state, **marks)
         if self._manager is not None:
             canvas = self._manager.canvas
-            self._image.set_data(frame)
+            canvas.figure.axes[0].images[0].set_data(frame)
             canvas.draw()
             canvas.start_event_loop(max(1e-3, self._period - (time.monotonic() - self._last)))
             self._last = time.monotonic()

@@ -10,10 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.portable import root
 from d4orm_env.core.problem import Problem
@@ -127,7 +126,7 @@ def reach_of(settings: Settings) -> float:
     return float(np.max(settings.team.radius)) + settings.margin + RESERVE
 
 
-def lattice_step(settings: Settings, sides: Any, passage: tuple[str, float] | None = None) -> float:
+def lattice_step(settings: Settings, sides: ArrayLike, passage: tuple[str, float] | None = None) -> float:
     """Step of a lattice that is fine enough for the robots, and for the narrowest passage wherever it is [m].
 
     Args:
@@ -138,7 +137,8 @@ def lattice_step(settings: Settings, sides: Any, passage: tuple[str, float] | No
     Raises:
         ValueError: If the passage is too narrow; the message says what would do.
     """
-    step = max(settings.spacing / 4, root(float(np.prod(sides)) / ENOUGH_POINTS, len(sides)))
+    lengths = np.asarray(sides, float)
+    step = max(settings.spacing / 4, root(float(lengths.prod()) / ENOUGH_POINTS, len(lengths)))
     if passage is None:
         return step
     (name, width), reach = passage, reach_of(settings)

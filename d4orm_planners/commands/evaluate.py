@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -85,9 +85,11 @@ class StudyOptions:
             time_limit=self.time_limit,
         )
         make_folder(self.out)
-        how: dict[str, Any] = {"trial_timeout": self.trial_timeout, "workers": self.workers, "ray": self.ray}
         with resumable(f"the finished trials are kept in {self.out}", enabled=not self.quiet) as progress:
-            return success_rates(run_study(study, self.out, **how, progress=progress))
+            trials = run_study(
+                study, self.out, trial_timeout=self.trial_timeout, workers=self.workers, ray=self.ray, progress=progress
+            )
+        return success_rates(trials)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,11 +141,11 @@ def _policies(texts: list[str]) -> dict[str, dict[str, object]]:
     return chosen
 
 
-def _with_settings(chosen: dict[str, dict[str, Any]], settings: dict[str, Any]) -> dict[str, dict[str, object]]:
+def _with_settings(chosen: dict[str, dict[str, object]], settings: dict[str, object]) -> dict[str, dict[str, object]]:
     """Add what ``--set`` says: ``orca.time_horizon`` to one policy, ``num_samples`` to all that have it."""
     from d4orm_planners.registry import setting_names
 
-    policies = {label: given.get("policy", label) for label, given in chosen.items()}
+    policies = {label: str(given.get("policy", label)) for label, given in chosen.items()}
     known = {
         label: setting_names(
             own, {name.removeprefix(f"{own}."): value for name, value in settings.items()} | chosen[label]

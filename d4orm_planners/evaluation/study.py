@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 from d4orm_env.core.arrays import duration, positive_number, shown, whole_number
 from d4orm_env.core.problem import Problem
@@ -16,6 +16,8 @@ from d4orm_env.scenarios.problems import is_scenario_file
 from d4orm_planners.evaluation.store import LARGEST_NUMBER
 from d4orm_planners.evaluation.trials import Configuration, Job
 from d4orm_planners.registry import PolicyLike, is_brought, list_policies, make_policy, origin
+
+T = TypeVar("T")
 
 Policies: TypeAlias = PolicyLike | Iterable[PolicyLike] | Mapping[str, PolicyLike | Mapping[str, object]]
 Scenario: TypeAlias = str | os.PathLike[str] | Problem | Callable[..., Problem]
@@ -88,7 +90,8 @@ class Study:
         sizes = tuple(dict.fromkeys(_several(self.num_robots)))
         cells = []
         named = False
-        for scenario in dict.fromkeys(_several(self.scenarios)):
+        scenarios: tuple[Scenario, ...] = _several(self.scenarios)
+        for scenario in dict.fromkeys(scenarios):
             if isinstance(scenario, Problem):
                 cells.append([scenario] * len(seeds))
             elif is_scenario_file(scenario):
@@ -109,7 +112,8 @@ def _labelled(policies: Policies) -> dict[str, tuple[PolicyLike, dict[str, objec
     if isinstance(policies, Mapping):
         return {_checked_label(label): _checked(label, given) for label, given in policies.items()}
     labelled: dict[str, tuple[PolicyLike, dict[str, object]]] = {}
-    for policy in _several(policies):
+    several: tuple[PolicyLike, ...] = _several(policies)
+    for policy in several:
         label = policy if isinstance(policy, str) else getattr(policy, "__name__", type(policy).__name__)
         if not (isinstance(policy, str) or is_brought(policy)):
             _checked_label(policy)
@@ -163,7 +167,8 @@ def _checked_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
     return checked
 
 
-def _several(values: Any) -> tuple[Any, ...]:
+def _several(values: T | Iterable[T]) -> tuple[T, ...]:
     """One value, or several."""
-    alone = isinstance(values, str | os.PathLike) or not isinstance(values, Iterable)
-    return (values,) if alone else tuple(values)
+    if isinstance(values, str | os.PathLike) or not isinstance(values, Iterable):
+        return (values,)
+    return tuple(values)

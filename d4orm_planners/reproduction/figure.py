@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Literal
 
 from d4orm_env.core.arrays import whole_number
 from d4orm_planners.evaluation.evaluate import Progress, run_study
@@ -50,7 +50,7 @@ class Section:
     """
 
     title: str
-    policies: Mapping[str, Mapping[str, Any]]
+    policies: Mapping[str, Mapping[str, object]]
     scenarios: tuple[str, ...]
     robots: tuple[int | None, ...] = (None,)
     quick_robots: tuple[int | None, ...] = (2,)
@@ -77,7 +77,7 @@ class Section:
     def quick(self) -> Section:
         """The same in a few seconds: tiny teams, few samples; of scenarios, nodes and levels of noise two at most."""
         policies = {
-            label: {**settings, **QUICK_SETTINGS.get(settings.get("policy", label), {})}
+            label: {**settings, **QUICK_SETTINGS.get(str(settings.get("policy", label)), {})}
             for label, settings in self.policies.items()
         }
         return replace(

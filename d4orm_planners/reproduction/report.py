@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from d4orm_planners.evaluation.leaderboard import origin
 from d4orm_planners.evaluation.report import deadline_table, errors, table, target, write_csv
-from d4orm_planners.evaluation.summary import success_by
+from d4orm_planners.evaluation.summary import SuccessWithin, success_by
 from d4orm_planners.reproduction.figure import Figure, Group
 from d4orm_planners.reproduction.numbers import METRICS, Measured, column, measured
 from d4orm_planners.reproduction.plots import draw
@@ -76,7 +75,7 @@ def _said(figure: Figure, row: Measured, metric: str) -> str:
 
 
 def _deadlines(figure: Figure, groups: Sequence[Group]) -> list[str]:
-    blocks: dict[str, list[tuple[str, Any]]] = {}
+    blocks: dict[str, list[tuple[str, list[SuccessWithin]]]] = {}
     for group in groups:
         first = group.trials[0]
         title = f"{group.section}, {first.robots} robots: success within a deadline for planning"
