@@ -144,10 +144,10 @@ def test_the_command_takes_its_lists(tmp_path: Path, monkeypatch: pytest.MonkeyP
         return [("memory", "one number", lambda: {"num_robots": 1, "imported": 2**20, "peak": 2**21})]
 
     monkeypatch.setattr(benchmark, "parts", pretend)
-    options = ("--robots", "4,8", "--models", "velocity2d", "--engines", "cpu,jax", "--seeds", "3", "--quick")
+    options = ("--num-robots", "4,8", "--models", "velocity2d", "--engines", "cpu,jax", "--seeds", "3", "--quick")
     assert call("bench", "--out", str(tmp_path / "new"), *options) == 0
     (settings,) = seen
-    assert (settings.robots, settings.models, settings.engines) == ((4, 8), ("velocity2d",), ("cpu", "jax"))
+    assert (settings.num_robots, settings.models, settings.engines) == ((4, 8), ("velocity2d",), ("cpu", "jax"))
     assert (settings.seeds, settings.num_steps) == (3, benchmark.QUICK["num_steps"])
     document = json.loads((tmp_path / "new" / "bench.json").read_text())
     assert document["settings"]["seeds"] == 3
@@ -157,8 +157,8 @@ def test_the_command_takes_its_lists(tmp_path: Path, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--robots", "4,x"), "list of whole numbers"),
-        (("--robots", "0"), "robots is 0"),
+        (("--num-robots", "4,x"), "list of whole numbers"),
+        (("--num-robots", "0"), "num_robots is 0"),
         (("--models", "boat"), "boat"),
         (("--engines", "gpu"), "gpu"),
         (("--seeds", "0"), "seeds is 0"),
@@ -196,8 +196,8 @@ def test_after_a_warm_up_nothing_is_left_to_compile(tmp_path: Path) -> None:
     assert " 0 found in the cache" in first
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.nb*")}
     assert before
-    run("-m", "d4orm_planners.cli", "plan", "--robots", "3", "--out", "plan.npz", "--quiet")
-    run("-m", "d4orm_planners.cli", "run", "plan.npz", "--noise", "0.01", "--quiet")
+    run("-m", "d4orm_planners.cli", "plan", "--num-robots", "3", "--out", "plan.npz", "--quiet")
+    run("-m", "d4orm_planners.cli", "run", "plan.npz", "--control-noise-std", "0.01", "--quiet")
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.nb*")} == before
     assert run("-m", "d4orm_planners.cli", "warmup").startswith("0 kernels compiled")
 

@@ -44,7 +44,14 @@ def rates_of(
 
 
 def trial(seed: int = 0, **changes: Any) -> Trial:
-    values = {"policy": "goal", "config": "{}", "problem": "abc", "noise": 0.1, "scenario": "circle", "robots": 2}
+    values = {
+        "policy": "goal",
+        "config": "{}",
+        "problem": "abc",
+        "control_noise_std": 0.1,
+        "scenario": "circle",
+        "num_robots": 2,
+    }
     values |= {"label": "goal", "dt": 0.1}
     outcome = {"success": True, "arrived": 2, "travel_time": 5.0, "makespan": 6.0, "steps": 60, "wall_time": 0.5}
     return Trial(**{**values, "model": "holonomic2d", "versions": "{}", **outcome, "seed": seed, **changes})
@@ -113,7 +120,11 @@ def test_a_trial_that_was_over_at_once_has_no_time_of_motion() -> None:
 
 def test_the_store_gives_back_what_was_added(tmp_path: Path) -> None:
     store = TrialStore(tmp_path / "trials.sqlite")
-    rows = [trial(0), trial(1, noise=1 / 3, success=False), trial(2, error="ValueError: no", travel_time=None)]
+    rows = [
+        trial(0),
+        trial(1, control_noise_std=1 / 3, success=False),
+        trial(2, error="ValueError: no", travel_time=None),
+    ]
     assert all(store.add(row) for row in rows)
     again = TrialStore(tmp_path / "trials.sqlite")
     assert sorted(again.trials(), key=lambda row: row.seed) == rows
@@ -159,8 +170,8 @@ def test_a_seed_that_the_store_has_no_room_for_is_refused(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("column", "value"),
     [
-        ("reward", "much"), ("robots", "many"), ("success", "yes"), ("seed", "first"), ("noise", "some"),
-        ("label", b"x"), ("history", "[[1"), ("history", "[1, 2]"), ("config", "none"), ("travel_time", "soon"),
+        ("reward", "much"), ("num_robots", "many"), ("success", "yes"), ("seed", "first"), ("config", "none"),
+        ("label", b"x"), ("history", "[[1"), ("history", "[1, 2]"), ("control_noise_std", "much"), ("travel_time", "a"),
     ],
 )  # fmt: skip
 def test_what_does_not_belong_in_a_column_is_one_clear_error(tmp_path: Path, column: str, value: Any) -> None:
@@ -305,7 +316,7 @@ def test_a_file_that_is_not_ours_is_refused_and_left_alone(d4orm, tmp_path: Path
 
 def test_success_and_failure_are_counted(tmp_path: Path) -> None:
     rates = rates_of(["goal", "orca"], tmp_path, **TINY)
-    assert [(row.policy, row.noise, row.trials, row.successes, row.contacts) for row in rates] == [
+    assert [(row.policy, row.control_noise_std, row.trials, row.successes, row.contacts) for row in rates] == [
         ("goal", 0.0, 2, 0, 2),
         ("goal", 0.3, 2, 0, 2),
         ("orca", 0.0, 2, 2, 0),
@@ -313,7 +324,7 @@ def test_success_and_failure_are_counted(tmp_path: Path) -> None:
     ]
     stored = TrialStore(tmp_path / STORE).trials()
     assert len(stored) == len({row.key for row in stored}) == 8
-    assert {(row.scenario, row.robots, row.model) for row in stored} == {("circle", 2, "holonomic2d")}
+    assert {(row.scenario, row.num_robots, row.model) for row in stored} == {("circle", 2, "holonomic2d")}
     assert all(row.steps and row.wall_time and '"numpy"' in row.versions for row in stored)
 
 
@@ -345,7 +356,9 @@ def test_resuming_runs_only_what_is_missing(tmp_path: Path, monkeypatch: pytest.
     rates_of(["goal"], tmp_path, **TINY)
     ran: list[tuple[int, tuple[float, ...]]] = []
     run_job = pool_module.run_job
-    monkeypatch.setattr(pool_module, "run_job", lambda job: (ran.append((job.seed, job.noise)), run_job(job))[1])
+    monkeypatch.setattr(
+        pool_module, "run_job", lambda job: (ran.append((job.seed, job.control_noise_std)), run_job(job))[1]
+    )
     before = rates_of(["goal"], tmp_path, **TINY)
     assert ran == []
     counts: list[tuple[int, int]] = []
@@ -391,7 +404,18 @@ def test_ctrl_c_keeps_what_was_done(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         return run_job(job)
 
     monkeypatch.setattr(pool_module, "run_job", interrupted)
-    arguments = ("--policies", "goal", "--robots", "2", "--trials", "3", "--noise", "0,0.3", "--workers", "1")
+    arguments = (
+        "--policies",
+        "goal",
+        "--num-robots",
+        "2",
+        "--seeds",
+        "3",
+        "--control-noise-std",
+        "0,0.3",
+        "--workers",
+        "1",
+    )
     status, _, err = d4orm(*arguments)
     assert status == 130
     assert "the same command goes on from there" in err
@@ -415,7 +439,18 @@ def test_the_number_of_workers_makes_no_difference(tmp_path: Path) -> None:
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, workers: int) -> None:
-    arguments = ["--policies", "goal", "--robots", "8", "--trials", "60", "--noise", "0,0.1", "--out", str(tmp_path)]
+    arguments = [
+        "--policies",
+        "goal",
+        "--num-robots",
+        "8",
+        "--seeds",
+        "60",
+        "--control-noise-std",
+        "0,0.1",
+        "--out",
+        str(tmp_path),
+    ]
     command = [sys.executable, "-m", "d4orm_planners.cli", "robustness", *arguments, "--workers", str(workers), "-q"]
     process = subprocess.Popen(command)
     deadline = time.monotonic() + 120
@@ -432,7 +467,9 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, workers: int) -> None
     assert TrialStore(tmp_path / STORE).trials() == first, "a worker outlived its parent"
     subprocess.run(command, check=True)
     rows = TrialStore(tmp_path / STORE).trials()
-    assert [(row.noise, row.seed) for row in rows] == [(noise, seed) for noise in (0.0, 0.1) for seed in range(60)]
+    assert [(row.control_noise_std, row.seed) for row in rows] == [
+        (noise, seed) for noise in (0.0, 0.1) for seed in range(60)
+    ]
     kept = {row.key: row for row in rows}
     assert all(kept[row.key] == row for row in first)
 
@@ -441,7 +478,7 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, workers: int) -> None
 def test_closed_loop_survives_noise_that_open_loop_does_not(tmp_path: Path) -> None:
     policies = {"d4orm-c2f": {"refine": "sync"}, "d4orm-d": {}, "goal": {}}
     rates = rates_of(policies, tmp_path, **{**TINY, "num_robots": 4, "control_noise_std": (0.0, 0.5)})
-    rows = {(row.policy, row.noise): row for row in rates}
+    rows = {(row.policy, row.control_noise_std): row for row in rates}
     assert rows["d4orm-d", 0.0].successes == rows["d4orm-c2f", 0.5].successes == 2
     assert rows["d4orm-d", 0.5].successes == 0
     assert rows["goal", 0.0].contacts == 2
@@ -451,8 +488,8 @@ def test_closed_loop_survives_noise_that_open_loop_does_not(tmp_path: Path) -> N
 
 
 def test_the_files(d4orm, tmp_path: Path) -> None:
-    arguments = ("--policies", "goal,orca", "--scenario", "circle,random", "--robots", "2,3", "--trials", "1")
-    status, out, err = d4orm(*arguments, "--noise", "0,0.1", "--workers", "1", "--out", "here")
+    arguments = ("--policies", "goal,orca", "--scenario", "circle,random", "--num-robots", "2,3", "--seeds", "1")
+    status, out, err = d4orm(*arguments, "--control-noise-std", "0,0.1", "--workers", "1", "--out", "here")
     assert status == 0, err
     written = {path.name for path in (tmp_path / "here").iterdir()}
     assert {"robustness.csv", "robustness.md", "robustness.png", STORE} <= written
@@ -521,14 +558,14 @@ def test_settings_reach_the_policies_that_have_them(d4orm, monkeypatch: pytest.M
     [
         (("--policies", "gaol"), "policy 'gaol' is unknown"),
         (("--scenario", "square"), "scenario 'square' is unknown"),
-        (("--robots", "0"), "num_robots is 0"),
-        (("--robots", "two"), "--robots 'two'"),
+        (("--num-robots", "0"), "num_robots is 0"),
+        (("--num-robots", "two"), "--num-robots 'two'"),
         (("--model", "hovercraft"), "model 'hovercraft' is unknown"),
-        (("--noise", "0,-0.1"), "noise is -0.1"),
-        (("--noise", "0,nan"), "noise is nan"),
-        (("--noise", "none"), "--noise 'none' is not a list of numbers"),
-        (("--trials", "0"), "trials is 0"),
-        (("--trials", "99999999999"), "1000000"),
+        (("--control-noise-std", "0,-0.1"), "noise is -0.1"),
+        (("--control-noise-std", "0,nan"), "noise is nan"),
+        (("--control-noise-std", "none"), "--control-noise-std 'none' is not a list of numbers"),
+        (("--seeds", "0"), "seeds is empty"),
+        (("--seeds", "99999999999"), "1000000"),
         (("--workers", "0"), "workers is 0"),
         (("--set", "speed=1"), "'speed' is a setting of none of the policies goal"),
         (("--set", "orca.time_horizon=1"), "'orca' is not among the policies"),
@@ -558,7 +595,9 @@ def test_a_library_that_is_missing_is_named_before_anything_runs(d4orm, monkeypa
 
 
 @pytest.mark.parametrize(
-    "options", [("--policies", ""), ("--scenario", ""), ("--robots", ""), ("--noise", "")], ids=lambda given: given[0]
+    "options",
+    [("--policies", ""), ("--scenario", ""), ("--num-robots", ""), ("--control-noise-std", "")],
+    ids=lambda given: given[0],
 )
 def test_nothing_to_do_is_refused(d4orm, tmp_path: Path, options: tuple[str, str]) -> None:
     status, _, err = d4orm("--policies", "goal", *options)

@@ -36,7 +36,7 @@ class BenchmarkSettings(CheckedSettings):
     """What to measure, and how long.
 
     Attributes:
-        robots: Team sizes.
+        num_robots: Team sizes.
         models: Robot models.
         engines: Of :data:`ENGINES`; ``"plain"`` is :mod:`d4orm_planners.benchmark.plain`.
         num_samples: ``M``.
@@ -60,7 +60,7 @@ class BenchmarkSettings(CheckedSettings):
         ValueError: If a value makes no sense; the message names it.
     """
 
-    robots: tuple[Robots, ...] = (4, 8, 16, 32, 64, 100)
+    num_robots: tuple[Robots, ...] = (4, 8, 16, 32, 64, 100)
     models: tuple[str, ...] = MODELS
     engines: tuple[str, ...] = ENGINES
     num_samples: Samples = 1024
@@ -90,7 +90,7 @@ class BenchmarkSettings(CheckedSettings):
 
 
 QUICK: Mapping[str, object] = {
-    "robots": (4, 8),
+    "num_robots": (4, 8),
     "models": ("holonomic2d", "differential_drive"),
     "num_steps": 20,
     "repetitions": 3,
@@ -130,7 +130,7 @@ def diameter(num_robots: int) -> float:
 def parts(settings: BenchmarkSettings) -> Iterator[Part]:
     """``(section, what, measurement)`` for everything that the settings ask for."""
     for model in settings.models:
-        for num_robots in settings.robots:
+        for num_robots in settings.num_robots:
             for engine in settings.engines:
                 if engine != "cpu" and num_robots > settings.most_robots_slow:
                     continue

@@ -17,7 +17,9 @@ def bench(
         "bench"
     ),
     quick: Annotated[bool, typer.Option("--quick", help="Small sizes and few repetitions, about a minute.")] = False,
-    robots: Annotated[str | None, typer.Option("--robots", "-k", help="Team sizes, as 4,8,16.")] = None,
+    num_robots: Annotated[
+        str | None, typer.Option("--num-robots", "--robots", "-k", help="Team sizes, as 4,8,16.")
+    ] = None,
     models: Annotated[str | None, typer.Option("--models", help="Robot models, separated by commas.")] = None,
     engines: Annotated[str | None, typer.Option("--engines", help="Of cpu, jax and plain, with commas.")] = None,
     seeds: Annotated[
@@ -31,7 +33,7 @@ def bench(
     from d4orm_planners.commands.progress import parts_progress
 
     given: dict[str, Any] = {
-        "robots": numbers("--robots", robots),
+        "num_robots": numbers("--num-robots", num_robots),
         "models": names(models),
         "engines": names(engines),
         "seeds": seeds,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -23,7 +22,10 @@ from d4orm_planners.commands.options import Model, Quiet, TimeLimit
 if TYPE_CHECKING:
     from d4orm_planners.evaluation.summary import SuccessRate
 
-Noise = Annotated[str, typer.Option("--noise", help="Standard deviations of the execution noise, as 0,0.1.")]
+NoiseLevels = Annotated[
+    str,
+    typer.Option("--control-noise-std", "--noise", help="Standard deviations of the execution noise, as 0,0.1."),
+]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to, and to go on from.")]
 
 
@@ -44,11 +46,15 @@ class StudyOptions:
     scenario: Annotated[
         str, typer.Option("--scenario", "--scenarios", "-s", help="Scenarios or YAML files, separated by commas.")
     ] = "circle"
-    robots: Annotated[
-        str | None, typer.Option("--robots", "-k", help="Team sizes, as 4,8; the scenario's own by default.")
+    num_robots: Annotated[
+        str | None,
+        typer.Option("--num-robots", "--robots", "-k", help="Team sizes, as 4,8; the scenario's own by default."),
     ] = None
     model: Model = None
-    noise: Noise = "0"
+    seeds: Annotated[
+        str, typer.Option("--seeds", "--trials", "-n", help="How many, or which: 50 for 0 to 49, 10-19, or 3,5,8.")
+    ] = "50"
+    control_noise_std: NoiseLevels = "0"
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="A setting of all policies that have it, or of one, as orca.time_horizon=2."),
@@ -64,7 +70,7 @@ class StudyOptions:
     out: Out = Path("evaluation")
     quiet: Quiet = False
 
-    def run(self, seeds: Iterable[int]) -> list[SuccessRate]:
+    def run(self) -> list[SuccessRate]:
         """Run the trials that are not stored yet, and sum all up.
 
         Raises:
@@ -78,9 +84,9 @@ class StudyOptions:
         study = Study(
             policies=_with_settings(_policies(self.policies or ["d4orm,goal"]), parse_settings(self.settings)),
             scenarios=names(self.scenario) or (),
-            seeds=seeds,
-            control_noise_std=decimals("--noise", self.noise),
-            num_robots=numbers("--robots", self.robots) or (None,),
+            seeds=_seeds(self.seeds),
+            control_noise_std=decimals("--control-noise-std", self.control_noise_std),
+            num_robots=numbers("--num-robots", self.num_robots) or (None,),
             model=self.model,
             time_limit=self.time_limit,
         )
@@ -92,22 +98,13 @@ class StudyOptions:
         return success_rates(trials)
 
 
-@dataclass(frozen=True, kw_only=True)
-class EvaluateOptions(StudyOptions):
-    """Those of ``d4orm evaluate``."""
-
-    seeds: Annotated[
-        str, typer.Option("--seeds", "-n", help="How many, or which: 50 for 0 to 49, 10-19, or 3,5,8.")
-    ] = "50"
-
-
-@takes(EvaluateOptions)
-def evaluate(options: EvaluateOptions) -> None:
+@takes(StudyOptions)
+def evaluate(options: StudyOptions) -> None:
     """Compare policies on scenarios, team sizes, seeds and levels of noise; goes on where it was stopped."""
     from d4orm_planners.commands.progress import tell_results
     from d4orm_planners.evaluation.report import PARQUET_HINT, markdown, write_results
 
-    rates = options.run(_seeds(options.seeds))
+    rates = options.run()
     written = write_results(options.out, rates)
     if not options.quiet:
         tell_results(markdown(rates), written)

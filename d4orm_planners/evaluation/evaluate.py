@@ -121,7 +121,7 @@ def run_study(
     return [
         (group[0].policy.label, [stored[job.key(level)] for job in group])
         for group in groups
-        for level in group[0].noise
+        for level in group[0].control_noise_std
     ]
 
 
@@ -131,13 +131,13 @@ def _missing(jobs: Sequence[Job], store: TrialStore) -> tuple[list[Job], int, in
     wanted: set[TrialKey] = set()
     missing = []
     for job in jobs:
-        keys = {level: job.key(level) for level in job.noise}
+        keys = {level: job.key(level) for level in job.control_noise_std}
         # The same problem may be asked for under two names.
         left = tuple(level for level, key in keys.items() if key not in finished and key not in wanted)
         wanted.update(keys.values())
         if left:
-            missing.append(replace(job, noise=left))
-    return missing, len(wanted) - sum(len(job.noise) for job in missing), len(wanted)
+            missing.append(replace(job, control_noise_std=left))
+    return missing, len(wanted) - sum(len(job.control_noise_std) for job in missing), len(wanted)
 
 
 def _run(
@@ -164,6 +164,6 @@ def _store(running: Generator[list[Trial]], store: TrialStore, done: int, total:
             written = writer.submit(store.add, *trials)
             done += len(trials)
             last = trials[-1]
-            progress(f"{last.label}, {last.scenario}, {last.robots} robots", done, total)
+            progress(f"{last.label}, {last.scenario}, {last.num_robots} robots", done, total)
     if written is not None:
         written.result()

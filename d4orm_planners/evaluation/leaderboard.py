@@ -40,7 +40,7 @@ def leaderboard(trials: Sequence[Trial], deadlines: Sequence[float] = ()) -> str
     blocks = [INTRODUCTION, "## Success", *_matrices(rates), "## Scenario by scenario"]
     for title, panel in panels(rates).items():
         # The best first, at every level of noise.
-        ranked = sorted(panel, key=lambda rate: (rate.noise, -rate.rate, rate.travel_time or float("inf")))
+        ranked = sorted(panel, key=lambda rate: (rate.control_noise_std, -rate.rate, rate.travel_time or float("inf")))
         blocks.append(table(title, HEADER, [cells(rate) for rate in ranked]))
     if deadlines:
         blocks += ["## Success within a deadline for planning", WITHIN, *_deadlines(groups, deadlines)]
@@ -53,7 +53,9 @@ def _groups(trials: Sequence[Trial]) -> dict[tuple[str, str, int, str, float], l
     groups: dict[tuple[str, str, int, str, float], list[Trial]] = {}
     for trial in trials:
         label = labels[trial.label, trial.config]
-        groups.setdefault((label, trial.scenario, trial.robots, trial.model, trial.noise), []).append(trial)
+        groups.setdefault((label, trial.scenario, trial.num_robots, trial.model, trial.control_noise_std), []).append(
+            trial
+        )
     return {key: groups[key] for key in sorted(groups, key=lambda key: (*key[1:], key[0]))}
 
 
@@ -76,12 +78,12 @@ def _matrices(rates: Sequence[SuccessRate]) -> list[str]:
     """Policies against scenarios, one table per level of noise."""
     columns = panels(rates)
     blocks = []
-    for noise in sorted({rate.noise for rate in rates}):
+    for noise in sorted({rate.control_noise_std for rate in rates}):
         found = {
             (rate.label, title): share(rate)
             for title, panel in columns.items()
             for rate in panel
-            if rate.noise == noise
+            if rate.control_noise_std == noise
         }
         rows = [
             (label, *(found.get((label, title), "-") for title in columns))

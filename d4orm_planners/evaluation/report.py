@@ -145,7 +145,7 @@ def cells(rate: SuccessRate) -> tuple[str, ...]:
     """A row under :data:`HEADER`."""
     return (
         rate.label,
-        f"{rate.noise:g}",
+        f"{rate.control_noise_std:g}",
         f"{rate.successes} of {rate.trials} ({rate.rate:.0%})",
         f"{rate.lower:.0%} to {rate.upper:.0%}",
         *(str(count) for count in (rate.verified, rate.contacts, rate.late, rate.errors)),
@@ -185,7 +185,7 @@ def panels(rates: Iterable[SuccessRate]) -> dict[str, list[SuccessRate]]:
     """Rates by scenario, team size and models, as titles, in order of appearance."""
     groups: dict[str, list[SuccessRate]] = {}
     for rate in rates:
-        groups.setdefault(f"{rate.scenario}, {rate.robots} robots, {rate.model}", []).append(rate)
+        groups.setdefault(f"{rate.scenario}, {rate.num_robots} robots, {rate.model}", []).append(rate)
     return groups
 
 
@@ -209,8 +209,8 @@ def _draw(path: Path, rates: Sequence[SuccessRate]) -> None:
         ax.set_visible(False)
     for ax, (title, group) in zip(axes, groups.items()):
         for policy in dict.fromkeys(rate.label for rate in group):
-            line = sorted((rate for rate in group if rate.label == policy), key=lambda rate: rate.noise)
-            noise = [rate.noise for rate in line]
+            line = sorted((rate for rate in group if rate.label == policy), key=lambda rate: rate.control_noise_std)
+            noise = [rate.control_noise_std for rate in line]
             (drawn,) = ax.plot(noise, [rate.rate for rate in line], marker="o", label=policy, clip_on=False)
             lower, upper = [rate.lower for rate in line], [rate.upper for rate in line]
             ax.fill_between(noise, lower, upper, color=drawn.get_color(), alpha=0.15, linewidth=0)

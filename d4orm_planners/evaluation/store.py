@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 APPLICATION_ID = 0x64346F72
 """Marks the file as one of ours, in its header ("d4or")."""
-VERSION = 4
+VERSION = 5
 STORE = "trials.sqlite"
 """Name of the file in a folder of results."""
 LARGEST_NUMBER = 2**63 - 1
@@ -31,14 +31,14 @@ class TrialKey(NamedTuple):
         policy: Registry name.
         config: All settings of the policy, as JSON with sorted keys.
         problem: :attr:`d4orm_env.core.problem.Problem.digest`.
-        noise: Standard deviation of the execution noise, in the controls' units.
+        control_noise_std: Standard deviation of the execution noise, in the controls' units.
         seed: Seed of the episode: of the policy and of the noise.
     """
 
     policy: str
     config: str
     problem: str
-    noise: float
+    control_noise_std: float
     seed: int
 
 
@@ -51,7 +51,7 @@ class Trial:
     Attributes:
         label: What the policy with these settings was called.
         scenario: Name of the scenario.
-        robots: Team size.
+        num_robots: Team size.
         model: Model names of the team, each once, joined by ``+``.
         dt: Time step [s].
         versions: Versions of the libraries, as JSON; ``{}`` where the process was lost.
@@ -84,11 +84,11 @@ class Trial:
     policy: str
     config: str
     problem: str
-    noise: float
+    control_noise_std: float
     seed: int
     label: str
     scenario: str
-    robots: int
+    num_robots: int
     model: str
     dt: float
     versions: str = "{}"
@@ -117,7 +117,7 @@ class Trial:
 
     @property
     def key(self) -> TrialKey:
-        return TrialKey(self.policy, self.config, self.problem, self.noise, self.seed)
+        return TrialKey(self.policy, self.config, self.problem, self.control_noise_std, self.seed)
 
 
 _NAMES = tuple(field.name for field in fields(Trial))

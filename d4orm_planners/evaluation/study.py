@@ -47,10 +47,12 @@ class Study:
             ValueError: For an unknown name or setting, a number that makes no sense, or nothing to do.
             ImportError: If a policy needs a library that is not installed.
         """
-        given = (positive_number(level, "noise", zero_allowed=True) for level in _several(self.control_noise_std))
+        given = (
+            positive_number(level, "control_noise_std", zero_allowed=True) for level in _several(self.control_noise_std)
+        )
         levels = tuple(dict.fromkeys(given))
         if not levels:
-            raise ValueError("noise is empty; give at least one level")
+            raise ValueError("control_noise_std is empty; give at least one level")
         policies, seeds = self.configurations(), _checked_seeds(self.seeds)
         return [
             [Job(policy, problem, seed, levels) for seed, problem in zip(seeds, problems)]

@@ -20,9 +20,9 @@ class SuccessRate:
         label: What the policy with its settings was called.
         policy: Registry name.
         scenario: Scenario name.
-        robots: Team size.
+        num_robots: Team size.
         model: Models of the team.
-        noise: Standard deviation of the execution noise, in the controls' units.
+        control_noise_std: Standard deviation of the execution noise, in the controls' units.
         trials: Trials, those with an error included.
         successes: Those in which everyone arrived in time and none was ever in contact.
         verified: Those with whose executed controls :func:`d4orm_env.verify` found no fault.
@@ -44,9 +44,9 @@ class SuccessRate:
     label: str
     policy: str
     scenario: str
-    robots: int
+    num_robots: int
     model: str
-    noise: float
+    control_noise_std: float
     trials: int
     successes: int
     verified: int
@@ -150,14 +150,14 @@ def success_rate(trials: Sequence[Trial], label: str | None = None) -> SuccessRa
         label=first.label if label is None else label,
         policy=first.policy,
         scenario=first.scenario,
-        robots=first.robots,
+        num_robots=first.num_robots,
         model=first.model,
-        noise=first.noise,
+        control_noise_std=first.control_noise_std,
         trials=count,
         successes=len(successes),
         verified=sum(trial.verified is True for trial in trials),
         contacts=sum(trial.collided > 0 for trial in trials),
-        late=sum(not trial.error and trial.arrived < trial.robots for trial in trials),
+        late=sum(not trial.error and trial.arrived < trial.num_robots for trial in trials),
         errors=len(errors),
         lower=lower,
         upper=upper,

@@ -82,13 +82,13 @@ class Job:
         policy: The policy with its settings.
         problem: The problem.
         seed: Of the policy and of the noise.
-        noise: Standard deviations of the execution noise, in the controls' units.
+        control_noise_std: Standard deviations of the execution noise, in the controls' units.
     """
 
     policy: Configuration
     problem: Problem
     seed: int
-    noise: tuple[float, ...]
+    control_noise_std: tuple[float, ...]
 
     def key(self, noise: float) -> TrialKey:
         """Of the trial at one level of noise."""
@@ -100,7 +100,7 @@ class Job:
             **self.key(noise)._asdict(),
             label=self.policy.label,
             scenario=self.problem.name,
-            robots=self.problem.num_robots,
+            num_robots=self.problem.num_robots,
             model="+".join(sorted(set(self.problem.team.models))),
             dt=self.problem.dt,
             date=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -117,7 +117,7 @@ def run_job(job: Job) -> Iterator[Trial]:
         KeyboardInterrupt: If Ctrl-C was pressed meanwhile.
     """
     timed: _TimedPolicy | None = None
-    for noise in job.noise:
+    for noise in job.control_noise_std:
         begin = time.perf_counter()
         error, outcome = "", {}
         try:

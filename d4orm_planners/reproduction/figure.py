@@ -15,7 +15,7 @@ from d4orm_planners.evaluation.study import Study
 
 PaperNumbers = Mapping[tuple[str, str, str], Mapping[str, str]]
 """By section, label and metric: what the paper says, by column."""
-Across = Literal["robots", "nodes", "scenario", "noise", "policy"]
+Across = Literal["num_robots", "nodes", "scenario", "control_noise_std", "policy"]
 
 _FEW: dict[str, object] = {"num_samples": 64, "num_steps": 10, "max_iterations": 3}
 QUICK_SETTINGS: Mapping[str, Mapping[str, object]] = MappingProxyType({
@@ -41,22 +41,22 @@ class Section:
         title: The paper's name of it.
         policies: Settings by label, see :func:`~d4orm_planners.evaluation.evaluate.evaluate`.
         scenarios: Scenario names.
-        robots: Team sizes; ``None`` is the scenario's own.
+        num_robots: Team sizes; ``None`` is the scenario's own.
         quick_robots: Those of the quick version.
         model: Robot model; ``None`` is the scenario's own.
         nodes: Numbers of nodes that every policy is run with; none leaves it to their other settings.
-        noise: Standard deviations of the execution noise, in the controls' units.
+        control_noise_std: Standard deviations of the execution noise, in the controls' units.
         time_limit: Seconds after which planners begin no further iteration; ``None`` leaves it to their other settings.
     """
 
     title: str
     policies: Mapping[str, Mapping[str, object]]
     scenarios: tuple[str, ...]
-    robots: tuple[int | None, ...] = (None,)
+    num_robots: tuple[int | None, ...] = (None,)
     quick_robots: tuple[int | None, ...] = (2,)
     model: str | None = None
     nodes: tuple[int, ...] = ()
-    noise: tuple[float, ...] = (0.0,)
+    control_noise_std: tuple[float, ...] = (0.0,)
     time_limit: float | None = None
 
     def studies(self, seeds: int) -> list[Study]:
@@ -66,8 +66,8 @@ class Section:
                 policies={label: {**settings, **nodes} for label, settings in self.policies.items()},
                 scenarios=self.scenarios,
                 seeds=range(seeds),
-                control_noise_std=self.noise,
-                num_robots=self.robots,
+                control_noise_std=self.control_noise_std,
+                num_robots=self.num_robots,
                 model=self.model,
                 time_limit=self.time_limit,
             )
@@ -84,9 +84,9 @@ class Section:
             self,
             policies=policies,
             scenarios=self.scenarios[:2],
-            robots=self.quick_robots,
+            num_robots=self.quick_robots,
             nodes=self.nodes[:2],
-            noise=tuple(dict.fromkeys((self.noise[0], self.noise[-1]))),
+            control_noise_std=tuple(dict.fromkeys((self.control_noise_std[0], self.control_noise_std[-1]))),
             time_limit=None if self.time_limit is None else min(self.time_limit, QUICK_TIME_LIMIT),
         )
 

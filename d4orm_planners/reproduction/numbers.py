@@ -23,9 +23,9 @@ class Measured:
         label: What the policy is called.
         policy: Registry name.
         scenario: Scenario name.
-        robots: Team size.
+        num_robots: Team size.
         model: Models of the team.
-        noise: Standard deviation of the execution noise, in the controls' units.
+        control_noise_std: Standard deviation of the execution noise, in the controls' units.
         trials: Trials.
         successes: See :func:`first_solution`; with noise, trials in which all arrived and none touched anything.
         lower: Lower end of the 95% confidence interval of the success rate (Wilson).
@@ -54,9 +54,9 @@ class Measured:
     label: str
     policy: str
     scenario: str
-    robots: int
+    num_robots: int
     model: str
-    noise: float
+    control_noise_std: float
     trials: int
     successes: int
     lower: float
@@ -92,11 +92,11 @@ def first_solution(trial: Trial) -> float | None:
     there was one. For a policy that plans under way the time is that before its first action.
     """
     times = (seconds for seconds, solved, _ in json.loads(trial.history) if solved)
-    if trial.error or (not trial.success and (trial.noise > 0 or not trial.status)):
+    if trial.error or (not trial.success and (trial.control_noise_std > 0 or not trial.status)):
         return None
     if not trial.status:
         return trial.preparation
-    return next(times, trial.wall_time if trial.noise > 0 else None)
+    return next(times, trial.wall_time if trial.control_noise_std > 0 else None)
 
 
 def measured(group: Group) -> Measured:
@@ -116,9 +116,9 @@ def measured(group: Group) -> Measured:
         label=group.label,
         policy=first.policy,
         scenario=first.scenario,
-        robots=first.robots,
+        num_robots=first.num_robots,
         model=first.model,
-        noise=first.noise,
+        control_noise_std=first.control_noise_std,
         trials=len(trials),
         successes=len(solved),
         lower=lower,
@@ -159,7 +159,7 @@ def _step_time(trials: Sequence[Trial]) -> float | None:
 
 def _nodes(trial: Trial) -> int:
     nodes = json.loads(trial.config).get("nodes", 1)
-    return trial.robots if nodes is None else int(nodes)
+    return trial.num_robots if nodes is None else int(nodes)
 
 
 @dataclass(frozen=True)

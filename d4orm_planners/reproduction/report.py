@@ -66,7 +66,7 @@ def _transposed(figure: Figure, title: str, rows: Sequence[Measured]) -> str:
         for name in figure.metrics:
             line += [METRICS[name].text(row)] + [_said(figure, row, name)] * (name in known)
         lines.append(line)
-    return table(f"{title}, {rows[0].robots} robots", header, lines)
+    return table(f"{title}, {rows[0].num_robots} robots", header, lines)
 
 
 def _said(figure: Figure, row: Measured, metric: str) -> str:
@@ -78,7 +78,7 @@ def _deadlines(figure: Figure, groups: Sequence[Group]) -> list[str]:
     blocks: dict[str, list[tuple[str, list[SuccessWithin]]]] = {}
     for group in groups:
         first = group.trials[0]
-        title = f"{group.section}, {first.robots} robots: success within a deadline for planning"
+        title = f"{group.section}, {first.num_robots} robots: success within a deadline for planning"
         blocks.setdefault(title, []).append((group.label, [success_by(group.trials, s) for s in figure.deadlines]))
     return [deadline_table(title, lines) for title, lines in blocks.items()]
 
