@@ -21,7 +21,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import inverse_initial_distance
 from d4orm_env.core.robot_model import SPEED, Ops
 from d4orm_env.core.transition import TimeStep
-from d4orm_planners.abandoning import run_or_abandon
+from d4orm_planners._abandoning import run_or_abandon
 
 OBJECTIVE_SCALE = 10.0
 """Of the mean cost of a step, so that IPOPT's tolerance tells good motions from bad ones."""

@@ -513,6 +513,14 @@ SPELLINGS: tuple[dict[str, Any], ...] = (
 )  # fmt: skip
 
 
+def test_several_models_meet_every_scenario_and_team_size(tmp_path: Path) -> None:
+    models = ["velocity2d", None, "differential_drive"]
+    rows = evaluate("goal", ["circle", "random"], out=tmp_path, model=models, num_robots=[1, 2], seeds=[0], workers=1)
+    named = ("velocity2d", "holonomic2d", "differential_drive")
+    expected = [(name, model, size) for name in ("circle", "random") for model in named for size in (1, 2)]
+    assert [(row.scenario, row.model, row.num_robots) for row in rows] == expected
+
+
 # Bad input.
 
 BAD = [
@@ -572,8 +580,8 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
         ({"policies": object()}, "policy <object object at .* is no name; give one of d4orm"),
         ({"policies": [{"policy": "goal"}]}, "policy {'policy': 'goal'} is no name"),
         ({"policies": {3: {}}}, "policy 3 is no name"),
-        ({"scenarios": []}, "scenarios or num_robots is empty"),
-        ({"num_robots": []}, "scenarios or num_robots is empty"),
+        ({"scenarios": []}, "scenarios, num_robots or model is empty"),
+        ({"num_robots": []}, "scenarios, num_robots or model is empty"),
         ({"seeds": []}, "seeds is empty"),
         ({"seeds": 5}, r"seeds is 5; give the seeds themselves, as range\(50\)"),
         ({"seeds": [0.5]}, "seed must be a whole number, not 0.5"),

@@ -11,6 +11,7 @@ from matplotlib.backend_bases import FigureManagerBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.registry import backend_registry
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.problem import Problem
@@ -164,6 +165,7 @@ class WindowRenderer:
         self._frames = FrameRenderer(problem, size)
         self._period = problem.dt
         self._manager: FigureManagerBase | None = None
+        self._image: AxesImage
         self._last = -np.inf
         self._open_window(problem, size)
 
@@ -179,7 +181,7 @@ class WindowRenderer:
         figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100)
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
         axes.set_axis_off()
-        axes.imshow(np.full((size[1], size[0], 3), 255, np.uint8))
+        self._image = axes.imshow(np.full((size[1], size[0], 3), 255, np.uint8))
         self._manager = canvas_class.new_manager(figure, 1)
         self._manager.set_window_title(f"d4orm: {problem.name}")
         self._manager.canvas.mpl_connect("close_event", self._forget_window)
@@ -193,7 +195,7 @@ class WindowRenderer:
         frame = self._frames.draw(*state, **marks)
         if self._manager is not None:
             canvas = self._manager.canvas
-            canvas.figure.axes[0].images[0].set_data(frame)
+            self._image.set_data(frame)
             canvas.draw()
             canvas.start_event_loop(max(1e-3, self._period - (time.monotonic() - self._last)))
             self._last = time.monotonic()

@@ -17,7 +17,7 @@ from d4orm_planners.commands.inputs import (
     numbers,
     parse_settings,
 )
-from d4orm_planners.commands.options import Model, Quiet, TimeLimit
+from d4orm_planners.commands.options import Quiet, TimeLimit
 
 if TYPE_CHECKING:
     from d4orm_planners.evaluation.summary import SuccessRate
@@ -50,7 +50,9 @@ class StudyOptions:
         str | None,
         typer.Option("--num-robots", "--robots", "-k", help="Team sizes, as 4,8; the scenario's own by default."),
     ] = None
-    model: Model = None
+    model: Annotated[
+        str | None, typer.Option("--model", "-m", help="Robot models, as car,unicycle; the scenario's own by default.")
+    ] = None
     seeds: Annotated[
         str, typer.Option("--seeds", "--trials", "-n", help="How many, or which: 50 for 0 to 49, 10-19, or 3,5,8.")
     ] = "50"
@@ -87,7 +89,7 @@ class StudyOptions:
             seeds=_seeds(self.seeds),
             control_noise_std=decimals("--control-noise-std", self.control_noise_std),
             num_robots=numbers("--num-robots", self.num_robots) or (None,),
-            model=self.model,
+            model=names(self.model),
             time_limit=self.time_limit,
         )
         make_folder(self.out)

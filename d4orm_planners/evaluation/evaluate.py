@@ -32,7 +32,7 @@ def evaluate(
     seeds: Iterable[int] = range(50),
     control_noise_std: float | Iterable[float] = 0.0,
     num_robots: int | Iterable[int | None] | None = None,
-    model: str | None = None,
+    model: str | Iterable[str | None] | None = None,
     time_limit: float | None = None,
     trial_timeout: float | None = None,
     workers: int | None = None,
@@ -57,7 +57,7 @@ def evaluate(
         seeds: Each seeds the scenario, the policy and the noise of a trial.
         control_noise_std: Standard deviations of the Gaussian noise added to the controls, in their units.
         num_robots: Team sizes for scenarios by name; ``None`` is the scenario's own.
-        model: Robot model for scenarios by name; ``None`` is the scenario's own.
+        model: Robot models for scenarios by name; ``None`` is the scenario's own.
         time_limit: Seconds for planning, for planners without a ``time_limit`` of their own.
         trial_timeout: Seconds after which a trial is ended with an error; ``None`` waits.
         workers: Processes of one thread each, by default as many as there are cores; with 1, and without
@@ -66,7 +66,7 @@ def evaluate(
         progress: Called as ``progress(what, trials done, trials in all)``.
 
     Returns:
-        One row per scenario, team size, policy and level of noise, in that order.
+        One row per scenario, model, team size, policy and level of noise, in that order.
 
     Raises:
         ValueError: For an unknown name, a number that makes no sense, a policy of your own that worker processes cannot
@@ -104,8 +104,8 @@ def run_study(
     For the arguments and errors see :func:`evaluate`.
 
     Returns:
-        Trials, one per seed, behind the policy's label, for every scenario, team size, policy and level of noise, in
-        that order.
+        Trials, one per seed, behind the policy's label, for every scenario, model, team size, policy and level of
+        noise, in that order.
     """
     if trial_timeout is not None:
         trial_timeout = duration(trial_timeout, "trial_timeout")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -37,20 +36,17 @@ class Study:
     seeds: Iterable[int] = range(50)
     control_noise_std: float | Iterable[float] = 0.0
     num_robots: int | Iterable[int | None] | None = None
-    model: str | None = None
+    model: str | Iterable[str | None] | None = None
     time_limit: float | None = None
 
     def groups(self) -> list[list[Job]]:
-        """A list of jobs per scenario, team size and policy, in that order, with one for every seed.
+        """A list of jobs per scenario, model, team size and policy, in that order, with one for every seed.
 
         Raises:
             ValueError: For an unknown name or setting, a number that makes no sense, or nothing to do.
             ImportError: If a policy needs a library that is not installed.
         """
-        given = (
-            positive_number(level, "control_noise_std", zero_allowed=True) for level in _several(self.control_noise_std)
-        )
-        levels = tuple(dict.fromkeys(given))
+        levels = tuple(dict.fromkeys(map(_checked_noise, _several(self.control_noise_std))))
         if not levels:
             raise ValueError("control_noise_std is empty; give at least one level")
         policies, seeds = self.configurations(), _checked_seeds(self.seeds)
@@ -88,8 +84,9 @@ class Study:
         return choice
 
     def _problems(self, seeds: Sequence[int]) -> list[list[Problem]]:
-        """One list per scenario and team size, with a problem for every seed."""
-        sizes = tuple(dict.fromkeys(_several(self.num_robots)))
+        """One list per scenario, model and team size, with a problem for every seed."""
+        sizes = dict.fromkeys(_several(self.num_robots))
+        models: tuple[str | None, ...] = _several(self.model)
         cells = []
         named = False
         scenarios: tuple[Scenario, ...] = _several(self.scenarios)
@@ -100,11 +97,14 @@ class Study:
                 cells.append([_load(Path(scenario))] * len(seeds))
             else:
                 named = True
-                make = partial(make_problem, scenario, model=self.model)
-                cells += [[make(num_robots=size, seed=seed) for seed in seeds] for size in sizes]
+                cells += [
+                    [make_problem(scenario, size, seed, model=model) for seed in seeds]
+                    for model in dict.fromkeys(models)
+                    for size in sizes
+                ]
         if not cells:
-            raise ValueError("scenarios or num_robots is empty; give at least one of each")
-        if not named and (self.model is not None or any(size is not None for size in sizes)):
+            raise ValueError("scenarios, num_robots or model is empty; give at least one of each")
+        if not named and any(given is not None for given in (*models, *sizes)):
             raise ValueError("num_robots and model do not go with scenario files; change them in the files")
         return cells
 
@@ -155,6 +155,10 @@ def _load(path: Path) -> Problem:
     problem = load_problem(path)
     # Two files that give no name still differ.
     return problem.replace(name=path.stem) if problem.name == "custom" else problem
+
+
+def _checked_noise(level: float) -> float:
+    return positive_number(level, "control_noise_std", zero_allowed=True)
 
 
 def _checked_seeds(seeds: Iterable[int]) -> tuple[int, ...]:

@@ -17,9 +17,9 @@ from d4orm_env import navigation_v0, verify
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.errors import UnknownKeywordError, describe
 from d4orm_env.core.problem import Problem
+from d4orm_planners._machine import describe_machine, versions
 from d4orm_planners.episode import run_episode
 from d4orm_planners.evaluation.store import Trial, TrialKey
-from d4orm_planners.machine import describe_machine, versions
 from d4orm_planners.plan import IterationRecord, Plan
 from d4orm_planners.policy import Actions, Observations, OpenLoop, Policy
 from d4orm_planners.registry import is_planned, make_policy, policy_settings
