@@ -535,7 +535,7 @@ BAD = [
     (("-k", "0"), "num_robots is 0"),
     (("-k", "two"), "--num-robots 'two'"),
     (("-m", "hovercraft"), "model 'hovercraft' is unknown"),
-    (("--control-noise-std", "0,-0.1"), "noise is -0.1"),
+    (("--control-noise-std", "0,-0.1"), "control_noise_std is -0.1"),
     (("--control-noise-std", "much"), "--control-noise-std 'much' is not a list of numbers"),
     (("-n", "0"), "seeds is empty"),
     (("-n", "few"), "--seeds 'few' is neither a number"),
@@ -586,7 +586,7 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
         ({"seeds": 5}, r"seeds is 5; give the seeds themselves, as range\(50\)"),
         ({"seeds": [0.5]}, "seed must be a whole number, not 0.5"),
         ({"seeds": [2**63]}, "seed is 9223372036854775808; a store of trials has room for seeds up to"),
-        ({"control_noise_std": []}, "noise is empty"),
+        ({"control_noise_std": []}, "control_noise_std is empty"),
     ],
 )
 def test_bad_arguments(tmp_path: Path, changes: dict[str, Any], message: str) -> None:

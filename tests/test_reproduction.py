@@ -253,7 +253,7 @@ def test_what_nodes_sent_is_over_the_successes() -> None:
 def test_the_papers_rows_stand_below_ours_and_its_other_methods_too() -> None:
     paper = {("Circle", "d4orm", "runtime"): {"8": "0.13"}, ("Circle", "rival", "runtime"): {"8": "9.99"}}
     page = markdown(figure(paper=paper), [Group("Circle", "d4orm", [trial()])])
-    assert "|  | robots | 8 |" in page
+    assert "|  | num_robots | 8 |" in page
     ours = page.index("| runtime, s | d4orm | 1.50 (1.50-1.50) |")
     assert ours < page.index("| runtime, s | d4orm (the paper) | 0.13 |")
     assert "| runtime, s | rival (the paper) | 9.99 |" in page

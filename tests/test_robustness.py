@@ -170,8 +170,8 @@ def test_a_seed_that_the_store_has_no_room_for_is_refused(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("column", "value"),
     [
-        ("reward", "much"), ("num_robots", "many"), ("success", "yes"), ("seed", "first"), ("config", "none"),
-        ("label", b"x"), ("history", "[[1"), ("history", "[1, 2]"), ("control_noise_std", "much"), ("travel_time", "a"),
+        ("reward", "much"), ("robots", "many"), ("success", "yes"), ("seed", "first"), ("config", "none"),
+        ("label", b"x"), ("history", "[[1"), ("history", "[1, 2]"), ("noise", "much"), ("travel_time", "a"),
     ],
 )  # fmt: skip
 def test_what_does_not_belong_in_a_column_is_one_clear_error(tmp_path: Path, column: str, value: Any) -> None:
@@ -179,7 +179,8 @@ def test_what_does_not_belong_in_a_column_is_one_clear_error(tmp_path: Path, col
     TrialStore(path).add(trial())
     with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute(f"UPDATE trials SET {column} = ?", (value,))
-    message = rf"trial store .*trials\.sqlite is damaged \(trial 0 has {re.escape(repr(value))} as {column}\)"
+    shown = {"robots": "num_robots", "noise": "control_noise_std"}.get(column, column)
+    message = rf"trial store .*trials\.sqlite is damaged \(trial 0 has {re.escape(repr(value))} as {shown}\)"
     with pytest.raises(ValueError, match=message):
         TrialStore.existing(path).trials()
 
@@ -561,8 +562,8 @@ def test_settings_reach_the_policies_that_have_them(d4orm, monkeypatch: pytest.M
         (("--num-robots", "0"), "num_robots is 0"),
         (("--num-robots", "two"), "--num-robots 'two'"),
         (("--model", "hovercraft"), "model 'hovercraft' is unknown"),
-        (("--control-noise-std", "0,-0.1"), "noise is -0.1"),
-        (("--control-noise-std", "0,nan"), "noise is nan"),
+        (("--control-noise-std", "0,-0.1"), "control_noise_std is -0.1"),
+        (("--control-noise-std", "0,nan"), "control_noise_std is nan"),
         (("--control-noise-std", "none"), "--control-noise-std 'none' is not a list of numbers"),
         (("--seeds", "0"), "seeds is empty"),
         (("--seeds", "99999999999"), "1000000"),

@@ -214,7 +214,7 @@ def test_other_settings_in_the_same_folder_are_refused(trained: tuple[TrainingSe
         ({"steps": 1e6}, "steps must be a whole number, not 1000000.0"),
         ({"seed": 2**64}, "seed is about 1e19"),
         ({"scenario_settings": {"num_robots": 3}}, "scenario_settings has 'num_robots'; give it itself, --num-robots"),
-        ({"scenario_settings": {"seed": 3}}, "scenario_settings has 'seed'; give 'seed'"),
+        ({"scenario_settings": {"seed": 3}}, "scenario_settings has 'seed'; give it itself, --seed"),
         ({"scenario_settings": [3]}, "scenario_settings"),
     ],
 )

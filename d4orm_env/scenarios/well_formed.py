@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +18,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.free_space import FreeSpace, Mask, free_space
 from d4orm_env.scenarios.layout import Layout, build
-from d4orm_env.scenarios.placement import Points, round_up, with_random_obstacles
+from d4orm_env.scenarios.placement import Area, Points, round_up, with_random_obstacles
 from d4orm_env.scenarios.settings import STARTS_AND_GOALS, Settings
 
 RESERVE = 1e-3
@@ -174,14 +173,14 @@ def populate(
     """
     world = with_obstacles(settings, world)
     starts, goals = draw_team(settings, free_space(world, reach_of(settings), step), remedy, exchange)
-    return build(replace(settings, num_obstacles=0), Layout(starts, goals, world, travel, np.zeros(world.dimension)))
+    return build(settings, Layout(starts, goals, world, travel))
 
 
 def with_obstacles(settings: Settings, world: World, places: Points | None = None) -> World:
     """A world with bounds and the random obstacles asked for, clear of starts and goals if they are known."""
     low, high = world.bounds.astype(np.float64)
     places = np.empty((0, world.dimension)) if places is None else places
-    return with_random_obstacles(settings, world, places, (high - low) / 2, is_round=False, centre=(low + high) / 2)
+    return with_random_obstacles(settings, world, places, Area((high - low) / 2, centre=(low + high) / 2))
 
 
 def draw_team(

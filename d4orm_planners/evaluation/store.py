@@ -6,7 +6,7 @@ import json
 import os
 import sqlite3
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import astuple, dataclass, fields
 from itertools import chain
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 APPLICATION_ID = 0x64346F72
 """Marks the file as one of ours, in its header ("d4or")."""
-VERSION = 5
+VERSION = 4
 STORE = "trials.sqlite"
 """Name of the file in a folder of results."""
 LARGEST_NUMBER = 2**63 - 1
@@ -120,8 +120,17 @@ class Trial:
         return TrialKey(self.policy, self.config, self.problem, self.control_noise_std, self.seed)
 
 
-_NAMES = tuple(field.name for field in fields(Trial))
-_KEY = ", ".join(TrialKey._fields)
+_FORMER = {"num_robots": "robots", "control_noise_std": "noise"}
+"""Columns that keep the names they have in the files that are out there."""
+
+
+def _columns(names: Iterable[str]) -> tuple[str, ...]:
+    return tuple(_FORMER.get(name, name) for name in names)
+
+
+_FIELDS = tuple(field.name for field in fields(Trial))
+_NAMES, _KEYS = _columns(_FIELDS), _columns(TrialKey._fields)
+_KEY = ", ".join(_KEYS)
 _TRUTHS = ("success", "verified")
 _JSON = {"config": dict, "versions": dict, "machine": dict, "history": list}
 _SQL = {"str": "TEXT", "int": "INTEGER", "float": "REAL", "bool": "INTEGER"}
@@ -135,13 +144,15 @@ _PYTHON: Mapping[str, tuple[type, ...]] = {
 _TYPES = {field.name: str(field.type).split(" | ") for field in fields(Trial)}
 _KINDS = {name: tuple(chain(*(_PYTHON[kind] for kind in kinds))) for name, kinds in _TYPES.items()}
 """What may be in a row, by column."""
-_COLUMNS = (f"{name} {_SQL[kinds[0]]}{'' if 'None' in kinds else ' NOT NULL'}" for name, kinds in _TYPES.items())
+_COLUMNS = (
+    f"{name} {_SQL[kinds[0]]}{'' if 'None' in kinds else ' NOT NULL'}" for name, kinds in zip(_NAMES, _TYPES.values())
+)
 _CREATE = f"CREATE TABLE trials ({', '.join(_COLUMNS)}, PRIMARY KEY ({_KEY})) WITHOUT ROWID"
 # What has run to its end stays as it is; only a trial that failed may be tried again.
 _ADD = (
     f"INSERT INTO trials ({', '.join(_NAMES)}) VALUES ({', '.join('?' * len(_NAMES))}) ON CONFLICT ({_KEY}) "
     + "DO UPDATE SET "
-    + ", ".join(f"{name} = excluded.{name}" for name in _NAMES if name not in TrialKey._fields)
+    + ", ".join(f"{name} = excluded.{name}" for name in _NAMES if name not in _KEYS)
     + " WHERE trials.error != ''"
 )
 
@@ -205,7 +216,7 @@ class TrialStore:
         """All trials, in order of key."""
         with self._connection() as connection:
             rows = connection.execute(f"SELECT {', '.join(_NAMES)} FROM trials ORDER BY {_KEY}").fetchall()
-        return [self._trial(number, dict(zip(_NAMES, row))) for number, row in enumerate(rows)]
+        return [self._trial(number, dict(zip(_FIELDS, row))) for number, row in enumerate(rows)]
 
     def _trial(self, number: int, values: dict[str, Any]) -> Trial:
         """A row as a trial. SQLite keeps truth values as numbers, and whatever it is given in any column."""

@@ -34,44 +34,31 @@ QUICK_TIME_LIMIT = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Section:
-    """Policies that meet the same problems: a panel of a figure, or a table.
+class Section(Study):
+    """A study whose policies meet the same problems: a panel of a figure, or a table.
 
     Attributes:
         title: The paper's name of it.
-        policies: Settings by label, see :func:`~d4orm_planners.evaluation.evaluate.evaluate`.
-        scenarios: Scenario names.
-        num_robots: Team sizes; ``None`` is the scenario's own.
-        quick_robots: Those of the quick version.
-        model: Robot model; ``None`` is the scenario's own.
+        quick_robots: Team sizes of the quick version.
         nodes: Numbers of nodes that every policy is run with; none leaves it to their other settings.
-        control_noise_std: Standard deviations of the execution noise, in the controls' units.
-        time_limit: Seconds after which planners begin no further iteration; ``None`` leaves it to their other settings.
     """
 
     title: str
     policies: Mapping[str, Mapping[str, object]]
     scenarios: tuple[str, ...]
     num_robots: tuple[int | None, ...] = (None,)
-    quick_robots: tuple[int | None, ...] = (2,)
-    model: str | None = None
-    nodes: tuple[int, ...] = ()
     control_noise_std: tuple[float, ...] = (0.0,)
-    time_limit: float | None = None
+    quick_robots: tuple[int | None, ...] = (2,)
+    nodes: tuple[int, ...] = ()
 
     def studies(self, seeds: int) -> list[Study]:
         """One study with the policies, or one for every number of nodes."""
+        variants = [{"nodes": number} for number in self.nodes] or [{}]
         return [
-            Study(
-                policies={label: {**settings, **nodes} for label, settings in self.policies.items()},
-                scenarios=self.scenarios,
-                seeds=range(seeds),
-                control_noise_std=self.control_noise_std,
-                num_robots=self.num_robots,
-                model=self.model,
-                time_limit=self.time_limit,
+            replace(
+                self, seeds=range(seeds), policies={label: {**own, **nodes} for label, own in self.policies.items()}
             )
-            for nodes in ([{"nodes": number} for number in self.nodes] or [{}])
+            for nodes in variants
         ]
 
     def quick(self) -> Section:
