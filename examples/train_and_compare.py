@@ -20,11 +20,11 @@ from d4orm_planners.rl.training import TrainingSettings, train
 
 def main() -> None:
     parser = argument_parser(__doc__)
-    parser.add_argument("--robots", type=count, default=4, help="size of the team")
+    parser.add_argument("--num-robots", "--robots", type=count, default=4, help="size of the team")
     parser.add_argument("--steps", type=count, default=5_000_000, help="robot-steps to train")
     parser.add_argument("--trials", type=count, default=20, help="random instances per policy and level of noise")
     arguments = parser.parse_args()
-    settings = TrainingSettings(num_robots=arguments.robots, steps=arguments.steps, lessons=20)
+    settings = TrainingSettings(num_robots=arguments.num_robots, steps=arguments.steps, lessons=20)
     noise, trials = (0.0, 0.2, 0.5), arguments.trials
     if arguments.quick:
         settings = TrainingSettings(num_robots=2, steps=2048, num_envs=32, lessons=2, validation_worlds=4)

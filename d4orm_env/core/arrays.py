@@ -89,7 +89,7 @@ def frozen_per_robot(value: ArrayLike, name: str, num_robots: int) -> FloatArray
 
 @dataclass(frozen=True, eq=False, init=False)
 class Frozen:
-    """Data that are set once. A copy, or what a pickle brings, has read-only arrays too and makes anew what is cached."""
+    """Data that are set once. Copies, unpickled ones too, have read-only arrays and make anew what is cached."""
 
     def _set(self, **values: object) -> None:
         for name, value in values.items():
