@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -11,10 +11,7 @@ from d4orm_planners.commands.inputs import make_folder
 from d4orm_planners.commands.options import Engine, Seed
 from d4orm_planners.commands.outputs import episode_rows, print_plan, print_table, require_solved
 from d4orm_planners.commands.plan import solving
-
-if TYPE_CHECKING:
-    from d4orm_planners.episode import Episode
-    from d4orm_planners.plan import Plan
+from d4orm_planners.commands.run import execute
 
 
 def demo(
@@ -24,8 +21,9 @@ def demo(
     engine: Engine = "auto",
 ) -> None:
     """Plan robots across a circle, execute the plan in the environment, verify it, and write pictures."""
-    from d4orm_env import make_problem
+    from d4orm_env import make_problem, verify
     from d4orm_env.render import save_animation, save_picture
+    from d4orm_planners.policy import OpenLoop
     from d4orm_planners.registry import make_planner
 
     make_folder(out)
@@ -35,7 +33,11 @@ def demo(
         plan = planner.solve(problem, seed, callback=callback)
     print_plan(plan)
     require_solved(plan)
-    episode = _execute(plan, seed)
+    episode = execute(problem, OpenLoop(plan=plan), seed)
+    report = verify(problem, plan.controls)
+    verdict = "yes" if report.ok else "no: " + "; ".join(map(str, report.violations[:3]))
+    rows = [("verified", verdict), ("closest approach", f"{report.min_separation * 100:.1f} cm between surfaces")]
+    print_table("Executed in the environment", [*episode_rows(episode.metrics), *rows])
     files = {"plan": out / "plan.npz", "picture": out / "plan.png", "animation": out / "execution.gif"}
     plan.save(files["plan"])
     title = f"{problem.num_robots} robots, planned by D4orm in {plan.wall_time:.2f} s"
@@ -45,21 +47,3 @@ def demo(
         typer.echo(f"{name:<10} {path}")
     if not episode.metrics["success"]:
         raise typer.Exit(1)
-
-
-def _execute(plan: Plan, seed: int) -> Episode:
-    from d4orm_env import navigation_v0, verify
-    from d4orm_planners.episode import run_episode
-    from d4orm_planners.policy import OpenLoop
-
-    env = navigation_v0.parallel_env(problem=plan.problem)
-    episode = run_episode(env, OpenLoop(plan=plan), seed=seed)
-    env.close()
-    report = verify(plan.problem, plan.controls)
-    rows = [
-        *episode_rows(episode.metrics),
-        ("verified", "yes" if report.ok else "no: " + "; ".join(str(violation) for violation in report.violations[:3])),
-        ("closest approach", f"{report.min_separation * 100:.1f} cm between surfaces"),
-    ]
-    print_table("Executed in the environment", rows)
-    return episode

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from d4orm_planners.commands.inputs import check_target, parse_settings
+from d4orm_planners.commands.inputs import check_target, parse_settings, refuse_options
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
@@ -28,6 +28,8 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no t
 @dataclass(frozen=True, kw_only=True)
 class ProblemOptions:
     """Which problem."""
+
+    context: typer.Context
 
     scenario: Annotated[
         str,
@@ -55,19 +57,13 @@ class ProblemOptions:
         from d4orm_env.scenarios import load_problem, make_problem
         from d4orm_env.scenarios.problems import is_scenario_file
 
+        common = ("num_robots", "model", "num_obstacles")
         if is_scenario_file(self.scenario):
-            given = {
-                "--num-robots": self.num_robots,
-                "--model": self.model,
-                "--num-obstacles": self.num_obstacles,
-                "--scenario-set": self.scenario_settings and " ".join(self.scenario_settings),
-            }
-            for option, value in given.items():
-                if value is not None:
-                    raise ValueError(f"{option} {value} does not go with a scenario file; change it in {self.scenario}")
+            reason = f"does not go with a scenario file; change it in {self.scenario}"
+            refuse_options(self.context, (*common, "scenario_settings"), reason)
             return load_problem(self.scenario)
         own = parse_settings(self.scenario_settings, "--scenario-set")
-        for name in ("num_robots", "seed", "model", "num_obstacles"):
+        for name in (*common, "seed"):
             if name in own:
                 raise ValueError(f"--scenario-set {name} is said by --{name.replace('_', '-')}; use that")
         return make_problem(

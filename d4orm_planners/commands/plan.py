@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 class PlanOptions(PictureOptions, ProblemOptions):
     """What to plan, with what, and what to write."""
 
-    context: typer.Context
     planner: Annotated[
         str, typer.Option("--planner", "-p", help="Planner (see `d4orm planners`), or package.module:Name.")
     ] = "d4orm"

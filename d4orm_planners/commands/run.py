@@ -15,6 +15,7 @@ from d4orm_planners.commands.outputs import episode_rows, print_table
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
+    from d4orm_planners.episode import Episode
     from d4orm_planners.policy import Policy
 
 
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 class RunOptions(PictureOptions, ProblemOptions):
     """What to run, and where."""
 
-    context: typer.Context
     plan_file: Annotated[Path | None, typer.Argument(help="Plan to execute; plans anew without one.")] = None
     policy: Annotated[str, typer.Option("--policy", "-p", help="Planner, policy or package.module:Name to run.")] = (
         "d4orm"
@@ -45,7 +45,7 @@ class RunOptions(PictureOptions, ProblemOptions):
             return self.problem(), make_policy(self.policy)
         refuse_options(
             self.context,
-            {"policy", *(field.name for field in fields(ProblemOptions))} - {"seed"},
+            {"policy", *(field.name for field in fields(ProblemOptions) if field.name != "seed")},
             f"does not go with a plan file; {self.plan_file} has a problem and controls of its own",
         )
         plan = Plan.load(self.plan_file)
@@ -55,16 +55,22 @@ class RunOptions(PictureOptions, ProblemOptions):
 @takes(RunOptions)
 def run(options: RunOptions) -> None:
     """Run a plan or a policy in the environment, step by step, and judge what happened."""
-    from d4orm_env import navigation_v0
-    from d4orm_planners.episode import run_episode
-
     options.check_pictures()
     problem, policy = options.chosen()
-    env = navigation_v0.parallel_env(problem=problem, control_noise_std=options.control_noise_std)
-    episode = run_episode(env, policy, seed=options.seed)
-    env.close()
+    episode = execute(problem, policy, options.seed, options.control_noise_std)
     options.draw(problem, episode.trajectory)
     if not options.quiet:
         print_table("Execution", episode_rows(episode.metrics))
     if not episode.metrics["success"]:
         raise typer.Exit(1)
+
+
+def execute(problem: Problem, policy: Policy, seed: int, control_noise_std: float = 0.0) -> Episode:
+    """An episode of a policy on a problem."""
+    from d4orm_env import navigation_v0
+    from d4orm_planners.episode import run_episode
+
+    env = navigation_v0.parallel_env(problem=problem, control_noise_std=control_noise_std)
+    episode = run_episode(env, policy, seed=seed)
+    env.close()
+    return episode
