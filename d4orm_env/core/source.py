@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from types import CodeType, FunctionType
+from typing import Any
 
 
-def pieces(function: Callable[..., object], seen: frozenset[FunctionType] = frozenset()) -> Iterator[object]:
+def pieces(function: Any, seen: frozenset[FunctionType] = frozenset()) -> Iterator[object]:
     """Source text or bytecode, and the numbers that the code holds or names, through all functions that it calls."""
-    assert isinstance(function, FunctionType)
     code = function.__code__
     yield _text(function)
     yield from _numbers(code)

@@ -136,7 +136,7 @@ def lattice_step(settings: Settings, sides: ArrayLike, passage: tuple[str, float
     Raises:
         ValueError: If the passage is too narrow; the message says what would do.
     """
-    lengths = np.asarray(sides, float)
+    lengths = np.asarray(sides)
     step = max(settings.spacing / 4, root(float(lengths.prod()) / ENOUGH_POINTS, len(lengths)))
     if passage is None:
         return step

@@ -21,7 +21,7 @@ def parse_settings(settings: list[str] | None, option: str = "--set") -> dict[st
     """
     from d4orm_env.core.yaml_text import parse_yaml
 
-    values: dict[str, Any] = {}
+    values = {}
     for setting in settings or []:
         name, separator, text = setting.partition("=")
         if not separator or not name:

@@ -30,7 +30,6 @@ class ProblemOptions:
     """Which problem."""
 
     context: typer.Context
-
     scenario: Annotated[
         str,
         typer.Option(

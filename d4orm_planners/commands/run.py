@@ -24,9 +24,7 @@ class RunOptions(PictureOptions, ProblemOptions):
     """What to run, and where."""
 
     plan_file: Annotated[Path | None, typer.Argument(help="Plan to execute; plans anew without one.")] = None
-    policy: Annotated[str, typer.Option("--policy", "-p", help="Planner, policy or package.module:Name to run.")] = (
-        "d4orm"
-    )
+    policy: Annotated[str, typer.Option("--policy", "-p", help="Planner, policy or package.module:Name.")] = "d4orm"
     control_noise_std: Annotated[
         float, typer.Option("--control-noise-std", "--noise", help="Standard deviation of the execution noise.")
     ] = 0.0
