@@ -11,14 +11,15 @@ from typing import Any
 
 import pytest
 
+from d4orm_env.core.dynamics import COMMON, MODEL_CODES
 from d4orm_planners import cli
 from d4orm_planners.benchmark import benchmark, report, timing
-from d4orm_planners.benchmark.benchmark import BenchmarkSettings, parts, run_parts
+from d4orm_planners.benchmark.benchmark import MODELS, BenchmarkSettings, parts, run_parts
 from d4orm_planners.benchmark.probes import measure_startup
 from d4orm_planners.benchmark.timing import Spread, measure
 
 TINY: dict[str, Any] = {
-    "robots": (2, 3),
+    "num_robots": (2, 3),
     "models": ("holonomic2d",),
     "num_samples": 64,
     "horizon": 10,
@@ -108,9 +109,16 @@ def test_the_numbers_hang_together(results: dict[str, list[Any]]) -> None:
     assert default["solved"] == default["seeds"] == default["seconds"].count == 2
 
 
+def test_every_model_that_comes_with_the_package_is_measured_and_the_plain_loop_where_it_has_it() -> None:
+    todo = parts(BenchmarkSettings(**{**TINY, "models": MODELS, "engines": ("cpu", "plain")}))
+    measured = {what for section, what, _ in todo if section == "denoising"}
+    assert {what.split()[1] for what in measured} == set(MODEL_CODES)
+    assert {what.split()[1] for what in measured if what.endswith("plain")} == set(COMMON)
+
+
 def test_whole_iterations_that_would_take_too_long_are_left_out(results: dict[str, list[Any]]) -> None:
     assert all(row["iteration"] is not None for row in results["denoising"])
-    settings = BenchmarkSettings(**{**TINY, "engines": ("cpu",), "robots": (2,), "iteration_limit": 1e-6})
+    settings = BenchmarkSettings(**{**TINY, "engines": ("cpu",), "num_robots": (2,), "iteration_limit": 1e-6})
     _, _, work = next(parts(settings))
     row = work()
     assert row["iteration"] is None
@@ -123,7 +131,7 @@ def test_report_files(results: dict[str, list[Any]], tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"bench.json", "bench.md"}
     document = json.loads((tmp_path / "bench.json").read_text())
     assert document["format"] == report.FORMAT
-    assert document["settings"]["robots"] == [2, 3]
+    assert document["settings"]["num_robots"] == [2, 3]
     assert document["machine"]["processor"]
     assert document["machine"]["libraries"]["numba"]
     step = results["denoising"][0]["step"]
