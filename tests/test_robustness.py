@@ -27,7 +27,7 @@ from d4orm_planners.evaluation import pool as pool_module
 from d4orm_planners.evaluation import store as store_module
 from d4orm_planners.evaluation import trials as trials_module
 from d4orm_planners.evaluation.evaluate import run_study
-from d4orm_planners.evaluation.report import robustness_markdown, write_robustness
+from d4orm_planners.evaluation.report import HEADER, markdown, write_robustness
 from d4orm_planners.evaluation.store import APPLICATION_ID, STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import SuccessRate, success_rate, success_rates, wilson_interval
@@ -390,7 +390,7 @@ def test_an_error_is_a_row_and_is_tried_again(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(trials_module, "make_policy", lambda name, **settings: Unlucky())
     rates = rates_of(["goal"], tmp_path, **TINY)
     assert [(row.trials, row.errors, row.error) for row in rates] == [(2, 1, "RuntimeError: out of luck")] * 2
-    assert "- `goal`: RuntimeError: out of luck" in robustness_markdown(rates)
+    assert "- `goal`: RuntimeError: out of luck" in markdown(rates)
     monkeypatch.undo()
     rates = rates_of(["goal"], tmp_path, **TINY)
     assert [(row.trials, row.errors) for row in rates] == [(2, 0)] * 2
@@ -405,7 +405,7 @@ def test_ctrl_c_keeps_what_was_done(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         return run_job(job)
 
     monkeypatch.setattr(pool_module, "run_job", interrupted)
-    arguments = (
+    arguments = [
         "--policies",
         "goal",
         "--num-robots",
@@ -416,7 +416,7 @@ def test_ctrl_c_keeps_what_was_done(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         "0,0.3",
         "--workers",
         "1",
-    )
+    ]
     status, _, err = d4orm(*arguments)
     assert status == 130
     assert "the same command goes on from there" in err
@@ -440,18 +440,7 @@ def test_the_number_of_workers_makes_no_difference(tmp_path: Path) -> None:
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, workers: int) -> None:
-    arguments = [
-        "--policies",
-        "goal",
-        "--num-robots",
-        "8",
-        "--seeds",
-        "60",
-        "--control-noise-std",
-        "0,0.1",
-        "--out",
-        str(tmp_path),
-    ]
+    arguments = f"--policies goal --num-robots 8 --seeds 60 --control-noise-std 0,0.1 --out {tmp_path}".split()
     command = [sys.executable, "-m", "d4orm_planners.cli", "robustness", *arguments, "--workers", str(workers), "-q"]
     process = subprocess.Popen(command)
     deadline = time.monotonic() + 120
@@ -507,12 +496,12 @@ def test_the_files(d4orm, tmp_path: Path) -> None:
 
 def test_the_table_row_by_row(tmp_path: Path) -> None:
     rates = [success_rate([trial(0, wall_time=0.25), trial(1, success=False, collided=2)])]
-    assert robustness_markdown(rates).splitlines() == [
+    assert markdown(rates).splitlines() == [
         "### circle, 2 robots, holonomic2d",
         "",
-        "| policy | noise | success | 95% interval | contact | not in time | errors | travel time, s | planning, s |",
-        "|---|---|---|---|---|---|---|---|---|",
-        "| goal | 0.1 | 1 of 2 (50%) | 9% to 91% | 1 | 0 | 0 | 5.00 | 0.38 |",
+        f"| {' | '.join(HEADER)} |",
+        f"|{'---|' * len(HEADER)}",
+        "| goal | 0.1 | 1 of 2 (50%) | 9% to 91% | 0 | 1 | 0 | 0 | 5.00 | 0.38 | 0.062 (-0.202 to 0.327) |",
     ]
     paths = write_robustness(tmp_path, rates)
     assert sorted(path.name for path in paths) == sorted(path.name for path in tmp_path.iterdir())

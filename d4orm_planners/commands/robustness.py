@@ -21,10 +21,10 @@ class RobustnessOptions(StudyOptions):
 def robustness(options: RobustnessOptions) -> None:
     """Measure how often policies succeed when their controls are executed with noise."""
     from d4orm_planners.commands.progress import tell_results
-    from d4orm_planners.evaluation.report import robustness_markdown, write_robustness
+    from d4orm_planners.evaluation.report import markdown, write_robustness
 
     rates = options.run()
     written = write_robustness(options.out, rates)
     if not options.quiet:
-        tell_results(robustness_markdown(rates), written)
+        tell_results(markdown(rates), written)
     require_trials(rates)

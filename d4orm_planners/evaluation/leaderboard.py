@@ -53,9 +53,8 @@ def _groups(trials: Sequence[Trial]) -> dict[tuple[str, str, int, str, float], l
     groups: dict[tuple[str, str, int, str, float], list[Trial]] = {}
     for trial in trials:
         label = labels[trial.label, trial.config]
-        groups.setdefault((label, trial.scenario, trial.num_robots, trial.model, trial.control_noise_std), []).append(
-            trial
-        )
+        key = (label, trial.scenario, trial.num_robots, trial.model, trial.control_noise_std)
+        groups.setdefault(key, []).append(trial)
     return {key: groups[key] for key in sorted(groups, key=lambda key: (*key[1:], key[0]))}
 
 

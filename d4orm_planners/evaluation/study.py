@@ -46,7 +46,10 @@ class Study:
             ValueError: For an unknown name or setting, a number that makes no sense, or nothing to do.
             ImportError: If a policy needs a library that is not installed.
         """
-        levels = tuple(dict.fromkeys(map(_checked_noise, _several(self.control_noise_std))))
+        noise = (
+            positive_number(std, "control_noise_std", zero_allowed=True) for std in _several(self.control_noise_std)
+        )
+        levels = tuple(dict.fromkeys(noise))
         if not levels:
             raise ValueError("control_noise_std is empty; give at least one level")
         policies, seeds = self.configurations(), _checked_seeds(self.seeds)
@@ -155,10 +158,6 @@ def _load(path: Path) -> Problem:
     problem = load_problem(path)
     # Two files that give no name still differ.
     return problem.replace(name=path.stem) if problem.name == "custom" else problem
-
-
-def _checked_noise(level: float) -> float:
-    return positive_number(level, "control_noise_std", zero_allowed=True)
 
 
 def _checked_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
