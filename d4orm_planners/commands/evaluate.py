@@ -9,14 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from d4orm_planners.commands.dataclass_options import takes
-from d4orm_planners.commands.inputs import (
-    MOST_SEEDS,
-    decimals,
-    make_folder,
-    names,
-    numbers,
-    parse_settings,
-)
+from d4orm_planners.commands.inputs import MOST_SEEDS, decimals, make_folder, names, numbers, parse_settings
 from d4orm_planners.commands.options import Quiet, TimeLimit
 
 if TYPE_CHECKING:
