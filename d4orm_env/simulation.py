@@ -12,13 +12,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env._episode_record import EpisodeRecord
 from d4orm_env.core.arrays import BoolArray, FloatArray, frozen_array, whole_number
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import inverse_initial_distance
 from d4orm_env.engine.base import StepResult, WorldEngine
 from d4orm_env.env_inputs import checked_cycles, checked_states, noise_std
+from d4orm_env.episode_record import EpisodeRecord
 from d4orm_env.joint_state import JointState, join_state, state_bounds
 from d4orm_env.lifelong import fresh_goal, goal_region, reached_goals
 from d4orm_env.options import EnvOptions
@@ -208,7 +208,7 @@ class Simulation:
         return join_state(JointState(self.states, self.arrays.goal, self.controls, self.arrived, self.steps))
 
     def metrics(self) -> dict[str, float]:
-        """The episode so far in numbers; see :meth:`d4orm_env._episode_record.EpisodeRecord.metrics`."""
+        """The episode so far in numbers; see :meth:`d4orm_env.episode_record.EpisodeRecord.metrics`."""
         self.require_reset()
         return self.record.metrics()
 

@@ -11,7 +11,6 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env._episode_record import EpisodeCounts, episode_metrics
 from d4orm_env._vector_infos import final_infos, masked
 from d4orm_env._vector_inputs import checked_autoreset_mode, reset_mask, world_seeds
 from d4orm_env._world_draws import OWN_ARRAYS, WorldDraws
@@ -19,6 +18,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, whole_number
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.env_inputs import checked_states, joint_controls
+from d4orm_env.episode_record import EpisodeCounts, episode_metrics
 from d4orm_env.joint_env import joint_spaces
 from d4orm_env.options import EnvOptions
 from d4orm_env.rewards import RewardInput, along_ways, compute_rewards
@@ -244,7 +244,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         return np.concatenate([part.reshape(self.num_envs, -1).astype(np.float32) for part in parts], axis=1)
 
     def metrics(self) -> dict[str, NDArray[np.float64]]:
-        """``(B,)`` numbers of the present episodes; see :func:`d4orm_env._episode_record.episode_metrics`.
+        """``(B,)`` numbers of the present episodes; see :func:`d4orm_env.episode_record.episode_metrics`.
 
         Raises:
             RuntimeError: Before the first reset.

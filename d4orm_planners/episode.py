@@ -27,7 +27,7 @@ class Episode:
     Attributes:
         problem: What the environment ran.
         trajectory: The executed motion, ``T`` steps long; ``T`` is at most the horizon.
-        metrics: The environment's own, see :meth:`d4orm_env._episode_record.EpisodeRecord.metrics`, and
+        metrics: The environment's own, see :meth:`d4orm_env.episode_record.EpisodeRecord.metrics`, and
             ``mean_squared_jerk``, see :func:`d4orm_env.core.metrics.mean_squared_jerk`.
         observations: Observations of all agents at the reset and after every step.
         infos: Infos likewise.

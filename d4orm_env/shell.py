@@ -40,7 +40,7 @@ class EnvironmentShell:
         return self._simulation.state()
 
     def metrics(self) -> dict[str, float]:
-        """The episode so far in numbers; see :meth:`d4orm_env._episode_record.EpisodeRecord.metrics`.
+        """The episode so far in numbers; see :meth:`d4orm_env.episode_record.EpisodeRecord.metrics`.
 
         Raises:
             RuntimeError: Before the first reset.
