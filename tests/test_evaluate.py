@@ -458,6 +458,7 @@ def test_the_leaderboard_holds_everything_in_the_store(d4orm, tmp_path: Path) ->
     assert d4orm("leaderboard", ".", "--out", "page.md", "--deadlines", "0.2,1") == (0, "wrote page.md\n", "")
     page = (tmp_path / "page.md").read_text()
     assert page.startswith("# Leaderboard\n")
+    assert page.index("### holonomic2d, no noise") < page.index("### holonomic2d, noise 0.1")
     assert "| policy | circle, 2 robots, holonomic2d | random, 2 robots, holonomic2d |" in page
     assert "| orca | 100% (34% to 100%) | - |" in page
     ranked = [line.split(" | ")[0] for line in page.splitlines() if "%) | " in line and " of " in line]

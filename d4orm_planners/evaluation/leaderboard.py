@@ -74,10 +74,10 @@ def _labels(trials: Iterable[Trial]) -> dict[tuple[str, str], str]:
 
 
 def _matrices(rates: Sequence[SuccessRate]) -> list[str]:
-    """Policies against scenarios, one table per level of noise."""
-    columns = panels(rates)
+    """Policies against scenarios, one table per robot model and level of noise."""
     blocks = []
-    for noise in sorted({rate.control_noise_std for rate in rates}):
+    for model, noise in sorted({(rate.model, rate.control_noise_std) for rate in rates}):
+        columns = panels(rate for rate in rates if rate.model == model)
         found = {
             (rate.label, title): share(rate)
             for title, panel in columns.items()
@@ -88,7 +88,8 @@ def _matrices(rates: Sequence[SuccessRate]) -> list[str]:
             (label, *(found.get((label, title), "-") for title in columns))
             for label in sorted({label for label, _ in found})
         ]
-        blocks.append(table("No noise" if noise == 0 else f"Noise {noise:g}", ("policy", *columns), rows))
+        title = f"{model}, noise {noise:g}" if noise else f"{model}, no noise"
+        blocks.append(table(title, ("policy", *columns), rows))
     return blocks
 
 
