@@ -555,6 +555,7 @@ def test_settings_reach_the_policies_that_have_them(d4orm, monkeypatch: pytest.M
         (("--control-noise-std", "0,nan"), "control_noise_std is nan"),
         (("--control-noise-std", "none"), "--control-noise-std 'none' is not a list of numbers"),
         (("--seeds", "0"), "seeds is empty"),
+        (("--trials", "0"), "seeds is empty"),
         (("--seeds", "99999999999"), "1000000"),
         (("--workers", "0"), "workers is 0"),
         (("--set", "speed=1"), "'speed' is a setting of none of the policies goal"),
