@@ -6,7 +6,7 @@ import json
 import os
 import sqlite3
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import astuple, dataclass, fields
 from itertools import chain
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 APPLICATION_ID = 0x64346F72
 """Marks the file as one of ours, in its header ("d4or")."""
-VERSION = 4
+VERSION = 5
 STORE = "trials.sqlite"
 """Name of the file in a folder of results."""
 LARGEST_NUMBER = 2**63 - 1
@@ -120,17 +120,10 @@ class Trial:
         return TrialKey(self.policy, self.config, self.problem, self.control_noise_std, self.seed)
 
 
+_NAMES = tuple(field.name for field in fields(Trial))
+_KEY = ", ".join(TrialKey._fields)
 _FORMER = {"num_robots": "robots", "control_noise_std": "noise"}
-"""Columns that keep the names they have in the files that are out there."""
-
-
-def _columns(names: Iterable[str]) -> tuple[str, ...]:
-    return tuple(_FORMER.get(name, name) for name in names)
-
-
-_FIELDS = tuple(field.name for field in fields(Trial))
-_NAMES, _KEYS = _columns(_FIELDS), _columns(TrialKey._fields)
-_KEY = ", ".join(_KEYS)
+"""Columns that had other names in version 4."""
 _TRUTHS = ("success", "verified")
 _JSON = {"config": dict, "versions": dict, "machine": dict, "history": list}
 _SQL = {"str": "TEXT", "int": "INTEGER", "float": "REAL", "bool": "INTEGER"}
@@ -144,15 +137,13 @@ _PYTHON: Mapping[str, tuple[type, ...]] = {
 _TYPES = {field.name: str(field.type).split(" | ") for field in fields(Trial)}
 _KINDS = {name: tuple(chain(*(_PYTHON[kind] for kind in kinds))) for name, kinds in _TYPES.items()}
 """What may be in a row, by column."""
-_COLUMNS = (
-    f"{name} {_SQL[kinds[0]]}{'' if 'None' in kinds else ' NOT NULL'}" for name, kinds in zip(_NAMES, _TYPES.values())
-)
+_COLUMNS = (f"{name} {_SQL[kinds[0]]}{'' if 'None' in kinds else ' NOT NULL'}" for name, kinds in _TYPES.items())
 _CREATE = f"CREATE TABLE trials ({', '.join(_COLUMNS)}, PRIMARY KEY ({_KEY})) WITHOUT ROWID"
 # What has run to its end stays as it is; only a trial that failed may be tried again.
 _ADD = (
     f"INSERT INTO trials ({', '.join(_NAMES)}) VALUES ({', '.join('?' * len(_NAMES))}) ON CONFLICT ({_KEY}) "
     + "DO UPDATE SET "
-    + ", ".join(f"{name} = excluded.{name}" for name in _NAMES if name not in _KEYS)
+    + ", ".join(f"{name} = excluded.{name}" for name in _NAMES if name not in TrialKey._fields)
     + " WHERE trials.error != ''"
 )
 
@@ -215,8 +206,10 @@ class TrialStore:
     def trials(self) -> list[Trial]:
         """All trials, in order of key."""
         with self._connection() as connection:
-            rows = connection.execute(f"SELECT {', '.join(_NAMES)} FROM trials ORDER BY {_KEY}").fetchall()
-        return [self._trial(number, dict(zip(_FIELDS, row))) for number, row in enumerate(rows)]
+            former = {} if _pragma(connection, "user_version") == VERSION else _FORMER
+            columns = ", ".join(f"{former.get(name, name)} AS {name}" for name in _NAMES)
+            rows = connection.execute(f"SELECT {columns} FROM trials ORDER BY {_KEY}").fetchall()
+        return [self._trial(number, dict(zip(_NAMES, row))) for number, row in enumerate(rows)]
 
     def _trial(self, number: int, values: dict[str, Any]) -> Trial:
         """A row as a trial. SQLite keeps truth values as numbers, and whatever it is given in any column."""
@@ -263,7 +256,7 @@ class TrialStore:
         return sqlite3.connect(name, uri=True, timeout=PATIENCE, isolation_level=None)
 
     def _make(self, connection: sqlite3.Connection) -> None:
-        """Make the table in a new file."""
+        """Make the table in a new file, or rename the columns of one from before."""
         if _pragma(connection, "application_id") != APPLICATION_ID:
             # One transaction, so that of two processes that find no file one makes the table.
             connection.execute("BEGIN IMMEDIATE")
@@ -272,12 +265,20 @@ class TrialStore:
                 connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
                 connection.execute(f"PRAGMA user_version = {VERSION}")
             connection.execute("COMMIT")
+        elif _pragma(connection, "user_version") == VERSION - 1:
+            connection.execute("BEGIN IMMEDIATE")
+            if _pragma(connection, "user_version") == VERSION - 1:  # and no other process has been here meanwhile
+                for name, former in _FORMER.items():
+                    connection.execute(f"ALTER TABLE trials RENAME COLUMN {former} TO {name}")
+                connection.execute(f"PRAGMA user_version = {VERSION}")
+            connection.execute("COMMIT")
 
     def _check(self, connection: sqlite3.Connection) -> None:
         """Refuse a file of another kind or version, which stays untouched."""
         if _pragma(connection, "application_id") != APPLICATION_ID:
             raise self._foreign("it is another program's database")
-        if (version := _pragma(connection, "user_version")) != VERSION:
+        readable = (VERSION, VERSION - 1) if self._read_only else (VERSION,)
+        if (version := _pragma(connection, "user_version")) not in readable:
             raise self._foreign(f"it has version {version}, and this program reads version {VERSION}")
 
     def _foreign(self, reason: str) -> ValueError:
