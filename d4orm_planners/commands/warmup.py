@@ -47,7 +47,9 @@ class WarmupReport:
 
 
 TEAMS = (*((model, model) for model in COMMON), ("holonomic2d", "differential_drive"))
-"""The smallest teams of common models that have a sampling kernel of their own."""
+"""The smallest teams of common models that have kernels of their own."""
+
+_RULES = SamplingRules(weights=SoftmaxWeights(1.0))
 
 
 def compile_for_planning(
@@ -78,10 +80,16 @@ def _in_another_process(call: str) -> subprocess.Popen[bytes]:
 def roll_out_once(models: tuple[str, ...], *, drives: bool = True) -> None:
     """Roll out a plan of the smallest problem of a team of these models on the CPU, and drive straight.
 
-    Samples are weighed here too, and first: the process that samples needs that last, and has more to do.
+    Samples are weighed and averaged here too, and first: the process that scores them, which takes longer, needs that
+    last.
     """
-    SoftmaxWeights(1.0)(np.zeros((1, 2), np.float32), np)
+    from d4orm_env.engine.cpu import Sampling
+    from d4orm_env.engine.threads import Threads
+
     problem = _smallest_problem(models)
+    rewards = np.zeros((1, 2), np.float32)
+    run = Sampling(SamplingTask(problem, _no_controls(problem)), _RULES, rewards.size, 0, Threads(1))
+    run.moments(_RULES.weights(rewards, np), with_second=False)
     get_engine("cpu").rollout(problem, _no_controls(problem))
     if drives:
         prepare_drives(problem)
@@ -92,8 +100,7 @@ def sample_once(teams: tuple[tuple[str, ...], ...]) -> None:
     for models in teams:
         problem = _smallest_problem(models)
         task = SamplingTask(problem, _no_controls(problem))
-        rules = SamplingRules(weights=SoftmaxWeights(1.0))
-        get_engine("cpu").prepare(task, rules, np.ones(1, np.float32), 2)
+        get_engine("cpu").prepare(task, _RULES, np.ones(1, np.float32), 2)
 
 
 def warm_up() -> WarmupReport:
@@ -175,5 +182,6 @@ def _kernels() -> list[Any]:
     modules = [import_module(f"{engine.__name__}.{module.name}") for module in pkgutil.iter_modules(engine.__path__)
                if module.name != "jax"]  # fmt: skip
     found = {name: value for module in modules for name, value in vars(module).items() if isinstance(value, Dispatcher)}
-    kernels = [*found.values(), *world_kernels(COMMON), *map(score_kernel, TEAMS), *map(drive_kernel, COMMON)]
+    worlds = {kernel for models in TEAMS for kernel in world_kernels(models)}
+    kernels = [*found.values(), *worlds, *map(score_kernel, TEAMS), *map(drive_kernel, COMMON)]
     return [kernel for kernel in kernels if kernel.stats.cache_path is not None]
