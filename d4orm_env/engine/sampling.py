@@ -335,7 +335,7 @@ def _score_tile(
                 rest = num_steps - (first + count)
                 _add_standing(goals[k], inverse[k], np.float32(rest), robot)
             enclose(k, radius[k] + HALF * margin, dimension, places, boxes)
-            if near_static(arrays, k, static, boxes):
+            if near_static(arrays, k, static, boxes, scratch.spare):
                 for step in range(count):
                     rows = own_places[step * dimension * TILE : (step + 1) * dimension * TILE]
                     touch = obstacles.near_obstacles(arrays, radius[k] + margin, rows, scratch.spare)

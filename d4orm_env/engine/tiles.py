@@ -28,7 +28,7 @@ ZERO = np.float32(0)
 ONE = np.float32(1)
 
 # First rows of a robot in the workspace. A power of two in all would map the same row of every robot to the same cache
-# set, so that one is left unused.
+# set.
 STATE, CONTROL, GOAL, DOCKED, DISTANCE2, SPARE, ROWS = 0, 6, 10, 13, 14, 15, 17
 STRIDE = ROWS * TILE
 

@@ -29,6 +29,7 @@ from d4orm_env.engine.tiles import (
     ONE,
     OPTIONS,
     ROBOT,
+    ROWS,
     SPARE,
     STATE,
     STRIDE,
@@ -49,10 +50,13 @@ for _function in (
     observation._see_robots,
     observation._see_obstacles,
     observation.insert_nearest,
+    observation._comes_before,
     observation._find_nearest_robots,
     observation._find_nearest_obstacles,
-    observation._insert_box,
-    observation._insert_triangle,
+    observation._list_of,
+    observation._point_to,
+    observation._distance_to_box,
+    observation._gap_to_triangle,
 ):
     register_jitable(**INLINED)(_function)
 
@@ -117,7 +121,7 @@ def _judge(
         tiles.mark_pairs(arrays, extra, w, near)
         for k in range(num_robots):
             robot = w[k * STRIDE : (k + 1) * STRIDE]
-            places, spare = robot[STATE * TILE : CONTROL * TILE], robot[SPARE * TILE : (SPARE + 1) * TILE]
+            places, spare = robot[STATE * TILE : CONTROL * TILE], robot[SPARE * TILE : ROWS * TILE]
             near[k, OBSTACLE] |= obstacles.near_obstacles(arrays, arrays.radius[k] + extra, places, spare)
         for s in range(min(TILE, collided.shape[0] - first)):
             for k in range(num_robots):
@@ -232,7 +236,7 @@ def _allocate_sensed(num_robots: Any, dimension: Any, num_neighbors: Any, num_ob
     return observation.Sensed(
         np.empty((num_robots, dimension), np.float32), np.empty((num_robots, dimension), np.float32),
         np.empty((num_robots, 2), np.float32), np.empty(num_robots, np.float32),
-        np.empty((num_neighbors, 2), np.float32), np.empty((num_obstacles, 1 + dimension), np.float32),
+        np.empty((num_neighbors, 2), np.float32), np.empty((num_obstacles, 2), np.float32),
     )  # fmt: skip
 
 
