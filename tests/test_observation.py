@@ -258,7 +258,7 @@ def balls(random: np.random.Generator, dimension: int) -> Any:
 RANDOM = np.random.default_rng(0)
 SCATTERED = {
     "boxes and circles": scattered(2, boxes=boxes(RANDOM, 2), circles=balls(RANDOM, 2)),
-    "polygons": scattered(2, polygons=[np.array([(0, 0), (1, 0.2), (0.3, 0.8)]) + (i - 4, -i % 3) for i in range(8)]),
+    "polygons": scattered(2, polygons=[np.add([(0, 0), (1, 0.2), (0.3, 0.8)], (i - 4, -i % 3)) for i in range(8)]),
     "spheres and boxes": scattered(3, boxes=boxes(RANDOM, 3), spheres=balls(RANDOM, 3)),
     "cylinders": scattered(3, cylinders=balls(RANDOM, 2)),
     "cylinders and spheres": scattered(3, cylinders=balls(RANDOM, 2)[:20], spheres=balls(RANDOM, 3)),

@@ -15,7 +15,6 @@ from d4orm_env.core.polygon import check_polygon, triangulate
 from d4orm_env.core.shapes import Shapes
 from d4orm_env.core.world_index import WorldIndex, build_index, nearest_distance
 
-
 _LEVELS = 3
 """Grids of an index that finds obstacles for robots wherever they drive; the last is 16 times as wide as the first."""
 

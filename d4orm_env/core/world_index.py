@@ -239,7 +239,7 @@ class _Turn(NamedTuple):
     def of(cls, shapes: Shapes) -> _Turn:
         lower, upper = shapes.extent()
         ended = np.isfinite(shapes.boxes[:, : shapes.dimension])
-        axes = ended.all(axis=0) if len(ended) else np.ones(shapes.dimension, bool)
+        axes: NDArray[np.bool_] = np.all(ended, axis=0)
         # Where some end and others do not, the directions may be anything.
         radius = np.inf if (ended.any(axis=0) & ~axes).any() else float(np.linalg.norm((upper - lower)[axes])) / 2
         return cls(axes, (lower + upper) / 2, radius)

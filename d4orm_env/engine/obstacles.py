@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba.cpython.unsafe.numbers import trailing_zeros
+from numba.cpython.unsafe import numbers
 
 from d4orm_env.core import collision
 from d4orm_env.engine.lanes import CHUNK, TILE, at_most, use_wide_registers
@@ -17,6 +17,9 @@ from d4orm_env.engine.tiles import NOWHERE, ONE, OPS, ZERO, compiled, inlined, t
 
 _HALF = np.float32(0.5)
 _BIT = np.uint64(1)
+
+_trailing_zeros: Any = numbers.trailing_zeros
+"""Its calls in compiled code lack the first argument, which type checkers cannot know."""
 
 
 @inlined
@@ -78,10 +81,11 @@ def _near_indexed(index: Any, boxes: Any, triangles: Any, reach: Any, places: An
     sure = at_most(spare, 0, reach - index.slack)
     unsure = near & ~sure
     while unsure != NOWHERE:
-        s = np.int64(trailing_zeros(unsure))
+        sample: Any = np.int64(_trailing_zeros(unsure))
         unsure &= unsure - _BIT
-        if _touches(index, boxes, triangles, cells[s], reach, places[s], places[TILE + s], places[third + s]):
-            sure |= _BIT << np.uint64(s)
+        x, y, z = places[sample], places[TILE + sample], places[third + sample]
+        if _touches(index, boxes, triangles, cells[sample], reach, x, y, z):
+            sure |= _BIT << np.uint64(sample)
     return sure
 
 
