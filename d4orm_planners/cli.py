@@ -187,7 +187,7 @@ def run(
     env.close()
     draw(problem, episode.trajectory, picture, animation)
     if not quiet:
-        print_table("Execution", episode_rows(episode.metrics))
+        print_table("Execution", episode_rows(episode))
     if not episode.metrics["success"]:
         raise typer.Exit(1)
 
@@ -312,7 +312,7 @@ def _execute(plan: Plan, seed: int) -> Episode:
     env.close()
     report = verify(plan.problem, plan.controls)
     rows = [
-        *episode_rows(episode.metrics),
+        *episode_rows(episode),
         ("verified", "yes" if report.ok else "no: " + "; ".join(str(violation) for violation in report.violations[:3])),
         ("closest approach", f"{report.min_separation * 100:.1f} cm between surfaces"),
     ]

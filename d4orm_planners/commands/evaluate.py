@@ -18,7 +18,7 @@ from d4orm_planners.commands.inputs import (
     numbers,
     parse_settings,
 )
-from d4orm_planners.commands.options import Model, Quiet, TimeLimit
+from d4orm_planners.commands.options import Model, Quiet, ScenarioSettings, TimeLimit
 
 if TYPE_CHECKING:
     from d4orm_planners.evaluation.summary import SuccessRate
@@ -48,6 +48,7 @@ class StudyOptions:
         str | None, typer.Option("--robots", "-k", help="Team sizes, as 4,8; the scenario's own by default.")
     ] = None
     model: Model = None
+    scenario_settings: ScenarioSettings = None
     noise: Noise = "0"
     settings: Annotated[
         list[str] | None,
@@ -82,6 +83,7 @@ class StudyOptions:
             control_noise_std=decimals("--noise", self.noise),
             num_robots=numbers("--robots", self.robots) or (None,),
             model=self.model,
+            scenario_settings=parse_settings(self.scenario_settings, "--scenario-set"),
             time_limit=self.time_limit,
         )
         make_folder(self.out)

@@ -50,7 +50,7 @@ class Trial:
 
     Attributes:
         label: What the policy with these settings was called.
-        scenario: Name of the scenario.
+        scenario: Name of the scenario, with the arguments that it was given.
         robots: Team size.
         model: Model names of the team, each once, joined by ``+``.
         dt: Time step [s].
@@ -64,6 +64,8 @@ class Trial:
         arrived: Robots that arrived.
         travel_time: Mean arrival time [s], with the time of the whole episode for a robot that did not arrive.
         makespan: Latest arrival time [s], likewise.
+        stretch: Way travelled over the shortest free way, see :func:`d4orm_env.core.metrics.mean_stretch`; ``None`` if
+            nobody arrived, and in rows that older versions wrote.
         reward: Mean over steps and robots.
         mean_squared_jerk: See :func:`d4orm_env.core.metrics.mean_squared_jerk` [m^2/s^6].
         steps: Steps of the episode.
@@ -101,6 +103,7 @@ class Trial:
     arrived: int = 0
     travel_time: float | None = None
     makespan: float | None = None
+    stretch: float | None = None
     reward: float | None = None
     mean_squared_jerk: float | None = None
     steps: int = 0
@@ -135,8 +138,8 @@ _PYTHON: Mapping[str, tuple[type, ...]] = {
 _TYPES = {field.name: str(field.type).split(" | ") for field in fields(Trial)}
 _KINDS = {name: tuple(chain(*(_PYTHON[kind] for kind in kinds))) for name, kinds in _TYPES.items()}
 """What may be in a row, by column."""
-_COLUMNS = (f"{name} {_SQL[kinds[0]]}{'' if 'None' in kinds else ' NOT NULL'}" for name, kinds in _TYPES.items())
-_CREATE = f"CREATE TABLE trials ({', '.join(_COLUMNS)}, PRIMARY KEY ({_KEY})) WITHOUT ROWID"
+_COLUMNS = {name: f"{name} {_SQL[kinds[0]]}{'' if 'None' in kinds else ' NOT NULL'}" for name, kinds in _TYPES.items()}
+_CREATE = f"CREATE TABLE trials ({', '.join(_COLUMNS.values())}, PRIMARY KEY ({_KEY})) WITHOUT ROWID"
 # What has run to its end stays as it is; only a trial that failed may be tried again.
 _ADD = (
     f"INSERT INTO trials ({', '.join(_NAMES)}) VALUES ({', '.join('?' * len(_NAMES))}) ON CONFLICT ({_KEY}) "
@@ -166,6 +169,7 @@ class TrialStore:
                 self._make(connection)
             self._check(connection)
             if not read_only:
+                _add_columns(connection)
                 _use_wal(connection)
 
     @classmethod
@@ -204,7 +208,9 @@ class TrialStore:
     def trials(self) -> list[Trial]:
         """All trials, in order of key."""
         with self._connection() as connection:
-            rows = connection.execute(f"SELECT {', '.join(_NAMES)} FROM trials ORDER BY {_KEY}").fetchall()
+            missing = _missing_columns(connection)
+            columns = (f"NULL AS {name}" if name in missing else name for name in _NAMES)
+            rows = connection.execute(f"SELECT {', '.join(columns)} FROM trials ORDER BY {_KEY}").fetchall()
         return [self._trial(number, dict(zip(_NAMES, row))) for number, row in enumerate(rows)]
 
     def _trial(self, number: int, values: dict[str, Any]) -> Trial:
@@ -276,6 +282,19 @@ class TrialStore:
         return ValueError(
             f"trial store {self.path} is damaged ({reason}); put a copy in its place, or move it away to begin anew"
         )
+
+
+def _missing_columns(connection: sqlite3.Connection) -> set[str]:
+    """Columns that the table lacks, because an older version made it."""
+    return set(_NAMES) - {row[1] for row in connection.execute("PRAGMA table_info(trials)")}
+
+
+def _add_columns(connection: sqlite3.Connection) -> None:
+    if _missing_columns(connection):
+        connection.execute("BEGIN IMMEDIATE")
+        for name in _missing_columns(connection):
+            connection.execute(f"ALTER TABLE trials ADD COLUMN {_COLUMNS[name]}")
+        connection.execute("COMMIT")
 
 
 def _use_wal(connection: sqlite3.Connection) -> None:

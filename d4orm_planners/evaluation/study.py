@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -36,6 +35,7 @@ class Study:
     control_noise_std: float | Iterable[float] = 0.0
     num_robots: int | Iterable[int | None] | None = None
     model: str | None = None
+    scenario_settings: Mapping[str, object] = field(default_factory=dict)
     time_limit: float | None = None
 
     def groups(self) -> list[list[Job]]:
@@ -51,8 +51,8 @@ class Study:
             raise ValueError("noise is empty; give at least one level")
         policies, seeds = self.configurations(), _checked_seeds(self.seeds)
         return [
-            [Job(policy, problem, seed, levels) for seed, problem in zip(seeds, problems)]
-            for problems in self._problems(seeds)
+            [Job(policy, problem, scenario, seed, levels) for seed, problem in zip(seeds, problems)]
+            for scenario, problems in self._problems(seeds)
             for policy in policies
         ]
 
@@ -83,24 +83,35 @@ class Study:
             raise ValueError(f"policies[{label!r}] has the name of another policy; give it another label")
         return choice
 
-    def _problems(self, seeds: Sequence[int]) -> list[list[Problem]]:
-        """One list per scenario and team size, with a problem for every seed."""
+    def _problems(self, seeds: Sequence[int]) -> list[tuple[str, list[Problem]]]:
+        """A name and a list per scenario and team size, with a problem for every seed."""
         sizes = tuple(dict.fromkeys(_several(self.num_robots)))
+        for name, own in (("num_robots", "num_robots"), ("model", "model"), ("seed", "seeds")):
+            if name in self.scenario_settings:
+                raise ValueError(f"scenario_settings has {name!r}; give {own!r} itself instead")
+        said = ", ".join(f"{name}={value}" for name, value in self.scenario_settings.items())
         cells = []
         named = False
         for scenario in dict.fromkeys(_several(self.scenarios)):
             if isinstance(scenario, Problem):
-                cells.append([scenario] * len(seeds))
+                cells.append((scenario.name, [scenario] * len(seeds)))
             elif is_scenario_file(scenario):
-                cells.append([_load(Path(scenario))] * len(seeds))
+                problem = _load(Path(scenario))
+                cells.append((problem.name, [problem] * len(seeds)))
             else:
                 named = True
-                make = partial(make_problem, scenario, model=self.model)
-                cells += [[make(num_robots=size, seed=seed) for seed in seeds] for size in sizes]
+                for size in sizes:
+                    problems = [
+                        make_problem(scenario, num_robots=size, seed=seed, model=self.model, **self.scenario_settings)
+                        for seed in seeds
+                    ]
+                    cells.append((f"{problems[0].name} ({said})" if said else problems[0].name, problems))
         if not cells:
             raise ValueError("scenarios or num_robots is empty; give at least one of each")
-        if not named and (self.model is not None or any(size is not None for size in sizes)):
-            raise ValueError("num_robots and model do not go with scenario files; change them in the files")
+        if not named and (self.model is not None or self.scenario_settings or any(size is not None for size in sizes)):
+            raise ValueError(
+                "num_robots, model and scenario_settings do not go with scenario files; change them in the files"
+            )
         return cells
 
 
