@@ -52,6 +52,8 @@ def fresh_goal(
 ) -> FloatArray:
     """A random goal where ``robot`` would keep the margin to every body, every other goal, obstacles and bounds.
 
+    Among obstacles it is one that has a free way to the robot's first goal, unless its start has none.
+
     Args:
         problem: The problem; its goals are not looked at.
         robot: Who gets the goal.
@@ -60,7 +62,7 @@ def fresh_goal(
         random: Where the draws come from.
 
     Returns:
-        ``(d,)`` the goal, uniform over the free part of :func:`goal_region`.
+        ``(d,)`` the goal, uniform over the free and reachable part of :func:`goal_region`.
 
     Raises:
         RuntimeError: If 5120 draws find no free place.
@@ -78,6 +80,8 @@ def fresh_goal(
         free = problem.world.clearance(places) > radius[robot] + problem.margin
         gaps = np.linalg.norm(places[:, None] - bodies, axis=-1) - keep_off
         free &= (gaps > 0).all(axis=1)
+        if free.any() and problem.world.num_obstacles and np.isfinite(problem.ways.length[robot]):
+            free[free] = np.isfinite(problem.ways.distance_from(robot, places[free]))
         if free.any():
             place: FloatArray = places[np.argmax(free)].astype(np.float32)
             return place

@@ -67,6 +67,12 @@ class Ways:
         """``(..., K)`` float64 length of the ways from points ``(..., K, d)`` to the goals [m]."""
         return self._look(points)[1]
 
+    def distance_from(self, robot: int, places: Floats) -> Floats:
+        """``(Q,)`` float64 length of the ways of one robot from places ``(Q, d)`` to its goal [m]."""
+        if not self._fields:
+            return np.linalg.norm(places - self.problem.goal[robot], axis=1)
+        return self._fields[robot].look(places)[1]
+
     def direction(self, points: ArrayLike) -> Floats:
         """``(..., K, d)`` float64 unit vectors along the ways; zero at a goal and where there is no way."""
         return self.ahead(points)[0]

@@ -11,6 +11,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,7 @@ def test_a_planners_trial_says_everything(tmp_path: Path) -> None:
     assert 0 < stored.wall_time < stored.elapsed  # type: ignore[operator]
     assert 0 < stored.reward < 1  # type: ignore[operator]
     assert stored.mean_squared_jerk > 0  # type: ignore[operator]
+    assert 1 <= stored.stretch == row.stretch < 2  # type: ignore[operator]
     assert row.compute == pytest.approx(stored.wall_time / (stored.steps * 0.1))  # type: ignore[operator]
 
 
@@ -122,6 +124,29 @@ def test_two_configurations_of_one_policy_and_problems_of_all_kinds(tmp_path: Pa
         ("orca", json.loads(trials.Configuration("", "orca", {}).config)["time_horizon"]),
         ("hasty", 3.0),
     }
+
+
+def test_scenarios_with_other_arguments_are_other_trials(tmp_path: Path) -> None:
+    for diameter in (6.0, 7.0):
+        evaluate("goal", out=tmp_path, **TINY, scenario_settings={"diameter": diameter})
+    stored = TrialStore(tmp_path / STORE).trials()
+    assert len(stored) == 4
+    assert {(row.scenario, row.problem) for row in stored} == {
+        (f"circle (diameter={diameter})", make_problem("circle", num_robots=2, diameter=diameter, seed=seed).digest)
+        for diameter in (6.0, 7.0)
+        for seed in range(2)
+    }
+
+
+def test_a_store_without_the_newest_column_is_read_and_gets_it(tmp_path: Path) -> None:
+    store = TrialStore(tmp_path / STORE)
+    store.add(trial(0, stretch=1.5))
+    with closing(sqlite3.connect(store.path)) as connection:
+        connection.execute("ALTER TABLE trials DROP COLUMN stretch")
+        connection.commit()
+    assert TrialStore.existing(tmp_path).trials() == [trial(0, stretch=None)]
+    TrialStore(tmp_path / STORE).add(trial(1, stretch=1.25))
+    assert TrialStore.existing(tmp_path).trials() == [trial(0, stretch=None), trial(1, stretch=1.25)]
 
 
 def test_a_problem_with_two_names_runs_once(tmp_path: Path) -> None:
@@ -416,8 +441,8 @@ def test_a_disk_that_fills_up_while_exporting_is_one_line(
 
 def test_the_table_row_by_row(tmp_path: Path) -> None:
     rows = [
-        trial(0, wall_time=0.25, travel_time=4.0),
-        trial(1, travel_time=6.0),
+        trial(0, wall_time=0.25, travel_time=4.0, stretch=1.25),
+        trial(1, travel_time=6.0, stretch=1.75),
         trial(2, success=False, verified=False, collided=2),
     ]
     write_csv(tmp_path / "trials.csv", [vars(row) for row in rows])
@@ -426,10 +451,10 @@ def test_the_table_row_by_row(tmp_path: Path) -> None:
         "### circle, 2 robots, holonomic2d",
         "",
         "| policy | noise | success | 95% interval | verified | contact | not in time | errors | travel time, s | "
-        "planning, s | computing per s of motion, s |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "stretch | planning, s | computing per s of motion, s |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
         # The interval of two values, 4 and 6: half of it is 12.7062 * sqrt(2) / sqrt(2).
-        "| d4orm | 0 | 2 of 3 (67%) | 21% to 94% | 2 | 1 | 0 | 0 | 5.00 (-7.71 to 17.71) | 0.50 | "
+        "| d4orm | 0 | 2 of 3 (67%) | 21% to 94% | 2 | 1 | 0 | 0 | 5.00 (-7.71 to 17.71) | 1.50 | 0.50 | "
         "0.069 (0.010 to 0.129) |",
     ]
 
@@ -532,7 +557,12 @@ BAD = [
     (("-p", "orca,orca:time_horizon=5"), "policy 'orca,orca' is unknown"),
     (("-s", "square"), "scenario 'square' is unknown"),
     (("-s", "missing.yaml"), "missing.yaml"),
-    (("-s", "good.yaml", "-k", "3"), "num_robots and model do not go with scenario files"),
+    (("-s", "good.yaml", "-k", "3"), "num_robots, model and scenario_settings do not go with scenario files"),
+    (("-s", "good.yaml", "--scenario-set", "dt=0.1"), "scenario_settings do not go with scenario files"),
+    (("--scenario-set", "diameter"), "--scenario-set 'diameter' is not of the form name=value"),
+    (("--scenario-set", "loops=1"), "scenario 'circle' takes no argument 'loops'"),
+    (("--scenario-set", "num_robots=3"), "scenario_settings has 'num_robots'; give 'num_robots' itself"),
+    (("--scenario-set", "seed=3"), "scenario_settings has 'seed'; give 'seeds' itself"),
     (("-k", "0"), "num_robots is 0"),
     (("-k", "two"), "--num-robots 'two'"),
     (("-m", "hovercraft"), "model 'hovercraft' is unknown"),

@@ -194,8 +194,11 @@ def test_a_code_that_is_no_models_is_refused(engine: str) -> None:
 
 
 def test_teams_of_common_models_share_kernels_that_know_no_other(boat: Model) -> None:
-    common = world_kernels(("holonomic2d",))
-    assert world_kernels(("velocity2d", "differential_drive")) == common
+    common, mixed = world_kernels(("holonomic2d",)), world_kernels(("velocity2d", "differential_drive"))
+    assert mixed._replace(roll_out=common.roll_out) == common
+    # A plan waits for no more models than it must.
+    assert common.roll_out.py_func.__qualname__.endswith("roll_out_holonomic2d")
+    assert mixed.roll_out is world_kernels(("holonomic2d", "velocity2d")).roll_out
     with_boat = world_kernels(("holonomic2d", "boat"))
     assert with_boat.roll_out is not common.roll_out
     assert with_boat.roll_out.py_func.__qualname__.endswith("_holonomic2d_boat")

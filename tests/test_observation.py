@@ -226,19 +226,62 @@ def test_a_layout_cannot_be_changed() -> None:
         layout.high[0] = 1
 
 
-@given(keys=st.lists(st.integers(0, 9), max_size=12), size=st.integers(0, 5))
-def test_insert_nearest_keeps_the_smallest_in_order(keys: list[int], size: int) -> None:
+@given(keys=st.lists(st.integers(0, 9), max_size=12), size=st.integers(0, 5), data=st.data())
+def test_insert_nearest_keeps_the_smallest_in_order(keys: list[int], size: int, data: st.DataObject) -> None:
     table = np.full((size, 2), np.inf)
-    for number, key in enumerate(keys):
-        row = insert_nearest(key, table)
-        if row >= 0:
-            table[row, 1] = number
-    # Of equal keys the one that came first stays first.
+    for number in data.draw(st.permutations(range(len(keys)))):
+        insert_nearest(keys[number], number, table)
+    # Of equal keys the one with the lower number comes first, whichever came first.
     expected = sorted(range(len(keys)), key=lambda number: (keys[number], number))[:size]
     count = len(expected)
     assert table[:count, 1].tolist() == expected
     assert table[:count, 0].tolist() == [keys[number] for number in expected]
     assert np.isinf(table[count:, 0]).all()
+
+
+def scattered(dimension: int, **shapes: Any) -> Problem:
+    team = Team(("holonomic2d" if dimension == 2 else "holonomic3d",) * 8)
+    start = np.zeros((8, 2 * dimension))
+    start[:, 0], start[:, 1] = 5, 0.5 * np.arange(8)
+    return Problem(team, start, start[:, :dimension] + [1, *[0] * (dimension - 1)], world=World(dimension, **shapes))
+
+
+def boxes(random: np.random.Generator, dimension: int) -> Any:
+    low = random.uniform(-3, 3, (60, dimension))
+    return np.hstack([low, low + random.uniform(0.1, 1, (60, dimension))])
+
+
+def balls(random: np.random.Generator, dimension: int) -> Any:
+    return np.hstack([random.uniform(-3, 3, (60, dimension)), random.uniform(0.1, 0.5, (60, 1))])
+
+
+RANDOM = np.random.default_rng(0)
+SCATTERED = {
+    "boxes and circles": scattered(2, boxes=boxes(RANDOM, 2), circles=balls(RANDOM, 2)),
+    "polygons": scattered(2, polygons=[np.add([(0, 0), (1, 0.2), (0.3, 0.8)], (i - 4, -i % 3)) for i in range(8)]),
+    "spheres and boxes": scattered(3, boxes=boxes(RANDOM, 3), spheres=balls(RANDOM, 3)),
+    "cylinders": scattered(3, cylinders=balls(RANDOM, 2)),
+    "cylinders and spheres": scattered(3, cylinders=balls(RANDOM, 2)[:20], spheres=balls(RANDOM, 3)),
+    "maze": make_problem("maze", num_robots=8, seed=0),
+}
+
+
+@pytest.mark.parametrize("name", SCATTERED)
+def test_the_nearest_obstacles_are_found_from_any_distance(name: str) -> None:
+    problem = SCATTERED[name]
+    layout = ObservationLayout.for_problem(problem, 0, 4)
+    robots, d = problem.num_robots, problem.dimension
+    random = np.random.default_rng(1)
+    assert problem.arrays_to_observe(4).grid.nearest == 4
+    assert problem.arrays.grid.nearest < 4  # so that all are looked at
+    for distance in np.repeat([0.5, 3, 5, 10, 20, 40, 80, 160, 1e4], 20):
+        state = np.zeros_like(problem.start)
+        state[:, :d] = random.uniform(-distance, distance, (robots, d))
+        seen = [
+            ENGINE.observe(arrays, layout, state, np.zeros((robots, d)), np.zeros(robots, bool), 0.5)
+            for arrays in (problem.arrays, problem.arrays_to_observe(4))
+        ]
+        np.testing.assert_array_equal(*seen)
 
 
 def test_the_plain_function_and_the_compiled_one_agree() -> None:
@@ -251,7 +294,7 @@ def test_the_plain_function_and_the_compiled_one_agree() -> None:
     velocity = np.array([controls[0], [0, 0], problem.start[2, 2:]], np.float32)
     heading = np.array([[0, 0], [math.cos(0.5), math.sin(0.5)], [0, 0]], np.float32)
     plain = np.empty_like(compiled)
-    sensed = Sensed(position, velocity, heading, np.zeros(3), np.empty((3, 2)), np.empty((3, 3)))
+    sensed = Sensed(position, velocity, heading, np.zeros(3), np.empty((3, 2)), np.empty((3, 2)))
     for k in range(3):
         observe_robot(k, problem.arrays, problem.goal, sensed, 0.5, plain[k])
     np.testing.assert_allclose(np.clip(plain, layout.low, layout.high), compiled, atol=1e-6)

@@ -26,7 +26,7 @@ def _mark(radius, margin, moving, moving_radius, boxes, first, count, places, sc
 
 @numba.njit
 def _near_static(arrays, k, bounds, scratch):
-    return proximity.near_static(arrays, k, bounds, scratch.boxes)
+    return proximity.near_static(arrays, k, bounds, scratch.boxes, scratch.spare)
 
 
 def places_of(positions):

@@ -496,4 +496,4 @@ def test_kernels_of_different_models_share_no_file() -> None:
     assert score_kernel(("velocity2d", "holonomic2d")) is score_kernel(teams[-1])
     assert score_kernel(("holonomic2d",) * 5) is score_kernel(("holonomic2d",))
     # Teams with another model compile no more than the models that they have.
-    assert score_kernel(("car", "holonomic2d")).py_func.__qualname__.endswith("_car_holonomic2d")
+    assert score_kernel(("car", "holonomic2d")).py_func.__qualname__.endswith("_holonomic2d_car")

@@ -12,6 +12,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.core.world_index import WIDER, WorldIndex
 
 
 class Sensed(NamedTuple):
@@ -23,7 +24,7 @@ class Sensed(NamedTuple):
         heading: ``(K, 2)`` cosine and sine, zeros for models without a heading.
         arrived: ``(K,)`` 0 or 1.
         nearest_robots: ``(num_neighbors, 2)`` scratch: squared distance, robot.
-        nearest_obstacles: ``(num_obstacles, 1 + d)`` scratch: distance of the surface, vector to it.
+        nearest_obstacles: ``(num_obstacles, 2)`` scratch: distance of the surface, obstacle.
     """
 
     position: FloatArray
@@ -55,7 +56,7 @@ def observe_robot(
     _find_nearest_robots(k, sensed.position, sensed.nearest_robots)
     _see_robots(k, arrays.radius, sensed, neighbors, out)
     _find_nearest_obstacles(sensed.position[k], arrays, sensed.nearest_obstacles)
-    _see_obstacles(arrays.radius[k], sensed.nearest_obstacles, obstacles, out)
+    _see_obstacles(sensed.position[k], arrays, arrays.radius[k], sensed.nearest_obstacles, obstacles, out)
 
 
 def _see_itself(k: int, arrays: ProblemArrays, goal: FloatArray, sensed: Sensed, out: FloatArray) -> None:
@@ -89,29 +90,35 @@ def _see_robots(k: int, radius: FloatArray, sensed: Sensed, i: int, out: FloatAr
         i += 2 + 2 * d
 
 
-def _see_obstacles(radius: float, nearest: FloatArray, i: int, out: FloatArray) -> None:
+def _see_obstacles(
+    place: FloatArray, arrays: ProblemArrays, radius: float, nearest: FloatArray, i: int, out: FloatArray
+) -> None:
     """Fill the rows of obstacles, from component ``i`` on."""
-    d = nearest.shape[1] - 1
+    d = place.shape[0]
     for row in range(nearest.shape[0]):
         present = nearest[row, 0] < np.inf
         out[i] = 1 if present else 0
-        for axis in range(d):
-            out[i + 1 + axis] = nearest[row, 1 + axis] if present else 0
         out[i + 1 + d] = nearest[row, 0] - radius if present else 0
+        for axis in range(d):
+            out[i + 1 + axis] = 0
+        if present:
+            _point_to(int(nearest[row, 1]), place, arrays, out[i + 1 : i + 1 + d])
         i += 2 + d
 
 
-def insert_nearest(key: float, table: FloatArray) -> int:
-    """Row of a table sorted by its first column where ``key`` belongs, made free; -1 if it is too large for it."""
+def insert_nearest(key: float, number: float, table: FloatArray) -> None:
+    """Put the row ``(key, number)`` where it belongs in a sorted table, whose last row drops out for it."""
     row = table.shape[0] - 1
-    if row < 0 or key >= table[row, 0]:
-        return -1
-    while row > 0 and key < table[row - 1, 0]:
-        for column in range(table.shape[1]):
-            table[row, column] = table[row - 1, column]
+    if row < 0 or not _comes_before(key, number, table[row]):
+        return
+    while row > 0 and _comes_before(key, number, table[row - 1]):
+        table[row, 0], table[row, 1] = table[row - 1, 0], table[row - 1, 1]
         row -= 1
-    table[row, 0] = key
-    return row
+    table[row, 0], table[row, 1] = key, number
+
+
+def _comes_before(key: float, number: float, row: FloatArray) -> bool:
+    return key < row[0] or (key == row[0] and number < row[1])
 
 
 def _find_nearest_robots(k: int, position: FloatArray, nearest: FloatArray) -> None:
@@ -124,9 +131,7 @@ def _find_nearest_robots(k: int, position: FloatArray, nearest: FloatArray) -> N
             for axis in range(1, position.shape[1]):
                 gap = position[other, axis] - position[k, axis]
                 gap2 += gap * gap
-            row = insert_nearest(gap2, nearest)
-            if row >= 0:
-                nearest[row, 1] = other
+            insert_nearest(gap2, other, nearest)
 
 
 def _find_nearest_obstacles(place: FloatArray, arrays: ProblemArrays, nearest: FloatArray) -> None:
@@ -135,49 +140,67 @@ def _find_nearest_obstacles(place: FloatArray, arrays: ProblemArrays, nearest: F
         return
     nearest[:, 0] = np.inf
     index, count = arrays.grid, arrays.boxes.shape[0] + arrays.triangles.shape[0]
-    begin, end, cell, listed = 0, count, 0, (count > 0) & (index.nearest >= nearest.shape[0])
-    for axis in range(d):
-        step = (place[axis] - index.low[axis]) * index.scale
-        # Beyond the grid every obstacle may be among the nearest.
-        listed &= (step >= 0) & (step < index.size[axis])
-        cell = cell * index.size[axis] + int(step) if listed else 0
-    if listed:
-        begin, end = index.first[cell], index.first[cell + 1]
+    own = _list_of(place, index) if count > 0 and index.nearest >= nearest.shape[0] else -1
+    begin, end = (index.first[own], index.first[own + 1]) if own >= 0 else (0, count)
     for number in range(begin, end):
-        item = index.items[number] if listed else number
+        item = index.items[number] if own >= 0 else number
         if item < arrays.boxes.shape[0]:
-            _insert_box(place, arrays.boxes[item], nearest)
+            insert_nearest(_distance_to_box(place, arrays.boxes[item]) - arrays.boxes[item, 2 * d], item, nearest)
         else:
-            _insert_triangle(place, arrays.triangles[item - arrays.boxes.shape[0]], nearest)
+            gap = _gap_to_triangle(place, arrays.triangles[item - arrays.boxes.shape[0]])
+            insert_nearest(gap[0], item, nearest)
     for axis in range(d):
         for side in range(2):
-            gap = arrays.bounds[side, axis] - place[axis]
-            row = insert_nearest(-gap if side == 0 else gap, nearest)
-            if row >= 0:
-                nearest[row, 1:] = 0
-                nearest[row, 1 + axis] = gap
+            beyond = arrays.bounds[side, axis] - place[axis]
+            insert_nearest(-beyond if side == 0 else beyond, count + 2 * axis + side, nearest)
 
 
-def _insert_box(place: FloatArray, box: FloatArray, nearest: FloatArray) -> None:
+def _list_of(place: FloatArray, index: WorldIndex) -> int:
+    """Number of the list of obstacles in the innermost grid that holds a place; -1 beyond them all."""
+    width = 1.0
+    for level in range(index.levels):
+        cell, inside = 0, True
+        for axis in range(place.shape[0]):
+            middle = 0.5 * index.size[axis]
+            step = ((place[axis] - index.low[axis]) * index.scale - middle) / width + middle
+            inside &= (step >= 0) & (step < index.size[axis])
+            cell = cell * index.size[axis] + int(step) if inside else 0
+        if inside:
+            return level * index.clearance.shape[0] + cell
+        width *= WIDER
+    return -1
+
+
+def _point_to(item: int, place: FloatArray, arrays: ProblemArrays, out: FloatArray) -> None:
+    """Fill the vector to the nearest point of an obstacle, or of a bound, which come last."""
+    d, boxes, triangles = place.shape[0], arrays.boxes.shape[0], arrays.triangles.shape[0]
+    if item < boxes:
+        box = arrays.boxes[item]
+        distance, radius = _distance_to_box(place, box), box[2 * d]
+        # Inside a box, whose radius is zero, the vector is too.
+        share = (distance - radius) / max(distance, 1e-6) if radius > 0 else 1.0
+        for axis in range(d):
+            out[axis] = (min(max(place[axis], box[axis]), box[d + axis]) - place[axis]) * share
+    elif item < boxes + triangles:
+        distance, out[0], out[1] = _gap_to_triangle(place, arrays.triangles[item - boxes])
+    else:
+        axis, side = (item - boxes - triangles) // 2, (item - boxes - triangles) % 2
+        out[axis] = arrays.bounds[side, axis] - place[axis]
+
+
+def _distance_to_box(place: FloatArray, box: FloatArray) -> float:
+    """Distance to the box that is rounded off."""
     d = place.shape[0]
     gap = min(max(place[0], box[0]), box[d]) - place[0]
     distance2 = gap * gap
     for axis in range(1, d):
         gap = min(max(place[axis], box[axis]), box[d + axis]) - place[axis]
         distance2 += gap * gap
-    radius, farthest = box[2 * d], nearest[nearest.shape[0] - 1, 0]
-    if distance2 > (farthest + radius) * (farthest + radius) and farthest > 0:
-        return  # for less than a square root
-    distance = np.sqrt(distance2)
-    row = insert_nearest(distance - radius, nearest)
-    if row >= 0:
-        # Inside a box, whose radius is zero, the vector is too.
-        share = (distance - radius) / max(distance, 1e-6) if radius > 0 else 1.0
-        for axis in range(d):
-            nearest[row, 1 + axis] = (min(max(place[axis], box[axis]), box[d + axis]) - place[axis]) * share
+    return np.sqrt(distance2)
 
 
-def _insert_triangle(place: FloatArray, corners: FloatArray, nearest: FloatArray) -> None:
+def _gap_to_triangle(place: FloatArray, corners: FloatArray) -> tuple[float, float, float]:
+    """Distance of a triangle and the vector to its nearest point, zero inside."""
     inside, nearest_x, nearest_y, least = True, 0.0, 0.0, np.inf
     for edge in range(3):
         after = (edge + 1) % 3
@@ -189,7 +212,4 @@ def _insert_triangle(place: FloatArray, corners: FloatArray, nearest: FloatArray
         gap_x, gap_y = share * along_x - offset_x, share * along_y - offset_y
         if gap_x * gap_x + gap_y * gap_y < least:
             least, nearest_x, nearest_y = gap_x * gap_x + gap_y * gap_y, gap_x, gap_y
-    row = insert_nearest(0.0 if inside else np.sqrt(least), nearest)
-    if row >= 0:
-        nearest[row, 1] = 0.0 if inside else nearest_x
-        nearest[row, 2] = 0.0 if inside else nearest_y
+    return (0.0, 0.0, 0.0) if inside else (np.sqrt(least), nearest_x, nearest_y)

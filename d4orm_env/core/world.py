@@ -15,6 +15,9 @@ from d4orm_env.core.polygon import check_polygon, triangulate
 from d4orm_env.core.shapes import Shapes
 from d4orm_env.core.world_index import WorldIndex, build_index, nearest_distance
 
+_LEVELS = 3
+"""Grids of an index that finds obstacles for robots wherever they drive; the last is 16 times as wide as the first."""
+
 
 @dataclass(frozen=True, eq=False, init=False)
 class World(Frozen):
@@ -149,16 +152,19 @@ class World(Frozen):
         Args:
             reach: The largest distance from an obstacle at which it counts [m].
             nearest: How many of the nearest obstacles it is to find.
-            places: ``(N, dimension)`` places round which it is to find them, however far from obstacles [m].
+            places: ``(N, dimension)`` places round which it is to find them, however far from obstacles [m], and in
+                wider grids farther away.
         """
         reach = margin = _rounded_up(reach)
+        levels = 1
         if places is not None and self.shapes.count:
             lower, upper = self.shapes.extent()
-            margin = _rounded_up(max(reach, 2 * float(np.max([lower - places, places - upper]))))
+            margin = _rounded_up(max(reach, float(np.max([lower - places, places - upper]))))
+            levels = _LEVELS
         key = (reach, nearest, margin)
         if key not in self._indices:
             # Cells of a quarter of a reach leave few points undecided.
-            self._indices[key] = build_index(self.shapes, reach / 4, margin, nearest)
+            self._indices[key] = build_index(self.shapes, reach / 4, margin, nearest, levels)
         return self._indices[key]
 
     def clearance(self, positions: ArrayLike) -> np.ndarray:

@@ -28,6 +28,9 @@ MAX_CELLS = 2**21
 FREE_CELLS, CELLS_PER_OBSTACLE = 2**15, 2**8
 """No more cells than these allow: more would take longer to make than they save."""
 
+WIDER = 4
+"""How much wider each grid of an index is than the one before it."""
+
 _PAIRS_AT_ONCE = 2**18
 """Cells times obstacles whose distances are worked out in one go."""
 
@@ -48,10 +51,13 @@ class WorldIndex(NamedTuple):
         slack: ``()`` float32 by how much the clearance at the centre of its cell and that at a point may differ [m],
             rounding included.
         clearance: ``(C,)`` float32 at the centres [m], negative inside an obstacle.
-        first: ``(C + 1,)`` int32 where each cell's part of ``items`` begins.
-        items: int32 numbers of the obstacles, as in :class:`~d4orm_env.core.shapes.Shapes`.
+        first: ``(levels C + 1,)`` int32 where each cell's part of ``items`` begins.
+        items: int32 numbers of the obstacles, as in :class:`~d4orm_env.core.shapes.Shapes`, those of a cell by their
+            distance from its centre.
         longest: ``()`` int32 the most obstacles of any cell.
         nearest: ``()`` int32 how many of the nearest obstacles of any of its points a cell is sure to have.
+        levels: ``()`` int32 for how many grids, one round the other, there are lists: each has ``C`` cells about the
+            same middle, ``WIDER`` times as large as those of the one inside it. All else is said of the first.
     """
 
     low: FloatArray
@@ -64,6 +70,7 @@ class WorldIndex(NamedTuple):
     items: Ints
     longest: np.int32
     nearest: np.int32
+    levels: np.int32
 
     @property
     def num_bytes(self) -> int:
@@ -79,7 +86,7 @@ class _Cells(NamedTuple):
     item: NDArray[np.int64]
 
 
-def build_index(shapes: Shapes, cell: float, reach: float, nearest: int = 1) -> WorldIndex:
+def build_index(shapes: Shapes, cell: float, reach: float, nearest: int = 1, levels: int = 1) -> WorldIndex:
     """The index of some obstacles.
 
     Args:
@@ -87,14 +94,16 @@ def build_index(shapes: Shapes, cell: float, reach: float, nearest: int = 1) -> 
         cell: Size of a cell [m]; larger where there would be more cells than is worthwhile.
         reach: How far round the obstacles the grid reaches [m]; at least to where none of them counts.
         nearest: How many of the nearest obstacles of any point a cell's list is sure to hold.
+        levels: How many grids, one round the other.
     """
     if not shapes.count:
         nothing = np.zeros(0)
         corner = np.zeros(shapes.dimension)
-        return _frozen(corner, 1.0, np.stack([corner, corner]), corner, 0.0, nothing, nothing, nothing, nearest)
+        ends = np.stack([corner, corner])
+        return _frozen(corner, 1.0, ends, corner, 0.0, nothing, nothing, nothing, 0, nearest, levels)
     while True:
         low, size, cell = _layout(shapes, cell, reach)
-        index = _filled(shapes, low, size, cell, nearest)
+        index = _filled(shapes, low, size, cell, nearest, levels)
         if index.num_bytes <= MAX_BYTES or index.size.max() == 1:
             return index
         cell *= 1.5
@@ -138,11 +147,38 @@ def _layout(shapes: Shapes, cell: float, reach: float) -> tuple[Floats, NDArray[
         cell *= 1.1 * max(1.0, (size.prod() / most) ** (1 / len(lower)))
 
 
-def _filled(shapes: Shapes, low: Floats, size: NDArray[np.int64], cell: float, nearest: int) -> WorldIndex:
-    largest = np.abs([low, low + size * cell]).max()
+def _filled(shapes: Shapes, low: Floats, size: NDArray[np.int64], cell: float, nearest: int, levels: int) -> WorldIndex:
+    middle, half = low + size * cell / 2, size * cell / 2
+    largest = np.abs([middle - half, middle + half]).max()
     rounding = 1e-3 * cell + 16 * _EPSILON * largest
     slack = cell * np.sqrt(len(low)) / 2 + rounding
-    leaves = list(_refined(shapes, low, size, cell, rounding, nearest))
+    grids = []
+    for level in range(levels):
+        wider = WIDER**level
+        # What the grid inside this one answers need not be worked out again.
+        hole = half * wider / WIDER - 0.01 * cell if level else np.zeros(len(low))
+        grids.append(_grid(shapes, middle, hole, size, cell * wider, rounding * wider, nearest))
+    clearance, counts = grids[0].clearance, np.concatenate([grid.counts for grid in grids])
+    first, items = np.concatenate([[0], np.cumsum(counts)]), np.concatenate([grid.items for grid in grids])
+    ends = np.stack([low, low + size * cell])
+    endless = ~np.isfinite(shapes.boxes[:, : len(low)]).all(axis=0)
+    ends[:, endless] = [[-np.inf], [np.inf]]
+    longest = grids[0].counts.max()
+    return _frozen(low, 1 / cell, ends, size, slack, clearance, first, items, longest, nearest, levels)
+
+
+class _Grid(NamedTuple):
+    """``(C,)`` clearance at the cells' centres and numbers of their obstacles, and these, cell by cell."""
+
+    clearance: Floats
+    counts: NDArray[np.int64]
+    items: Ints
+
+
+def _grid(
+    shapes: Shapes, middle: Floats, hole: Floats, size: NDArray[np.int64], cell: float, rounding: float, nearest: int
+) -> _Grid:
+    leaves = list(_refined(shapes, middle, hole, size, cell, rounding, nearest))
     number = [np.ravel_multi_index(tuple(part.place.T), tuple(size)) for part, _ in leaves]
     clearance, counts = np.empty(size.prod()), np.empty(size.prod(), np.int64)
     for own, (part, gap) in zip(number, leaves, strict=True):
@@ -152,16 +188,17 @@ def _filled(shapes: Shapes, low: Floats, size: NDArray[np.int64], cell: float, n
     for own, (part, _) in zip(number, leaves, strict=True):
         before = np.arange(len(part.cell)) - np.searchsorted(part.cell, part.cell)
         items[first[own[part.cell]] + before] = part.item
-    ends = np.stack([low, low + size * cell])
-    endless = ~np.isfinite(shapes.boxes[:, : len(low)]).all(axis=0)
-    ends[:, endless] = [[-np.inf], [np.inf]]
-    return _frozen(low, 1 / cell, ends, size, slack, clearance, first, items, nearest)
+    return _Grid(clearance, counts, items)
 
 
 def _refined(
-    shapes: Shapes, low: Floats, size: NDArray[np.int64], cell: float, rounding: float, nearest: int
+    shapes: Shapes, middle: Floats, hole: Floats, size: NDArray[np.int64], cell: float, rounding: float, nearest: int
 ) -> Iterator[tuple[_Cells, Floats]]:
-    """All cells of the grid with the obstacles that count there, and the clearance at their centres, part by part."""
+    """All cells of a grid with the obstacles that count there, and the clearance at their centres, part by part.
+
+    Cells no farther than ``hole`` from the middle get hardly any.
+    """
+    low, turn = middle - size * cell / 2, _Turn.of(shapes)
     levels = 0
     while shapes.count * np.ceil(size / 2**levels).prod() > _PAIRS_AT_ONCE and 2**levels < size.max():
         levels += 1
@@ -175,14 +212,44 @@ def _refined(
         centre = low + (cells.place + 0.5) * width
         distance = shapes.signed_distance(centre[cells.cell], cells.item)
         bounds = np.searchsorted(cells.cell, np.arange(len(cells.place)))
-        bar = _smallest(distance, cells.cell, bounds, nearest)
-        keep = distance <= (bar + width * np.sqrt(len(size)) + 2 * rounding)[cells.cell]
+        clearance, diagonal = np.minimum.reduceat(distance, bounds), width * np.sqrt(len(size))
+        bar = _smallest(distance, cells.cell, bounds, nearest) + diagonal * turn.at_most(centre, diagonal / 2)
+        unasked: NDArray[np.bool_] = np.all(np.abs(centre - middle) <= hole - width / 2, axis=1)
+        keep = distance <= (np.where(unasked, clearance, bar) + 2 * rounding)[cells.cell]
         cells = _Cells(cells.place, cells.cell[keep], cells.item[keep])
         if level == 0:
-            yield cells, np.minimum.reduceat(distance, bounds)
+            order = np.lexsort((distance[keep], cells.cell))
+            cells = _Cells(cells.place, cells.cell, cells.item[order])
+            yield cells, clearance
             continue
         for part in _halved(cells):
             waiting.append((level - 1, _split(part, np.ceil(size / 2 ** (level - 1)))))
+
+
+class _Turn(NamedTuple):
+    """How far apart the directions to two obstacles can be. All lie in a ball of this middle and radius, along the axes
+    on which they end.
+    """
+
+    axes: NDArray[np.bool_]
+    middle: Floats
+    radius: float
+
+    @classmethod
+    def of(cls, shapes: Shapes) -> _Turn:
+        lower, upper = shapes.extent()
+        ended = np.isfinite(shapes.boxes[:, : shapes.dimension])
+        axes: NDArray[np.bool_] = np.all(ended, axis=0)
+        # Where some end and others do not, the directions may be anything.
+        radius = np.inf if (ended.any(axis=0) & ~axes).any() else float(np.linalg.norm((upper - lower)[axes])) / 2
+        return cls(axes, (lower + upper) / 2, radius)
+
+    def at_most(self, places: Floats, reach: float) -> Floats:
+        """``(N,)`` half of the length of the difference of two such directions, as unit vectors, within reach of places
+        ``(N, d)``: by no more than twice this the distances of two obstacles change differently on the way there.
+        """
+        distance = np.linalg.norm((places - self.middle)[:, self.axes], axis=1) - reach
+        return np.minimum(1.0, self.radius / np.maximum(distance, 1e-9))
 
 
 def _smallest(distance: Floats, cell: NDArray[np.int64], bounds: NDArray[np.int64], nearest: int) -> Floats:
@@ -229,12 +296,14 @@ def _frozen(
     clearance: Floats,
     first: Floats | NDArray[np.int64],
     items: Floats | Ints,
+    longest: int,
     nearest: int,
+    levels: int,
 ) -> WorldIndex:
     index = WorldIndex(
         low.astype(np.float32), np.float32(scale), ends.astype(np.float32), size.astype(np.int32),
         np.float32(slack), clearance.astype(np.float32), first.astype(np.int32), items.astype(np.int32),
-        np.int32(np.diff(first).max(initial=0)), np.int32(nearest),
+        np.int32(longest), np.int32(nearest), np.int32(levels),
     )  # fmt: skip
     for array in index:
         if isinstance(array, np.ndarray):

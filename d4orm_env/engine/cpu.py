@@ -142,7 +142,7 @@ class CpuEngine:
         should_stop: Callable[[], bool] | None = None,
     ) -> SamplingResult:
         """See :meth:`d4orm_env.engine.base.Engine.denoise`."""
-        run = _Sampling(task, rules, num_samples, seed, self._threads)
+        run = Sampling(task, rules, num_samples, seed, self._threads)
         factor = np.ones_like(task.base)
         mean_rewards = np.empty(len(noise_scale), np.float32)
         done = excluded = 0
@@ -168,7 +168,7 @@ class CpuEngine:
         return SamplingResult(mean, mean_rewards[:done], excluded)
 
 
-class _Sampling:
+class Sampling:
     """One denoising run: its arrays and the threads that share its tiles."""
 
     def __init__(self, task: SamplingTask, rules: SamplingRules, num_samples: int, seed: int, threads: Any) -> None:

@@ -9,31 +9,31 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numba.cpython.unsafe import numbers
 
 from d4orm_env.core import collision
-from d4orm_env.engine.lanes import CHUNK, TILE, at_most
+from d4orm_env.engine.lanes import CHUNK, TILE, at_most, use_wide_registers
 from d4orm_env.engine.tiles import NOWHERE, ONE, OPS, ZERO, compiled, inlined, to_fixed_tuple
 
 _HALF = np.float32(0.5)
 _BIT = np.uint64(1)
 
-
-@compiled
-def _steps_along(x: Any, low: Any, scale: Any, count: Any) -> Any:
-    """Number along one axis of the cell that holds ``x``, of the outermost one beyond the grid; 0 for no number."""
-    place, last = (x - low) * scale, np.float32(count - 1)
-    place = place if place > ZERO else ZERO
-    return np.int64(np.int32(place if place < last else last))
+_trailing_zeros: Any = numbers.trailing_zeros
+"""Its calls in compiled code lack the first argument, which type checkers cannot know."""
 
 
 @inlined
-def _cell(index: Any, x: Any, y: Any, z: Any) -> Any:
-    """Number of the cell that holds a point; ``z`` is not looked at in the plane."""
-    low, scale, size = index.low, index.scale, index.size
-    cell = _steps_along(x, low[0], scale, size[0]) * size[1] + _steps_along(y, low[1], scale, size[1])
-    if low.shape[0] == 2:
-        return cell
-    return cell * size[2] + _steps_along(z, low[2], scale, size[2])
+def _count_steps(index: Any, axis: Any, row: Any, cells: Any) -> None:
+    """Carry the numbers of the cells that hold some points on by the next axis, along which they lie at ``row``.
+
+    Points beyond the grid count as in its outermost cells, not a number as in the first one.
+    """
+    low, scale, size = index.low[axis], index.scale, np.uint32(index.size[axis])
+    last = np.float32(size - 1)
+    for s in range(cells.shape[0]):
+        place = (row[s] - low) * scale
+        place = place if place > ZERO else ZERO
+        cells[s] = cells[s] * size + np.uint32(np.int32(place if place < last else last))
 
 
 @inlined
@@ -51,9 +51,8 @@ def _touches_box(box: Any, i: Any, reach: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 @inlined
-def _touches(index: Any, boxes: Any, triangles: Any, reach: Any, x: Any, y: Any, z: Any) -> Any:
+def _touches(index: Any, boxes: Any, triangles: Any, cell: Any, reach: Any, x: Any, y: Any, z: Any) -> Any:
     """Whether a body of this reach touches one of the obstacles that its cell knows."""
-    cell = _cell(index, x, y, z)
     for number in range(index.first[cell], index.first[cell + 1]):
         item = index.items[number]
         if item < boxes.shape[0]:
@@ -67,20 +66,26 @@ def _touches(index: Any, boxes: Any, triangles: Any, reach: Any, x: Any, y: Any,
 @compiled
 def _near_indexed(index: Any, boxes: Any, triangles: Any, reach: Any, places: Any, spare: Any) -> Any:
     """Where a body of this reach, its centre in the first rows of ``places``, touches an obstacle."""
+    use_wide_registers()
     third = 2 * TILE if index.low.shape[0] == 3 else 0
-    clearance = index.clearance
+    cells = spare[TILE : 2 * TILE].view(np.uint32)
     for s in range(TILE):
-        spare[s] = clearance[_cell(index, places[s], places[TILE + s], places[third + s])]
+        cells[s] = 0
+    for axis in range(index.low.shape[0]):
+        _count_steps(index, axis, places[axis * TILE : (axis + 1) * TILE], cells)
+    for s in range(TILE):
+        spare[s] = index.clearance[cells[s]]
     near = at_most(spare, 0, reach + index.slack)
     if near == NOWHERE:
         return near
     sure = at_most(spare, 0, reach - index.slack)
     unsure = near & ~sure
-    for s in range(TILE):
-        if unsure >> np.uint64(s) & _BIT != NOWHERE:
-            x, y, z = places[s], places[TILE + s], places[third + s]
-            if _touches(index, boxes, triangles, reach, x, y, z):
-                sure |= _BIT << np.uint64(s)
+    while unsure != NOWHERE:
+        sample: Any = np.int64(_trailing_zeros(unsure))
+        unsure &= unsure - _BIT
+        x, y, z = places[sample], places[TILE + sample], places[third + sample]
+        if _touches(index, boxes, triangles, cells[sample], reach, x, y, z):
+            sure |= _BIT << np.uint64(sample)
     return sure
 
 
@@ -88,7 +93,7 @@ def _near_indexed(index: Any, boxes: Any, triangles: Any, reach: Any, places: An
 def near_obstacles(arrays: Any, reach: Any, places: Any, spare: Any) -> Any:
     """Where a body of this reach, its centre in the first rows of ``places``, touches an obstacle or the bounds.
 
-    ``spare`` is a row to overwrite.
+    ``spare`` is two rows to overwrite.
     """
     mask = NOWHERE
     if arrays.grid.clearance.shape[0] > 0:
@@ -104,7 +109,7 @@ def near_obstacles(arrays: Any, reach: Any, places: Any, spare: Any) -> Any:
 
 
 @compiled
-def may_touch(index: Any, reach: Any, widening: Any, boxes: Any, begin: Any, axis_step: Any) -> Any:
+def may_touch(index: Any, reach: Any, widening: Any, boxes: Any, begin: Any, axis_step: Any, spare: Any) -> Any:
     """Whether a body may touch an obstacle anywhere in the lanes of :func:`~d4orm_env.engine.lanes.enclose`.
 
     Args:
@@ -114,23 +119,29 @@ def may_touch(index: Any, reach: Any, widening: Any, boxes: Any, begin: Any, axi
         boxes: The lanes, those of the first axis from ``begin`` on, those of the next ``axis_step`` later.
         begin: See ``boxes``.
         axis_step: See ``boxes``.
+        spare: Two rows to overwrite.
     """
-    d, unclear = index.low.shape[0], False
-    third = 2 * axis_step if d == 3 else 0
-    for lane in range(begin, begin + CHUNK):
-        square, beyond = ZERO, ZERO
-        for axis in range(d):
-            low, high = boxes[lane + axis * axis_step], boxes[lane + axis * axis_step + CHUNK]
-            half, middle = _HALF * (high - low) - widening, _HALF * (high + low)
-            square += half * half
-            outside: Any = collision.axis_gap(middle, index.ends[0, axis], index.ends[1, axis], ZERO, OPS)
-            beyond += outside * outside
-        x = _HALF * (boxes[lane] + boxes[lane + CHUNK])
-        y = _HALF * (boxes[lane + axis_step] + boxes[lane + axis_step + CHUNK])
-        z = _HALF * (boxes[lane + third] + boxes[lane + third + CHUNK])
-        clearance = index.clearance[_cell(index, x, y, z)]
+    use_wide_registers()
+    middles, squares, beyond = spare[:CHUNK], spare[CHUNK : 2 * CHUNK], spare[2 * CHUNK : 3 * CHUNK]
+    cells = spare[3 * CHUNK : 4 * CHUNK].view(np.uint32)
+    for lane in range(CHUNK):
+        squares[lane] = beyond[lane] = ZERO
+        cells[lane] = 0
+    for axis in range(index.low.shape[0]):
+        low, high = index.ends[0, axis], index.ends[1, axis]
+        lows, highs = boxes[begin : begin + CHUNK], boxes[begin + CHUNK : begin + 2 * CHUNK]
+        for lane in range(CHUNK):
+            half, middles[lane] = _HALF * (highs[lane] - lows[lane]) - widening, _HALF * (highs[lane] + lows[lane])
+            squares[lane] += half * half
+            outside: Any = collision.axis_gap(middles[lane], low, high, ZERO, OPS)
+            beyond[lane] += outside * outside
+        _count_steps(index, axis, middles, cells)
+        begin += axis_step
+    unclear = False
+    for lane in range(CHUNK):
         # Seen from beyond the grid all obstacles lie behind its nearest point, at no less than a right angle; but not
         # along an axis on which some have no end.
-        clearance = np.sqrt(beyond + clearance * clearance) if beyond > ZERO else clearance
-        unclear |= not clearance > reach + index.slack + np.sqrt(square)
+        clearance, far2 = index.clearance[cells[lane]], beyond[lane]
+        clearance = np.sqrt(far2 + clearance * clearance) if far2 > ZERO else clearance
+        unclear |= not clearance > reach + index.slack + np.sqrt(squares[lane])
     return unclear

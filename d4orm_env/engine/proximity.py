@@ -49,7 +49,7 @@ class Scratch(NamedTuple):
         num_robots: ``(K,)`` how many robots before it each may touch,
         robots: ``(K, K)`` and which.
         near: ``(K, BLOCK)`` who is near a robot or a body at which step of the block, a bit for every sample.
-        spare: ``(TILE,)`` a row to overwrite.
+        spare: ``(2 TILE,)`` two rows to overwrite.
     """
 
     boxes: Any
@@ -64,7 +64,7 @@ def make_scratch(num_robots: int, dimension: int) -> Scratch:
     return Scratch(
         tiles.aligned_zeros(num_robots * dimension * BOX), np.empty(num_robots, np.int32),
         np.empty((num_robots, num_robots), np.int32), np.empty((num_robots, BLOCK), np.uint64),
-        tiles.aligned_zeros(TILE),
+        tiles.aligned_zeros(2 * TILE),
     )  # fmt: skip
 
 
@@ -226,15 +226,15 @@ def mark_robots(
 
 
 @inlined
-def near_static(arrays: Any, k: Any, bounds: Any, boxes: Any) -> Any:
+def near_static(arrays: Any, k: Any, bounds: Any, boxes: Any, spare: Any) -> Any:
     """Whether in this block any sample of robot ``k`` may be within the margin of an obstacle, or of ``bounds``, see
-    :func:`bound_boxes`.
+    :func:`bound_boxes`. ``spare`` is two rows to overwrite.
     """
     dimension, limits, touch = arrays.goal.shape[1], bounds.reshape(-1), False
     if arrays.grid.clearance.shape[0] > 0:
         # The boxes are wider than the places by the radius and half of the margin.
         reach, half = arrays.radius[k] + arrays.margin, arrays.radius[k] + _HALF * arrays.margin + SLACK
-        touch = may_touch(arrays.grid, reach, half, boxes, box_of(k, dimension) + 2 * TILE, BOX)
+        touch = may_touch(arrays.grid, reach, half, boxes, box_of(k, dimension) + 2 * TILE, BOX, spare)
     for bound in range(bounds.shape[0]):
         touch |= _meets(k, bound, dimension, boxes, limits)
     return touch

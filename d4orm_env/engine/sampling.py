@@ -15,7 +15,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from d4orm_env.core import collision, reward, robot_model, transition
-from d4orm_env.core.dynamics import COMMON, MODELS
+from d4orm_env.core.dynamics import MODELS
 from d4orm_env.engine import lanes, noise, obstacles, proximity, tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.lanes import (
@@ -42,6 +42,7 @@ from d4orm_env.engine.tiles import (
     inlined,
     make_stepper,
     models_key,
+    models_of_kernel,
     to_fixed_tuple,
 )
 
@@ -334,7 +335,7 @@ def _score_tile(
                 rest = num_steps - (first + count)
                 _add_standing(goals[k], inverse[k], np.float32(rest), robot)
             enclose(k, radius[k] + HALF * margin, dimension, places, boxes)
-            if near_static(arrays, k, static, boxes):
+            if near_static(arrays, k, static, boxes, scratch.spare):
                 for step in range(count):
                     rows = own_places[step * dimension * TILE : (step + 1) * dimension * TILE]
                     touch = obstacles.near_obstacles(arrays, radius[k] + margin, rows, scratch.spare)
@@ -362,31 +363,8 @@ def _fill_keys(seed: Any, step: Any, num_robots: Any, num_steps: Any, num_pairs:
                 keys[1, stream] = key[1]
 
 
-@inlined
-def _score_tiles(
-    run_robot: Any, arrays: Any, offset: Any, scale: Any, docked: Any, collisions: Any, penalty: Any, moving: Any,
-    moving_radius: Any, body_boxes: Any, static: Any, seed: Any, step: Any, tile_range: Any, space: Any, scratch: Any,
-    kept: Any, rewards: Any,
-) -> None:  # fmt: skip
-    num_robots, num_samples = rewards.shape
-    _fill_keys(seed, step, num_robots, kept.shape[2], kept.shape[3], space.keys)
-    for index in range(tile_range[0], tile_range[1]):
-        first = index * TILE
-        _score_tile(
-            run_robot, arrays, offset, scale, docked, collisions, penalty, moving, moving_radius, body_boxes, static,
-            index * DRAWS, kept.reshape(-1), space, scratch,
-        )  # fmt: skip
-        for k in range(num_robots):
-            # The last tile may reach beyond the last sample.
-            for s in range(min(TILE, num_samples - first)):
-                rewards[k, first + s] = space.w[k * STRIDE + TOTAL * TILE + s] / np.float32(offset.shape[0])
-
-
 def score_kernel(models: tuple[str, ...]) -> Any:
     """The first pass for a team of these models.
-
-    Every model has a kernel of its own, because compiling takes seconds a model; mixed teams of common models
-    share one for all of these that have their dimension.
 
     The kernel fills the columns of ``rewards`` ``(K, M)`` that a range of tiles covers with mean rewards over time. Its
     arguments:
@@ -407,11 +385,7 @@ def score_kernel(models: tuple[str, ...]) -> Any:
     - ``kept``: ``(T, K, H, P, 2, DRAWS)`` the noise of ``T`` tiles, in ``P`` pairs of components, output.
     - ``rewards``: Output.
     """
-    different = set(models)
-    if len(different) > 1 and different <= set(COMMON):
-        dimension = MODELS[models[0]].dimension
-        different = {name for name in COMMON if MODELS[name].dimension == dimension}
-    return _score_kernel(tuple(sorted(different)))
+    return _score_kernel(models_of_kernel(models))
 
 
 @cache
@@ -425,10 +399,18 @@ def _score_kernel(models: tuple[str, ...]) -> Any:
         scratch: Any, kept: Any, rewards: Any,
     ) -> None:  # fmt: skip
         use_wide_registers()
-        _score_tiles(
-            run_robot, arrays, offset, scale, docked, collisions, penalty, moving, moving_radius, body_boxes, static,
-            seed, step, tile_range, space, scratch, kept, rewards,
-        )  # fmt: skip
+        num_robots, num_samples = rewards.shape
+        _fill_keys(seed, step, num_robots, kept.shape[2], kept.shape[3], space.keys)
+        for index in range(tile_range[0], tile_range[1]):
+            first = index * TILE
+            _score_tile(
+                run_robot, arrays, offset, scale, docked, collisions, penalty, moving, moving_radius, body_boxes,
+                static, index * DRAWS, kept.reshape(-1), space, scratch,
+            )  # fmt: skip
+            for k in range(num_robots):
+                # The last tile may reach beyond the last sample.
+                for s in range(min(TILE, num_samples - first)):
+                    rewards[k, first + s] = space.w[k * STRIDE + TOTAL * TILE + s] / np.float32(offset.shape[0])
 
     return score_tiles
 

@@ -20,7 +20,7 @@ from numba.extending import register_jitable
 from numba.np.unsafe import ndarray
 
 from d4orm_env.core import collision, reward, robot_model, transition
-from d4orm_env.core.dynamics import MODEL_CODES, MODELS, model_digest
+from d4orm_env.core.dynamics import COMMON, MODEL_CODES, MODELS, model_digest
 from d4orm_env.core.robot_model import MOVED, Model, ModelFunctions, Ops, RungeKutta, runge_kutta
 from d4orm_env.engine.lanes import TILE, at_most, use_wide_registers, within_2, within_3
 
@@ -28,7 +28,7 @@ ZERO = np.float32(0)
 ONE = np.float32(1)
 
 # First rows of a robot in the workspace. A power of two in all would map the same row of every robot to the same cache
-# set, so that one is left unused.
+# set.
 STATE, CONTROL, GOAL, DOCKED, DISTANCE2, SPARE, ROWS = 0, 6, 10, 13, 14, 15, 17
 STRIDE = ROWS * TILE
 
@@ -289,6 +289,19 @@ def _integrator(function: Any) -> Any:
         return runge_kutta(derivative, moved, x, u, limits, h, ops)
 
     return integrate
+
+
+def models_of_kernel(models: tuple[str, ...]) -> tuple[str, ...]:
+    """Models that a kernel for a team of these is compiled for, in the order of their codes.
+
+    Every model has kernels of its own, because compiling takes seconds a model; mixed teams of common models share
+    those for all of these that have their dimension.
+    """
+    different = set(models)
+    if len(different) > 1 and different <= set(COMMON):
+        dimension = MODELS[models[0]].dimension
+        different = {name for name in COMMON if MODELS[name].dimension == dimension}
+    return tuple(sorted(different, key=MODEL_CODES.__getitem__))
 
 
 def models_key(sources: str, names: tuple[str, ...]) -> str:

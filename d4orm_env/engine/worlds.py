@@ -14,7 +14,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from d4orm_env.core import collision, observation, reward, robot_model, transition
-from d4orm_env.core.dynamics import COMMON, MODEL_CODES, names_of_codes
+from d4orm_env.core.dynamics import COMMON, names_of_codes
 from d4orm_env.engine import lanes, obstacles, tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.lanes import TILE, use_wide_registers
@@ -29,6 +29,7 @@ from d4orm_env.engine.tiles import (
     ONE,
     OPTIONS,
     ROBOT,
+    ROWS,
     SPARE,
     STATE,
     STRIDE,
@@ -36,6 +37,7 @@ from d4orm_env.engine.tiles import (
     compiled,
     inlined,
     models_key,
+    models_of_kernel,
     motion_reader,
     robot_mover,
 )
@@ -48,10 +50,13 @@ for _function in (
     observation._see_robots,
     observation._see_obstacles,
     observation.insert_nearest,
+    observation._comes_before,
     observation._find_nearest_robots,
     observation._find_nearest_obstacles,
-    observation._insert_box,
-    observation._insert_triangle,
+    observation._list_of,
+    observation._point_to,
+    observation._distance_to_box,
+    observation._gap_to_triangle,
 ):
     register_jitable(**INLINED)(_function)
 
@@ -116,7 +121,7 @@ def _judge(
         tiles.mark_pairs(arrays, extra, w, near)
         for k in range(num_robots):
             robot = w[k * STRIDE : (k + 1) * STRIDE]
-            places, spare = robot[STATE * TILE : CONTROL * TILE], robot[SPARE * TILE : (SPARE + 1) * TILE]
+            places, spare = robot[STATE * TILE : CONTROL * TILE], robot[SPARE * TILE : ROWS * TILE]
             near[k, OBSTACLE] |= obstacles.near_obstacles(arrays, arrays.radius[k] + extra, places, spare)
         for s in range(min(TILE, collided.shape[0] - first)):
             for k in range(num_robots):
@@ -198,16 +203,17 @@ def roll_out_kernel(names: tuple[str, ...]) -> Any:
         num_robots = arrays.radius.shape[0]
         w = tiles.aligned_zeros(num_robots * STRIDE)
         near = np.empty((num_robots, 2), np.uint64)
+        lane = np.int64(0)  # a literal zero would compile what it is passed to once more
         for t in range(1, controls.shape[0]):
             # Loops, because numba takes seconds to compile assignments of slices.
             for k in range(num_robots):
                 for i in range(states.shape[2]):
                     states[t, k, i] = states[t - 1, k, i]
                 docked[t, k] = docked[t - 1, k]
-            _load_world(goal, states, controls, docked, t, 0, w)
+            _load_world(goal, states, controls, docked, t, lane, w)
             for k in range(num_robots):
                 move_robot(arrays, k, w)
-            _store_world(states, controls, docked, t, 0, w)
+            _store_world(states, controls, docked, t, lane, w)
         _judge_all(arrays, goal, inverse, states, controls, docked, collided, violated, rewards, w, near)
 
     return roll_out
@@ -230,7 +236,7 @@ def _allocate_sensed(num_robots: Any, dimension: Any, num_neighbors: Any, num_ob
     return observation.Sensed(
         np.empty((num_robots, dimension), np.float32), np.empty((num_robots, dimension), np.float32),
         np.empty((num_robots, 2), np.float32), np.empty(num_robots, np.float32),
-        np.empty((num_neighbors, 2), np.float32), np.empty((num_obstacles, 1 + dimension), np.float32),
+        np.empty((num_neighbors, 2), np.float32), np.empty((num_obstacles, 2), np.float32),
     )  # fmt: skip
 
 
@@ -475,11 +481,13 @@ class WorldKernels(NamedTuple):
 
 
 def world_kernels(models: tuple[str, ...]) -> WorldKernels:
-    """Kernels for a team of these models: the same for all mixtures of common ones, and else of just these."""
-    different = set(models)
-    names = COMMON if different <= set(COMMON) else tuple(sorted(different, key=MODEL_CODES.__getitem__))
+    """Kernels for a team of these models. Rolling out, which a first plan waits for, has them by models as sampling;
+    the others are the same for all mixtures of common models.
+    """
+    own = models_of_kernel(models)
+    names = COMMON if set(own) <= set(COMMON) else own
     return WorldKernels(
-        step_worlds_kernel(names), roll_out_kernel(names), observe_world_kernel(names), advance_worlds_kernel(names)
+        step_worlds_kernel(names), roll_out_kernel(own), observe_world_kernel(names), advance_worlds_kernel(names)
     )
 
 

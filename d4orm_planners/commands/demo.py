@@ -37,7 +37,7 @@ def demo(
     report = verify(problem, plan.controls)
     verdict = "yes" if report.ok else "no: " + "; ".join(map(str, report.violations[:3]))
     rows = [("verified", verdict), ("closest approach", f"{report.min_separation * 100:.1f} cm between surfaces")]
-    print_table("Executed in the environment", [*episode_rows(episode.metrics), *rows])
+    print_table("Executed in the environment", [*episode_rows(episode), *rows])
     files = {"plan": out / "plan.npz", "picture": out / "plan.png", "animation": out / "execution.gif"}
     plan.save(files["plan"])
     title = f"{problem.num_robots} robots, planned by D4orm in {plan.wall_time:.2f} s"

@@ -10,7 +10,7 @@ import typer
 
 from d4orm_planners.commands.dataclass_options import takes
 from d4orm_planners.commands.inputs import MOST_SEEDS, decimals, make_folder, names, numbers, parse_settings
-from d4orm_planners.commands.options import Quiet, TimeLimit
+from d4orm_planners.commands.options import Quiet, ScenarioSettings, TimeLimit
 
 if TYPE_CHECKING:
     from d4orm_planners.evaluation.summary import SuccessRate
@@ -46,6 +46,7 @@ class StudyOptions:
     model: Annotated[
         str | None, typer.Option("--model", "-m", help="Robot models, as car,unicycle; the scenario's own by default.")
     ] = None
+    scenario_settings: ScenarioSettings = None
     seeds: Annotated[
         str, typer.Option("--seeds", "--trials", "-n", help="How many, or which: 50 for 0 to 49, 10-19, or 3,5,8.")
     ] = "50"
@@ -83,6 +84,7 @@ class StudyOptions:
             control_noise_std=decimals("--control-noise-std", self.control_noise_std),
             num_robots=numbers("--num-robots", self.num_robots) or (None,),
             model=names(self.model),
+            scenario_settings=parse_settings(self.scenario_settings, "--scenario-set"),
             time_limit=self.time_limit,
         )
         make_folder(self.out)

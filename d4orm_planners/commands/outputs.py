@@ -7,17 +7,20 @@ from typing import TYPE_CHECKING
 import typer
 
 if TYPE_CHECKING:
+    from d4orm_planners.episode import Episode
     from d4orm_planners.plan import Plan
 
 
-def episode_rows(metrics: dict[str, float]) -> list[tuple[str, str]]:
+def episode_rows(episode: Episode) -> list[tuple[str, str]]:
     """What happened in an episode."""
+    metrics = episode.metrics
     return [
         ("success", "yes" if metrics["success"] else "no"),
         ("arrived", f"{metrics['arrived']:.0f}"),
         ("robots in contact", f"{metrics['collided']:.0f}"),
         ("travel time", f"{metrics['travel_time']:.2f} s"),
         ("makespan", f"{metrics['makespan']:.2f} s"),
+        ("stretch", f"{episode.stretch:.2f}"),
     ]
 
 
@@ -30,6 +33,7 @@ def print_plan(plan: Plan) -> None:
         ("iterations", f"{plan.iterations}"),
         ("travel time", f"{metrics['travel_time']:.2f} s"),
         ("makespan", f"{metrics['makespan']:.2f} s"),
+        ("stretch", f"{plan.stretch:.2f}"),
         ("reward", f"{metrics['reward']:.3f}"),
     ]
     if not plan.solved:

@@ -58,7 +58,7 @@ def run(options: RunOptions) -> None:
     episode = execute(problem, policy, options.seed, options.control_noise_std)
     options.draw(problem, episode.trajectory)
     if not options.quiet:
-        print_table("Execution", episode_rows(episode.metrics))
+        print_table("Execution", episode_rows(episode))
     if not episode.metrics["success"]:
         raise typer.Exit(1)
 

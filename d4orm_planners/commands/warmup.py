@@ -22,6 +22,7 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.dynamics import COMMON
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
 from d4orm_env.engine.base import SamplingRules, SamplingTask
 from d4orm_env.engine.caching import has_to_be_compiled
 from d4orm_env.engine.choice import get_engine
@@ -47,7 +48,9 @@ class WarmupReport:
 
 
 TEAMS = (*((model, model) for model in COMMON), ("holonomic2d", "differential_drive"))
-"""The smallest teams of common models that have a sampling kernel of their own."""
+"""The smallest teams of common models that have kernels of their own."""
+
+_RULES = SamplingRules(weights=SoftmaxWeights(1.0))
 
 
 def compile_for_planning(
@@ -72,16 +75,24 @@ def compile_for_planning(
 
 
 def _in_another_process(call: str) -> subprocess.Popen[bytes]:
-    return subprocess.Popen([sys.executable, "-c", f"from {__name__} import roll_out_once, sample_once; {call}"])
+    return subprocess.Popen(
+        [sys.executable, "-c", f"from {__name__} import find_way, roll_out_once, sample_once; {call}"]
+    )
 
 
 def roll_out_once(models: tuple[str, ...], *, drives: bool = True) -> None:
     """Roll out a plan of the smallest problem of a team of these models on the CPU, and drive straight.
 
-    Samples are weighed here too, and first: the process that samples needs that last, and has more to do.
+    Samples are weighed and averaged here too, and first: the process that scores them, which takes longer, needs that
+    last.
     """
-    SoftmaxWeights(1.0)(np.zeros((1, 2), np.float32), np)
+    from d4orm_env.engine.cpu import Sampling
+    from d4orm_env.engine.threads import Threads
+
     problem = _smallest_problem(models)
+    rewards = np.zeros((1, 2), np.float32)
+    run = Sampling(SamplingTask(problem, _no_controls(problem)), _RULES, rewards.size, 0, Threads(1))
+    run.moments(_RULES.weights(rewards, np), with_second=False)
     get_engine("cpu").rollout(problem, _no_controls(problem))
     if drives:
         prepare_drives(problem)
@@ -92,8 +103,13 @@ def sample_once(teams: tuple[tuple[str, ...], ...]) -> None:
     for models in teams:
         problem = _smallest_problem(models)
         task = SamplingTask(problem, _no_controls(problem))
-        rules = SamplingRules(weights=SoftmaxWeights(1.0))
-        get_engine("cpu").prepare(task, rules, np.ones(1, np.float32), 2)
+        get_engine("cpu").prepare(task, _RULES, np.ones(1, np.float32), 2)
+
+
+def find_way() -> None:
+    """Find the shortest free way round an obstacle."""
+    problem = _smallest_problem(TEAMS[0])
+    problem.replace(world=World(circles=[(0.5, 5, 1)])).ways.distance(problem.goal)
 
 
 def warm_up() -> WarmupReport:
@@ -105,14 +121,16 @@ def warm_up() -> WarmupReport:
     # Before anything runs: what the other process compiles is in the cache when it is needed here.
     missing = [kernel for kernel in _kernels() if has_to_be_compiled(kernel)]
     # The last kernel, for three models, takes as long as two others.
-    other = _in_another_process(f"roll_out_once({TEAMS[0]}); sample_once({TEAMS[1:-1]})")
+    other = _in_another_process(f"roll_out_once({TEAMS[0]}); sample_once({TEAMS[1:-1]}); find_way()")
     sample_once((TEAMS[0], TEAMS[-1]))
+    for models in TEAMS[1:]:
+        roll_out_once(models)
+    _step_environments()
     other.wait()
     sample_once(TEAMS)
-    for models in TEAMS:
-        roll_out_once(models)
+    roll_out_once(TEAMS[0])
+    find_way()
     _plan()
-    _step_environments()
     seconds = time.perf_counter() - begin
     kernels = [kernel for kernel in _kernels() if kernel.signatures]
     compiled = [kernel for kernel in kernels if kernel.stats.cache_misses or kernel in missing]
@@ -175,5 +193,6 @@ def _kernels() -> list[Any]:
     modules = [import_module(f"{engine.__name__}.{module.name}") for module in pkgutil.iter_modules(engine.__path__)
                if module.name != "jax"]  # fmt: skip
     found = {name: value for module in modules for name, value in vars(module).items() if isinstance(value, Dispatcher)}
-    kernels = [*found.values(), *world_kernels(COMMON), *map(score_kernel, TEAMS), *map(drive_kernel, COMMON)]
+    worlds = {kernel for models in TEAMS for kernel in world_kernels(models)}
+    kernels = [*found.values(), *worlds, *map(score_kernel, TEAMS), *map(drive_kernel, COMMON)]
     return [kernel for kernel in kernels if kernel.stats.cache_path is not None]

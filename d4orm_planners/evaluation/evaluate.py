@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
@@ -33,6 +33,7 @@ def evaluate(
     control_noise_std: float | Iterable[float] = 0.0,
     num_robots: int | Iterable[int | None] | None = None,
     model: str | Iterable[str | None] | None = None,
+    scenario_settings: Mapping[str, object] | None = None,
     time_limit: float | None = None,
     trial_timeout: float | None = None,
     workers: int | None = None,
@@ -58,6 +59,8 @@ def evaluate(
         control_noise_std: Standard deviations of the Gaussian noise added to the controls, in their units.
         num_robots: Team sizes for scenarios by name; ``None`` is the scenario's own.
         model: Robot models for scenarios by name; ``None`` is the scenario's own.
+        scenario_settings: Further arguments of the scenarios by name, as ``{"corridor_width": 0.8}``; every one of them
+            must take all of these. The results name them behind the scenario.
         time_limit: Seconds for planning, for planners without a ``time_limit`` of their own.
         trial_timeout: Seconds after which a trial is ended with an error; ``None`` waits.
         workers: Processes of one thread each, by default as many as there are cores; with 1, and without
@@ -81,6 +84,7 @@ def evaluate(
         control_noise_std=control_noise_std,
         num_robots=num_robots,
         model=model,
+        scenario_settings=scenario_settings or {},
         time_limit=time_limit,
     )
     trials = run_study(study, out, trial_timeout=trial_timeout, workers=workers, ray=ray, progress=progress)

@@ -15,7 +15,7 @@ from d4orm_planners.evaluation.summary import SuccessRate, SuccessWithin
 
 PARQUET_HINT = 'trials.parquet is not written, which needs pyarrow; install it with pip install "d4orm-env[evaluate]"'
 HEADER = ("policy", "noise", "success", "95% interval", "verified", "contact", "not in time", "errors",
-          "travel time, s", "planning, s", "computing per s of motion, s")  # fmt: skip
+          "travel time, s", "stretch", "planning, s", "computing per s of motion, s")  # fmt: skip
 
 
 def write_results(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) -> list[Path]:
@@ -135,6 +135,7 @@ def cells(rate: SuccessRate) -> tuple[str, ...]:
         f"{rate.lower:.0%} to {rate.upper:.0%}",
         *(str(count) for count in (rate.verified, rate.contacts, rate.late, rate.errors)),
         _interval(rate.travel_time, rate.travel_time_lower, rate.travel_time_upper, 2),
+        "-" if rate.stretch is None else f"{rate.stretch:.2f}",
         "-" if rate.wall_time is None else f"{rate.wall_time:.2f}",
         _interval(rate.compute, rate.compute_lower, rate.compute_upper, 3),
     )

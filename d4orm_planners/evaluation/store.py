@@ -50,7 +50,7 @@ class Trial:
 
     Attributes:
         label: What the policy with these settings was called.
-        scenario: Name of the scenario.
+        scenario: Name of the scenario, with the arguments that it was given.
         num_robots: Team size.
         model: Model names of the team, each once, joined by ``+``.
         dt: Time step [s].
@@ -64,6 +64,8 @@ class Trial:
         arrived: Robots that arrived.
         travel_time: Mean arrival time [s], with the time of the whole episode for a robot that did not arrive.
         makespan: Latest arrival time [s], likewise.
+        stretch: Way travelled over the shortest free way, see :func:`d4orm_env.core.metrics.mean_stretch`; ``None`` if
+            nobody arrived, and in rows that older versions wrote.
         reward: Mean over steps and robots.
         mean_squared_jerk: See :func:`d4orm_env.core.metrics.mean_squared_jerk` [m^2/s^6].
         steps: Steps of the episode.
@@ -101,6 +103,7 @@ class Trial:
     arrived: int = 0
     travel_time: float | None = None
     makespan: float | None = None
+    stretch: float | None = None
     reward: float | None = None
     mean_squared_jerk: float | None = None
     steps: int = 0
@@ -137,8 +140,8 @@ _PYTHON: Mapping[str, tuple[type, ...]] = {
 _TYPES = {field.name: str(field.type).split(" | ") for field in fields(Trial)}
 _KINDS = {name: tuple(chain(*(_PYTHON[kind] for kind in kinds))) for name, kinds in _TYPES.items()}
 """What may be in a row, by column."""
-_COLUMNS = (f"{name} {_SQL[kinds[0]]}{'' if 'None' in kinds else ' NOT NULL'}" for name, kinds in _TYPES.items())
-_CREATE = f"CREATE TABLE trials ({', '.join(_COLUMNS)}, PRIMARY KEY ({_KEY})) WITHOUT ROWID"
+_COLUMNS = {name: f"{name} {_SQL[kinds[0]]}{'' if 'None' in kinds else ' NOT NULL'}" for name, kinds in _TYPES.items()}
+_CREATE = f"CREATE TABLE trials ({', '.join(_COLUMNS.values())}, PRIMARY KEY ({_KEY})) WITHOUT ROWID"
 # What has run to its end stays as it is; only a trial that failed may be tried again.
 _ADD = (
     f"INSERT INTO trials ({', '.join(_NAMES)}) VALUES ({', '.join('?' * len(_NAMES))}) ON CONFLICT ({_KEY}) "
@@ -206,8 +209,9 @@ class TrialStore:
     def trials(self) -> list[Trial]:
         """All trials, in order of key."""
         with self._connection() as connection:
-            former = {} if _pragma(connection, "user_version") == VERSION else _FORMER
-            columns = ", ".join(f"{former.get(name, name)} AS {name}" for name in _NAMES)
+            there = _columns(connection)
+            former = {name: name if name in there else _FORMER.get(name, "NULL") for name in _NAMES}
+            columns = ", ".join(f"{column} AS {name}" for name, column in former.items())
             rows = connection.execute(f"SELECT {columns} FROM trials ORDER BY {_KEY}").fetchall()
         return [self._trial(number, dict(zip(_NAMES, row))) for number, row in enumerate(rows)]
 
@@ -256,7 +260,7 @@ class TrialStore:
         return sqlite3.connect(name, uri=True, timeout=PATIENCE, isolation_level=None)
 
     def _make(self, connection: sqlite3.Connection) -> None:
-        """Make the table in a new file, or rename the columns of one from before."""
+        """Make the table in a new file, or give one from before the columns of now."""
         if _pragma(connection, "application_id") != APPLICATION_ID:
             # One transaction, so that of two processes that find no file one makes the table.
             connection.execute("BEGIN IMMEDIATE")
@@ -268,8 +272,13 @@ class TrialStore:
         elif _pragma(connection, "user_version") == VERSION - 1:
             connection.execute("BEGIN IMMEDIATE")
             if _pragma(connection, "user_version") == VERSION - 1:  # and no other process has been here meanwhile
-                for name, former in _FORMER.items():
-                    connection.execute(f"ALTER TABLE trials RENAME COLUMN {former} TO {name}")
+                for name in set(_NAMES) - _columns(connection):
+                    change = (
+                        f"RENAME COLUMN {_FORMER[name]} TO {name}"
+                        if name in _FORMER
+                        else f"ADD COLUMN {_COLUMNS[name]}"
+                    )
+                    connection.execute(f"ALTER TABLE trials {change}")
                 connection.execute(f"PRAGMA user_version = {VERSION}")
             connection.execute("COMMIT")
 
@@ -288,6 +297,10 @@ class TrialStore:
         return ValueError(
             f"trial store {self.path} is damaged ({reason}); put a copy in its place, or move it away to begin anew"
         )
+
+
+def _columns(connection: sqlite3.Connection) -> set[str]:
+    return {row[1] for row in connection.execute("PRAGMA table_info(trials)")}
 
 
 def _use_wal(connection: sqlite3.Connection) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -37,6 +38,7 @@ class Study:
     control_noise_std: float | Iterable[float] = 0.0
     num_robots: int | Iterable[int | None] | None = None
     model: str | Iterable[str | None] | None = None
+    scenario_settings: Mapping[str, object] = field(default_factory=dict)
     time_limit: float | None = None
 
     def groups(self) -> list[list[Job]]:
@@ -54,8 +56,8 @@ class Study:
             raise ValueError("control_noise_std is empty; give at least one level")
         policies, seeds = self.configurations(), _checked_seeds(self.seeds)
         return [
-            [Job(policy, problem, seed, levels) for seed, problem in zip(seeds, problems)]
-            for problems in self._problems(seeds)
+            [Job(policy, problem, scenario, seed, levels) for seed, problem in zip(seeds, problems)]
+            for scenario, problems in self._problems(seeds)
             for policy in policies
         ]
 
@@ -86,8 +88,12 @@ class Study:
             raise ValueError(f"policies[{label!r}] has the name of another policy; give it another label")
         return choice
 
-    def _problems(self, seeds: Sequence[int]) -> list[list[Problem]]:
-        """One list per scenario, model and team size, with a problem for every seed."""
+    def _problems(self, seeds: Sequence[int]) -> list[tuple[str, list[Problem]]]:
+        """A name and a list per scenario, model and team size, with a problem for every seed."""
+        for name, own in (("num_robots", "num_robots"), ("model", "model"), ("seed", "seeds")):
+            if name in self.scenario_settings:
+                raise ValueError(f"scenario_settings has {name!r}; give {own!r} itself instead")
+        said = ", ".join(f"{name}={value}" for name, value in self.scenario_settings.items())
         sizes = dict.fromkeys(_several(self.num_robots))
         models: tuple[str | None, ...] = _several(self.model)
         cells = []
@@ -95,20 +101,23 @@ class Study:
         scenarios: tuple[Scenario, ...] = _several(self.scenarios)
         for scenario in dict.fromkeys(scenarios):
             if isinstance(scenario, Problem):
-                cells.append([scenario] * len(seeds))
+                cells.append((scenario.name, [scenario] * len(seeds)))
             elif is_scenario_file(scenario):
-                cells.append([_load(Path(scenario))] * len(seeds))
+                problem = _load(Path(scenario))
+                cells.append((problem.name, [problem] * len(seeds)))
             else:
                 named = True
-                cells += [
-                    [make_problem(scenario, size, seed, model=model) for seed in seeds]
-                    for model in dict.fromkeys(models)
-                    for size in sizes
-                ]
+                for model, size in product(dict.fromkeys(models), sizes):
+                    problems = [
+                        make_problem(scenario, size, seed, model=model, **self.scenario_settings) for seed in seeds
+                    ]
+                    cells.append((f"{problems[0].name} ({said})" if said else problems[0].name, problems))
         if not cells:
             raise ValueError("scenarios, num_robots or model is empty; give at least one of each")
-        if not named and any(given is not None for given in (*models, *sizes)):
-            raise ValueError("num_robots and model do not go with scenario files; change them in the files")
+        if not named and (said or any(given is not None for given in (*models, *sizes))):
+            raise ValueError(
+                "num_robots, model and scenario_settings do not go with scenario files; change them in the files"
+            )
         return cells
 
 

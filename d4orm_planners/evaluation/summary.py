@@ -79,6 +79,7 @@ class SuccessRate(Compared):
         travel_time: Mean over the successes of the mean arrival time [s]; ``None`` without any.
         travel_time_lower: Lower end of its interval (Student's t); ``None`` with fewer than two successes.
         travel_time_upper: Upper end.
+        stretch: Mean over the successes of the way travelled over the shortest free way; ``None`` without any.
         wall_time: Median seconds of planning, or of choosing all actions, in a trial; ``None`` if all raised errors.
         compute: Mean seconds of planning, or of choosing actions, per second of motion, likewise.
         compute_lower: Lower end of its interval (Student's t); ``None`` with fewer than two trials.
@@ -91,6 +92,7 @@ class SuccessRate(Compared):
     travel_time: float | None
     travel_time_lower: float | None
     travel_time_upper: float | None
+    stretch: float | None
     wall_time: float | None
     compute: float | None
     compute_lower: float | None
@@ -169,6 +171,7 @@ def success_rate(trials: Sequence[Trial], label: str | None = None) -> SuccessRa
     """
     successes = [trial for trial in trials if trial.success]
     travel = mean_interval([trial.travel_time for trial in successes if trial.travel_time is not None])
+    stretch = [trial.stretch for trial in successes if trial.stretch is not None]
     timed = [(trial.wall_time, trial.steps * trial.dt) for trial in trials if trial.wall_time is not None]
     compute = mean_interval([seconds / motion for seconds, motion in timed if motion > 0])
     return SuccessRate(
@@ -179,6 +182,7 @@ def success_rate(trials: Sequence[Trial], label: str | None = None) -> SuccessRa
         travel_time=travel[0],
         travel_time_lower=travel[1],
         travel_time_upper=travel[2],
+        stretch=float(np.mean(stretch)) if stretch else None,
         wall_time=float(np.median([seconds for seconds, _ in timed])) if timed else None,
         compute=compute[0],
         compute_lower=compute[1],

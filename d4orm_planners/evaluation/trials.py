@@ -81,12 +81,14 @@ class Job:
     Attributes:
         policy: The policy with its settings.
         problem: The problem.
+        scenario: What it is called in the results.
         seed: Of the policy and of the noise.
         control_noise_std: Standard deviations of the execution noise, in the controls' units.
     """
 
     policy: Configuration
     problem: Problem
+    scenario: str
     seed: int
     control_noise_std: tuple[float, ...]
 
@@ -99,7 +101,7 @@ class Job:
         return Trial(
             **self.key(noise)._asdict(),
             label=self.policy.label,
-            scenario=self.problem.name,
+            scenario=self.scenario,
             num_robots=self.problem.num_robots,
             model="+".join(sorted(set(self.problem.team.models))),
             dt=self.problem.dt,
@@ -142,12 +144,14 @@ def _outcome(policy: _TimedPolicy, job: Job, noise: float) -> dict[str, Any]:
     report = verify(problem, np.concatenate([executed, rest]))
     metrics, plan = episode.metrics, policy.plan
     sent = {} if plan is None else plan.metrics
+    stretch = episode.stretch if metrics["arrived"] else np.inf
     return {
         "success": bool(metrics["success"]),
         "verified": report.ok,
         "violation": "" if report.ok else str(report.violations[0]),
         **{name: int(metrics[name]) for name in ("collided", "arrived", "steps")},
         **{name: float(metrics[name]) for name in ("travel_time", "makespan", "reward", "mean_squared_jerk")},
+        "stretch": stretch if np.isfinite(stretch) else None,
         "iterations": None if plan is None else plan.iterations,
         "status": "" if plan is None else plan.status,
         "history": "[]" if plan is None else compact_history(plan.history),
