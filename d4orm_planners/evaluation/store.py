@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 APPLICATION_ID = 0x64346F72
 """Marks the file as one of ours, in its header ("d4or")."""
 VERSION = 5
+READABLE = (4, VERSION)
+"""Of version 4 some columns have other names, and one is missing."""
 STORE = "trials.sqlite"
 """Name of the file in a folder of results."""
 LARGEST_NUMBER = 2**63 - 1
@@ -269,25 +271,20 @@ class TrialStore:
                 connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
                 connection.execute(f"PRAGMA user_version = {VERSION}")
             connection.execute("COMMIT")
-        elif _pragma(connection, "user_version") == VERSION - 1:
+        elif _pragma(connection, "user_version") in READABLE and set(_NAMES) - _columns(connection):
             connection.execute("BEGIN IMMEDIATE")
-            if _pragma(connection, "user_version") == VERSION - 1:  # and no other process has been here meanwhile
-                for name in set(_NAMES) - _columns(connection):
-                    change = (
-                        f"RENAME COLUMN {_FORMER[name]} TO {name}"
-                        if name in _FORMER
-                        else f"ADD COLUMN {_COLUMNS[name]}"
-                    )
-                    connection.execute(f"ALTER TABLE trials {change}")
-                connection.execute(f"PRAGMA user_version = {VERSION}")
+            for name in set(_NAMES) - _columns(connection):
+                former = _FORMER.get(name)
+                change = f"RENAME COLUMN {former} TO {name}" if former else f"ADD COLUMN {_COLUMNS[name]}"
+                connection.execute(f"ALTER TABLE trials {change}")
+            connection.execute(f"PRAGMA user_version = {VERSION}")
             connection.execute("COMMIT")
 
     def _check(self, connection: sqlite3.Connection) -> None:
         """Refuse a file of another kind or version, which stays untouched."""
         if _pragma(connection, "application_id") != APPLICATION_ID:
             raise self._foreign("it is another program's database")
-        readable = (VERSION, VERSION - 1) if self._read_only else (VERSION,)
-        if (version := _pragma(connection, "user_version")) not in readable:
+        if (version := _pragma(connection, "user_version")) not in READABLE:
             raise self._foreign(f"it has version {version}, and this program reads version {VERSION}")
 
     def _foreign(self, reason: str) -> ValueError:
