@@ -594,3 +594,21 @@ def look(space: Any, lattice: Any, reach: Any, front: Any, places: Any, target: 
                             length[b], anchor[b] = bent, a
                             target[b, 0], target[b, 1], target[b, 2] = place
             ring += 1
+
+
+@cached_kernel(SOURCES, variant="lines", **OPTIONS)
+def free_lines(space: Any, reach: Any, tails: Any, heads: Any, free: Any) -> None:
+    """Whether a body of this reach moves freely on straight lines.
+
+    Args:
+        space: The world.
+        reach: The distance to keep [m]; an end that lies nearer is left and reached on lines that come no nearer.
+        tails: ``(Q, 3)``.
+        heads: ``(Q, 3)``.
+        free: ``(Q,)`` bool, output.
+    """
+    for b in range(tails.shape[0]):
+        p, q = _place(tails, b), _place(heads, b)
+        free[b] = _sees(
+            space, reach, p, _clearance(space, p[0], p[1], p[2]), q, _clearance(space, q[0], q[1], q[2])
+        )

@@ -14,7 +14,7 @@ from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
-from d4orm_planners.guidance import (
+from d4orm_planners.d4orm_c2f.coarse import (
     Guidance,
     coarse_problem,
     interpolate,

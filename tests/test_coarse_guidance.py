@@ -10,7 +10,7 @@ from planner_support import hop_problem
 
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.choice import get_engine
-from d4orm_planners.guidance import (
+from d4orm_planners.d4orm_c2f.coarse import (
     Guidance,
     coarse_problem,
     interpolate,

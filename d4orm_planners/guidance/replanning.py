@@ -1,0 +1,131 @@
+"""A better way for one robot among all others as they drive, compiled with numba: A* in space and time on the roadmap."""
+
+from __future__ import annotations
+
+import heapq
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.tiles import OPTIONS, compiled
+from d4orm_planners.guidance import nearness, pibt
+from d4orm_planners.guidance.pibt import closed
+
+SOURCES = fingerprint((nearness, pibt))
+
+
+class Others(NamedTuple):
+    """Where everybody is at every step.
+
+    Attributes:
+        positions: ``(T + 1, K, 3)`` float64; afterwards they stay where they are [m].
+        need: ``(K,)`` how far the robot that is replanned keeps from each [m].
+    """
+
+    positions: Any
+    need: Any
+
+
+@compiled
+def _is_clear(others: Any, k: Any, step: Any, x: Any, y: Any, z: Any) -> Any:
+    """Whether nobody is near a place at a step."""
+    row = min(step, others.positions.shape[0] - 1)
+    for i in range(others.positions.shape[1]):
+        dx, dy = others.positions[row, i, 0] - x, others.positions[row, i, 1] - y
+        dz = others.positions[row, i, 2] - z
+        if i != k and dx * dx + dy * dy + dz * dz < others.need[i] * others.need[i]:
+            return False
+    return True
+
+
+@cached_kernel(SOURCES, variant="way", **OPTIONS)
+def find_way(
+    roadmap: Any, bodies: Any, nobody: Any, costs: Any, others: Any, k: Any, stride: Any, wait: Any, latest: Any
+) -> Any:
+    """The soonest way of a robot to its goal among all others.
+
+    Args:
+        roadmap: The roadmap.
+        bodies: The robots.
+        nobody: ``(N,)`` int32 of -1: others who have docked are told by their places.
+        costs: ``(N,)`` float32 length of the way from every node.
+        others: Where they are.
+        k: The robot.
+        stride: How far it drives in a step [m].
+        wait: Steps that it waits at a time.
+        latest: Step by which it must have arrived.
+
+    Returns:
+        ``(n, 3)`` int64 nodes, the steps at which it sets out for each and comes to each; none where there is no way.
+    """
+    goal, start = bodies.goals[k], np.int64(roadmap.starts[k])
+    goal_x, goal_y, goal_z = roadmap.nodes[goal, 0], roadmap.nodes[goal, 1], roadmap.nodes[goal, 2]
+    # Nobody may come near its goal once it stands there.
+    dock = others.positions.shape[0] - 1
+    while dock >= 0 and _is_clear(others, k, dock, goal_x, goal_y, goal_z):
+        dock -= 1
+    num_nodes = roadmap.nodes.shape[0]
+    # By which entry of ``path`` each node is come to at each step.
+    came = np.full((num_nodes, latest + 1), -1, np.int32)
+    path = np.empty((1024, 4), np.int64)
+    path[0, 0], path[0, 1], path[0, 2], path[0, 3] = start, 0, 0, -1
+    used, done = 1, np.zeros((num_nodes, latest + 1), np.bool_)
+    came[start, 0] = 0
+    heap = [(np.float64(costs[start]) / stride, np.int64(0))]
+    while len(heap) > 0:
+        _, entry = heapq.heappop(heap)
+        node, step = path[entry, 0], path[entry, 2]
+        if done[node, step]:
+            continue
+        done[node, step] = True
+        if node == goal and step > dock:
+            count, walk = 0, entry
+            while walk >= 0:
+                count, walk = count + 1, path[walk, 3]
+            found, walk = np.empty((count, 3), np.int64), entry
+            while walk >= 0:
+                count -= 1
+                found[count, 0], found[count, 1], found[count, 2] = path[walk, 0], path[walk, 1], path[walk, 2]
+                walk = path[walk, 3]
+            return found
+        if node == goal and bodies.docks:
+            continue
+        tail = roadmap.nodes[node]
+        for e in range(roadmap.first[node], roadmap.first[node + 1] + 1):
+            head, steps = node, wait
+            if e < roadmap.first[node + 1]:
+                head = np.int64(roadmap.heads[e])
+                if not costs[head] < np.inf or closed(roadmap, bodies, nobody, k, node, e):
+                    continue
+                if head == goal and bodies.docks and step + np.int64(np.ceil(roadmap.lengths[e] / stride)) <= dock:
+                    continue
+                steps = np.int64(np.ceil(roadmap.lengths[e] / stride))
+            until = step + steps
+            if until > latest or done[head, until]:
+                continue
+            before = came[head, until]
+            if before >= 0 and path[before, 3] >= 0 and head != node and path[before, 1] <= step:
+                continue
+            free, place = True, roadmap.nodes[head]
+            for s in range(1, steps + 1):
+                share = s / steps
+                free &= _is_clear(
+                    others,
+                    k,
+                    step + s,
+                    tail[0] + share * (place[0] - tail[0]),
+                    tail[1] + share * (place[1] - tail[1]),
+                    tail[2] + share * (place[2] - tail[2]),
+                )
+                if not free:
+                    break
+            if not free:
+                continue
+            if used == path.shape[0]:
+                path = np.concatenate((path, np.empty((used, 4), np.int64)))
+            path[used, 0], path[used, 1], path[used, 2], path[used, 3] = head, step, until, entry
+            came[head, until] = used
+            heapq.heappush(heap, (until + np.float64(costs[head]) / stride, np.int64(used)))
+            used += 1
+    return np.empty((0, 3), np.int64)
