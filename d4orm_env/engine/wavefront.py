@@ -596,19 +596,18 @@ def look(space: Any, lattice: Any, reach: Any, front: Any, places: Any, target: 
             ring += 1
 
 
+@compiled
+def is_free_line(space: Any, reach: Any, tail: Any, head: Any) -> Any:
+    """Whether a body of this reach moves freely straight from one place to another.
+
+    An end that lies nearer than that to something is left and reached on a line that comes no nearer.
+    """
+    p, q = (tail[0], tail[1], tail[2]), (head[0], head[1], head[2])
+    return _sees(space, reach, p, _clearance(space, p[0], p[1], p[2]), q, _clearance(space, q[0], q[1], q[2]))
+
+
 @cached_kernel(SOURCES, variant="lines", **OPTIONS)
 def free_lines(space: Any, reach: Any, tails: Any, heads: Any, free: Any) -> None:
-    """Whether a body of this reach moves freely on straight lines.
-
-    Args:
-        space: The world.
-        reach: The distance to keep [m]; an end that lies nearer is left and reached on lines that come no nearer.
-        tails: ``(Q, 3)``.
-        heads: ``(Q, 3)``.
-        free: ``(Q,)`` bool, output.
-    """
+    """:func:`is_free_line` of many, from ``tails`` ``(Q, 3)`` to ``heads`` ``(Q, 3)``; ``free`` ``(Q,)`` is output."""
     for b in range(tails.shape[0]):
-        p, q = _place(tails, b), _place(heads, b)
-        free[b] = _sees(
-            space, reach, p, _clearance(space, p[0], p[1], p[2]), q, _clearance(space, q[0], q[1], q[2])
-        )
+        free[b] = is_free_line(space, reach, tails[b], heads[b])

@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from d4orm_env.core import robot_model, transition
-from d4orm_env.core.arrays import LARGEST
+from d4orm_env.core.arrays import LARGEST, FloatArray
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_model import ACCELERATION, SPEED, TURN_RATE
 from d4orm_env.engine import lanes, tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.tiles import OPS, OPTIONS, ZERO, compiled, inlined, make_stepper, models_key, to_fixed_tuple
+from d4orm_env.engine.tiles import ONE, OPS, OPTIONS, ZERO, compiled, inlined, make_stepper, models_key, to_fixed_tuple
 from d4orm_planners.guidance.routes import Routes
 
 SOURCES = fingerprint((robot_model, transition, lanes, tiles))
@@ -29,7 +29,7 @@ BRAKING = 0.5
 """Share of its acceleration that a robot counts on before corners and in them."""
 
 
-FACING, CREEP = 0.8, 0.01
+FACING, CREEP = np.float32(0.8), np.float32(0.01)
 """Cosine of the angle between heading and way from which on a robot drives, and share of its speed at which it turns."""
 RESERVE = 0.8
 """Share of the way to where it must stop that a robot plans to stop in."""
@@ -118,25 +118,82 @@ def direct(
 
 
 @cached_kernel(SOURCES, variant="paces", **OPTIONS)
-def fill_paces(routes: Any, dt: Any, corner: Any, speed: Any, braking: Any, paces: Any) -> None:
-    """How fast every point may be passed.
+def fill_paces(arcs: Any, dt: Any, corner: Any, speed: Any, braking: Any, paces: Any) -> None:
+    """How fast every point of a route may be passed.
 
     Args:
-        routes: The routes.
+        arcs: ``(P,)`` length of the route up to each [m].
         dt: Time step, in which a robot should not drive past a corner [s].
-        corner: ``(T,)`` how fast each could be by itself [m/s].
-        speed: ``(K,)`` how fast each robot can be [m/s].
-        braking: ``(K,)`` how fast it brakes [m/s^2].
-        paces: ``(T,)`` output.
+        corner: ``(P,)`` how fast each could be by itself [m/s].
+        speed: How fast the robot can be [m/s].
+        braking: How fast it brakes [m/s^2].
+        paces: ``(P,)`` output.
     """
-    for k in range(speed.shape[0]):
-        after = before = speed[k]
-        for i in range(routes.first[k + 1] - 1, routes.first[k] - 1, -1):
-            if i + 1 < routes.first[k + 1]:
-                after = np.sqrt(after * after + 2 * braking[k] * (routes.arcs[i + 1] - routes.arcs[i]))
-                after = min(after, before + (routes.arcs[i + 1] - routes.arcs[i]) / (2 * dt))
-            after = before = min(min(after, corner[i]), speed[k])
-            paces[i] = max(after, SLOWEST * speed[k])
+    after = before = speed
+    for i in range(arcs.shape[0] - 1, -1, -1):
+        if i + 1 < arcs.shape[0]:
+            way = arcs[i + 1] - arcs[i]
+            after = min(np.sqrt(after * after + 2 * braking * way), before + way / (2 * dt))
+        after = before = min(min(after, corner[i]), speed)
+        paces[i] = max(after, SLOWEST * speed)
+
+
+@cache
+def steering(name: str) -> Any:
+    """Compiled control of a robot of the model with this name towards a target.
+
+    ``(state, target, room, pace, limits, h) -> control`` drives as fast as ``pace`` allows, and so as to be able to stop
+    within ``room``.
+    """
+    robot = MODELS[name]
+    approach, track = inlined(robot.functions.approach), inlined(robot.functions.track)
+    limit_control = inlined(robot.functions.limit_control)
+    d, heading = robot.dimension, -1 if robot.heading_index is None else robot.heading_index
+    if d == 2:
+
+        @inlined
+        def scaled(origin: Any, step: Any, factor: Any) -> Any:
+            return (origin[0] + step[0] * factor, origin[1] + step[1] * factor)
+
+        @inlined
+        def length(step: Any) -> Any:
+            return np.sqrt(step[0] * step[0] + step[1] * step[1])
+
+        @inlined
+        def between(state: Any, target: Any) -> Any:
+            return (target[0] - state[0], target[1] - state[1])
+    else:
+
+        @inlined
+        def scaled(origin: Any, step: Any, factor: Any) -> Any:
+            return (origin[0] + step[0] * factor, origin[1] + step[1] * factor, origin[2] + step[2] * factor)
+
+        @inlined
+        def length(step: Any) -> Any:
+            return np.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
+
+        @inlined
+        def between(state: Any, target: Any) -> Any:
+            return (target[0] - state[0], target[1] - state[1], target[2] - state[2])
+
+    @inlined
+    def steer(state: Any, target: Any, room: Any, pace: Any, limits: Any, h: Any) -> Any:
+        gap = between(state, target)
+        distance = length(gap)
+        # As fast as it could drive to a point straight ahead that is as far off as its room goes, towards its target.
+        factor = room / distance if distance > ZERO else ZERO
+        wanted = approach(state, scaled(state, gap, factor), limits, h, OPS)
+        if heading >= 0 and distance > ZERO:
+            # It turns before it drives.
+            facing = (OPS.cos(state[heading]) * gap[0] + OPS.sin(state[heading]) * gap[1]) / distance
+            pace *= min(max((facing - FACING) / (ONE - FACING), CREEP), ONE)
+        speed = length(wanted)
+        if speed > pace:
+            factor = pace / speed
+            wanted = scaled(between(wanted, wanted), wanted, factor)
+        return limit_control(track(state, wanted, limits, h, OPS), limits, OPS)
+
+    return steer
 
 
 @cache
@@ -148,11 +205,8 @@ def drive_kernel(name: str) -> Any:
     ``controls`` ``(K, m)`` output.
     """
     robot = MODELS[name]
-    move, dock = make_stepper(robot)
-    approach, track = inlined(robot.functions.approach), inlined(robot.functions.track)
-    limit_control = inlined(robot.functions.limit_control)
+    (move, dock), steer = make_stepper(robot), steering(name)
     n, m, d, num_limits = robot.state_size, robot.control_size, robot.dimension, len(robot.limit_names)
-    heading = -1 if robot.heading_index is None else robot.heading_index
 
     @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
     def drive(
@@ -173,31 +227,8 @@ def drive_kernel(name: str) -> Any:
             k = robots[b]
             own, goal = to_fixed_tuple(limits[b], num_limits), to_fixed_tuple(goals[b], d)
             state, target = to_fixed_tuple(states[k], n), to_fixed_tuple(progress.targets[k], d)
-            square = ZERO
-            for axis in range(d):
-                gap = target[axis] - state[axis]
-                square += gap * gap
-            distance = np.sqrt(square)
-            # As fast as it could drive to a point straight ahead that is as far off as its room goes, towards its target.
-            scale = progress.room[k] / distance if distance > ZERO else ZERO
-            ahead = progress.targets[k].copy()
-            for axis in range(d):
-                ahead[axis] = states[k, axis] + (target[axis] - states[k, axis]) * scale
-            wanted = approach(state, to_fixed_tuple(ahead, d), own, h, OPS)
-            speed = ZERO
-            for axis in range(d):
-                speed += wanted[axis] * wanted[axis]
-                ahead[axis] = wanted[axis]
-            speed, pace = np.sqrt(speed), progress.pace[k]
-            if heading >= 0 and distance > ZERO:
-                # It turns before it drives.
-                facing = np.cos(state[heading]) * (target[0] - state[0]) + np.sin(state[heading]) * (target[1] - state[1])
-                pace *= min(max((facing / distance - FACING) / (1 - FACING), CREEP), 1)
-            if speed > pace:
-                for axis in range(d):
-                    ahead[axis] *= pace / speed
             standing = transition.stands(docked[k], docks)
-            control = limit_control(track(state, to_fixed_tuple(ahead, d), own, h, OPS), own, OPS)
+            control = steer(state, target, progress.room[k], progress.pace[k], own, h)
             for i in range(m):
                 controls[k, i] = ZERO if standing else control[i]
             control = to_fixed_tuple(controls[k], m)
@@ -208,37 +239,22 @@ def drive_kernel(name: str) -> Any:
     return drive
 
 
-class Drive(NamedTuple):
-    """How a team drives along its routes.
-
-    Attributes:
-        controls: ``(T, K, m)`` float32.
-        positions: ``(T + 1, K, 3)`` float64 [m].
-        passed: ``(T + 1, K)`` int64 the point of its route that each is at, counted from its first.
-        arrivals: ``(K,)`` int64 step of arrival; ``T + 1`` for who has not arrived.
-    """
-
-    controls: Any
-    positions: Any
-    passed: Any
-    arrivals: Any
-
-    def times(self, routes: Routes, robot: int) -> Any:
-        """``(P,)`` float64 when a robot passes each point of its route."""
-        points = np.arange(routes.first[robot + 1] - routes.first[robot])
-        return np.searchsorted(self.passed[:, robot], points).astype(np.float64)
-
-
-def drive_along(problem: Problem, routes: Routes, most_steps: int) -> Drive:
+def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[FloatArray, Any, Any]:
     """Drive the team along its routes until everybody has arrived, or for ``most_steps``.
 
     Args:
         problem: The team.
         routes: Its routes.
         most_steps: ``T``, if it does not end sooner.
+
+    Returns:
+        Controls ``(T, K, m)``, places ``(T + 1, K, 3)`` float64 [m] and ``(K,)`` the step of each arrival; ``T + 1`` for
+        who has not arrived.
     """
     team, arrays, d, num_robots = problem.team, problem.arrays, problem.dimension, problem.num_robots
-    paces = _paces(problem, routes)
+    paces = np.concatenate([
+        paces_along(problem, robot, routes.arcs[own], routes.bends[own]) for robot, own in enumerate(routes.each())
+    ])
     controls = np.zeros((most_steps, num_robots, problem.control_size), np.float32)
     states, docked = problem.start.copy(), np.zeros(num_robots, bool)
     progress = Progress(
@@ -248,7 +264,7 @@ def drive_along(problem: Problem, routes: Routes, most_steps: int) -> Drive:
         room=np.zeros(num_robots, np.float32),
         pace=np.zeros(num_robots, np.float32),
     )
-    positions, passed = np.zeros((most_steps + 1, num_robots, 3)), np.zeros((most_steps + 1, num_robots), np.int64)
+    places = np.zeros((most_steps + 1, num_robots, 3))
     arrivals = np.full(num_robots, most_steps + 1, np.int64)
     docking = np.array([arrays.squared_goal_radius, arrays.squared_goal_speed])
     parts = []
@@ -258,31 +274,25 @@ def drive_along(problem: Problem, routes: Routes, most_steps: int) -> Drive:
     beyond = BEYOND if problem.docks and problem.goal_speed is None else 0.0
     ends, steps = np.diff(routes.first) - 1, 0
     while True:
-        positions[steps, :, :d] = states[:, :d]
-        direct(routes, paces, problem.dt, beyond, positions[steps], docked & problem.docks, progress)
-        passed[steps] = progress.at
+        places[steps, :, :d] = states[:, :d]
+        direct(routes, paces, problem.dt, beyond, places[steps], docked & problem.docks, progress)
         # Without docking a robot may come through its goal before it has made way for others.
         there = docked & (problem.docks | (progress.at == ends))
         arrivals[:] = np.where(there, np.minimum(arrivals, steps), most_steps + 1)
         if steps == most_steps or there.all():
-            return Drive(controls[:steps], positions[: steps + 1], passed[: steps + 1], arrivals)
+            return controls[:steps], places[: steps + 1], arrivals
         for drive, *rows in parts:
             drive(arrays.time_step, docking, arrays.docks, *rows, progress, states, docked, controls[steps])
         steps += 1
 
 
-def _paces(problem: Problem, routes: Routes) -> Any:
-    """``(T,)`` how fast each point of the routes may be passed [m/s]."""
-    limits = np.asarray(problem.team.limits, np.float64)
-    corner = np.empty(len(routes.points))
-    braking = np.full(problem.num_robots, LARGEST)
-    for robot, model in enumerate(problem.team.robot_models):
-        own = slice(routes.first[robot], routes.first[robot + 1])
-        if ACCELERATION in model.control_limits:
-            braking[robot] = BRAKING * limits[robot, ACCELERATION]
-        corner[own] = np.sqrt(BRAKING * limits[robot, ACCELERATION] * routes.bends[own])
-        if model.heading_index is not None:
-            corner[own] = np.minimum(corner[own], BRAKING * limits[robot, TURN_RATE] * routes.bends[own])
-    paces = np.empty(len(corner))
-    fill_paces(routes, problem.dt, corner, limits[:, SPEED], braking, paces)
+def paces_along(problem: Problem, robot: int, arcs: Any, bends: Any) -> Any:
+    """``(P,)`` how fast a robot may pass each point of its route [m/s], from their places along it and their bends."""
+    model, limits = problem.team.robot_models[robot], np.asarray(problem.team.limits[robot], np.float64)
+    corner = np.sqrt(BRAKING * limits[ACCELERATION] * bends)
+    if model.heading_index is not None:
+        corner = np.minimum(corner, BRAKING * limits[TURN_RATE] * bends)
+    braking = BRAKING * limits[ACCELERATION] if ACCELERATION in model.control_limits else LARGEST
+    paces = np.empty(len(arcs))
+    fill_paces(arcs, problem.dt, corner, limits[SPEED], braking, paces)
     return paces

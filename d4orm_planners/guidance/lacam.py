@@ -63,7 +63,7 @@ class Moves:
     arrived: BoolArray
 
 
-class _Team:
+class Team:
     """The robots' ways to their goals around those that have docked."""
 
     def __init__(self, problem: Problem, roadmap: Roadmap) -> None:
@@ -131,7 +131,7 @@ def find_moves(
     Returns:
         The moves; ``None`` where somebody has no way on the roadmap.
     """
-    team, num_robots = _Team(problem, roadmap), problem.num_robots
+    team, num_robots = Team(problem, roadmap), problem.num_robots
     bodies, costs = team.bodies, team.bodies.costs
     length = costs[np.arange(num_robots), roadmap.starts].astype(np.float64)
     if not np.isfinite(length).all():

@@ -9,10 +9,12 @@ import numpy as np
 
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS, compiled
+from d4orm_env.engine import wavefront
+from d4orm_env.engine.wavefront import is_free_line
 from d4orm_planners.guidance import nearness, pibt
 from d4orm_planners.guidance.pibt import closed
 
-SOURCES = fingerprint((nearness, pibt))
+SOURCES = fingerprint((nearness, pibt, wavefront))
 
 
 class Others(NamedTuple):
@@ -39,9 +41,70 @@ def _is_clear(others: Any, k: Any, step: Any, x: Any, y: Any, z: Any) -> Any:
     return True
 
 
+@compiled
+def _is_line_clear(others: Any, k: Any, tail: Any, head: Any, depart: Any, arrive: Any) -> Any:
+    """Whether nobody is near a robot that drives straight from one place to another between two steps."""
+    for step in range(depart + 1, arrive + 1):
+        share = (step - depart) / (arrive - depart)
+        x, y = tail[0] + share * (head[0] - tail[0]), tail[1] + share * (head[1] - tail[1])
+        if not _is_clear(others, k, step, x, y, tail[2] + share * (head[2] - tail[2])):
+            return False
+    return True
+
+
+@cached_kernel(SOURCES, variant="straighten", **OPTIONS)
+def straighten(
+    roadmap: Any, bodies: Any, space: Any, others: Any, k: Any, reach: Any, nodes: Any, departs: Any, arrives: Any
+) -> Any:
+    """Leave out nodes of a way where the straight line is free of obstacles and of others.
+
+    Args:
+        roadmap: The roadmap.
+        bodies: The robots.
+        space: The world; ``None`` where there are no obstacles.
+        others: Where they are.
+        k: The robot.
+        reach: What it keeps from obstacles [m].
+        nodes: ``(n,)`` of the way, changed in place as all that follow.
+        departs: ``(n,)`` steps at which it sets out for each.
+        arrives: ``(n,)`` steps at which it comes to each.
+
+    Returns:
+        How many are left.
+    """
+    goal, count, i = bodies.goals[k], 1, 0
+    while i + 1 < nodes.shape[0]:
+        j = i + 1
+        depart, tail = departs[j], roadmap.nodes[nodes[i]]
+        while j + 1 < nodes.shape[0]:
+            head = roadmap.nodes[nodes[j + 1]]
+            near = nearness.squared_gap(roadmap.nodes, goal, roadmap.nodes, nodes[i], roadmap.nodes, nodes[j + 1])
+            docked = bodies.docked + bodies.slack
+            if bodies.docks and nodes[j + 1] != goal and near < docked * docked:
+                break
+            if space is not None:
+                if not is_free_line(space, reach, tail, head):
+                    break
+            if not _is_line_clear(others, k, tail, head, depart, arrives[j + 1]):
+                break
+            j += 1
+        nodes[count], departs[count], arrives[count] = nodes[j], depart, arrives[j]
+        count, i = count + 1, j
+    return count
+
+
+@cached_kernel(SOURCES, variant="touches", **OPTIONS)
+def touches(others: Any, k: Any, places: Any) -> Any:
+    """Whether a robot at places ``(T + 1, 3)`` comes nearer to any other than it may, after the start."""
+    for step in range(1, places.shape[0]):
+        if not _is_clear(others, k, step, places[step, 0], places[step, 1], places[step, 2]):
+            return True
+    return False
+
+
 @cached_kernel(SOURCES, variant="way", **OPTIONS)
 def find_way(
-    roadmap: Any, bodies: Any, nobody: Any, costs: Any, others: Any, k: Any, stride: Any, wait: Any, latest: Any
+    roadmap: Any, bodies: Any, nobody: Any, costs: Any, others: Any, k: Any, stride: Any, wait: Any, launch: Any, latest: Any
 ) -> Any:
     """The soonest way of a robot to its goal among all others.
 
@@ -54,6 +117,7 @@ def find_way(
         k: The robot.
         stride: How far it drives in a step [m].
         wait: Steps that it waits at a time.
+        launch: Steps that it loses whenever it sets out.
         latest: Step by which it must have arrived.
 
     Returns:
@@ -98,29 +162,18 @@ def find_way(
                 head = np.int64(roadmap.heads[e])
                 if not costs[head] < np.inf or closed(roadmap, bodies, nobody, k, node, e):
                     continue
-                if head == goal and bodies.docks and step + np.int64(np.ceil(roadmap.lengths[e] / stride)) <= dock:
-                    continue
                 steps = np.int64(np.ceil(roadmap.lengths[e] / stride))
+                if path[entry, 3] < 0 or path[path[entry, 3], 0] == node:
+                    steps += launch
+                if head == goal and bodies.docks and step + steps <= dock:
+                    continue
             until = step + steps
-            if until > latest or done[head, until]:
+            if until + costs[head] / stride > latest or done[head, until]:
                 continue
             before = came[head, until]
             if before >= 0 and path[before, 3] >= 0 and head != node and path[before, 1] <= step:
                 continue
-            free, place = True, roadmap.nodes[head]
-            for s in range(1, steps + 1):
-                share = s / steps
-                free &= _is_clear(
-                    others,
-                    k,
-                    step + s,
-                    tail[0] + share * (place[0] - tail[0]),
-                    tail[1] + share * (place[1] - tail[1]),
-                    tail[2] + share * (place[2] - tail[2]),
-                )
-                if not free:
-                    break
-            if not free:
+            if not _is_line_clear(others, k, tail, roadmap.nodes[head], step, until):
                 continue
             if used == path.shape[0]:
                 path = np.concatenate((path, np.empty((used, 4), np.int64)))

@@ -75,10 +75,9 @@ class Routes(NamedTuple):
     wait_for: Any
     wait_until: Any
 
-    def of(self, robot: int) -> Route:
-        """One robot's."""
-        own = slice(self.first[robot], self.first[robot + 1])
-        return Route(self.points[own], self.times[own], self.bends[own])
+    def each(self) -> list[slice]:
+        """The rows of every robot."""
+        return [slice(low, high) for low, high in zip(self.first[:-1], self.first[1:])]
 
 
 class Stops(NamedTuple):

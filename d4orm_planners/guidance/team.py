@@ -1,0 +1,151 @@
+"""A team that drives on a roadmap: along the moves of a search at first, and on better ways for some robots at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray, IntArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.engine.wavefront import make_space
+from d4orm_planners.guidance.execution import drive_along
+from d4orm_planners.guidance.lacam import Team
+from d4orm_planners.guidance.replanning import Others, find_way, straighten, touches
+from d4orm_planners.guidance.roadmap import WALL_SLACK, Roadmap
+from d4orm_planners.guidance.routes import Floats, Stops, join_routes, make_routes, stops_of
+from d4orm_planners.guidance.timed_drive import drive_by_clock
+
+FIRST_CUT, CUT = 0.03, 0.1
+"""By how much corners are cut at most on first routes, and on those that others let through [m]."""
+CRUISES = (0.9, 0.75)
+"""Shares of its speed that a robot is taken to drive at when its way is planned, the next where it is late so."""
+WAIT = 3
+"""Steps that it waits at a time."""
+LAUNCH = 0.4
+"""Share of the time to full speed that setting out costs."""
+OVERTIME = 3
+"""Horizons within which first routes must be driven; they become shorter afterwards."""
+FAR = 1e9
+"""Where robots are that are not there yet [m]."""
+LATER = 30
+"""Steps by which a robot may come later for the sake of others."""
+KEEP, TOUCH = 0.06, 0.005
+"""Distances beyond radii and margin that a new way is planned to keep, where starts and goals allow it, and keeps [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """How a team drives.
+
+    Attributes:
+        controls: ``(T, K, m)`` float32.
+        places: ``(T + 1, K, 3)`` float64 [m].
+        arrivals: ``(K,)`` int64 step of arrival; ``T + 1`` or more for who has not arrived.
+    """
+
+    controls: FloatArray
+    places: Floats
+    arrivals: IntArray
+
+    def cost(self, horizon: int) -> tuple[int, int]:
+        """Less is better: robots that come too late, and the sum of all arrival steps."""
+        return int((self.arrivals > horizon).sum()), int(self.arrivals.sum())
+
+    def until(self, horizon: int) -> FloatArray:
+        """Controls ``(H, K, m)``, at rest after the last arrival and cut off at the horizon."""
+        controls = np.zeros((horizon, *self.controls.shape[1:]), np.float32)
+        controls[: len(self.controls)] = self.controls[:horizon]
+        return controls
+
+
+def drive_moves(problem: Problem, roadmap: Roadmap, moves: IntArray) -> Driven:
+    """Drive a team along the moves of a search."""
+    stops = stops_of(roadmap, moves, problem.num_robots)
+    routes = join_routes(problem, make_routes(problem, stops, range(problem.num_robots), FIRST_CUT))
+    return Driven(*drive_along(problem, routes, OVERTIME * problem.horizon))
+
+
+class Replanning:
+    """Better ways for some robots of a team at a time, planned one after another around all others as they drive.
+
+    As in MAPF-LNS (J. Li, Z. Chen, D. Harabor, P. J. Stuckey and S. Koenig, IJCAI 2021).
+
+    Args:
+        problem: The team.
+        roadmap: The roadmap of its world.
+
+    Attributes:
+        alone: ``(K,)`` about how many steps each robot takes by itself.
+    """
+
+    def __init__(self, problem: Problem, roadmap: Roadmap) -> None:
+        self.problem, self.roadmap = problem, roadmap
+        self.space = make_space(problem) if problem.world.num_obstacles else None
+        self.bodies, self.nobody = Team(problem, roadmap).bodies, np.full(len(roadmap.nodes), -1, np.int32)
+        speed, acceleration = (np.asarray(problem.team.limits[:, column], np.float64) for column in (0, 1))
+        self.strides = problem.dt * speed
+        self.launch = np.round(LAUNCH * speed / acceleration / problem.dt).astype(np.int64)
+        places = [roadmap.nodes[ends] for ends in (roadmap.starts, roadmap.goals)]
+        gaps = [np.sqrt(((ends[:, None] - ends) ** 2).sum(axis=2)) for ends in places]
+        self.ends_apart = np.minimum(gaps[0], gaps[1] - self.bodies.docked) - 1e-6
+        self.alone = self.bodies.costs[np.arange(problem.num_robots), roadmap.starts] / self.strides
+
+    def from_scratch(self, order: IntArray) -> Driven | None:
+        """The team with ways planned one after another in this order; ``None`` where somebody finds none."""
+        problem = self.problem
+        steps, num_robots = problem.horizon, problem.num_robots
+        places = np.full((steps + 1, num_robots, 3), FAR)
+        driven = Driven(
+            np.zeros((steps, num_robots, problem.control_size), np.float32), places, np.full(num_robots, steps)
+        )
+        return driven if self.replan(driven, order, driven.arrivals.copy()) else None
+
+    def better(self, driven: Driven, robots: IntArray) -> Driven | None:
+        """The team with new ways for some robots, in their order, if that is better for all together."""
+        last = int(driven.arrivals.max())
+        changed = Driven(driven.controls[:last].copy(), driven.places[: last + 1].copy(), driven.arrivals.copy())
+        changed.places[:, robots] = FAR
+        if not self.replan(changed, robots, np.minimum(driven.arrivals + LATER, last)):
+            return None
+        return changed if changed.cost(self.problem.horizon) < driven.cost(self.problem.horizon) else None
+
+    def replan(self, driven: Driven, robots: IntArray, latest: IntArray) -> bool:
+        """Plan robots one after another around all others in ``driven``, which is changed; whether that succeeds."""
+        return all(
+            any(self.replan_one(driven, robot, int(latest[robot]), cruise) for cruise in CRUISES)
+            for robot in robots.tolist()
+        )
+
+    def replan_one(self, driven: Driven, robot: int, latest: int, cruise: float) -> bool:
+        """The same for one robot that drives at a share of its speed."""
+        roadmap, bodies, steps = self.roadmap, self.bodies, len(driven.controls)
+        apart = bodies.radius[robot] + bodies.radius + bodies.margin
+        others = Others(driven.places, np.minimum(apart + KEEP, self.ends_apart[robot]))
+        way = find_way(
+            roadmap,
+            bodies,
+            self.nobody,
+            bodies.costs[robot],
+            others,
+            robot,
+            cruise * self.strides[robot],
+            WAIT,
+            self.launch[robot],
+            latest,
+        )
+        if len(way) == 0:
+            return False
+        moving = np.append(True, way[1:, 0] != way[:-1, 0])
+        nodes, departs, arrives = (np.ascontiguousarray(column) for column in way[moving].T)
+        reach = bodies.reach[robot] * (1 + WALL_SLACK * 2 / 3)
+        left = straighten(roadmap, bodies, self.space, others, robot, reach, nodes, departs, arrives)
+        stops = Stops(
+            roadmap.nodes[nodes[:left]], np.array([0, left]), departs[:left].astype(float), arrives[:left].astype(float)
+        )
+        route = make_routes(self.problem, stops, [robot], CUT)[0]
+        controls, places, arrival = drive_by_clock(self.problem, robot, route, stops.departs, stops.arrives, steps)
+        if arrival > latest or touches(Others(driven.places, np.minimum(apart + TOUCH, others.need)), robot, places):
+            return False
+        driven.controls[:, robot], driven.places[:, robot], driven.arrivals[robot] = controls, places, arrival
+        return True
