@@ -161,7 +161,7 @@ def find_moves(
         forced = np.array(constraint.robots, np.int64), np.array(constraint.places, np.int64)
         while True:
             positions = here.positions.copy()
-            count = step_team(roadmap, bodies, scratch, here.order, *forced, seed + step, positions, moves)
+            count = step_team(roadmap, bodies, scratch, here.order, *forced, (seed + step) % 2**62, positions, moves)
             came = team.arrived(positions) & ~team.arrived(here.positions)
             if count < 0 or not bodies.docks or not came.any() or team.find_ways(positions):
                 break

@@ -12,6 +12,7 @@ from d4orm_env.engine.tiles import OPTIONS, compiled
 from d4orm_env.engine import wavefront
 from d4orm_env.engine.wavefront import is_free_line
 from d4orm_planners.guidance import nearness, pibt
+from d4orm_planners.guidance.nearness import cell_range
 from d4orm_planners.guidance.pibt import closed
 
 SOURCES = fingerprint((nearness, pibt, wavefront))
@@ -102,48 +103,104 @@ def touches(others: Any, k: Any, places: Any) -> Any:
     return False
 
 
+@compiled
+def _close_nodes(cells: Any, others: Any, k: Any, begins: Any) -> None:
+    """Mark with -1 in ``begins`` ``(N, T + 1)`` when somebody is near each node."""
+    nodes, steps, rows = cells.points, begins.shape[1], others.positions.shape[0]
+    for i in range(others.positions.shape[1]):
+        need, step = others.need[i], 0
+        while i != k and step < steps:
+            place = others.positions[min(step, rows - 1), i]
+            # Who stands still is looked at once.
+            end = step + 1
+            while end < steps:
+                after = others.positions[min(end, rows - 1), i]
+                if after[0] != place[0] or after[1] != place[1] or after[2] != place[2]:
+                    break
+                end += 1
+            low_i, high_i = cell_range(cells, 0, place[0] - need, place[0] + need)
+            low_j, high_j = cell_range(cells, 1, place[1] - need, place[1] + need)
+            low_k, high_k = cell_range(cells, 2, place[2] - need, place[2] + need)
+            for ci in range(low_i, high_i):
+                for cj in range(low_j, high_j):
+                    for ck in range(low_k, high_k):
+                        cell = (ci * cells.size[1] + cj) * cells.size[2] + ck
+                        for number in range(cells.first[cell], cells.first[cell + 1]):
+                            n = cells.items[number]
+                            dx, dy, dz = nodes[n, 0] - place[0], nodes[n, 1] - place[1], nodes[n, 2] - place[2]
+                            if dx * dx + dy * dy + dz * dz < need * need:
+                                begins[n, step:end] = -1
+            step = end
+
+
+@compiled
+def _fill_begins(begins: Any) -> None:
+    """Say of every node and step when the free interval around it begins."""
+    for n in range(begins.shape[0]):
+        begin = -1
+        for step in range(begins.shape[1]):
+            if begins[n, step] < 0:
+                begin = -1
+            else:
+                begin = step if begin < 0 else begin
+                begins[n, step] = begin
+
+
 @cached_kernel(SOURCES, variant="way", **OPTIONS)
 def find_way(
-    roadmap: Any, bodies: Any, nobody: Any, costs: Any, others: Any, k: Any, stride: Any, wait: Any, launch: Any, latest: Any
+    roadmap: Any,
+    cells: Any,
+    bodies: Any,
+    nobody: Any,
+    costs: Any,
+    others: Any,
+    k: Any,
+    stride: Any,
+    launch: Any,
+    latest: Any,
 ) -> Any:
-    """The soonest way of a robot to its goal among all others.
+    """The soonest way of a robot to its goal among all others: safe interval path planning.
+
+    After M. Phillips and M. Likhachev, *SIPP: safe interval path planning for dynamic environments* (ICRA 2011).
 
     Args:
         roadmap: The roadmap.
+        cells: Its nodes.
         bodies: The robots.
         nobody: ``(N,)`` int32 of -1: others who have docked are told by their places.
         costs: ``(N,)`` float32 length of the way from every node.
         others: Where they are.
         k: The robot.
         stride: How far it drives in a step [m].
-        wait: Steps that it waits at a time.
         launch: Steps that it loses whenever it sets out.
         latest: Step by which it must have arrived.
 
     Returns:
         ``(n, 3)`` int64 nodes, the steps at which it sets out for each and comes to each; none where there is no way.
     """
-    goal, start = bodies.goals[k], np.int64(roadmap.starts[k])
-    goal_x, goal_y, goal_z = roadmap.nodes[goal, 0], roadmap.nodes[goal, 1], roadmap.nodes[goal, 2]
+    goal, start, nodes = bodies.goals[k], np.int64(roadmap.starts[k]), roadmap.nodes
     # Nobody may come near its goal once it stands there.
     dock = others.positions.shape[0] - 1
-    while dock >= 0 and _is_clear(others, k, dock, goal_x, goal_y, goal_z):
+    while dock >= 0 and _is_clear(others, k, dock, nodes[goal, 0], nodes[goal, 1], nodes[goal, 2]):
         dock -= 1
-    num_nodes = roadmap.nodes.shape[0]
-    # By which entry of ``path`` each node is come to at each step.
-    came = np.full((num_nodes, latest + 1), -1, np.int32)
+    begins = np.zeros((nodes.shape[0], latest + 1), np.int32)
+    _close_nodes(cells, others, k, begins)
+    _fill_begins(begins)
+    # The entry of ``path`` that comes first to each interval, kept at its beginning.
+    came = np.full((nodes.shape[0], latest + 1), -1, np.int32)
     path = np.empty((1024, 4), np.int64)
     path[0, 0], path[0, 1], path[0, 2], path[0, 3] = start, 0, 0, -1
-    used, done = 1, np.zeros((num_nodes, latest + 1), np.bool_)
-    came[start, 0] = 0
+    used = 1
+    # Where it starts others may be near as well.
+    begins[start, 0] = came[start, 0] = 0
     heap = [(np.float64(costs[start]) / stride, np.int64(0))]
     while len(heap) > 0:
         _, entry = heapq.heappop(heap)
-        node, step = path[entry, 0], path[entry, 2]
-        if done[node, step]:
+        node, arrived = path[entry, 0], path[entry, 2]
+        begin = begins[node, arrived]
+        if came[node, begin] != entry:
             continue
-        done[node, step] = True
-        if node == goal and step > dock:
+        if node == goal and arrived > dock:
             count, walk = 0, entry
             while walk >= 0:
                 count, walk = count + 1, path[walk, 3]
@@ -155,30 +212,30 @@ def find_way(
             return found
         if node == goal and bodies.docks:
             continue
-        tail = roadmap.nodes[node]
-        for e in range(roadmap.first[node], roadmap.first[node + 1] + 1):
-            head, steps = node, wait
-            if e < roadmap.first[node + 1]:
-                head = np.int64(roadmap.heads[e])
-                if not costs[head] < np.inf or closed(roadmap, bodies, nobody, k, node, e):
+        tail = nodes[node]
+        for e in range(roadmap.first[node], roadmap.first[node + 1]):
+            head = np.int64(roadmap.heads[e])
+            left = costs[head] / stride
+            if not costs[head] < np.inf or closed(roadmap, bodies, nobody, k, node, e):
+                continue
+            steps, depart = np.int64(np.ceil(roadmap.lengths[e] / stride)), arrived
+            while depart <= latest and begins[node, depart] == begin:
+                until = depart + steps + (launch if depart > arrived or path[entry, 3] < 0 else 0)
+                if until + left > latest:
+                    break
+                depart += 1
+                safe = begins[head, until]
+                if safe < 0 or (head == goal and bodies.docks and until <= dock):
                     continue
-                steps = np.int64(np.ceil(roadmap.lengths[e] / stride))
-                if path[entry, 3] < 0 or path[path[entry, 3], 0] == node:
-                    steps += launch
-                if head == goal and bodies.docks and step + steps <= dock:
+                before = came[head, safe]
+                if before >= 0 and path[before, 2] <= until:
                     continue
-            until = step + steps
-            if until + costs[head] / stride > latest or done[head, until]:
-                continue
-            before = came[head, until]
-            if before >= 0 and path[before, 3] >= 0 and head != node and path[before, 1] <= step:
-                continue
-            if not _is_line_clear(others, k, tail, roadmap.nodes[head], step, until):
-                continue
-            if used == path.shape[0]:
-                path = np.concatenate((path, np.empty((used, 4), np.int64)))
-            path[used, 0], path[used, 1], path[used, 2], path[used, 3] = head, step, until, entry
-            came[head, until] = used
-            heapq.heappush(heap, (until + np.float64(costs[head]) / stride, np.int64(used)))
-            used += 1
+                if not _is_line_clear(others, k, tail, nodes[head], depart - 1, until):
+                    continue
+                if used == path.shape[0]:
+                    path = np.concatenate((path, np.empty((used, 4), np.int64)))
+                path[used, 0], path[used, 1], path[used, 2], path[used, 3] = head, depart - 1, until, entry
+                came[head, safe] = used
+                heapq.heappush(heap, (until + left, np.int64(used)))
+                used += 1
     return np.empty((0, 3), np.int64)

@@ -26,7 +26,7 @@ SPACING = 0.04
 
 CUTS = (1.0, 0.5, 0.25)
 """Shares of the allowed cut that corners are rounded by; the first that leaves room at walls."""
-ARC_POINTS = 5
+ARC_POINTS, ARC_CHECKS = 9, 17
 WAIT_SLACK = 0.09
 """Distance beyond radii and margin that robots under way keep [m]."""
 SHARPEST = 0.1
@@ -144,8 +144,8 @@ def _corner_radii(problem: Problem, corners: Floats, owner: IntArray, cut: float
         radius = np.minimum(level * np.cos(half) / (1 - np.cos(half)), straight / np.tan(half))
         fits = left.copy()
         if problem.world.num_obstacles:
-            arcs = _arcs(corners[inner], before, after, half, radius, 5)[..., : problem.dimension]
-            room = problem.world.clearance(arcs.reshape(-1, problem.dimension)).reshape(len(inner), 5)
+            arcs = _arcs(corners[inner], before, after, half, radius, ARC_CHECKS)[..., : problem.dimension]
+            room = problem.world.clearance(arcs.reshape(-1, problem.dimension)).reshape(len(inner), ARC_CHECKS)
             fits &= (room > reach[:, None]).all(axis=1)
         fits &= radius > SHARPEST
         radii[inner[fits]] = radius[fits]
