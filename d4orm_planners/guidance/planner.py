@@ -17,10 +17,12 @@ if TYPE_CHECKING:
     from d4orm_planners.guidance.roadmap import Roadmap
     from d4orm_planners.guidance.team import Driven, Replanning
 
-TRIES = (1.25, 1.0, 1.6, 1.25, 1.0, 2.2)
-"""How fine the roadmap of each try is; see :func:`~d4orm_planners.guidance.roadmap.lay_roadmap`."""
+FINENESS = (1.6, 1.25, 1.0, 2.2, 3.0)
+"""How fine the roadmaps are that are tried; see :func:`~d4orm_planners.guidance.roadmap.lay_roadmap`."""
+TURNS = 30
+"""Ways that are planned per robot before path finding for all at once is tried."""
 STEPS = 3000
-"""Steps of path finding after which another try is sooner."""
+"""Steps of path finding for all at once after which the next roadmap is tried."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +90,7 @@ class Guided(Planner):
 
 
 def first_ways(search: Search) -> Guide | None:
-    """Ways for the whole team, or as many robots as possible; ``None`` if no try finds any before time is up.
+    """Ways for the whole team, or as many robots as possible; ``None`` if nothing is found before time is up.
 
     Raises:
         ValueError: If a robot has no way even by itself; the message names it.
@@ -98,20 +100,24 @@ def first_ways(search: Search) -> Guide | None:
     from d4orm_planners.guidance.team import Replanning, drive_moves
 
     problem, best = search.problem, None
-    for number, fineness in enumerate(TRIES):
+    random = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE))
+    for number, fineness in enumerate(FINENESS):
         roadmap = lay_roadmap(problem, fineness)
-        seed = search.iteration_seed(Stream.GUIDANCE, number)
+        replanning = Replanning(problem, roadmap)
+        if not np.isfinite(replanning.alone).all():
+            if number == 0:
+                problem.check_reachable()
+            continue
+        driven = replanning.one_by_one(random, search.should_stop, TURNS * problem.num_robots)
+        if driven is not None:
+            return Guide(roadmap, replanning, driven)
+        seed = search.iteration_seed(Stream.GUIDANCE, number + 1)
         found = find_moves(problem, roadmap, seed, search.should_stop, STEPS)
         if found is not None and (best is None or found.arrived.sum() > best[1].arrived.sum()):
-            best = roadmap, found
+            best = Guide(roadmap, replanning, drive_moves(problem, roadmap, found.moves)), found
         if search.should_stop() or (found is not None and found.arrived.all()):
             break
-        if found is None and number == 0:
-            problem.check_reachable()
-    if best is None:
-        return None
-    roadmap, found = best
-    return Guide(roadmap, Replanning(problem, roadmap), drive_moves(problem, roadmap, found.moves))
+    return best and best[0]
 
 
 def compile_guidance(problem: Problem) -> None:
