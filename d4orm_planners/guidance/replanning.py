@@ -13,9 +13,12 @@ from d4orm_env.engine import wavefront
 from d4orm_env.engine.wavefront import is_free_line
 from d4orm_planners.guidance import nearness, pibt
 from d4orm_planners.guidance.nearness import cell_range
-from d4orm_planners.guidance.pibt import closed
 
 SOURCES = fingerprint((nearness, pibt, wavefront))
+
+
+BLOCK = 16
+"""Steps for which it is known at once whether somebody is about."""
 
 
 class Others(NamedTuple):
@@ -39,6 +42,47 @@ def _is_clear(others: Any, k: Any, step: Any, x: Any, y: Any, z: Any) -> Any:
         dz = others.positions[row, i, 2] - z
         if i != k and dx * dx + dy * dy + dz * dz < others.need[i] * others.need[i]:
             return False
+    return True
+
+
+@compiled
+def _fill_boxes(others: Any, boxes: Any) -> None:
+    """The lowest and highest places of everybody in every block of steps; ``boxes`` ``(B, K, 6)`` is output."""
+    positions, num_robots = others.positions, others.positions.shape[1]
+    for block in range(boxes.shape[0]):
+        for i in range(num_robots):
+            for axis in range(3):
+                low, high = np.inf, -np.inf
+                for step in range(block * BLOCK, (block + 1) * BLOCK):
+                    place = positions[min(step, positions.shape[0] - 1), i, axis]
+                    low, high = min(low, place), max(high, place)
+                boxes[block, i, axis], boxes[block, i, axis + 3] = low, high
+
+
+@compiled
+def _is_line_free(others: Any, boxes: Any, k: Any, tail: Any, head: Any, depart: Any, arrive: Any) -> Any:
+    """:func:`_is_line_clear`, looking only at those who are about."""
+    for block in range((depart + 1) // BLOCK, arrive // BLOCK + 1):
+        first, last = max(depart + 1, block * BLOCK), min(arrive + 1, (block + 1) * BLOCK)
+        for i in range(boxes.shape[1]):
+            need = others.need[i]
+            if (
+                i == k
+                or boxes[block, i, 0] - need > max(tail[0], head[0])
+                or boxes[block, i, 3] + need < min(tail[0], head[0])
+                or boxes[block, i, 1] - need > max(tail[1], head[1])
+                or boxes[block, i, 4] + need < min(tail[1], head[1])
+                or boxes[block, i, 2] - need > max(tail[2], head[2])
+                or boxes[block, i, 5] + need < min(tail[2], head[2])
+            ):
+                continue
+            for step in range(first, last):
+                share, row = (step - depart) / (arrive - depart), min(step, others.positions.shape[0] - 1)
+                dx = tail[0] + share * (head[0] - tail[0]) - others.positions[row, i, 0]
+                dy = tail[1] + share * (head[1] - tail[1]) - others.positions[row, i, 1]
+                dz = tail[2] + share * (head[2] - tail[2]) - others.positions[row, i, 2]
+                if dx * dx + dy * dy + dz * dz < need * need:
+                    return False
     return True
 
 
@@ -134,16 +178,25 @@ def _close_nodes(cells: Any, others: Any, k: Any, begins: Any) -> None:
 
 
 @compiled
-def _fill_begins(begins: Any) -> None:
-    """Say of every node and step when the free interval around it begins."""
+def _fill_begins(begins: Any, ends: Any) -> None:
+    """Say of every node and step when the free interval around it begins, and of every beginning when it ends.
+
+    Steps at which a node is not free know the next one at which it is, as its complement.
+    """
     for n in range(begins.shape[0]):
-        begin = -1
+        begin, end = -1, begins.shape[1]
         for step in range(begins.shape[1]):
             if begins[n, step] < 0:
                 begin = -1
             else:
                 begin = step if begin < 0 else begin
                 begins[n, step] = begin
+                ends[n, begin] = step + 1
+        for step in range(begins.shape[1] - 1, -1, -1):
+            if begins[n, step] < 0:
+                begins[n, step] = ~end
+            else:
+                end = step
 
 
 @cached_kernel(SOURCES, variant="way", **OPTIONS)
@@ -151,7 +204,6 @@ def find_way(
     roadmap: Any,
     cells: Any,
     bodies: Any,
-    nobody: Any,
     costs: Any,
     others: Any,
     k: Any,
@@ -167,7 +219,6 @@ def find_way(
         roadmap: The roadmap.
         cells: Its nodes.
         bodies: The robots.
-        nobody: ``(N,)`` int32 of -1: others who have docked are told by their places.
         costs: ``(N,)`` float32 length of the way from every node.
         others: Where they are.
         k: The robot.
@@ -183,16 +234,22 @@ def find_way(
     dock = others.positions.shape[0] - 1
     while dock >= 0 and _is_clear(others, k, dock, nodes[goal, 0], nodes[goal, 1], nodes[goal, 2]):
         dock -= 1
+    boxes = np.empty((latest // BLOCK + 2, others.positions.shape[1], 6))
+    _fill_boxes(others, boxes)
     begins = np.zeros((nodes.shape[0], latest + 1), np.int32)
     _close_nodes(cells, others, k, begins)
-    _fill_begins(begins)
+    ends = np.empty((nodes.shape[0], latest + 1), np.int32)
+    _fill_begins(begins, ends)
     # The entry of ``path`` that comes first to each interval, kept at its beginning.
     came = np.full((nodes.shape[0], latest + 1), -1, np.int32)
+    aside = (bodies.docked + bodies.slack / 2) ** 2
     path = np.empty((1024, 4), np.int64)
     path[0, 0], path[0, 1], path[0, 2], path[0, 3] = start, 0, 0, -1
     used = 1
     # Where it starts others may be near as well.
-    begins[start, 0] = came[start, 0] = 0
+    if begins[start, 0] < 0:
+        begins[start, 0], ends[start, 0] = 0, 1
+    came[start, 0] = 0
     heap = [(np.float64(costs[start]) / stride, np.int64(0))]
     while len(heap) > 0:
         _, entry = heapq.heappop(heap)
@@ -216,25 +273,35 @@ def find_way(
         for e in range(roadmap.first[node], roadmap.first[node + 1]):
             head = np.int64(roadmap.heads[e])
             left = costs[head] / stride
-            if not costs[head] < np.inf or closed(roadmap, bodies, nobody, k, node, e):
+            if roadmap.room[e] < bodies.reach[k] or not costs[head] < np.inf:
                 continue
-            steps, depart = np.int64(np.ceil(roadmap.lengths[e] / stride)), arrived
-            while depart <= latest and begins[node, depart] == begin:
-                until = depart + steps + (launch if depart > arrived or path[entry, 3] < 0 else 0)
+            if bodies.docks and head != goal and nearness.squared_gap(nodes, goal, nodes, node, nodes, head) < aside:
+                continue
+            steps, depart, failures = np.int64(np.ceil(roadmap.lengths[e] / stride)), arrived, 0
+            while depart < ends[node, begin]:
+                lost = launch if depart > arrived or path[entry, 3] < 0 else 0
+                until = depart + steps + lost
                 if until + left > latest:
                     break
-                depart += 1
                 safe = begins[head, until]
-                if safe < 0 or (head == goal and bodies.docks and until <= dock):
+                if safe < 0:
+                    depart += ~safe - until
                     continue
                 before = came[head, safe]
                 if before >= 0 and path[before, 2] <= until:
+                    depart += ends[head, safe] - until
                     continue
-                if not _is_line_clear(others, k, tail, nodes[head], depart - 1, until):
+                depart += 1
+                if head == goal and bodies.docks and until <= dock:
+                    continue
+                if not _is_line_free(others, boxes, k, tail, nodes[head], depart - 1, until):
+                    # Whoever stands in the way often does so for long.
+                    failures += 1
+                    depart += failures // 4
                     continue
                 if used == path.shape[0]:
                     path = np.concatenate((path, np.empty((used, 4), np.int64)))
-                path[used, 0], path[used, 1], path[used, 2], path[used, 3] = head, depart - 1, until, entry
+                path[used, 0], path[used, 1], path[used, 2], path[used, 3] = head, until - steps - lost, until, entry
                 came[head, safe] = used
                 heapq.heappush(heap, (until + left, np.int64(used)))
                 used += 1

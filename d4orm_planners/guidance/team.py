@@ -28,6 +28,8 @@ LAUNCH = 0.4
 """Share of the time to full speed that setting out costs."""
 OVERTIME = 3
 """Horizons within which first routes must be driven; they become shorter afterwards."""
+SOON, PATIENCE = 1.5, 60
+"""How many times as long as alone, and how many steps more, a way may take that is looked for at first."""
 FAR = 1e9
 """Where robots are that are not there yet [m]."""
 LATER = 30
@@ -85,7 +87,7 @@ class Replanning:
         self.problem, self.roadmap = problem, roadmap
         self.cells = sort_into_cells(roadmap.nodes, float(2 * np.asarray(problem.team.radius).max() + problem.margin))
         self.space = make_space(problem) if problem.world.num_obstacles else None
-        self.bodies, self.nobody = Team(problem, roadmap).bodies, np.full(len(roadmap.nodes), -1, np.int32)
+        self.bodies = Team(problem, roadmap).bodies
         speed, acceleration = (np.asarray(problem.team.limits[:, column], np.float64) for column in (0, 1))
         self.strides = problem.dt * speed
         self.launch = np.round(LAUNCH * speed / acceleration / problem.dt).astype(np.int64)
@@ -173,19 +175,22 @@ class Replanning:
         roadmap, bodies, steps = self.roadmap, self.bodies, len(driven.controls)
         apart = bodies.radius[robot] + bodies.radius + bodies.margin
         others = Others(driven.places, np.minimum(apart + KEEP, self.ends_apart[robot]))
-        way = find_way(
-            roadmap,
-            self.cells,
-            bodies,
-            self.nobody,
-            bodies.costs[robot],
-            others,
-            robot,
-            cruise * self.strides[robot],
-            self.launch[robot],
-            latest,
-        )
-        if len(way) == 0:
+        # Looked for among the sooner ones at first, because that is where it mostly is.
+        for bound in sorted({min(int(SOON * self.alone[robot]) + PATIENCE, latest), latest}):
+            way = find_way(
+                roadmap,
+                self.cells,
+                bodies,
+                bodies.costs[robot],
+                others,
+                robot,
+                cruise * self.strides[robot],
+                self.launch[robot],
+                bound,
+            )
+            if len(way):
+                break
+        else:
             return False
         nodes, departs, arrives = (np.ascontiguousarray(column) for column in way.T)
         reach = bodies.reach[robot] * (1 + WALL_SLACK * 2 / 3)
