@@ -165,7 +165,9 @@ def observe_ways(observations: FloatArray, layout: ObservationLayout, ways: Ways
     seen[..., parts.length] = np.minimum(length, layout.high[-1])[..., None]
 
 
-def lay_lattice(problem: Problem, space: Space | None, reach: float, step: float, most: int, pad: float = 0.0) -> Lattice:
+def lay_lattice(
+    problem: Problem, space: Space | None, reach: float, step: float, most: int, pad: float = 0.0
+) -> Lattice:
     """Nodes so far apart wherever ways may lead; farther apart where there would be too many.
 
     Args:

@@ -30,7 +30,7 @@ BRAKING = 0.5
 
 
 FACING, CREEP = np.float32(0.8), np.float32(0.01)
-"""Cosine of the angle between heading and way from which on a robot drives, and share of its speed at which it turns."""
+"""Cosine of the angle between heading and way from which on a robot drives, and share of its speed before that."""
 RESERVE = 0.8
 """Share of the way to where it must stop that a robot plans to stop in."""
 BEYOND = 2.0
@@ -64,9 +64,7 @@ def _square(points: Any, i: Any, position: Any) -> Any:
 
 
 @cached_kernel(SOURCES, variant="direct", **OPTIONS)
-def direct(
-    routes: Any, paces: Any, dt: Any, beyond: Any, positions: Any, standing: Any, progress: Any
-) -> None:
+def direct(routes: Any, paces: Any, dt: Any, beyond: Any, positions: Any, standing: Any, progress: Any) -> None:
     """Say where everybody is to drive next.
 
     Args:
@@ -99,8 +97,8 @@ def direct(
         progress.waits[k] = wait
         i, here = first + progress.at[k], positions[k]
         limit = last if wait == end else max(first + routes.wait_at[wait] - 1, i)
-        # The slower it must be there, the less far ahead it looks. A sharp corner is driven to before it is turned, and left
-        # as soon as it is as good as reached.
+        # The slower it must be there, the less far ahead it looks. A sharp corner is driven to before it is turned, and
+        # left as soon as it is as good as reached.
         target, slowest = min(i + 1, limit), paces[i]
         while target < limit and (
             (arcs[target] - arcs[i] < LOOKAHEAD + 1.5 * dt * slowest and routes.bends[target] > 0.0)
@@ -142,8 +140,8 @@ def fill_paces(arcs: Any, dt: Any, corner: Any, speed: Any, braking: Any, paces:
 def steering(name: str) -> Any:
     """Compiled control of a robot of the model with this name towards a target.
 
-    ``(state, target, room, pace, limits, h) -> control`` drives as fast as ``pace`` allows, and so as to be able to stop
-    within ``room``.
+    ``(state, target, room, pace, limits, h) -> control`` drives as fast as ``pace`` allows, and so as to be able to
+    stop within ``room``.
     """
     robot = MODELS[name]
     approach, track = inlined(robot.functions.approach), inlined(robot.functions.track)
@@ -248,13 +246,13 @@ def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[Floa
         most_steps: ``T``, if it does not end sooner.
 
     Returns:
-        Controls ``(T, K, m)``, places ``(T + 1, K, 3)`` float64 [m] and ``(K,)`` the step of each arrival; ``T + 1`` for
-        who has not arrived.
+        Controls ``(T, K, m)``, places ``(T + 1, K, 3)`` float64 [m] and ``(K,)`` the step of each arrival; ``T + 1``
+        for who has not arrived.
     """
     team, arrays, d, num_robots = problem.team, problem.arrays, problem.dimension, problem.num_robots
-    paces = np.concatenate([
-        paces_along(problem, robot, routes.arcs[own], routes.bends[own]) for robot, own in enumerate(routes.each())
-    ])
+    paces = np.concatenate(
+        [paces_along(problem, robot, routes.arcs[own], routes.bends[own]) for robot, own in enumerate(routes.each())]
+    )
     controls = np.zeros((most_steps, num_robots, problem.control_size), np.float32)
     states, docked = problem.start.copy(), np.zeros(num_robots, bool)
     progress = Progress(

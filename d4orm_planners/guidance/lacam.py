@@ -1,8 +1,8 @@
 """Path finding for a team on a roadmap: LaCAM, a search over where the whole team is.
 
-After K. Okumura, *LaCAM: search-based algorithm for quick multi-agent pathfinding* (AAAI 2023). What follows a configuration is
-made by :mod:`pibt <d4orm_planners.guidance.pibt>`, at first without constraints; whenever a configuration comes up again
-one more robot is told where to go next, so that in the end everything is tried that there is.
+After K. Okumura, *LaCAM: search-based algorithm for quick multi-agent pathfinding* (AAAI 2023). What follows a
+configuration is made by :mod:`pibt <d4orm_planners.guidance.pibt>`, at first without constraints; whenever a
+configuration comes up again one more robot is told where to go next, so that in the end everything is tried.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, IntArray
 from d4orm_env.core.problem import Problem
@@ -85,7 +86,7 @@ class Team:
         for robot in range(num_robots):
             self.fill(robot, self.nobody)
 
-    def docked_at(self, mask: BoolArray) -> IntArray:
+    def docked_at(self, mask: BoolArray) -> NDArray[np.int32]:
         """``(N,)`` who has docked at each node, of the robots in a mask ``(K,)``; -1 for nobody."""
         docked = np.full(len(self.roadmap.nodes), -1, np.int32)
         docked[self.roadmap.goals[mask]] = np.flatnonzero(mask)
@@ -104,7 +105,7 @@ class Team:
         """Bring all ways up to date; whether everybody has one, around those that have docked."""
         mask = self.arrived(positions) if self.bodies.docks else self.nobody
         docked = self.docked_at(mask)
-        for robot in np.flatnonzero(~mask):
+        for robot in np.flatnonzero(~mask).tolist():
             before = self.masks[robot]
             if before is mask or (before == mask).all():
                 continue

@@ -1,8 +1,8 @@
 """One step of the whole team on a roadmap, compiled with numba: priority inheritance with backtracking (PIBT).
 
 After K. Okumura, M. Machida, X. Defago and Y. Tamura, *Priority inheritance with backtracking for iterative multi-agent
-path finding* (AIJ 2022). Here a step is a sequence of moves of single robots, each of which keeps clear of where all others
-stand at that moment: who is in a robot's way moves first. So no two ever exchange places or turn in a ring, robots may
+path finding* (AIJ 2022). Here a step is a sequence of moves of single robots, each of which keeps clear of where all
+others stand at that moment: who is in a robot's way moves first. So no two ever exchange places or turn in a ring, robots may
 have any size and nodes lie anywhere, and the sequence says who goes first wherever ways cross.
 """
 
@@ -248,7 +248,7 @@ def _move(
         k = scratch.robots[depth]
         if scratch.edges[depth] == NOTHING:
             e = scratch.options[depth, scratch.tried[depth]]
-            if e == NOTHING or e == STAY:
+            if e < 0:
                 leave_it = e == NOTHING or forced < 0 or forced == positions[k] or depth > 0
                 if not leave_it:
                     scratch.tried[depth] += 1

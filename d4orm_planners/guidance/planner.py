@@ -21,6 +21,8 @@ FINENESS = (1.6, 1.25, 1.0, 2.2, 3.0)
 """How fine the roadmaps are that are tried; see :func:`~d4orm_planners.guidance.roadmap.lay_roadmap`."""
 TURNS = 30
 """Ways that are planned per robot before path finding for all at once is tried."""
+ROUND = 1.25
+"""How many times as long as straight a way is that leads far round; on a lattice any may be 1.1 times as long."""
 STEPS = 3000
 """Steps of path finding for all at once after which the next roadmap is tried."""
 
@@ -55,38 +57,37 @@ class Guide:
 
 
 class Guided(Planner):
-    """Path finding for the team on a roadmap (LaCAM, PIBT), driven under the robots' dynamics by precedence."""
+    """Path finding on a roadmap, one robot after another or for all at once, driven under the robots' own dynamics."""
 
     name: ClassVar[str] = "guided"
     config_class = GuidedConfig
     config: GuidedConfig
 
-    def init(self, search: Search) -> Guide | None:
-        """See :meth:`Planner.init`."""
-        with search.watch.paused():
-            compile_guidance(search.problem)
-        return None
-
     def iterate(self, search: Search, state: Guide | None) -> tuple[Guide | None, Iteration]:
         """See :meth:`Planner.iterate`: first ways for the whole team, then better ones for some robots at a time."""
-        if state is None:
-            state = first_ways(search)
-            if state is None:
-                return None, Iteration(search.current.controls, note="no way found on the roadmap")
+        if state is not None:
+            state = better_ways(search, state, self.config.neighbours, self.config.replannings)
         else:
-            state = self.better_ways(search, state)
-        return state, Iteration(state.driven.until(search.problem.horizon))
+            state = first_ways(search)
+        return state, guided_iteration(search, state)
 
-    def better_ways(self, search: Search, state: Guide) -> Guide:
-        """Replan some groups of robots; what is no better for all together is left."""
-        random = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE))
-        replanning, driven = state.replanning, state.driven
-        for _ in range(self.config.replannings):
-            if search.should_stop():
-                break
-            robots = replanning.neighbours(driven, random, self.config.neighbours)
-            driven = replanning.better(driven, robots) or driven
-        return replace(state, driven=driven)
+
+def guided_iteration(search: Search, guide: Guide | None) -> Iteration:
+    """What a team that drives so does within the horizon; what it did before if nothing was found."""
+    if guide is None:
+        return Iteration(search.current.controls, note="no ways found on the roadmap")
+    return Iteration(guide.driven.until(search.problem.horizon))
+
+
+def better_ways(search: Search, guide: Guide, neighbours: int, replannings: int) -> Guide:
+    """Replan so many groups of at most so many robots; what is no better for all together is left."""
+    random, driven = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE)), guide.driven
+    for _ in range(replannings):
+        if search.should_stop():
+            break
+        robots = guide.replanning.neighbours(driven, random, neighbours)
+        driven = guide.replanning.better(driven, robots) or driven
+    return replace(guide, driven=driven)
 
 
 def first_ways(search: Search) -> Guide | None:
@@ -100,6 +101,8 @@ def first_ways(search: Search) -> Guide | None:
     from d4orm_planners.guidance.team import Replanning, drive_moves
 
     problem, best = search.problem, None
+    with search.watch.paused():
+        compile_guidance(problem)
     random = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE))
     for number, fineness in enumerate(FINENESS):
         roadmap = lay_roadmap(problem, fineness)
@@ -120,10 +123,23 @@ def first_ways(search: Search) -> Guide | None:
     return best and best[0]
 
 
+def leads_round(problem: Problem) -> bool:
+    """Whether obstacles lead somebody's shortest way far round, so that straight ways are no place to begin."""
+    if not problem.world.num_obstacles:
+        return False
+    from d4orm_planners.guidance.lacam import Team
+    from d4orm_planners.guidance.roadmap import lay_roadmap
+
+    roadmap = lay_roadmap(problem)
+    straight = np.linalg.norm(problem.goal - problem.start[:, : problem.dimension], axis=1)
+    ways = Team(problem, roadmap).bodies.costs[np.arange(problem.num_robots), roadmap.starts]
+    return bool((ways > ROUND * straight + problem.goal_radius).any())
+
+
 def compile_guidance(problem: Problem) -> None:
     """Compile what path finding for such a team in such a world needs, if it is not yet."""
-    from d4orm_planners.guidance.roadmap import lay_roadmap
     from d4orm_planners.guidance.lacam import find_moves
+    from d4orm_planners.guidance.roadmap import lay_roadmap
     from d4orm_planners.guidance.team import Replanning, drive_moves, is_compiled
 
     if is_compiled(problem):

@@ -1,4 +1,4 @@
-"""A better way for one robot among all others as they drive, compiled with numba: A* in space and time on the roadmap."""
+"""A way for one robot among all others as they drive, compiled with numba: in space and time, on the roadmap."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from d4orm_env.engine import wavefront
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS, compiled
-from d4orm_env.engine import wavefront
 from d4orm_env.engine.wavefront import is_free_line
 from d4orm_planners.guidance import nearness, pibt
 from d4orm_planners.guidance.nearness import cell_range
@@ -127,7 +127,8 @@ def straighten(
             docked = bodies.docked + bodies.slack
             if bodies.docks and nodes[j + 1] != goal and near < docked * docked:
                 break
-            if space is not None:
+            # Nested, because the compiler leaves out what is never reached.
+            if space is not None:  # noqa: SIM102
                 if not is_free_line(space, reach, tail, head):
                     break
             if not _is_line_clear(others, k, tail, head, depart, arrives[j + 1]):

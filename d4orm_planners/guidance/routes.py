@@ -1,13 +1,14 @@
 """Who goes first: from moves on a roadmap to routes, and whom each robot has to let pass before it goes on.
 
-As in action dependency graphs (W. Hoenig, S. Kiesel, A. Tinka, J. W. Durham and N. Ayanian, 2019) only the order matters,
-not the time: wherever two routes come too near to each other, who moved there first goes first. Since the moves
+As in action dependency graphs (W. Hoenig, S. Kiesel, A. Tinka, J. W. Durham and N. Ayanian, 2019) only the order
+matters, not the time: wherever two routes come too near to each other, who moved there first goes first. Since the moves
 can be made one after another, in their order, nobody ever waits in a ring.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,8 +42,8 @@ class Route(NamedTuple):
     Attributes:
         points: ``(P, 3)`` float64 [m].
         times: ``(P,)`` float64 when each is passed, of which only the order counts.
-        bends: ``(P,)`` float64 radius of the bend at each point [m]; infinite on straight stretches, zero where it turns
-            on the spot.
+        bends: ``(P,)`` float64 radius of the bend at each point [m]; infinite on straight stretches, zero at sharp
+            corners.
     """
 
     points: Any
@@ -77,7 +78,7 @@ class Routes(NamedTuple):
 
     def each(self) -> list[slice]:
         """The rows of every robot."""
-        return [slice(low, high) for low, high in zip(self.first[:-1], self.first[1:])]
+        return [slice(low, high) for low, high in pairwise(self.first)]
 
 
 class Stops(NamedTuple):
@@ -113,7 +114,7 @@ def make_routes(problem: Problem, stops: Stops, robots: Sequence[int], cut: floa
     """The routes of robots along corners, which are rounded by ``cut`` at most [m], less where walls are near."""
     owner = np.repeat(np.asarray(robots), np.diff(stops.begin))
     points, first, times, bends = _rounded(stops, _corner_radii(problem, stops.places, owner, cut))
-    ends = [slice(low, high) for low, high in zip(first[:-1], first[1:])]
+    ends = [slice(low, high) for low, high in pairwise(first)]
     return [Route(points[own], times[own], bends[own]) for own in ends]
 
 

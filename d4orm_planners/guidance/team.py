@@ -1,4 +1,4 @@
-"""A team that drives on a roadmap: along the moves of a search at first, and on better ways for some robots at a time."""
+"""A team that drives on a roadmap: on ways planned one after another, and on better ones for some robots at a time."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numba.types import none
+from numba import types
 
 from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.problem import Problem
@@ -22,8 +22,8 @@ from d4orm_planners.guidance.timed_drive import drive_by_clock, timed_kernel
 FIRST_CUT = 0.03
 """By how much corners are cut at most on first routes [m]."""
 MANNERS = ((0.9, 0.1), (0.75, 0.03), (0.6, 0.01))
-"""Shares of its speed that a robot is taken to drive at when its way is planned, and by how much it cuts corners [m]; the
-next where it is late so, or comes too near to something."""
+"""Shares of its speed that a robot is taken to drive at when its way is planned, and by how much it cuts corners [m];
+the next where it is late so, or comes too near to something."""
 LAUNCH = 0.4
 """Share of the time to full speed that setting out costs."""
 OVERTIME = 3
@@ -35,7 +35,7 @@ FAR = 1e9
 LATER = 30
 """Steps by which a robot may come later for the sake of others."""
 KEEP, TOUCH = 0.06, 0.005
-"""Distances beyond radii and margin that a new way is planned to keep, where starts and goals allow it, and keeps [m]."""
+"""Distances beyond radii and margin that a way is planned to keep, where starts and goals allow it, and keeps [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,10 +120,8 @@ class Replanning:
             return None
         return changed if changed.cost(self.problem.horizon) < driven.cost(self.problem.horizon) else None
 
-    def one_by_one(
-        self, random: np.random.Generator, should_stop: Callable[[], bool], most: int
-    ) -> Driven | None:
-        """The team with ways planned one after another; who finds none displaces those in its way, whose turn comes again.
+    def one_by_one(self, random: np.random.Generator, should_stop: Callable[[], bool], most: int) -> Driven | None:
+        """The team with ways planned one after another; who finds none displaces others, whose turn comes again.
 
         Args:
             random: Of the order, and of who may be displaced.
@@ -214,5 +212,5 @@ def is_compiled(problem: Problem) -> bool:
     """Whether all that a team like this in a world like this needs has been compiled in this process."""
     open_world = not problem.world.num_obstacles
     return all(timed_kernel(model).signatures for model in set(problem.team.models)) and any(
-        (signature[2] is none) == open_world for signature in straighten.signatures
+        (signature[2] is types.none) == open_world for signature in straighten.signatures
     )

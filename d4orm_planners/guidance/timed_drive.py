@@ -62,7 +62,16 @@ def timed_kernel(name: str) -> Any:
 
     @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
     def drive(
-        dt: Any, docking: Any, docks: Any, limits: Any, goal: Any, route: Any, beyond: Any, state: Any, controls: Any, places: Any
+        dt: Any,
+        docking: Any,
+        docks: Any,
+        limits: Any,
+        goal: Any,
+        route: Any,
+        beyond: Any,
+        state: Any,
+        controls: Any,
+        places: Any,
     ) -> Any:
         h, rules = transition.TimeStep(dt[0], dt[1], dt[2], dt[3]), (docking[0], docking[1], docks)
         own, goal_place, x = to_fixed_tuple(limits, num_limits), to_fixed_tuple(goal, d), to_fixed_tuple(state, n)
@@ -95,7 +104,7 @@ def timed_kernel(name: str) -> Any:
             time = route.arrives[corner] - step
             if time > 1.0 and stop >= route.corners[corner]:
                 pace = min(pace, np.float32((route.corners[corner] - arcs[at] + 0.02) / (time * dt[0])))
-            ahead, target, slowest = LOOKAHEAD + 1.5 * dt[0] * route.paces[at], min(at + 1, last), route.paces[at]
+            target, slowest = min(at + 1, last), route.paces[at]
             while (
                 target < last
                 and arcs[target] < stop
