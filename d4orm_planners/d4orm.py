@@ -37,8 +37,8 @@ class D4ormConfig(ContinuationSettings, DenoisingConfig):
         late_steps: Share of the steps, the last ones, at which the noise is small enough for fewer samples.
         late_samples: Share of the samples that these steps draw.
         start: What the first iteration does without initial controls. ``"team"`` deforms standing still, as in the
-            paper; ``"guided"`` drives on ways found on a roadmap (:mod:`d4orm_planners.guidance`), which later iterations
-            deform; ``"auto"`` does the second where obstacles lead somebody far round.
+            paper; ``"guided"`` drives on ways found on a roadmap (:mod:`d4orm_planners.guidance`), which later
+            iterations deform; ``"auto"`` does the second where obstacles lead somebody far round.
         random_start: Start every deformation from ``U_N ~ N(0, I)``, as Algorithm 1 is written, rather than from zero.
             The code that the paper's authors published starts from zero, and so does the preset: it solves more.
     """

@@ -77,7 +77,7 @@ class D4ormD(D4orm):
         return state, team.iteration()
 
     def is_guided(self, search: Search) -> bool:
-        """Whether this iteration is to find ways on a roadmap: the first, or one after some that brought no solution."""
+        """Whether this iteration is to find ways on a roadmap: the first, or one after some without a solution."""
         if search.iteration == 0:
             return super().is_guided(search)
         stuck = search.iteration == GUIDED_AFTER and not search.best.solved and search.problem.world.num_obstacles > 0

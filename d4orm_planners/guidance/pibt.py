@@ -2,8 +2,8 @@
 
 After K. Okumura, M. Machida, X. Defago and Y. Tamura, *Priority inheritance with backtracking for iterative multi-agent
 path finding* (AIJ 2022). Here a step is a sequence of moves of single robots, each of which keeps clear of where all
-others stand at that moment: who is in a robot's way moves first. So no two ever exchange places or turn in a ring, robots may
-have any size and nodes lie anywhere, and the sequence says who goes first wherever ways cross.
+others stand at that moment: who is in a robot's way moves first. So no two ever exchange places or turn in a ring,
+robots may have any size and nodes lie anywhere, and the sequence says who goes first wherever ways cross.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Who goes first: from moves on a roadmap to routes, and whom each robot has to let pass before it goes on.
 
 As in action dependency graphs (W. Hoenig, S. Kiesel, A. Tinka, J. W. Durham and N. Ayanian, 2019) only the order
-matters, not the time: wherever two routes come too near to each other, who moved there first goes first. Since the moves
-can be made one after another, in their order, nobody ever waits in a ring.
+matters, not the time: wherever two routes come too near to each other, who moved there first goes first. Since the
+moves can be made one after another, in their order, nobody ever waits in a ring.
 """
 
 from __future__ import annotations
