@@ -9,14 +9,14 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.engine.base import SamplingTask
-from d4orm_planners.guidance.planner import first_ways, guided_iteration, leads_round
+from d4orm_planners.guidance.planner import Guide, first_ways, guided_iteration, leads_round
 from d4orm_planners.planner import Iteration, State
 from d4orm_planners.sampling.optimizer import DenoisingPlanner, standard_normal
 from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, Credit, DenoisingConfig
 from d4orm_planners.search import Search
 from d4orm_planners.settings import Samples, Share, ShareOrNone, Steps, one_of
 
-PATIENT_AFTER = 2
+PATIENT_AFTER = 4
 """Iterations without a solution after which the default goes on by the paper's rules: team credit, unclipped, ..."""
 PATIENT_SAMPLES = 1024
 """... and with so many samples."""
@@ -67,7 +67,7 @@ class D4orm(DenoisingPlanner):
         """See :meth:`Planner.iterate`."""
         if search.iteration == 0 and self.is_guided(search):
             guide = first_ways(search)
-            if guide is not None:
+            if isinstance(guide, Guide):
                 return state, guided_iteration(search, guide)
         return super().iterate(search, state)
 

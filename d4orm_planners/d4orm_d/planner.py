@@ -65,7 +65,7 @@ class D4ormD(D4orm):
             return state, guided_iteration(search, state)
         if self.is_guided(search):
             guide = first_ways(search)
-            if guide is not None:
+            if isinstance(guide, Guide):
                 return guide, guided_iteration(search, guide)
         if search.iteration == 0 and not search.current.controls.any():
             drives = self.straight_start(search.problem)

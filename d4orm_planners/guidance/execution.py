@@ -31,6 +31,8 @@ BRAKING = 0.5
 
 FACING, CREEP = np.float32(0.8), np.float32(0.01)
 """Cosine of the angle between heading and way from which on a robot drives, and share of its speed before that."""
+REACHED = 4e-4
+"""Square of the distance from which on a robot has come to a point [m^2]."""
 RESERVE = 0.8
 """Share of the way to where it must stop that a robot plans to stop in."""
 BEYOND = 2.0
@@ -85,7 +87,8 @@ def direct(routes: Any, paces: Any, dt: Any, beyond: Any, positions: Any, standi
             following += 1
             # Where two arcs join, points coincide but for rounding.
             if arcs[following] - arcs[i] > 0.01 or following == last:
-                if _square(points, following, here) > _square(points, i, here):
+                gap = _square(points, following, here)
+                if gap > _square(points, i, here) and gap > REACHED:
                     break
                 i = following
         progress.at[k] = (last if standing[k] else i) - first
@@ -102,7 +105,7 @@ def direct(routes: Any, paces: Any, dt: Any, beyond: Any, positions: Any, standi
         target, slowest = min(i + 1, limit), paces[i]
         while target < limit and (
             (arcs[target] - arcs[i] < LOOKAHEAD + 1.5 * dt * slowest and routes.bends[target] > 0.0)
-            or _square(points, target, here) < 4e-4
+            or _square(points, target, here) < REACHED
         ):
             target += 1
             slowest = min(slowest, paces[target])

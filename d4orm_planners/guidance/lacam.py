@@ -83,8 +83,30 @@ class Team:
         )
         self.nobody = np.zeros(num_robots, bool)
         self.masks = [self.nobody] * num_robots
+        self.holds = self.nobody.copy()
         for robot in range(num_robots):
             self.fill(robot, self.nobody)
+        self.waits_for = [self.nobody] * num_robots
+
+    def order_arrivals(self) -> None:
+        """Find out who must arrive before whom."""
+        if self.bodies.docks:
+            self.waits_for = [self.closed_by(robot) for robot in range(len(self.waits_for))]
+
+    def closed_by(self, robot: int) -> BoolArray:
+        """``(K,)`` who has no way left once a robot has docked, and so must arrive before it."""
+        alone, others = self.nobody.copy(), self.nobody.copy()
+        alone[robot] = True
+        docked, starts = self.docked_at(alone), self.roadmap.starts
+        for other in range(len(alone)):
+            costs = self.bodies.costs[other]
+            if other == robot or not np.isfinite(costs[starts[other]]):
+                continue
+            if not is_open(self.roadmap, self.bodies, docked, other, starts[other], costs):
+                around = np.empty_like(costs)
+                fill_costs(self.roadmap, self.bodies, docked, other, self.roadmap.goals[other], around)
+                others[other] = not np.isfinite(around[starts[other]])
+        return others
 
     def docked_at(self, mask: BoolArray) -> NDArray[np.int32]:
         """``(N,)`` who has docked at each node, of the robots in a mask ``(K,)``; -1 for nobody."""
@@ -92,10 +114,11 @@ class Team:
         docked[self.roadmap.goals[mask]] = np.flatnonzero(mask)
         return docked
 
-    def fill(self, robot: int, mask: BoolArray) -> None:
-        """A robot's ways anew."""
-        fill_costs(self.roadmap, self.bodies, self.docked_at(mask), robot, self.bodies.costs[robot])
-        self.masks[robot] = mask
+    def fill(self, robot: int, mask: BoolArray, holds: bool = False) -> None:
+        """A robot's ways anew: to its goal, or while it holds for others to where it started, out of their way."""
+        end = self.roadmap.starts[robot] if holds else self.roadmap.goals[robot]
+        fill_costs(self.roadmap, self.bodies, self.docked_at(mask), robot, end, self.bodies.costs[robot])
+        self.masks[robot], self.holds[robot] = mask, holds
 
     def arrived(self, positions: IntArray) -> BoolArray:
         """``(K,)`` who is at its goal."""
@@ -106,12 +129,13 @@ class Team:
         mask = self.arrived(positions) if self.bodies.docks else self.nobody
         docked = self.docked_at(mask)
         for robot in np.flatnonzero(~mask).tolist():
-            before = self.masks[robot]
-            if before is mask or (before == mask).all():
+            before, holds = self.masks[robot], bool((self.waits_for[robot] & ~mask).any())
+            if holds == self.holds[robot] and (before is mask or (before == mask).all()):
                 continue
             costs, at = self.bodies.costs[robot], positions[robot]
-            if (before & ~mask).any() or not is_open(self.roadmap, self.bodies, docked, robot, at, costs):
-                self.fill(robot, mask)
+            stale = holds != self.holds[robot] or bool((before & ~mask).any())
+            if stale or not (holds or is_open(self.roadmap, self.bodies, docked, robot, at, costs)):
+                self.fill(robot, mask, holds)
                 if not np.isfinite(costs[at]):
                     return False
         return True
@@ -137,6 +161,7 @@ def find_moves(
     length = costs[np.arange(num_robots), roadmap.starts].astype(np.float64)
     if not np.isfinite(length).all():
         return None
+    team.order_arrivals()
     scratch = _scratch(roadmap, num_robots)
     start = Configuration(roadmap.starts.copy(), None, np.empty((0, 2), np.int64), length / (length.max() + 1))
     known, open_, best, moves = {start.positions.tobytes(): start}, [start], start, np.empty((num_robots, 2), np.int64)
@@ -158,7 +183,7 @@ def find_moves(
             for place in (at, *roadmap.heads[roadmap.first[at] : roadmap.first[at + 1]].tolist()):
                 here.untried.append(Constraint((*constraint.robots, robot), (*constraint.places, place)))
         team.find_ways(here.positions)
-        scratch.may_dock[:] = True
+        scratch.may_dock[:] = ~team.holds
         forced = np.array(constraint.robots, np.int64), np.array(constraint.places, np.int64)
         while True:
             positions = here.positions.copy()
@@ -168,6 +193,7 @@ def find_moves(
                 break
             # Who would close somebody's only way must wait until that one has passed.
             scratch.may_dock[came] = False
+            team.find_ways(here.positions)
         if count < 0:
             continue
         again = known.get(positions.tobytes())

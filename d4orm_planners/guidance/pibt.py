@@ -23,6 +23,8 @@ SOURCES = fingerprint((nearness,))
 FREE, MOVING, DONE = 0, 1, 2
 """Robots that have not moved yet in a step; that are about to, once others have made way; that have, or stay."""
 STAY, NOTHING = -1, -2
+IDLE = 0.05
+"""Detour that a robot rather makes than stay where it is [m]."""
 
 
 class Bodies(NamedTuple):
@@ -125,11 +127,11 @@ def closed(roadmap: Any, bodies: Any, docked: Any, k: Any, tail: Any, e: Any) ->
 
 
 @cached_kernel(SOURCES, variant="costs", **OPTIONS)
-def fill_costs(roadmap: Any, bodies: Any, docked: Any, k: Any, costs: Any) -> None:
-    """Length of a robot's shortest way from every node to its goal; ``costs`` ``(N,)`` is output."""
+def fill_costs(roadmap: Any, bodies: Any, docked: Any, k: Any, end: Any, costs: Any) -> None:
+    """Length of a robot's shortest way from every node to one; ``costs`` ``(N,)`` is output."""
     costs[:] = np.inf
-    heap = [(0.0, bodies.goals[k])]
-    costs[bodies.goals[k]] = 0.0
+    heap = [(0.0, np.int64(end))]
+    costs[end] = 0.0
     while len(heap) > 0:
         cost, n = heapq.heappop(heap)
         if cost > costs[n]:
@@ -182,7 +184,7 @@ def _rank_options(roadmap: Any, bodies: Any, scratch: Any, depth: Any, k: Any, a
         elif pushed:
             continue
         else:
-            value, option = np.float64(costs[at]), np.int64(STAY)
+            value, option = np.float64(costs[at]) + IDLE, np.int64(STAY)
         # Ties are broken at random, lest two robots go on getting into each other's way.
         value += 1e-3 * _mixed(np.uint64(seed) + np.uint64(k), np.uint64(e))
         place = count

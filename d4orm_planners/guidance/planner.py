@@ -56,26 +56,39 @@ class Guide:
     driven: Driven
 
 
+@dataclass(frozen=True)
+class NoWays:
+    """The state of the search when no ways were found.
+
+    Attributes:
+        why: For the record of the iterations.
+    """
+
+    why: str
+
+
 class Guided(Planner):
     """Path finding on a roadmap, one robot after another or for all at once, driven under the robots' own dynamics."""
 
     name: ClassVar[str] = "guided"
     config_class = GuidedConfig
+    # The paper names path finding as what is missing, and so has no parameters for it.
+    presets: ClassVar = {"paper": {}}
     config: GuidedConfig
 
-    def iterate(self, search: Search, state: Guide | None) -> tuple[Guide | None, Iteration]:
+    def iterate(self, search: Search, state: Guide | NoWays | None) -> tuple[Guide | NoWays, Iteration]:
         """See :meth:`Planner.iterate`: first ways for the whole team, then better ones for some robots at a time."""
-        if state is not None:
+        if isinstance(state, Guide):
             state = better_ways(search, state, self.config.neighbours, self.config.replannings)
-        else:
+        elif state is None:
             state = first_ways(search)
+        if isinstance(state, NoWays):
+            return state, Iteration(search.current.controls, note=state.why)
         return state, guided_iteration(search, state)
 
 
-def guided_iteration(search: Search, guide: Guide | None) -> Iteration:
-    """What a team that drives so does within the horizon; what it did before if nothing was found."""
-    if guide is None:
-        return Iteration(search.current.controls, note="no ways found on the roadmap")
+def guided_iteration(search: Search, guide: Guide) -> Iteration:
+    """What a team that drives so does within the horizon."""
     return Iteration(guide.driven.until(search.problem.horizon))
 
 
@@ -86,16 +99,12 @@ def better_ways(search: Search, guide: Guide, neighbours: int, replannings: int)
         if search.should_stop():
             break
         robots = guide.replanning.neighbours(driven, random, neighbours)
-        driven = guide.replanning.better(driven, robots) or driven
+        driven = guide.replanning.better(driven, robots, random) or driven
     return replace(guide, driven=driven)
 
 
-def first_ways(search: Search) -> Guide | None:
-    """Ways for the whole team, or as many robots as possible; ``None`` if nothing is found before time is up.
-
-    Raises:
-        ValueError: If a robot has no way even by itself; the message names it.
-    """
+def first_ways(search: Search) -> Guide | NoWays:
+    """Ways for the whole team, or as many robots as possible; why there are none if nothing is found in time."""
     from d4orm_planners.guidance.lacam import find_moves
     from d4orm_planners.guidance.roadmap import lay_roadmap
     from d4orm_planners.guidance.team import Replanning, drive_moves
@@ -109,7 +118,10 @@ def first_ways(search: Search) -> Guide | None:
         replanning = Replanning(problem, roadmap)
         if not np.isfinite(replanning.alone).all():
             if number == 0:
-                problem.check_reachable()
+                try:
+                    problem.check_reachable()
+                except ValueError as error:
+                    return NoWays(str(error))
             continue
         driven = replanning.one_by_one(random, search.should_stop, TURNS * problem.num_robots)
         if driven is not None:
@@ -120,7 +132,7 @@ def first_ways(search: Search) -> Guide | None:
             best = Guide(roadmap, replanning, drive_moves(problem, roadmap, found.moves)), found
         if search.should_stop() or (found is not None and found.arrived.all()):
             break
-    return best and best[0]
+    return best[0] if best else NoWays("no ways found on the roadmaps")
 
 
 def leads_round(problem: Problem) -> bool:
@@ -150,4 +162,4 @@ def compile_guidance(problem: Problem) -> None:
         found = find_moves(alone, roadmap, 0, lambda: False, STEPS)
         if found is not None:
             driven = drive_moves(alone, roadmap, found.moves)
-            Replanning(alone, roadmap).better(driven, np.zeros(1, np.int64))
+            Replanning(alone, roadmap).better(driven, np.zeros(1, np.int64), np.random.default_rng(0))

@@ -27,7 +27,10 @@ SPACING = 0.04
 
 CUTS = (1.0, 0.5, 0.25)
 """Shares of the allowed cut that corners are rounded by; the first that leaves room at walls."""
-ARC_POINTS, ARC_CHECKS = 9, 17
+ARC_POINTS, ARC_CHECKS, ARC_SLACK = 9, 17, 0.01
+"""Points along an arc, those that are looked at for walls, and how far from those they keep beyond the margin [m]."""
+STRAIGHT, TURNING_BACK = 1e-4, 0.31
+"""Sine and cosine of half the angle by which ways turn at corners: less is no corner, and cannot be rounded."""
 WAIT_SLACK = 0.09
 """Distance beyond radii and margin that robots under way keep [m]."""
 SHARPEST = 0.1
@@ -122,67 +125,89 @@ def join_routes(problem: Problem, routes: Sequence[Route]) -> Routes:
     """Everybody's routes, and who waits for whom."""
     points, times, bends = (np.concatenate(parts) for parts in zip(*routes))
     first = np.append(0, np.cumsum([len(route.times) for route in routes])).astype(np.int64)
-    arcs = np.append(0.0, np.cumsum(np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=1))))
+    arcs = np.append(0.0, np.cumsum(_lengths(np.diff(points, axis=0))))
     arcs -= np.repeat(arcs[first[:-1]], np.diff(first))
     radius = np.asarray(problem.team.radius, np.float64)
     cells = sort_into_cells(points, 2 * float(radius.max()) + problem.margin + WAIT_SLACK)
     return Routes(points, times, bends, first, arcs, *_find_waits(cells, first, times, radius, problem.margin))
 
 
+class Bends(NamedTuple):
+    """Corners of ways, without the angles themselves, whose functions differ from one processor to the next.
+
+    Attributes:
+        corners: ``(C, 3)`` where they are [m].
+        before: ``(C, 3)`` unit vectors that lead to each.
+        after: ``(C, 3)`` unit vectors that lead on from each.
+        straight: ``(C,)`` half of the shorter of the ways to the corners next to each [m].
+        cosine: ``(C,)`` of half the angle by which the way turns.
+        sine: ``(C,)``.
+    """
+
+    corners: Any
+    before: Any
+    after: Any
+    straight: Any
+    cosine: Any
+    sine: Any
+
+
+def _bends_at(corners: Floats, inner: IntArray) -> Bends:
+    """The corners with these numbers, each with the one before it and the one after it."""
+    before, after = corners[inner] - corners[inner - 1], corners[inner + 1] - corners[inner]
+    one, other = _lengths(before), _lengths(after)
+    before, after = before / np.maximum(one, 1e-12)[:, None], after / np.maximum(other, 1e-12)[:, None]
+    cosine = np.clip(before[:, 0] * after[:, 0] + before[:, 1] * after[:, 1] + before[:, 2] * after[:, 2], -1.0, 1.0)
+    halves = np.sqrt((1 + cosine) / 2), np.sqrt((1 - cosine) / 2)
+    return Bends(corners[inner], before, after, np.minimum(one, other) / 2, *halves)
+
+
+def _arcs(bends: Bends, radius: Floats, num_points: int) -> Floats:
+    """``(C, P, 3)`` points along the arcs that round corners."""
+    reach = radius * bends.sine / bends.cosine
+    begin, end = bends.corners - bends.before * reach[:, None], bends.corners + bends.after * reach[:, None]
+    inward = bends.after - bends.before
+    inward /= np.maximum(_lengths(inward), 1e-12)[:, None]
+    centre = bends.corners + inward * (radius / bends.cosine)[:, None]
+    share = np.linspace(0, 1, num_points)[None, :, None]
+    spokes = (begin - centre)[:, None] * (1 - share) + (end - centre)[:, None] * share
+    arcs: Floats = centre[:, None] + spokes * (radius[:, None] / np.maximum(_lengths(spokes), 1e-12))[..., None]
+    return arcs
+
+
 def _corner_radii(problem: Problem, corners: Floats, owner: IntArray, cut: float) -> Floats:
     """``(C,)`` radius of the arc that rounds each corner [m]; infinite where there is none, zero for a sharp one."""
     radii = np.full(len(corners), np.inf)
     inner = np.flatnonzero((owner[:-2] == owner[1:-1]) & (owner[1:-1] == owner[2:])) + 1
-    before, after, half = _corner_angles(corners, inner)
-    bend = half > 1e-4
-    inner, before, after, half = inner[bend], before[bend], after[bend], half[bend]
-    straight = np.minimum(_lengths(before), _lengths(after)) / 2
+    inner = inner[_bends_at(corners, inner).sine > STRAIGHT]
     radii[inner] = 0.0
-    reach = np.asarray(problem.team.radius, np.float64)[owner[inner]] + problem.margin + 0.01
-    left = half < 0.4 * np.pi
+    # Who turns back does so on the spot.
+    inner = inner[_bends_at(corners, inner).cosine > TURNING_BACK]
     for share in CUTS:
-        level = share * cut
-        radius = np.minimum(level * np.cos(half) / (1 - np.cos(half)), straight / np.tan(half))
-        fits = left.copy()
+        bends = _bends_at(corners, inner)
+        most = share * cut * bends.cosine / (1 - bends.cosine)
+        radius = np.minimum(most, bends.straight * bends.cosine / bends.sine)
+        fits = np.ones(len(inner), bool)
         if problem.world.num_obstacles:
-            arcs = _arcs(corners[inner], before, after, half, radius, ARC_CHECKS)[..., : problem.dimension]
+            reach = np.asarray(problem.team.radius, np.float64)[owner[inner]] + problem.margin + ARC_SLACK
+            arcs = _arcs(bends, radius, ARC_CHECKS)[..., : problem.dimension]
             room = problem.world.clearance(arcs.reshape(-1, problem.dimension)).reshape(len(inner), ARC_CHECKS)
-            fits &= (room > reach[:, None]).all(axis=1)
-        fits &= radius > SHARPEST
-        radii[inner[fits]] = radius[fits]
-        left &= ~fits
+            fits = (room > reach[:, None]).all(axis=1)
+        rounded = fits & (radius > SHARPEST)
+        radii[inner[rounded]] = radius[rounded]
+        inner = inner[~fits]
     return radii
 
 
 def _lengths(steps: Floats) -> Floats:
-    length: Floats = np.sqrt((steps * steps).sum(axis=-1))
+    length: Floats = np.sqrt(steps[..., 0] ** 2 + steps[..., 1] ** 2 + steps[..., 2] ** 2)
     return length
-
-
-def _corner_angles(corners: Floats, inner: IntArray) -> tuple[Floats, Floats, Floats]:
-    """Steps to corners and on from them, and half the angles by which ways turn there."""
-    before, after = corners[inner] - corners[inner - 1], corners[inner + 1] - corners[inner]
-    cosine = (before * after).sum(axis=1) / np.maximum(_lengths(before) * _lengths(after), 1e-12)
-    return before, after, np.arccos(np.clip(cosine, -1.0, 1.0)) / 2
-
-
-def _arcs(corners: Floats, before: Floats, after: Floats, half: Floats, radius: Floats, num_points: int) -> Floats:
-    """``(C, P, 3)`` points along the arcs that round corners."""
-    one, other = before / _lengths(before)[:, None], after / _lengths(after)[:, None]
-    side = (other - one * np.cos(2 * half)[:, None]) / np.sin(2 * half)[:, None]
-    angle = 2 * half[:, None, None] * np.linspace(0, 1, num_points)[None, :, None]
-    begin = corners - one * (radius * np.tan(half))[:, None]
-    arcs: Floats = begin[:, None] + radius[:, None, None] * (
-        one[:, None] * np.sin(angle) + side[:, None] * (1 - np.cos(angle))
-    )
-    return arcs
 
 
 def _rounded(stops: Stops, radii: Floats) -> tuple[Floats, IntArray, Floats, Floats]:
     """``(points, first, times, bends)`` along ways with corners that are rounded by these radii."""
     corners, rounded = stops.places, np.flatnonzero((radii > 0) & np.isfinite(radii))
-    before, after, half = _corner_angles(corners, rounded)
-    arcs = _arcs(corners[rounded], before, after, half, radii[rounded], ARC_POINTS)
+    arcs = _arcs(_bends_at(corners, rounded), radii[rounded], ARC_POINTS)
     # Corners that are rounded become as many points, others stay one.
     repeats = np.ones(len(corners), np.int64)
     repeats[rounded] = ARC_POINTS

@@ -24,6 +24,8 @@ FIRST_CUT = 0.03
 MANNERS = ((0.9, 0.1), (0.75, 0.03), (0.6, 0.01))
 """Shares of its speed that a robot is taken to drive at when its way is planned, and by how much it cuts corners [m];
 the next where it is late so, or comes too near to something."""
+LEISURE = 0.1
+"""Share of that by which it is slower, at most: drawn for every way, so that no two searches are the same."""
 LAUNCH = 0.4
 """Share of the time to full speed that setting out costs."""
 OVERTIME = 3
@@ -111,12 +113,13 @@ class Replanning:
         gaps[robot] = -1.0
         return random.permutation(np.argsort(gaps)[: random.integers(1, min(len(delay), most) + 1)])
 
-    def better(self, driven: Driven, robots: IntArray) -> Driven | None:
+    def better(self, driven: Driven, robots: IntArray, random: np.random.Generator) -> Driven | None:
         """The team with new ways for some robots, in their order, if that is better for all together."""
         last = int(driven.arrivals.max())
         changed = Driven(driven.controls[:last].copy(), driven.places[: last + 1].copy(), driven.arrivals.copy())
         changed.places[:, robots] = FAR
-        if not self.replan(changed, robots, np.minimum(driven.arrivals + LATER, last)):
+        latest = np.minimum(driven.arrivals + LATER, last)
+        if not all(self.replan_one(changed, robot, int(latest[robot]), random) for robot in robots.tolist()):
             return None
         return changed if changed.cost(self.problem.horizon) < driven.cost(self.problem.horizon) else None
 
@@ -146,7 +149,7 @@ class Replanning:
                 around = driven.places.copy()
                 around[:, settled & (random.random(num_robots) >= hard)] = FAR
                 here = Driven(driven.controls, around, driven.arrivals)
-                if any(self.replan_one(here, robot, steps, *manner) for manner in MANNERS):
+                if self.replan_one(here, robot, steps, random):
                     break
             else:
                 return None
@@ -161,15 +164,13 @@ class Replanning:
             waiting[:0] = random.permutation(np.flatnonzero(displaced)).tolist()
         return None if waiting else driven
 
-    def replan(self, driven: Driven, robots: IntArray, latest: IntArray) -> bool:
-        """Plan robots one after another around all others in ``driven``, which is changed; whether that succeeds."""
-        return all(
-            any(self.replan_one(driven, robot, int(latest[robot]), *manner) for manner in MANNERS)
-            for robot in robots.tolist()
-        )
+    def replan_one(self, driven: Driven, robot: int, latest: int, random: np.random.Generator) -> bool:
+        """Plan a robot's way around all others in ``driven``, which is changed; whether that succeeds."""
+        haste = 1 - random.random() * LEISURE
+        return any(self.find_and_drive(driven, robot, latest, cruise * haste, cut) for cruise, cut in MANNERS)
 
-    def replan_one(self, driven: Driven, robot: int, latest: int, cruise: float, cut: float) -> bool:
-        """The same for one robot that drives in one of the :data:`MANNERS`."""
+    def find_and_drive(self, driven: Driven, robot: int, latest: int, cruise: float, cut: float) -> bool:
+        """The same in one of the :data:`MANNERS`."""
         roadmap, bodies, steps = self.roadmap, self.bodies, len(driven.controls)
         apart = bodies.radius[robot] + bodies.radius + bodies.margin
         others = Others(driven.places, np.minimum(apart + KEEP, self.ends_apart[robot]))

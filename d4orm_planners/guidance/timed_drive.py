@@ -14,7 +14,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS, ZERO, compiled, make_stepper, models_key, to_fixed_tuple
 from d4orm_planners.guidance import execution
-from d4orm_planners.guidance.execution import BEYOND, LOOKAHEAD, RESERVE, steering
+from d4orm_planners.guidance.execution import BEYOND, LOOKAHEAD, REACHED, RESERVE, steering
 from d4orm_planners.guidance.routes import Route
 
 SOURCES = execution.SOURCES + fingerprint((execution,))
@@ -87,7 +87,8 @@ def timed_kernel(name: str) -> Any:
             while following < last:
                 following += 1
                 if arcs[following] - arcs[at] > 0.01 or following == last:
-                    if _square(points, following, px, py, pz) > _square(points, at, px, py, pz):
+                    gap = _square(points, following, px, py, pz)
+                    if gap > _square(points, at, px, py, pz) and gap > REACHED:
                         break
                     at = following
             while corner < last_corner and arcs[at] >= route.corners[corner] - 0.02:
@@ -110,7 +111,7 @@ def timed_kernel(name: str) -> Any:
                 and arcs[target] < stop
                 and (
                     (arcs[target] - arcs[at] < LOOKAHEAD + 1.5 * dt[0] * slowest and route.bends[target] > 0.0)
-                    or _square(points, target, px, py, pz) < 4e-4
+                    or _square(points, target, px, py, pz) < REACHED
                 )
             ):
                 target += 1
@@ -159,7 +160,8 @@ def drive_by_clock(
     arrays, model = problem.arrays, problem.team.models[robot]
     # Corners are rounded: the middle of those of its points that are passed at its time.
     at = (np.searchsorted(route.times, arrives) + np.searchsorted(route.times, arrives, side="right") - 1) // 2
-    arcs = np.append(0.0, np.cumsum(np.sqrt((np.diff(route.points, axis=0) ** 2).sum(axis=1))))
+    moves = np.diff(route.points, axis=0)
+    arcs = np.append(0.0, np.cumsum(np.sqrt(moves[:, 0] ** 2 + moves[:, 1] ** 2 + moves[:, 2] ** 2)))
     paces = execution.paces_along(problem, robot, arcs, route.bends)
     controls = np.zeros((steps, problem.control_size), np.float32)
     places = np.empty((steps + 1, 3))
