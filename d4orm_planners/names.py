@@ -76,6 +76,7 @@ for _name, _path in {
     "mbd": "mbd:MBD",
     "i-mbd": "mbd:IterativeMBD",
     "ipopt": "ipopt:Ipopt",
+    "guided": "guidance.planner:Guided",
 }.items():
     register_planner(_name, f"d4orm_planners.{_path}")
 
