@@ -20,7 +20,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK ?= 1
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
-demo: $(CORE_STAMP) ## Plan 16 robots across a circle, execute the plan, write pictures to demo/
+demo: $(CORE_STAMP) ## Plan 16 robots across a warehouse, execute the plan, write pictures to demo/
 	$(BIN)/d4orm demo --out demo
 
 test: $(DEV_STAMP) ## Run the whole test suite; PYTEST_ARGS='-m "not slow"' for the quick part

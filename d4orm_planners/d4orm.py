@@ -9,7 +9,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.engine.base import SamplingTask
-from d4orm_planners.guidance.planner import Guide, first_ways, guided_iteration, leads_round
+from d4orm_planners.guidance.planner import Guide, compile_roadmap, first_ways, guided_iteration, leads_round
 from d4orm_planners.planner import Iteration, State
 from d4orm_planners.sampling.optimizer import DenoisingPlanner, standard_normal
 from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, Credit, DenoisingConfig
@@ -90,7 +90,11 @@ class D4orm(DenoisingPlanner):
         """Whether the first iteration is to find ways on a roadmap."""
         if search.current.controls.any() or self.config.start not in ("auto", "guided"):
             return False
-        return self.config.start == "guided" or leads_round(search.problem)
+        if self.config.start == "guided":
+            return True
+        with search.watch.paused():
+            compile_roadmap(search.problem)
+        return leads_round(search.problem)
 
     def stages(self, search: Search) -> list[tuple[FloatArray, int]]:
         """See :meth:`SamplingPlanner.stages`."""

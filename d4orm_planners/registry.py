@@ -15,6 +15,9 @@ from d4orm_planners.policy import OpenLoop, Policy, RobotFunction, TeamFunction,
 from d4orm_planners.references import source_digest, written
 from d4orm_planners.settings import NOTHING
 
+RECOMMENDED = "d4orm-d"
+"""The planner that solves most problems, and soonest."""
+
 PolicyLike: TypeAlias = str | Policy | Planner | type[object] | Callable[..., object]
 """What :func:`make_policy` takes; other objects with ``reset`` and ``act`` as well."""
 
@@ -39,8 +42,8 @@ def describe_policy(name: str) -> str:
     return _summary(find_policy(name))
 
 
-def make_planner(name: str | type[Planner], *, preset: str | None = None, **config: object) -> Planner:
-    """A planner by name.
+def make_planner(name: str | type[Planner] = RECOMMENDED, *, preset: str | None = None, **config: object) -> Planner:
+    """A planner by name; without one, that which solves most, soonest.
 
     Args:
         name: One of :func:`list_planners`, ``"package.module:Name"`` (or ``"folder/file.py:Name"``) of a planner class,

@@ -26,7 +26,7 @@ def main() -> int:
     arguments.out.mkdir(parents=True, exist_ok=True)
 
     problem = load_problem(arguments.scenario)
-    plan = make_planner("d4orm").solve(problem, seed=arguments.seed)
+    plan = make_planner().solve(problem, seed=arguments.seed)
     if not plan.solved:
         failed = plan.history[-1].num_failed
         print(f"no solution after {plan.iterations} iterations ({failed} robots fail); try another --seed")

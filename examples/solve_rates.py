@@ -3,6 +3,7 @@
     python examples/solve_rates.py --seeds 20
     python examples/solve_rates.py --seeds 20 --cases big --planner d4orm-d
     python examples/solve_rates.py --seeds 20 --cases big --planner d4orm-d --improve 3
+    python examples/solve_rates.py --seeds 20 --cases walls --planner d4orm-d
 
 Random instances differ by seed; those of the AMSwarm comparison have their starts jittered by 5 mm. Every plan that
 counts as solved has passed ``verify()``. Iterations and seconds are those to the first solution, compilation not
@@ -41,7 +42,16 @@ BIG: list[tuple[str, str, dict[str, Any], int]] = [
     ("sphere, 64", "sphere", {"num_robots": 64}, 200),
     *((f"AMSwarm {i}, 10", f"amswarm_{i}", {"num_robots": 10}, 200) for i in range(1, 6)),
 ]
-SETS = {"paper": CASES, "big": BIG}
+WALLS: list[tuple[str, str, dict[str, Any], int]] = [
+    *((f"rooms, {num}", "rooms", {"num_robots": num}, 200) for num in (10, 20, 40)),
+    *((f"maze, {num}", "maze", {"num_robots": num}, 200) for num in (10, 20)),
+    *((f"warehouse, {num}", "warehouse", {"num_robots": num}, 200) for num in (40, 100)),
+    ("corridor, 4 + 4", "corridor", {"num_robots": 8}, 200),
+    ("doorway, 8", "doorway", {"num_robots": 8}, 200),
+    ("forest in space, 16", "forest", {"num_robots": 16, "model": "holonomic3d"}, 200),
+    ("forest, 16 differential drives", "forest", {"num_robots": 16, "model": "differential_drive"}, 200),
+]
+SETS = {"paper": CASES, "big": BIG, "walls": WALLS}
 JITTER = 0.005
 
 

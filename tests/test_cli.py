@@ -187,7 +187,7 @@ BAD = [
     (("run", "--control-noise-std", "-1"), "control_noise_std is -1"),
     (("run", "--policy", "nope"), "policy 'nope' is unknown"),
     (("demo", "--out", "good.yaml"), "good.yaml"),
-    (("demo", "--num-robots", "500"), "diameter"),
+    (("demo", "--num-robots", "0"), "num_robots"),
     (("nonsense",), "nonsense"),
 ]  # fmt: skip
 

@@ -20,15 +20,15 @@ def demo(
     seed: Seed = 0,
     engine: Engine = "auto",
 ) -> None:
-    """Plan robots across a circle, execute the plan in the environment, verify it, and write pictures."""
+    """Plan robots across a warehouse, execute the plan in the environment, verify it, and write pictures."""
     from d4orm_env import make_problem, verify
     from d4orm_env.render import save_animation, save_picture
     from d4orm_planners.policy import OpenLoop
     from d4orm_planners.registry import make_planner
 
     make_folder(out)
-    problem = make_problem("circle", num_robots=num_robots, seed=seed)
-    planner = make_planner("d4orm", engine=engine)
+    problem = make_problem("warehouse", num_robots=num_robots, seed=seed)
+    planner = make_planner(engine=engine)
     with solving(planner, problem) as callback:
         plan = planner.solve(problem, seed, callback=callback)
     print_plan(plan)
@@ -40,7 +40,7 @@ def demo(
     print_table("Executed in the environment", [*episode_rows(episode), *rows])
     files = {"plan": out / "plan.npz", "picture": out / "plan.png", "animation": out / "execution.gif"}
     plan.save(files["plan"])
-    title = f"{problem.num_robots} robots, planned by D4orm in {plan.wall_time:.2f} s"
+    title = f"{problem.num_robots} robots in a warehouse, planned in {plan.wall_time:.2f} s"
     save_picture(problem, episode.trajectory, files["picture"], title=title)
     save_animation(problem, episode.trajectory, files["animation"])
     for name, path in files.items():

@@ -135,6 +135,16 @@ def first_ways(search: Search) -> Guide | NoWays:
     return best[0] if best else NoWays("no ways found on the roadmaps")
 
 
+def compile_roadmap(problem: Problem) -> None:
+    """Compile what :func:`leads_round` needs, if it is not yet."""
+    if not problem.world.num_obstacles:
+        return
+    from d4orm_planners.guidance.pibt import fill_costs
+
+    if not fill_costs.signatures:
+        leads_round(problem.select([0]))
+
+
 def leads_round(problem: Problem) -> bool:
     """Whether obstacles lead somebody's shortest way far round, so that straight ways are no place to begin."""
     if not problem.world.num_obstacles:
