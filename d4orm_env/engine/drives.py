@@ -66,7 +66,8 @@ class DrivenWays(NamedTuple):
 def drive_kernel(name: str) -> Any:
     """The compiled drives of robots of the model with this name, each as if nobody else were there.
 
-    The kernel fills, for robots of these numbers, controls ``u`` ``(R, V, H, m)``, left alone once docked, states ``x`` ``(R, V, H+1, n)`` and ``arrived`` ``(R, V)``.
+    The kernel fills, for robots of these numbers, controls ``u`` ``(R, V, H, m)``, left alone once docked,
+    states ``x`` ``(R, V, H+1, n)`` and ``arrived`` ``(R, V)``.
     """
     robot = MODELS[name]
     move, dock = make_stepper(robot)
