@@ -115,3 +115,24 @@ def test_arguments_are_left_alone() -> None:
     drives(problem, states, controls, np.array([[3], [5], [7]]))
     np.testing.assert_array_equal(states, trajectory.states)
     np.testing.assert_array_equal(controls, trajectory.controls)
+
+
+@pytest.mark.parametrize("model", [*MODEL_NAMES, "mixed"])
+def test_a_way_by_points_comes_near_all_of_them_in_turn(model: str) -> None:
+    problem = problem_of(model).replace(horizon=300)
+    given, _ = closing(problem, np.zeros((300, problem.num_robots, problem.control_size), np.float32))
+    start = np.asarray(problem.start)[:, None, None, : problem.dimension]
+    steps = np.zeros((1, 2, 2, problem.dimension))
+    steps[0, :, :, :2] = [[[1, 1], [2, -1]], [[-1, -1], [-1, 1]]]
+    switch = np.zeros((problem.num_robots, 2), int)
+    ways = drives(problem, given.states, given.controls, switch, start + steps)
+    assert ways.arrived.all()
+    for point in range(2):
+        gap = np.linalg.norm(ways.positions - (start + steps)[:, :, point], axis=3)
+        assert (gap.min(axis=0) < 0.5).all()
+        first = (gap < 0.5).argmax(axis=0)
+        if point:
+            assert (first > before).all()
+        before = first
+    rollout = CPU.rollout(problem, ways.controls[:, :, 1])
+    np.testing.assert_allclose(rollout.states, ways.states[:, :, 1], atol=1e-4)
