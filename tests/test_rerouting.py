@@ -56,14 +56,13 @@ def test_a_mixed_team_is_rerouted_model_by_model() -> None:
 
 
 def test_who_cannot_pass_waits() -> None:
-    """In a lane that is too narrow to pass in, one robot crosses the way of another, which has all the time it needs."""
+    """In a lane too narrow to pass in, one robot docks on the way of another, and so must come after it."""
     start = [[0, 0, 0, 0], [2.0, -2.0, 0, 0]]
     walls = [[-1, 0.3, 4, 0.6], [-1, -0.6, 1.5, -0.3], [2.5, -0.6, 4, -0.3]]
     world = World(boxes=walls)
     problem = Problem(Team(("holonomic2d",) * 2), start, [[3.5, 0], [2.0, 0.0]], world, horizon=200)
     team = rerouted(problem)
     assert_executed(team)
-    # The second docks in the lane, so that it must come after the first.
     assert team.faults([0, 1])[0].tolist() == [0, 0]
 
 

@@ -127,12 +127,9 @@ def test_a_way_by_points_comes_near_all_of_them_in_turn(model: str) -> None:
     switch = np.zeros((problem.num_robots, 2), int)
     ways = drives(problem, given.states, given.controls, switch, start + steps)
     assert ways.arrived.all()
-    for point in range(2):
-        gap = np.linalg.norm(ways.positions - (start + steps)[:, :, point], axis=3)
-        assert (gap.min(axis=0) < 0.5).all()
-        first = (gap < 0.5).argmax(axis=0)
-        if point:
-            assert (first > before).all()
-        before = first
+    gap = np.linalg.norm(ways.positions[:, :, :, None] - (start + steps), axis=4)
+    assert (gap.min(axis=0) < 0.5).all()
+    first = (gap < 0.5).argmax(axis=0)
+    assert (first[..., 1] > first[..., 0]).all()
     rollout = CPU.rollout(problem, ways.controls[:, :, 1])
     np.testing.assert_allclose(rollout.states, ways.states[:, :, 1], atol=1e-4)
