@@ -43,9 +43,15 @@ class D4ormD(D4orm):
 
     def init(self, search: Search) -> State:
         """See :meth:`Planner.init`."""
+        # Here, because importing numba takes long.
+        from d4orm_planners.d4orm_d.rerouting import prepare_rerouting
+
         with search.watch.paused():
             prepare_drives(search.problem)
-        return Groups() if self.config.decoupling == "groups" else Repairs.of(search.problem.num_robots)
+            if self.config.decoupling == "groups":
+                return Groups()
+            prepare_rerouting(TeamPaths(self, search, search.current.trajectory))
+        return Repairs.of(search.problem.num_robots)
 
     def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
         """See :meth:`Planner.iterate`: the whole team at first and once nobody fails, the failed robots in between."""

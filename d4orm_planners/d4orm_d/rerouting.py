@@ -41,6 +41,15 @@ def reroute(team: TeamPaths) -> None:
                 _try_detours(team, lost, random)
 
 
+def prepare_rerouting(team: TeamPaths) -> None:
+    """Compile what rerouting of this team needs, if it is not yet."""
+    firsts = {model.name: robots[0] for model, robots in by_model(team.problem)}
+    if not all(search_kernel(name).signatures for name in firsts):
+        robots = np.array(list(firsts.values()))
+        team.faults(robots)
+        _search(team, robots, np.zeros(len(robots), int), 0.0, REROUTE_RULES.contact)
+
+
 def _search(team: TeamPaths, robots: IntArray, blocks: IntArray, swing: float, contact: float) -> IntArray:
     """Let robots ``(R,)`` take the best ways that they find from these blocks ``(R,)`` on.
 
