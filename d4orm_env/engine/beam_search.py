@@ -40,11 +40,13 @@ class Moves(NamedTuple):
     """What a robot may do in a block, ``P`` things.
 
     Attributes:
-        turns: ``(P, 3)`` directions, along that to the goal and two across; zero to head for the goal itself.
+        turns: ``(P, 3)`` directions, along that to the goal and two across.
+        homewards: ``(P,)`` whether it heads for the goal, or so many goal radii from there in the direction.
         pace: ``(P,)`` share of the speed that it would have.
     """
 
     turns: FloatArray
+    homewards: BoolArray
     pace: FloatArray
 
 
@@ -192,11 +194,11 @@ def search_kernel(name: str) -> Any:
     no_control = (ZERO,) * m
 
     @inlined
-    def aim_of(place: Any, at: Any, limits: Any, goal: Any, moves: Any, number: Any) -> Any:
+    def aim_of(place: Any, at: Any, limits: Any, goal: Any, goal_radius: Any, moves: Any, number: Any) -> Any:
         """Where to head: ``place`` is an array, ``at`` a tuple of the same numbers."""
         turn = to_fixed_tuple(moves.turns[number], 3)
-        if turn[0] == ZERO and turn[1] == ZERO and turn[2] == ZERO:
-            return to_fixed_tuple(goal, d)
+        if moves.homewards[number]:
+            return turned(to_fixed_tuple(goal, d), goal_radius, turn, _frame(place, goal))
         return turned(at, _FAR * limits[SPEED], turn, _frame(place, goal))
 
     @inlined
@@ -212,6 +214,7 @@ def search_kernel(name: str) -> Any:
         dt, closed = arrays.time_step, is_closed(arrays)
         h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])
         docking = (arrays.squared_goal_radius, arrays.squared_goal_speed, arrays.docks)
+        goal_radius = np.sqrt(arrays.squared_goal_radius)
         num_blocks, num_moves, width = table.first.shape[0], moves.pace.shape[0], rules.width
         last_busy = min(num_blocks - 1, table.moving[0] + 1)
         beam, ways = _make_beam(width, n, d), _make_beam(width * num_moves, n, d)
@@ -233,7 +236,7 @@ def search_kernel(name: str) -> Any:
                 for way in range(size):
                     for number in range(num_moves):
                         state, control, at_goal = to_fixed_tuple(beam.states[way], n), no_control, False
-                        aim = aim_of(beam.states[way], state, limits, goal, moves, number)
+                        aim = aim_of(beam.states[way], state, limits, goal, goal_radius, moves, number)
                         faults, end = beam.faults[way], first
                         for t in range(first, last):
                             if not transition.stands(at_goal, arrays.docks):
@@ -291,7 +294,7 @@ def search_kernel(name: str) -> Any:
             for block in range(begin, num_blocks):
                 first, last = steps_of(table, block)
                 number = did[length - 1 - block + begin] if block - begin < length else 0
-                aim = aim_of(x[r, first - 1], state, limits, goal, moves, number)
+                aim = aim_of(x[r, first - 1], state, limits, goal, goal_radius, moves, number)
                 for t in range(first, last):
                     standing = transition.stands(at_goal, arrays.docks)
                     control = control_of(state, aim, moves.pace[number], limits, h)

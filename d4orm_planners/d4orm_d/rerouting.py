@@ -34,7 +34,8 @@ def reroute(team: TeamPaths) -> None:
             robots = failed[first : first + REROUTE_RULES.batch]
             # Some may have been helped by others before them.
             faults, begin = team.faults(robots)
-            earlier = random.integers(*REROUTE_RULES.earlier, len(robots), endpoint=True)
+            least, most = REROUTE_RULES.earlier
+            earlier = random.integers(least, most << sweep, len(robots), endpoint=True)
             blocks = np.maximum((begin - 1) // BLOCK - earlier, 0)
             lost = _search(team, robots[faults > 0], blocks[faults > 0], swing, contact)
             if len(lost):
@@ -94,10 +95,15 @@ def _moves(dimension: int, swing: float, *, has_heading: bool) -> Moves:
     across = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])[: 2 * (dimension - 1)]
     sides = portable.sin(angle)[:, None, None] * across
     ahead = np.broadcast_to(portable.cos(angle)[:, None, None], (*sides.shape[:2], 1))
-    home = np.zeros((1, 3))
     turned = np.concatenate([ahead, sides], axis=2).reshape(-1, 3)
-    parts = [(home, pace) for pace in REROUTE_RULES.paces] + [(turned, 1.0)]
+    home = np.zeros((1, 3))
+    beside = np.column_stack([np.zeros(len(across)), REROUTE_RULES.beside * across])
+    parts = [(home, True, pace) for pace in REROUTE_RULES.paces] + [(beside, True, 1.0), (turned, False, 1.0)]
     if has_heading:
-        parts += [(home, REROUTE_RULES.on_the_spot), (turned, REROUTE_RULES.on_the_spot)]
-    turns = np.concatenate([turns for turns, _ in parts]).astype(np.float32)
-    return Moves(turns, np.concatenate([np.full(len(turns), pace, np.float32) for turns, pace in parts]))
+        parts += [(home, True, REROUTE_RULES.on_the_spot), (turned, False, REROUTE_RULES.on_the_spot)]
+    sizes = [len(turns) for turns, _, _ in parts]
+    return Moves(
+        np.concatenate([turns for turns, _, _ in parts]).astype(np.float32),
+        np.repeat([homewards for _, homewards, _ in parts], sizes),
+        np.repeat([pace for _, _, pace in parts], sizes).astype(np.float32),
+    )

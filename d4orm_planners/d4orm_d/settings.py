@@ -55,10 +55,12 @@ class RerouteRules:
             cheaper.
         contact_growth: Times as much it costs in the next sweep: what cannot be had for little may be had for more.
         apart: How far apart the ways that are kept must be [m], or else twice as much in speed [m/s].
-        earlier: Blocks before a robot's first fault at which its new way begins: from one number to the other.
+        earlier: Blocks before a robot's first fault at which its new way begins: from one number to the other, which
+            doubles with each sweep.
         angles: By which a robot turns off from the way to its goal [degrees]; in space up and down as well.
         swing: From one sweep to the next all of them change by up to so much either way [degrees].
         paces: Shares of its speed with which a robot heads for its goal: waiting has no direction.
+        beside: Goal radii beside its goal to which it may head too: who docks there keeps clear of a neighbour.
         on_the_spot: The share with which one that has a heading turns, to its goal or to one side, as if it stood.
         detours: Random points by which it tries to drive if it has found no way.
     """
@@ -73,6 +75,7 @@ class RerouteRules:
     angles: tuple[float, ...] = (30.0, 60.0, 90.0, 135.0, 180.0)
     swing: float = 14.0
     paces: tuple[float, ...] = (1.0, 0.5, 0.0)
+    beside: float = 0.8
     on_the_spot: float = 0.001
     detours: int = 32
 
