@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from d4orm_planners.d4orm_d.team import TeamPaths
-from d4orm_planners.grouping import Graph, failure_groups, reconnected
+from d4orm_planners.grouping import Graph, conflicts, failure_groups, reconnected
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,14 +20,15 @@ class Groups:
 
     def replan(self, team: TeamPaths) -> Groups:
         """Replan every group with a failed robot in turn, the robots outside it as moving obstacles."""
-        planner, search, graph = team.planner, team.search, team.conflicts()
+        planner, search, problem = team.planner, team.search, team.problem
+        graph = conflicts(search.current.trajectory.positions, problem.team.radius, problem.margin)
         team.controls = planner.config.continued(search.current).copy()
         for group in failure_groups(search.current.failed, reconnected(graph, self.graph)):
             if search.should_stop():
                 break
             robots = list(group)
             _, controls, trajectory = team.deformed(
-                robots, team.problem.horizon, planner.config.num_samples, planner.noise_scale(), credit="team"
+                robots, problem.horizon, planner.config.num_samples, planner.noise_scale(), credit="team"
             )
             team.move(robots, controls, trajectory.states, trajectory.arrived[-1])
         return Groups(graph)

@@ -20,6 +20,9 @@ from d4orm_planners.planner import Iteration
 from d4orm_planners.search import Search
 from d4orm_planners.steering import Drives
 
+ROUNDING = 1e-5
+"""Kept beyond the margin: the engine, in float32, must not find near what this has found clear [m]."""
+
 Costs = NDArray[np.float64]
 
 
@@ -45,7 +48,8 @@ class TeamPaths:
         self.planner, self.search, self.problem = planner, search, search.problem
         self.controls, self.states = trajectory.controls.copy(), trajectory.states.copy()
         self.arrived: BoolArray = trajectory.arrived[-1].copy()
-        self.index = PathIndex(trajectory.positions, self.problem.team.radius, self.problem.margin)
+        margin = self.problem.margin + ROUNDING
+        self.index = PathIndex(trajectory.positions, self.problem.team.radius, margin)
         self._denoising_steps = self._excluded = self._runs = 0
 
     @property
