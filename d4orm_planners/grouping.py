@@ -2,88 +2,87 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
+from typing import TypeAlias
 
-import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+
+Graph: TypeAlias = tuple[frozenset[int], ...]
+"""For each robot those that it is in conflict with."""
 
 Groups = tuple[tuple[int, ...], ...]
 
 
-def conflicts(positions: FloatArray, radius: ArrayLike, margin: float) -> BoolArray:
-    """Which robots come within the margin of each other at any step.
+def conflicts(positions: FloatArray, radius: ArrayLike, margin: float) -> Graph:
+    """Which robots come within the margin of each other at any step after the start.
 
     Args:
-        positions: ``(T, K, d)`` [m].
+        positions: ``(H+1, K, d)`` [m].
         radius: ``(K,)`` [m].
         margin: [m].
-
-    Returns:
-        ``(K, K)`` symmetric, false on the diagonal.
     """
-    num_robots = positions.shape[1]
-    radii = np.asarray(radius, np.float64)
-    reach2 = (radii[:, None] + radii[None, :] + margin) ** 2
-    near = np.zeros((num_robots, num_robots), bool)
-    # Axis by axis and a few steps at a time, so that nothing of size T * K * K * d is ever held.
-    for first in range(0, len(positions), 16):
-        places = positions[first : first + 16].astype(np.float64)
-        gap2 = sum((places[:, :, None, axis] - places[:, None, :, axis]) ** 2 for axis in range(places.shape[2]))
-        near |= (gap2 <= reach2).any(axis=0)
-    np.fill_diagonal(near, False)
-    return near
+    # Here, because importing numba takes long.
+    from d4orm_env.engine.path_index import PathIndex
+
+    return graph_of(positions.shape[1], PathIndex(positions, radius, margin).pairs())
 
 
-def reconnected(graph: BoolArray, previous: BoolArray | None) -> BoolArray:
+def graph_of(num_robots: int, pairs: IntArray) -> Graph:
+    """The graph of conflicts between pairs ``(P, 2)``."""
+    neighbours: list[set[int]] = [set() for _ in range(num_robots)]
+    for first, second in pairs.tolist():
+        neighbours[first].add(second)
+        neighbours[second].add(first)
+    return tuple(map(frozenset, neighbours))
+
+
+def reconnected(graph: Graph, previous: Graph | None) -> Graph:
     """The graph of conflicts with those of the previous iteration added that are likely to come back.
 
     A robot of a previous group that now conflicts with a robot outside that group is joined again to those of its
     previous direct neighbours that are free of conflicts now.
 
     Args:
-        graph: ``(K, K)`` conflicts now.
-        previous: ``(K, K)`` conflicts in the previous iteration, or ``None``.
+        graph: Conflicts now.
+        previous: Conflicts in the previous iteration, or ``None``.
     """
     if previous is None:
         return graph
-    joined = graph.copy()
-    group_of = np.full(len(graph), -1)
-    for number, group in enumerate(components(previous)):
-        group_of[list(group)] = number
-    free = ~graph.any(axis=1)
-    for robot in np.flatnonzero(previous.any(axis=1)):
-        if (graph[robot] & (group_of != group_of[robot])).any():
-            neighbours = previous[robot] & free
-            joined[robot] |= neighbours
-            joined[:, robot] |= neighbours
-    return joined
+    joined = [set(neighbours) for neighbours in graph]
+    for group in components(previous):
+        for robot in group if len(group) > 1 else ():
+            if not graph[robot] <= set(group):
+                for other in previous[robot]:
+                    if not graph[other]:
+                        joined[robot].add(other)
+                        joined[other].add(robot)
+    return tuple(map(frozenset, joined))
 
 
-def components(graph: BoolArray) -> Groups:
-    """Connected components of a symmetric ``(K, K)`` graph, singletons included, in order of their first members."""
-    unseen = np.ones(len(graph), bool)
+def components(graph: Graph) -> Groups:
+    """Connected components, singletons included, in order of their first members."""
+    seen: set[int] = set()
     groups = []
     for first in range(len(graph)):
-        if not unseen[first]:
+        if first in seen:
             continue
-        members, frontier = np.zeros(len(graph), bool), np.zeros(len(graph), bool)
-        frontier[first] = True
-        while frontier.any():
+        members, frontier = {first}, {first}
+        while frontier:
+            frontier = set().union(*(graph[robot] for robot in frontier)) - members
             members |= frontier
-            frontier = graph[frontier].any(axis=0) & ~members
-        unseen &= ~members
-        groups.append(tuple(int(robot) for robot in np.flatnonzero(members)))
+        seen |= members
+        groups.append(tuple(sorted(members)))
     return tuple(groups)
 
 
-def failure_groups(failed: BoolArray, graph: BoolArray) -> Groups:
+def failure_groups(failed: BoolArray, graph: Graph) -> Groups:
     """Groups to replan: the components of the graph that hold a failed robot.
 
     Args:
         failed: ``(K,)`` robots that do not arrive, or violate the margin to anything.
-        graph: ``(K, K)`` conflicts, after :func:`reconnected`.
+        graph: Conflicts, after :func:`reconnected`.
 
     Returns:
         Disjoint groups of robots, each in ascending order. A robot that fails without conflict is a group of its own.
@@ -91,15 +90,15 @@ def failure_groups(failed: BoolArray, graph: BoolArray) -> Groups:
     return tuple(group for group in components(graph) if failed[list(group)].any())
 
 
-def independent_robots(candidates: Sequence[int], graph: BoolArray) -> tuple[int, ...]:
+def independent_robots(candidates: Iterable[int], graph: Graph) -> tuple[int, ...]:
     """Those of the candidates, taken in order, that conflict with none taken before; sorted.
 
     Args:
         candidates: Robots, the most wanted first.
-        graph: ``(K, K)`` conflicts.
+        graph: Conflicts.
     """
-    taken: list[int] = []
+    taken: set[int] = set()
     for robot in candidates:
-        if not graph[robot, taken].any():
-            taken.append(int(robot))
+        if taken.isdisjoint(graph[robot]):
+            taken.add(int(robot))
     return tuple(sorted(taken))

@@ -131,14 +131,14 @@ class Plan:
     def failures(self) -> dict[str, str]:
         """Which robots the plan leaves unsolved, and why: a sentence for each, by agent name; empty if it is solved."""
         problem, trajectory = self.problem, self.trajectory
-        near = conflicts(trajectory.positions[1:], problem.team.radius, problem.margin)
+        near = conflicts(trajectory.positions, problem.team.radius, problem.margin)
         reasons = {}
         for robot in range(problem.num_robots):
             faults = []
             if not trajectory.arrived[-1, robot]:
                 gap = np.linalg.norm(trajectory.positions[-1, robot] - problem.goal[robot])
                 faults.append(f"ends {gap:.2f} m from its goal")
-            others = [f"robot_{other}" for other in np.flatnonzero(near[robot])]
+            others = [f"robot_{other}" for other in sorted(near[robot])]
             if others:
                 faults.append(f"comes within the margin of {', '.join(others)}")
             clearance = problem.world.clearance(trajectory.positions[1:, robot]).min()

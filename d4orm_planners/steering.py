@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
@@ -40,7 +40,7 @@ def preferred_velocities(problem: Problem, states: FloatArray, goals: FloatArray
     """
     velocities = np.zeros(goals.shape, np.float32)
     h = TimeStep(*problem.arrays.time_step)
-    for model, robots in _by_model(problem):
+    for model, robots in by_model(problem):
         x, goal, limits = (tuple(rows[robots].T) for rows in (states, goals, problem.team.limits))
         velocities[robots] = np.stack(model.functions.approach(x, goal, limits, h, NUMPY_OPS), axis=1)
     return velocities
@@ -56,7 +56,7 @@ def track_velocities(problem: Problem, states: FloatArray, velocities: FloatArra
     """
     controls = np.zeros((problem.num_robots, problem.control_size), np.float32)
     h = TimeStep(*problem.arrays.time_step)
-    for model, robots in _by_model(problem):
+    for model, robots in by_model(problem):
         x, velocity, limits = (tuple(rows[robots].T) for rows in (states, velocities, problem.team.limits))
         wanted = model.functions.track(x, velocity, limits, h, NUMPY_OPS)
         allowed = model.functions.limit_control(wanted, limits, NUMPY_OPS)
@@ -66,7 +66,7 @@ def track_velocities(problem: Problem, states: FloatArray, velocities: FloatArra
     return np.clip(controls, -limit, limit)
 
 
-def _by_model(problem: Problem) -> Iterator[tuple[Model, list[int]]]:
+def by_model(problem: Problem) -> Iterator[tuple[Model, list[int]]]:
     """The models of the team, each with its robots."""
     models = problem.team.models
     for name in dict.fromkeys(models):
@@ -79,44 +79,55 @@ class Drives:
 
     Attributes:
         controls: ``(H, R, V, m)``, zero after arrival.
-        positions: ``(H+1, R, V, d)`` [m].
+        states: ``(H+1, R, V, n)``.
         arrived: ``(R, V)`` bool.
+        dimension: ``d``.
     """
 
     controls: FloatArray
-    positions: FloatArray
+    states: FloatArray
     arrived: BoolArray
+    dimension: int
 
-    def of(self, robot: int) -> Drives:
-        """The ways of one robot, without the axis of robots."""
-        return Drives(self.controls[:, robot], self.positions[:, robot], self.arrived[robot])
-
-    def joined(self, other: Drives) -> Drives:
-        """These ways and others of the same robots."""
-        return Drives(
-            np.concatenate([self.controls, other.controls], axis=-2),
-            np.concatenate([self.positions, other.positions], axis=-2),
-            np.concatenate([self.arrived, other.arrived], axis=-1),
-        )
+    @property
+    def positions(self) -> FloatArray:
+        """``(H+1, R, V, d)`` [m]."""
+        return self.states[..., : self.dimension]
 
 
-def closing_stretches(problem: Problem, states: FloatArray, controls: FloatArray, switch_times: ArrayLike) -> Drives:
-    """Follow the controls up to a time and drive straight to the goal from there.
+def drives(
+    problem: Problem, states: FloatArray, controls: FloatArray, switch_times: ArrayLike, vias: ArrayLike | None = None
+) -> Drives:
+    """Follow the controls up to a time, and from there drive straight from point to point and on to the goal.
+
+    Half a metre before a point a robot turns to the next one.
 
     Args:
         problem: The robots.
         states: ``(H+1, R, n)`` their states under ``controls``.
         controls: ``(H, R, m)`` as executed: clipped, zero for docked robots.
         switch_times: ``(R, V)`` time steps.
+        vias: ``(R, V, P, d)`` the points [m]; none by default.
     """
-    switch = np.asarray(switch_times)
-    vias = np.repeat(problem.goal[:, None], switch.shape[1], axis=1)
-    return _drive_teams(problem, states, controls, switch, vias)
+    # Here, because importing numba takes long.
+    from d4orm_env.engine.drives import DrivenWays, DriveRules, drive_kernel
+    from d4orm_env.engine.threads import Threads, available_cores
 
-
-def detours(problem: Problem, vias: FloatArray) -> Drives:
-    """Drive from the start straight towards a point ``(R, V, d)`` [m], and half a metre before it on to the goal."""
-    return _drive_teams(problem, *_standing(problem), np.zeros(vias.shape[:2], int), vias)
+    switch, arrays = np.asarray(switch_times, np.int64), problem.arrays
+    num_steps, dimension = problem.horizon, problem.dimension
+    points = np.empty((*switch.shape, 0, dimension), np.float32) if vias is None else np.asarray(vias, np.float32)
+    u = np.zeros((*switch.shape, num_steps, problem.control_size), np.float32)
+    x = np.zeros((*switch.shape, num_steps + 1, problem.state_size), np.float32)
+    arrived = np.zeros(switch.shape, bool)
+    docking = np.array([arrays.squared_goal_radius, arrays.squared_goal_speed])
+    rules = DriveRules(arrays.time_step, docking, arrays.docks, NEAR_VIA)
+    given_x, given_u = (np.ascontiguousarray(rows.swapaxes(0, 1), np.float32) for rows in (states, controls))
+    ways = DrivenWays(arrays.limits, problem.goal, given_x, given_u, switch, np.ascontiguousarray(points))
+    threads = Threads(available_cores())
+    for model, robots in by_model(problem):
+        kernel, index = drive_kernel(model.name), np.array(robots)
+        threads.over(len(index), lambda part: kernel(rules, ways, index[part[0] : part[1]], u, x, arrived))  # noqa: B023
+    return Drives(np.moveaxis(u, 2, 0), np.moveaxis(x, 2, 0), arrived, dimension)
 
 
 def prepare_drives(problem: Problem) -> None:
@@ -129,37 +140,10 @@ def prepare_drives(problem: Problem) -> None:
 
 def straight_drives(problem: Problem) -> Drives:
     """Drive from the start straight to the goal: a single way for every robot."""
-    return closing_stretches(problem, *_standing(problem), np.zeros((problem.num_robots, 1), int))
+    return drives(problem, *standing(problem), np.zeros((problem.num_robots, 1), int))
 
 
-def _standing(problem: Problem) -> tuple[FloatArray, FloatArray]:
-    """States and controls of robots that stay where they start."""
+def standing(problem: Problem) -> tuple[FloatArray, FloatArray]:
+    """States ``(H+1, K, n)`` and controls ``(H, K, m)`` of robots that stay where they start."""
     states = np.repeat(np.asarray(problem.start)[None], problem.horizon + 1, axis=0)
     return states, np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
-
-
-def _drive_teams(
-    problem: Problem, states: FloatArray, controls: FloatArray, switch: IntArray, vias: FloatArray
-) -> Drives:
-    """Every robot on each of its ways: as controlled until ``switch`` ``(R, V)``, then by ``vias`` ``(R, V, d)``."""
-    # Here, because importing numba takes long.
-    from d4orm_env.engine.drives import DrivenWays, DriveRules, drive_kernel
-
-    num_ways, arrays = switch.shape[1], problem.arrays
-    u = np.repeat(np.asarray(controls, np.float32)[:, :, None], num_ways, axis=2)
-    x = np.repeat(np.asarray(states, np.float32)[:, :, None], num_ways, axis=2)
-    arrived = np.zeros(switch.shape, bool)
-    docking = np.array([arrays.squared_goal_radius, arrays.squared_goal_speed])
-    rules = DriveRules(arrays.time_step, docking, arrays.docks, NEAR_VIA)
-    for model, robots in _by_model(problem):
-        # One lane for every robot and way.
-        lanes_x, lanes_u = (array[:, robots].reshape(len(array), -1, array.shape[-1]) for array in (x, u))
-        limits, goals = (np.repeat(rows[robots], num_ways, axis=0) for rows in (arrays.limits, problem.goal))
-        targets = np.ascontiguousarray(vias[robots], np.float32).reshape(goals.shape)
-        lanes_arrived = np.empty(len(goals), bool)
-        ways = DrivenWays(limits, goals, targets, switch[robots].ravel())
-        drive_kernel(model.name)(rules, ways, lanes_x, lanes_u, lanes_arrived)
-        x[:, robots] = lanes_x.reshape(len(x), len(robots), num_ways, -1)
-        u[:, robots] = lanes_u.reshape(len(u), len(robots), num_ways, -1)
-        arrived[robots] = lanes_arrived.reshape(len(robots), num_ways)
-    return Drives(u, x[..., : problem.dimension], arrived)

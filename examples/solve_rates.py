@@ -37,7 +37,7 @@ BIG: list[tuple[str, str, dict[str, Any], int]] = [
     ("four obstacles, 16", "four_obstacles", {"num_robots": 16}, 200),
     ("random, 64 on 8 x 8 m", "random", {"num_robots": 64, "size": 8.0}, 200),
     ("random, 64 on 10 x 10 m", "random", {"num_robots": 64, "size": 10.0}, 200),
-    ("random, 100 on 12.5 x 12.5 m", "random", {"num_robots": 100, "size": 12.5}, 200),
+    *((f"random, {robots}", "random", {"num_robots": robots}, 200) for robots in (100, 200, 500, 1000)),
     ("circle of 18 m, 100", "circle", {"num_robots": 100, "diameter": 18.0}, 200),
     ("sphere, 64", "sphere", {"num_robots": 64}, 200),
     *((f"AMSwarm {i}, 10", f"amswarm_{i}", {"num_robots": 10}, 200) for i in range(1, 6)),

@@ -83,7 +83,7 @@ def test_the_paper_preset_replans_exactly_the_groups_that_fail(clip: bool) -> No
     previous = None
     for _ in range(4):
         before = search.current
-        graph = conflicts(before.trajectory.positions[1:], CROSSING.team.radius, CROSSING.margin)
+        graph = conflicts(before.trajectory.positions, CROSSING.team.radius, CROSSING.margin)
         groups = failure_groups(before.failed, reconnected(graph, previous))
         replanned = {robot for group in groups for robot in group}
         search.advance()

@@ -14,9 +14,12 @@ import numpy as np
 import pytest
 
 from d4orm_env import make_problem, rollout
-from d4orm_env.engine import sampling, softmax, wavefront, worlds
+from d4orm_env.engine import path_index, sampling, softmax, wavefront, worlds
+from d4orm_env.engine.beam_search import search_kernel
+from d4orm_env.engine.drives import drive_kernel
 from d4orm_env.engine.softmax import softmax_weights
 from d4orm_env.engine.tiles import OPTIONS
+from d4orm_planners.commands.warmup import sample_once
 
 PORTABILITY = Path(__file__).parent / "portability"
 sys.path.insert(0, str(PORTABILITY))
@@ -53,12 +56,16 @@ def kernels() -> Iterator[tuple[str, Any]]:
     yield "spread", wavefront._spread
     yield "look", wavefront.look
     yield "settle", wavefront.settle_nodes
+    yield "drive", drive_kernel("differential_drive")
+    yield "search", search_kernel("differential_drive")
+    yield "meetings", path_index._count_met
     yield "roll out", worlds.world_kernels(("holonomic2d",)).roll_out
 
 
 @pytest.mark.slow
 def test_kernels_estimate_nothing_and_fuse_nothing() -> None:
     plans.digest(plans.CASES["differential drives"])
+    sample_once((("differential_drive",) * 2,))
     rooted = 0
     for name, kernel in kernels():
         # What comes from the cache has no assembly to show.

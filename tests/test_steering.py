@@ -12,7 +12,7 @@ from env_support import line_problem, mixed_problem
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.cpu import CpuEngine
-from d4orm_planners.steering import Drives, closing_stretches
+from d4orm_planners.steering import Drives, drives
 
 CPU = CpuEngine()
 SWITCH_TIMES = (0, 3, 10, 25, 79)
@@ -29,7 +29,7 @@ def closing(problem: Problem, controls: np.ndarray, times: Any = SWITCH_TIMES) -
     """The engine's rollout of the controls, and every robot's stretches at the same times."""
     trajectory = CPU.rollout(problem, controls)
     switch = np.tile(times, (problem.num_robots, 1))
-    return trajectory, closing_stretches(problem, trajectory.states, trajectory.controls, switch)
+    return trajectory, drives(problem, trajectory.states, trajectory.controls, switch)
 
 
 @pytest.mark.parametrize("goal_speed", [None, 0.2])
@@ -57,13 +57,11 @@ def test_every_robot_has_switch_times_of_its_own(model: str) -> None:
     problem = problem_of(model)
     trajectory = CPU.rollout(problem, random_controls(problem, seed=2))
     switch = np.array([[0, 12], [7, 3], [20, 40]])
-    together = closing_stretches(problem, trajectory.states, trajectory.controls, switch)
+    together = drives(problem, trajectory.states, trajectory.controls, switch)
     for robot in range(3):
         alone = problem.select([robot])
         n, m = alone.state_size, alone.control_size
-        single = closing_stretches(
-            alone, trajectory.states[:, [robot], :n], trajectory.controls[:, [robot], :m], switch[[robot]]
-        )
+        single = drives(alone, trajectory.states[:, [robot], :n], trajectory.controls[:, [robot], :m], switch[[robot]])
         np.testing.assert_allclose(together.positions[:, robot], single.positions[:, 0], atol=1e-5)
         np.testing.assert_array_equal(together.arrived[robot], single.arrived[0])
 
@@ -114,6 +112,24 @@ def test_arguments_are_left_alone() -> None:
     problem = problem_of("mixed")
     trajectory = CPU.rollout(problem, random_controls(problem, seed=2))
     states, controls = trajectory.states.copy(), trajectory.controls.copy()
-    closing_stretches(problem, states, controls, np.array([[3], [5], [7]]))
+    drives(problem, states, controls, np.array([[3], [5], [7]]))
     np.testing.assert_array_equal(states, trajectory.states)
     np.testing.assert_array_equal(controls, trajectory.controls)
+
+
+@pytest.mark.parametrize("model", [*MODEL_NAMES, "mixed"])
+def test_a_way_by_points_comes_near_all_of_them_in_turn(model: str) -> None:
+    problem = problem_of(model).replace(horizon=300)
+    given, _ = closing(problem, np.zeros((300, problem.num_robots, problem.control_size), np.float32))
+    start = np.asarray(problem.start)[:, None, None, : problem.dimension]
+    steps = np.zeros((1, 2, 2, problem.dimension))
+    steps[0, :, :, :2] = [[[1, 1], [2, -1]], [[-1, -1], [-1, 1]]]
+    switch = np.zeros((problem.num_robots, 2), int)
+    ways = drives(problem, given.states, given.controls, switch, start + steps)
+    assert ways.arrived.all()
+    gap = np.linalg.norm(ways.positions[:, :, :, None] - (start + steps), axis=4)
+    assert (gap.min(axis=0) < 0.5).all()
+    first = (gap < 0.5).argmax(axis=0)
+    assert (first[..., 1] > first[..., 0]).all()
+    rollout = CPU.rollout(problem, ways.controls[:, :, 1])
+    np.testing.assert_allclose(rollout.states, ways.states[:, :, 1], atol=1e-4)

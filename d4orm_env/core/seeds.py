@@ -18,7 +18,7 @@ class Stream(IntEnum):
     DEFORMATION_START = 1  # U_N, by run of the iteration
     REPAIR = 2  # samples of D4orm-D's repairs, by repair of the iteration
     REPAIR_ORDER = 3
-    DETOURS = 4  # by detour of the iteration
+    DETOURS = 4  # of D4orm-D, by sweep of the iteration
     CHOICE = 5  # what a node goes on from
     NODE = 6  # the seed of a node of D-D4orm
     PERTURBATION = 7  # of IPOPT's warm start

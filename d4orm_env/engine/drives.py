@@ -17,7 +17,6 @@ from d4orm_env.engine.tiles import (
     OPS,
     OPTIONS,
     SQUARED_GAP,
-    ZERO,
     inlined,
     make_stepper,
     models_key,
@@ -44,27 +43,31 @@ class DriveRules(NamedTuple):
 
 
 class DrivenWays(NamedTuple):
-    """``B`` ways, each straight towards a point until it has come near to that, and then to the goal.
+    """``V`` ways of each of ``R`` robots: as given at first, then straight by points to the goal.
 
     Attributes:
-        limits: ``(B, L)`` of the robots.
-        goals: ``(B, d)``.
-        vias: ``(B, d)`` the points.
-        switch: ``(B,)`` time step from which on it is driven so.
+        limits: ``(R, L)`` of the robots.
+        goals: ``(R, d)``.
+        states: ``(R, H+1, n)`` as given.
+        controls: ``(R, H, m)`` as given, inside the limits, zero for docked robots.
+        switch: ``(R, V)`` time step from which on a way is driven.
+        vias: ``(R, V, P, d)`` points to come near to one after the other, before the goal.
     """
 
     limits: FloatArray
     goals: FloatArray
-    vias: FloatArray
+    states: FloatArray
+    controls: FloatArray
     switch: NDArray[np.int64]
+    vias: FloatArray
 
 
 @cache
 def drive_kernel(name: str) -> Any:
     """The compiled drives of robots of the model with this name, each as if nobody else were there.
 
-    The kernel carries states ``x`` ``(H+1, B, n)`` and controls ``u`` ``(H, B, m)`` on in place, given up to ``switch``
-    and inside the limits from there on, zero once docked; ``arrived`` ``(B,)`` is output.
+    The kernel fills, for robots of these numbers, controls ``u`` ``(R, V, H, m)``, left alone once docked,
+    states ``x`` ``(R, V, H+1, n)`` and ``arrived`` ``(R, V)``.
     """
     robot = MODELS[name]
     move, dock = make_stepper(robot)
@@ -73,29 +76,45 @@ def drive_kernel(name: str) -> Any:
     n, m, d, num_limits = robot.state_size, robot.control_size, robot.dimension, len(robot.limit_names)
 
     @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
-    def drive(rules: DriveRules, ways: DrivenWays, x: FloatArray, u: FloatArray, arrived: BoolArray) -> None:
+    def drive(
+        rules: DriveRules, ways: DrivenWays, robots: Any, u: FloatArray, x: FloatArray, arrived: BoolArray
+    ) -> None:
         dt, docking = rules.time_step, (rules.docking[0], rules.docking[1], rules.docks)
         h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])
-        for b in range(ways.switch.shape[0]):
-            own_limits = to_fixed_tuple(ways.limits[b], num_limits)
-            goal, via = to_fixed_tuple(ways.goals[b], d), to_fixed_tuple(ways.vias[b], d)
-            first, at_goal = ways.switch[b], False
-            state = to_fixed_tuple(x[first, b], n)
-            if first > 0:
-                state, _, at_goal = dock(False, state, to_fixed_tuple(u[first - 1, b], m), own_limits, goal, docking)
-            for t in range(first, u.shape[0]):
-                standing = transition.stands(at_goal, rules.docks)
-                via = goal if squared_gap(state, via) < rules.near2 else via
-                wanted = track(state, approach(state, via, own_limits, h, OPS), own_limits, h, OPS)
-                control = limit_control(wanted, own_limits, OPS)
-                for i in range(m):
-                    u[t, b, i] = ZERO if standing else control[i]
-                control = to_fixed_tuple(u[t, b], m)
-                state, _, at_goal = dock(
-                    standing, move(standing, state, control, own_limits, h), control, own_limits, goal, docking
-                )
-                for i in range(n):
-                    x[t + 1, b, i] = state[i]
-            arrived[b] = at_goal
+        num_ways, horizon, num_vias = ways.switch.shape[1], ways.controls.shape[1], ways.vias.shape[2]
+        for r in robots:
+            own_limits, goal = to_fixed_tuple(ways.limits[r], num_limits), to_fixed_tuple(ways.goals[r], d)
+            for way in range(num_ways):
+                first, at_goal, passed = ways.switch[r, way], False, 0
+                for t in range(first + 1):
+                    for i in range(n):
+                        x[r, way, t, i] = ways.states[r, t, i]
+                for t in range(first):
+                    for i in range(m):
+                        u[r, way, t, i] = ways.controls[r, t, i]
+                state = to_fixed_tuple(ways.states[r, first], n)
+                if first > 0:
+                    control = to_fixed_tuple(ways.controls[r, first - 1], m)
+                    state, _, at_goal = dock(False, state, control, own_limits, goal, docking)
+                for t in range(first, horizon):
+                    if transition.stands(at_goal, rules.docks):
+                        for i in range(n):
+                            x[r, way, t + 1 :, i] = state[i]
+                        break
+                    aim = goal
+                    while passed < num_vias:
+                        aim = to_fixed_tuple(ways.vias[r, way, passed], d)
+                        if not squared_gap(state, aim) < rules.near2:
+                            break
+                        passed, aim = passed + 1, goal
+                    wanted = track(state, approach(state, aim, own_limits, h, OPS), own_limits, h, OPS)
+                    control = limit_control(wanted, own_limits, OPS)
+                    for i in range(m):
+                        u[r, way, t, i] = control[i]
+                    state = move(False, state, control, own_limits, h)
+                    state, _, at_goal = dock(False, state, control, own_limits, goal, docking)
+                    for i in range(n):
+                        x[r, way, t + 1, i] = state[i]
+                arrived[r, way] = at_goal
 
     return drive

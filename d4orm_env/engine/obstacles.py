@@ -63,6 +63,31 @@ def _touches(index: Any, boxes: Any, triangles: Any, cell: Any, reach: Any, x: A
     return False
 
 
+@inlined
+def is_closed(arrays: Any) -> Any:
+    """Whether there are obstacles or bounds at all."""
+    closed = arrays.grid.clearance.shape[0] > 0
+    for axis in range(arrays.goal.shape[1]):
+        closed |= arrays.bounds[0, axis] > -np.inf or arrays.bounds[1, axis] < np.inf
+    return closed
+
+
+@inlined
+def touches_static(arrays: Any, reach: Any, place: Any) -> Any:
+    """Whether a body of this reach touches an obstacle or the bounds where its centre is at ``place`` ``(d,)``."""
+    index = arrays.grid
+    for axis in range(place.shape[0]):
+        if collision.leaves(place[axis], reach, arrays.bounds[0, axis], arrays.bounds[1, axis]):
+            return True
+    if index.clearance.shape[0] == 0:
+        return False
+    x, y, z = place[0], place[1], place[place.shape[0] - 1]
+    clearance = index.clearance[_cell(index, x, y, z)]
+    if clearance > reach + index.slack or clearance <= reach - index.slack:
+        return clearance <= reach
+    return _touches(index, arrays.boxes, arrays.triangles, reach, x, y, z)
+
+
 @compiled
 def _near_indexed(index: Any, boxes: Any, triangles: Any, reach: Any, places: Any, spare: Any) -> Any:
     """Where a body of this reach, its centre in the first rows of ``places``, touches an obstacle."""

@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 Indices = NDArray[np.intp]
 
+_ROUNDING = 1e-6
+"""What boxes are widened by for it [m]."""
+
 MAX_NUMBERS = 2**18
 """Numbers in the largest arrays that are worked on at once, but for those of a single step."""
 
@@ -87,8 +90,12 @@ class Watch(ABC):
     def thing(self, column: Indices) -> Indices:
         """Index into ``names`` of what the column stands for."""
 
+    def select(self, stretch: Stretch) -> None:  # noqa: B027 - most watch the same pairs throughout
+        """Choose the pairs to watch in a stretch."""
+
     def observe(self, stretch: Stretch) -> None:
         """Judge a stretch. Only pairs that may touch, or come closer than any so far, are looked at closely."""
+        self.select(stretch)
         gap, shrinkage = self.begin(stretch)
         self.minimum = min(self.minimum, float(gap.min(initial=np.inf)))
         least = gap - shrinkage - 1e-9
@@ -128,14 +135,36 @@ class Watch(ABC):
 
 
 class Pairs(Watch):
-    """Robots against each other."""
+    """Robots against each other: in every stretch those that it takes close enough to matter."""
 
     def __init__(self, robot: Indices, radius: Floats) -> None:
-        rows, columns = np.triu_indices(len(robot), 1)
-        others = robot[rows] != robot[columns]  # two readings of one robot do not meet
         names = [f"robot_{index}" for index in range(len(radius))]
-        super().__init__("robot contact", robot, names, rows[others], columns[others])
-        self._size = radius[robot[self.rows]] + radius[robot[self.columns]]
+        nobody = np.empty(0, np.intp)
+        super().__init__("robot contact", robot, names, nobody, nobody)
+        self._radius = radius[robot]
+
+    def select(self, stretch: Stretch) -> None:
+        lower, upper = stretch.path.min(axis=(0, 1)), stretch.path.max(axis=(0, 1))
+        axis = int((upper.max(axis=0) - lower.min(axis=0)).argmax())
+        order = np.argsort(lower[:, axis], kind="stable")
+        # Who is further apart than any two are known to come does not matter.
+        a, b = order[:-1], order[1:]
+        gap = norm(stretch.path[0, 0, a] - stretch.path[0, 0, b]) - self._radius[a] - self._radius[b]
+        least = min(self.minimum, float(gap[self._robot[a] != self._robot[b]].min(initial=np.inf)))
+        widening = (self._radius + max(least, 0.0) / 2 + _ROUNDING)[:, None]
+        lower, upper = lower - widening, upper + widening
+        # Boxes that overlap along one axis: each with those that begin before it ends.
+        order = np.argsort(lower[:, axis], kind="stable")
+        places = np.arange(len(order))
+        count = np.searchsorted(lower[order, axis], upper[order, axis], side="right") - places - 1
+        first = np.repeat(places, count)
+        second = first + 1 + np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        a, b = order[first], order[second]
+        near = np.all((lower[a] <= upper[b]) & (lower[b] <= upper[a]), axis=1)
+        near &= self._robot[a] != self._robot[b]  # two readings of one robot do not meet
+        key = np.sort(np.minimum(a, b)[near] * len(order) + np.maximum(a, b)[near])
+        self.rows, self.columns = np.divmod(key, len(order))
+        self._size = self._radius[self.rows] + self._radius[self.columns]
 
     def begin(self, stretch: Stretch) -> tuple[Floats, Floats]:
         place = stretch.path[:, 0]

@@ -26,8 +26,9 @@ from d4orm_env.core.world import World
 from d4orm_env.engine.base import SamplingRules, SamplingTask
 from d4orm_env.engine.caching import has_to_be_compiled
 from d4orm_env.engine.choice import get_engine
+from d4orm_planners.registry import make_planner
 from d4orm_planners.sampling.weights import SoftmaxWeights
-from d4orm_planners.steering import prepare_drives
+from d4orm_planners.search import Search
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,9 @@ def roll_out_once(models: tuple[str, ...], *, drives: bool = True) -> None:
     run.moments(_RULES.weights(rewards, np), with_second=False)
     get_engine("cpu").rollout(problem, _no_controls(problem))
     if drives:
-        prepare_drives(problem)
+        # What it drives by itself, and how it looks for ways around others.
+        planner = make_planner("d4orm-d", engine="cpu")
+        planner.init(Search(planner, problem, seed=0))
 
 
 def sample_once(teams: tuple[tuple[str, ...], ...]) -> None:
@@ -154,7 +157,6 @@ def _no_controls(problem: Problem) -> FloatArray:
 
 def _plan() -> None:
     from d4orm_planners.names import PLANNERS
-    from d4orm_planners.registry import make_planner
     from d4orm_planners.sampling.optimizer import SamplingPlanner
 
     problem = _smallest_problem(TEAMS[0])
@@ -186,6 +188,7 @@ def _kernels() -> list[Any]:
     from numba.core.dispatcher import Dispatcher
 
     from d4orm_env import engine
+    from d4orm_env.engine.beam_search import search_kernel
     from d4orm_env.engine.drives import drive_kernel
     from d4orm_env.engine.sampling import score_kernel
     from d4orm_env.engine.worlds import world_kernels
@@ -195,4 +198,5 @@ def _kernels() -> list[Any]:
     found = {name: value for module in modules for name, value in vars(module).items() if isinstance(value, Dispatcher)}
     worlds = {kernel for models in TEAMS for kernel in world_kernels(models)}
     kernels = [*found.values(), *worlds, *map(score_kernel, TEAMS), *map(drive_kernel, COMMON)]
+    kernels += map(search_kernel, COMMON)
     return [kernel for kernel in kernels if kernel.stats.cache_path is not None]

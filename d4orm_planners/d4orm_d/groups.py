@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from d4orm_env.core.arrays import BoolArray
 from d4orm_planners.d4orm_d.team import TeamPaths
-from d4orm_planners.grouping import failure_groups, reconnected
+from d4orm_planners.grouping import Graph, conflicts, failure_groups, reconnected
 
 
 @dataclass(frozen=True, eq=False)
@@ -14,22 +13,22 @@ class Groups:
     """The state of the search by groups.
 
     Attributes:
-        graph: ``(K, K)`` conflicts before the last iteration by groups, or ``None`` before the first.
+        graph: Conflicts before the last iteration by groups, or ``None`` before the first.
     """
 
-    graph: BoolArray | None = None
+    graph: Graph | None = None
 
     def replan(self, team: TeamPaths) -> Groups:
         """Replan every group with a failed robot in turn, the robots outside it as moving obstacles."""
-        planner, search = team.planner, team.search
+        planner, search, problem = team.planner, team.search, team.problem
+        graph = conflicts(search.current.trajectory.positions, problem.team.radius, problem.margin)
         team.controls = planner.config.continued(search.current).copy()
-        for group in failure_groups(search.current.failed, reconnected(team.graph, self.graph)):
+        for group in failure_groups(search.current.failed, reconnected(graph, self.graph)):
             if search.should_stop():
                 break
             robots = list(group)
-            part, controls, trajectory = team.deformed(
-                robots, team.problem.horizon, planner.config.num_samples, planner.noise_scale(), credit="team"
+            _, controls, trajectory = team.deformed(
+                robots, problem.horizon, planner.config.num_samples, planner.noise_scale(), credit="team"
             )
-            team.controls[:, robots, : part.control_size] = controls
-            team.positions[:, robots] = trajectory.positions
-        return Groups(team.graph)
+            team.move(robots, controls, trajectory.states, trajectory.arrived[-1])
+        return Groups(graph)

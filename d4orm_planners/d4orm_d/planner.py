@@ -54,9 +54,15 @@ class D4ormD(D4orm):
 
     def init(self, search: Search) -> State:
         """See :meth:`Planner.init`."""
+        # Here, because importing numba takes long.
+        from d4orm_planners.d4orm_d.rerouting import prepare_rerouting
+
         with search.watch.paused():
             prepare_drives(search.problem)
-        return Groups() if self.config.decoupling == "groups" else Repairs.of(search.problem.num_robots)
+            if self.config.decoupling == "groups":
+                return Groups()
+            prepare_rerouting(TeamPaths(self, search, search.current.trajectory))
+        return Repairs.of(search.problem.num_robots)
 
     def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
         """See :meth:`Planner.iterate`: the whole team at first and once nobody fails, the failed robots in between."""
@@ -111,9 +117,8 @@ class D4ormD(D4orm):
             return None
         drives = straight_drives(problem)
         if self.config.start == "auto":
-            mean_conflicts = (
-                conflicts(drives.positions[1:, :, 0], problem.team.radius, problem.margin).sum(axis=1).mean()
-            )
-            if mean_conflicts >= problem.num_robots / 2:
+            graph = conflicts(drives.positions[:, :, 0], problem.team.radius, problem.margin)
+            # As many as when everybody meets half of the team.
+            if 2 * sum(map(len, graph)) >= problem.num_robots**2:
                 return None
         return drives.controls[:, :, 0]

@@ -46,6 +46,43 @@ class D4ormDConfig(D4ormConfig):
 
 
 @dataclass(frozen=True)
+class RerouteRules:
+    """The numbers of the search for ways around others.
+
+    Attributes:
+        sweeps: How many times in turn the robots that fail look for a way in an iteration.
+        batch: Robots that look for ways at the same time, not minding each other's: so that all cores have work.
+        width: Ways that a search keeps after each block of steps.
+        contact: What being near another robot for a block of steps costs in the first sweep [s]: waiting that long is
+            cheaper.
+        contact_growth: Times as much it costs in the next sweep: what cannot be had for little may be had for more.
+        apart: How far apart the ways that are kept must be [m], or else twice as much in speed [m/s].
+        earlier: Blocks before a robot's first fault at which its new way begins: from one number to the other, which
+            doubles with each sweep.
+        angles: By which a robot turns off from the way to its goal [degrees]; in space up and down as well.
+        swing: From one sweep to the next all of them change by up to so much either way [degrees].
+        paces: Shares of its speed with which a robot heads for its goal: waiting has no direction.
+        beside: Goal radii beside its goal to which it may head too: who docks there keeps clear of a neighbour.
+        on_the_spot: The share with which one that has a heading turns, to its goal or to one side, as if it stood.
+        detours: Random points by which it tries to drive if it has found no way.
+    """
+
+    sweeps: int = 6
+    batch: int = 16
+    width: int = 32
+    contact: float = 1.25
+    contact_growth: float = 2.0
+    apart: float = 0.15
+    earlier: tuple[int, int] = (2, 5)
+    angles: tuple[float, ...] = (30.0, 60.0, 90.0, 135.0, 180.0)
+    swing: float = 14.0
+    paces: tuple[float, ...] = (1.0, 0.5, 0.0)
+    beside: float = 0.8
+    on_the_spot: float = 0.001
+    detours: int = 32
+
+
+@dataclass(frozen=True)
 class RepairRules:
     """The numbers of independent repairs.
 
@@ -61,11 +98,8 @@ class RepairRules:
         joint_robots: ... and they are so few: robots that only together can get out of each other's way.
         shortenings: How many times in turn robots look for shorter ways home.
         earlier: Steps before a robot's arrival, or its nearest approach, at which it may turn straight to its goal.
-        detour_failures: Failed repairs in a row after which a robot may take a detour.
-        detours: Random detours that it chooses from.
-        missing_cost: Conflicts that a robot may get into instead of never arriving, or of touching an obstacle.
-        time_cost: Conflicts that a robot may get into instead of using the whole horizon: of two ways as good, the
-            sooner one.
+        batch: Robots that look for ways home at the same time: all ways of a big team take room.
+        missing_cost: Robots that a robot may meet rather than never arrive, or touch an obstacle.
     """
 
     noise_factors: tuple[float, ...] = (1.0, 2.0)
@@ -78,10 +112,8 @@ class RepairRules:
     joint_robots: int = 3
     shortenings: int = 2
     earlier: tuple[int, ...] = (0, 8, 16, 32, 64)
-    detour_failures: int = 2
-    detours: int = 32
-    missing_cost: float = 5.0
-    time_cost: float = 0.1
+    batch: int = 64
+    missing_cost: int = 5
 
 
-RULES = RepairRules()
+REROUTE_RULES, RULES = RerouteRules(), RepairRules()
