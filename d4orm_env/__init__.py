@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from d4orm_env.core.dynamics import register_model
 from d4orm_env.core.problem import Problem
@@ -30,7 +30,7 @@ __all__ = [
 register_environments()
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Load what brings PettingZoo, JAX or pydantic with it on first use only."""
     if name in ("load_problem", "save_problem"):
         return getattr(import_module("d4orm_env.scenarios"), name)

@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike
 
+from d4orm_env._viewer import RENDER_MODES
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.env_inputs import check_options, joint_controls
 from d4orm_env.options import EnvOptions
@@ -13,7 +14,6 @@ from d4orm_env.scenarios.problems import ScenarioLike
 from d4orm_env.shell import EnvironmentShell
 from d4orm_env.simulation import Simulation
 from d4orm_env.team_step import Info, TeamStep, agent_infos
-from d4orm_env.viewer import RENDER_MODES
 
 __all__ = ["JointNavigationEnv", "register_environments"]
 

@@ -7,7 +7,6 @@ controls in physical units, so that a plan's controls ``(H, K, m)`` can be stepp
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -17,13 +16,13 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import OrderEnforcingWrapper
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
+from d4orm_env._viewer import RENDER_MODES
 from d4orm_env.core.arrays import FloatArray, as_float32, whole_number
 from d4orm_env.env_inputs import MAX_ACTION, check_options, checked_cycles, usable
 from d4orm_env.options import EnvOptions
 from d4orm_env.scenarios.problems import ScenarioLike
 from d4orm_env.shell import EnvironmentShell
 from d4orm_env.team_step import AgentInfos, TeamStep, agent_infos
-from d4orm_env.viewer import RENDER_MODES
 
 __all__ = ["env", "parallel_env", "raw_env"]
 
@@ -258,11 +257,15 @@ class _TurnByTurn(parallel_to_aec_wrapper):
         super().step(action)
 
 
-def raw_env(*args: Any, **kwargs: Any) -> AECEnv[str, FloatArray, FloatArray | None]:
+def raw_env(
+    scenario: ScenarioLike | None = None, num_robots: int | None = None, **options: object
+) -> AECEnv[str, FloatArray, FloatArray | None]:
     """The robots act in turn and move together when the last has chosen; arguments of :class:`parallel_env`."""
-    return _TurnByTurn(parallel_env(*args, **kwargs))
+    return _TurnByTurn(parallel_env(scenario, num_robots, **options))
 
 
-def env(*args: object, **kwargs: object) -> AECEnv[str, FloatArray, FloatArray | None]:
+def env(
+    scenario: ScenarioLike | None = None, num_robots: int | None = None, **options: object
+) -> AECEnv[str, FloatArray, FloatArray | None]:
     """:func:`raw_env`, with calls in the wrong order caught; arguments of :class:`parallel_env`."""
-    return OrderEnforcingWrapper(raw_env(*args, **kwargs))
+    return OrderEnforcingWrapper(raw_env(scenario, num_robots, **options))

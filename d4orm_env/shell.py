@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from d4orm_env._viewer import Frame, Viewer
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.options import EnvOptions
 from d4orm_env.simulation import Simulation
-from d4orm_env.viewer import Frame, Viewer
 
 
 class EnvironmentShell:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import gymnasium
 import numpy as np
@@ -11,6 +11,9 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
+from d4orm_env._vector_infos import final_infos, masked
+from d4orm_env._vector_inputs import checked_autoreset_mode, reset_mask, world_seeds
+from d4orm_env._world_draws import OWN_ARRAYS, WorldDraws
 from d4orm_env.core.arrays import BoolArray, FloatArray, whole_number
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem_arrays import ProblemArrays
@@ -22,10 +25,7 @@ from d4orm_env.rewards import RewardInput, along_ways, compute_rewards
 from d4orm_env.scenarios.problems import ScenarioLike
 from d4orm_env.simulation import Simulation
 from d4orm_env.team_step import Info
-from d4orm_env.vector_infos import final_infos, masked
-from d4orm_env.vector_inputs import checked_autoreset_mode, reset_mask, world_seeds
 from d4orm_env.ways import observe_ways
-from d4orm_env.world_draws import OWN_ARRAYS, WorldDraws
 
 if TYPE_CHECKING:
     from d4orm_env.engine.base import WorldEngine
@@ -38,7 +38,7 @@ _READ_BEFORE = ("state", "distance", "docked", "total_reward")
 """What rewards are computed from that a step overwrites."""
 
 
-class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
+class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray[np.generic]]):
     """``num_envs`` worlds at once, ``gymnasium.make_vec("d4orm/Navigation-v0", num_envs=..., ...)``.
 
     World for world it is :class:`d4orm_env.joint_env.JointNavigationEnv`: observations ``(B, K * D)``, actions

@@ -145,7 +145,8 @@ def shortest_ways(problem: Problem) -> Ways:
         reach = float(np.asarray(problem.team.radius)[robot]) + problem.margin
         for refinement in range(1 + REFINEMENTS):
             if (reach, refinement) not in lattices:
-                lattices[reach, refinement] = _lattice(problem, space, reach, STEP * reach / 2**refinement)
+                step, most = STEP * reach / 2**refinement, min(MAX_NODES, MAX_NODES_IN_ALL // problem.num_robots)
+                lattices[reach, refinement] = lay_lattice(problem, space, reach, step, most)
             lattice = lattices[reach, refinement]
             field = _Field(space, lattice, reach, spread(space, lattice, reach, goal))
             length[robot] = field.look(start[robot : robot + 1])[1][0]
@@ -170,18 +171,28 @@ def observe_ways(observations: FloatArray, layout: ObservationLayout, ways: Ways
     seen[..., parts.length] = np.minimum(length, layout.high[-1])[..., None]
 
 
-def _lattice(problem: Problem, space: Space, reach: float, step: float) -> Lattice:
-    """Nodes so far apart wherever ways may lead; farther apart where there would be too many."""
+def lay_lattice(
+    problem: Problem, space: Space | None, reach: float, step: float, most: int, pad: float = 0.0
+) -> Lattice:
+    """Nodes so far apart wherever ways may lead; farther apart where there would be too many.
+
+    Args:
+        problem: The starts, goals and bounds.
+        space: Its obstacles; ``None`` where there are none.
+        reach: What must fit at a node [m].
+        step: Distance of neighbouring nodes [m].
+        most: Most nodes.
+        pad: How far beyond starts, goals and obstacles ways may lead, at least twice the reach [m].
+    """
     from d4orm_env.engine.wavefront import Lattice, settle_nodes
 
-    d = problem.dimension
-    obstacles, bounds = space.extent[:, :d], problem.world.bounds.astype(np.float64)
-    places = np.concatenate(
-        [problem.start[:, :d], problem.goal, np.where(np.isinf(obstacles), problem.goal[0], obstacles)]
-    )
-    low = np.maximum(places.min(axis=0) - 2 * reach, bounds[0])
-    high = np.minimum(places.max(axis=0) + 2 * reach, bounds[1])
-    most = min(MAX_NODES, MAX_NODES_IN_ALL // problem.num_robots)
+    d, bounds, pad = problem.dimension, problem.world.bounds.astype(np.float64), max(pad, 2 * reach)
+    places = np.concatenate([problem.start[:, :d], problem.goal]).astype(np.float64)
+    if space is not None:
+        obstacles = space.extent[:, :d]
+        places = np.concatenate([places, np.where(np.isinf(obstacles), problem.goal[0], obstacles)])
+    low = np.maximum(places.min(axis=0) - pad, bounds[0])
+    high = np.minimum(places.max(axis=0) + pad, bounds[1])
     while np.floor((high - low) / step + 1).prod() > most:
         step *= 1.05
     size = np.floor((high - low) / step).astype(np.int64) + 1
@@ -194,7 +205,13 @@ def _lattice(problem: Problem, space: Space, reach: float, step: float) -> Latti
         places=np.empty((size.prod(), 3)),
         free=np.empty(size.prod(), np.bool_),
     )
-    settle_nodes(space, lattice, reach)
+    if space is not None:
+        settle_nodes(space, lattice, reach)
+        return lattice
+    index = np.indices(tuple(lattice.size)).reshape(3, -1).T
+    lattice.places[:] = lattice.low + index * step
+    inside = (lattice.places[:, :d] >= bounds[0] + reach) & (lattice.places[:, :d] <= bounds[1] - reach)
+    lattice.free[:] = inside.all(axis=1)
     return lattice
 
 

@@ -21,7 +21,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import inverse_initial_distance
 from d4orm_env.core.robot_model import SPEED, Ops
 from d4orm_env.core.transition import TimeStep
-from d4orm_planners.abandoning import run_or_abandon
+from d4orm_planners._abandoning import run_or_abandon
 
 OBJECTIVE_SCALE = 10.0
 """Of the mean cost of a step, so that IPOPT's tolerance tells good motions from bad ones."""
@@ -322,7 +322,9 @@ class TeamProgram:
         return Motion(states, controls)
 
 
-def _stopper(casadi: Any, sizes: dict[str, int], keep: Callable[[Expression], None], ends: Callable[[], bool]) -> Any:
+def _stopper(
+    casadi: Any, sizes: dict[str, int], keep: Callable[[Expression], None], ends: Callable[[], bool]
+) -> Expression:
     """What IPOPT calls after every iteration of a program of these sizes, and what ends it once ``ends()`` is true."""
 
     class Stopper(casadi.Callback):

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.engine.base import SamplingTask
+from d4orm_planners.guidance.planner import Guide, first_ways, guided_iteration, leads_round
+from d4orm_planners.planner import Iteration, State
 from d4orm_planners.sampling.optimizer import DenoisingPlanner, standard_normal
 from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, Credit, DenoisingConfig
 from d4orm_planners.search import Search
-from d4orm_planners.settings import Samples, Share, ShareOrNone, Steps
+from d4orm_planners.settings import Samples, Share, ShareOrNone, Steps, one_of
+
+PATIENT_AFTER = 4
+"""Iterations without a solution after which the default goes on by the paper's rules: team credit, unclipped, ..."""
+PATIENT_SAMPLES = 1024
+"""... and with so many samples."""
+Start = Annotated[str, one_of(("auto", "team", "guided"))]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +36,9 @@ class D4ormConfig(ContinuationSettings, DenoisingConfig):
             in the rollout only.
         late_steps: Share of the steps, the last ones, at which the noise is small enough for fewer samples.
         late_samples: Share of the samples that these steps draw.
+        start: What the first iteration does without initial controls. ``"team"`` deforms standing still, as in the
+            paper; ``"guided"`` drives on ways found on a roadmap (:mod:`d4orm_planners.guidance`), which later
+            iterations deform; ``"auto"`` does the second where obstacles lead somebody far round.
         random_start: Start every deformation from ``U_N ~ N(0, I)``, as Algorithm 1 is written, rather than from zero.
             The code that the paper's authors published starts from zero, and so does the preset: it solves more.
     """
@@ -37,6 +49,7 @@ class D4ormConfig(ContinuationSettings, DenoisingConfig):
     clip_between_iterations: bool = True
     late_steps: ShareOrNone = 0.7
     late_samples: Share = 0.5
+    start: Start = "auto"
     random_start: bool = False
 
 
@@ -45,12 +58,45 @@ class D4orm(DenoisingPlanner):
 
     name: ClassVar[str] = "d4orm"
     config_class = D4ormConfig
-    presets: ClassVar = {"paper": {**PAPER, "credit": "team", "late_samples": 1.0, "random_start": False}}
+    presets: ClassVar = {
+        "paper": {**PAPER, "credit": "team", "late_samples": 1.0, "start": "team", "random_start": False}
+    }
     config: D4ormConfig
+
+    def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
+        """See :meth:`Planner.iterate`."""
+        if search.iteration == 0 and self.is_guided(search):
+            guide = first_ways(search)
+            if isinstance(guide, Guide):
+                return state, guided_iteration(search, guide)
+        return super().iterate(search, state)
+
+    def task(self, search: Search, base: FloatArray) -> SamplingTask:
+        """See :meth:`SamplingPlanner.task`."""
+        task = super().task(search, base)
+        return replace(task, credit="team") if self.is_patient(search) else task
+
+    def num_samples(self, search: Search) -> int:
+        """See :meth:`SamplingPlanner.num_samples`."""
+        samples = self.config.num_samples
+        return max(samples, PATIENT_SAMPLES) if self.is_patient(search) else samples
+
+    def is_patient(self, search: Search) -> bool:
+        """Whether it goes on as the paper does: what finds its way soonest may never find it among many."""
+        hasty = self.config.credit == "alternate"
+        return hasty and search.iteration >= PATIENT_AFTER and not search.best.solved
+
+    def is_guided(self, search: Search) -> bool:
+        """Whether the first iteration is to find ways on a roadmap."""
+        if search.current.controls.any() or self.config.start not in ("auto", "guided"):
+            return False
+        return self.config.start == "guided" or leads_round(search.problem)
 
     def stages(self, search: Search) -> list[tuple[FloatArray, int]]:
         """See :meth:`SamplingPlanner.stages`."""
         noise_scale, num_samples = self.noise_scale(), self.num_samples(search)
+        if self.is_patient(search):
+            return [(noise_scale, num_samples)]
         early = len(noise_scale) - round(self.config.late_steps * len(noise_scale))
         fewer = max(2, round(self.config.late_samples * num_samples))
         if fewer == num_samples:
@@ -60,7 +106,7 @@ class D4orm(DenoisingPlanner):
 
     def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
         """See :meth:`SamplingPlanner.initial`."""
-        base = self.config.continued(search.current)
+        base = search.current.planned if self.is_patient(search) else self.config.continued(search.current)
         return base, self.start(search, base)
 
     def start(self, search: Search, base: FloatArray, number: int = 0) -> FloatArray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from d4orm_env.core.metrics import mean_squared_jerk, mean_stretch
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.joint_state import JointState, split_state
+from d4orm_env.team_step import AgentInfos
 from d4orm_planners.registry import PolicyLike, make_policy
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ class Episode:
     trajectory: Trajectory
     metrics: dict[str, float]
     observations: tuple[dict[str, FloatArray], ...]
-    infos: tuple[dict[str, dict[str, Any]], ...]
+    infos: tuple[AgentInfos, ...]
 
     @cached_property
     def stretch(self) -> float:

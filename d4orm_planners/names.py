@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypeGuard
 
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.registry import Registry
 from d4orm_planners.planner import Planner
 
 
-def is_planner_class(thing: object) -> bool:
+def is_planner_class(thing: object) -> TypeGuard[type[Planner]]:
     """Whether a thing is a subclass of Planner."""
     return isinstance(thing, type) and issubclass(thing, Planner)
 
 
-def _admit_planner(name: str, thing: Any) -> type[Planner]:
+def _admit_planner(name: str, thing: object) -> type[Planner]:
     if not is_planner_class(thing):
         raise ValueError(f"planner {name!r} is {shown(thing)}; give a subclass of d4orm_planners.Planner")
-    planner_class: type[Planner] = thing
-    return planner_class
+    return thing
 
 
 def _admit_policy(name: str, thing: object) -> object:
@@ -63,7 +62,7 @@ def register_policy(name: str, factory: object) -> None:
     POLICIES.add(name, factory)
 
 
-def _refuse_name_of(other: Registry[Any], name: object) -> None:
+def _refuse_name_of(other: Registry[object], name: object) -> None:
     if name in other.own():
         raise ValueError(f"{other.what} {name!r} has that name already; register yours under another")
 
@@ -77,6 +76,7 @@ for _name, _path in {
     "mbd": "mbd:MBD",
     "i-mbd": "mbd:IterativeMBD",
     "ipopt": "ipopt:Ipopt",
+    "guided": "guidance.planner:Guided",
 }.items():
     register_planner(_name, f"d4orm_planners.{_path}")
 

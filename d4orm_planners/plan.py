@@ -14,6 +14,7 @@ import numpy as np
 
 from d4orm_env.core.archives import ArrayArchive
 from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.errors import first_line
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.metrics import mean_stretch, trajectory_metrics
 from d4orm_env.core.problem import Problem
@@ -190,7 +191,7 @@ class Plan:
             raise FileNotFoundError(f"there is no plan at {source}") from None
         except Exception as error:  # a damaged archive makes zipfile, zlib and NumPy raise errors of a dozen kinds
             raise ValueError(
-                f"{source} is not a readable plan ({_first_line(error)}); write it anew with Plan.save"
+                f"{source} is not a readable plan ({first_line(error)}); write it anew with Plan.save"
             ) from error
 
     @classmethod
@@ -272,7 +273,3 @@ def _agree(claimed: Trajectory, actual: Trajectory) -> bool:
         else np.array_equal(getattr(claimed, name), getattr(actual, name))
         for name in _ARRAYS
     )
-
-
-def _first_line(error: BaseException) -> str:
-    return str(error).splitlines()[0] if str(error) else type(error).__name__

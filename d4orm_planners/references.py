@@ -7,8 +7,8 @@ import hashlib
 import inspect
 import pickle
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from d4orm_env.core.errors import describe
 
@@ -31,7 +31,7 @@ def source_digest(thing: object) -> str:
     return hashlib.sha256(source).hexdigest()
 
 
-def written(thing: object) -> Any:
+def written(thing: object) -> type | Callable[..., object]:
     """The class or function whose source makes a thing what it is."""
     while isinstance(thing, functools.partial):
         thing = thing.func

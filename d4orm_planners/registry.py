@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeGuard
 
 from d4orm_env.core.arrays import duration, shown
 from d4orm_env.core.errors import UnknownKeywordError
@@ -90,7 +90,7 @@ def make_policy(name: PolicyLike, **config: Any) -> Policy:
     return _as_policy(kind(**config), owner)
 
 
-def find_policy(policy: object) -> Any:
+def find_policy(policy: object) -> object:
     """What stands behind a policy's name or import path; anything but text is returned as it is.
 
     Raises:
@@ -131,7 +131,7 @@ def is_planned(policy: object) -> bool:
     return is_planner_class(kind) or isinstance(kind, Planner)
 
 
-def makes_policy(kind: object) -> bool:
+def makes_policy(kind: object) -> TypeGuard[Callable[..., object]]:
     """Whether something that :func:`find_policy` found takes settings and makes a policy, rather than acts itself."""
     return isinstance(kind, type) or (not _acts(kind) and callable(kind) and _required(kind) == 0)
 
@@ -190,7 +190,7 @@ def policy_settings(name: object, **config: Any) -> dict[str, object]:
     return {**settings, "source": source_digest(code)} if foreign else settings
 
 
-def _planner_class(name: Any) -> type[Planner]:
+def _planner_class(name: object) -> type[Planner]:
     kind = name
     if isinstance(name, str) and (name in PLANNERS or ":" in name):
         kind = PLANNERS[name] if name in PLANNERS else load_reference(name)
@@ -208,7 +208,7 @@ def _planner_class(name: Any) -> type[Planner]:
     return kind
 
 
-def _acts(thing: object) -> bool:
+def _acts(thing: object) -> TypeGuard[Policy]:
     return callable(getattr(thing, "reset", None)) and callable(getattr(thing, "act", None))
 
 
@@ -245,10 +245,11 @@ def _required(function: Callable[..., object]) -> int | None:
     return None if not count and any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters) else count
 
 
-def _check_keywords(kind: Any, config: Mapping[str, object], owner: str) -> None:
+def _check_keywords(kind: Callable[..., object], config: Mapping[str, object], owner: str) -> None:
     """Refuse what a function or class that makes a policy does not take, and what it lacks."""
     if inspect.isabstract(kind):
-        raise ValueError(f"{owner} lacks {', '.join(sorted(kind.__abstractmethods__))}; define it in the class")
+        missing = ", ".join(sorted(vars(kind)["__abstractmethods__"]))
+        raise ValueError(f"{owner} lacks {missing}; define it in the class")
     try:
         signature = inspect.signature(kind)
     except (TypeError, ValueError):

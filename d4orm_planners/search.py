@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,7 +21,7 @@ from d4orm_planners.plan import IterationRecord, Plan, Status
 from d4orm_planners.stopwatch import Stopwatch
 
 if TYPE_CHECKING:
-    from d4orm_planners.planner import Planner
+    from d4orm_planners.planner import Planner, State
 
 
 class Search:
@@ -79,7 +79,7 @@ class Search:
         self.iteration = 0
         self.denoising_steps = 0
         self.history: list[IterationRecord] = []
-        self.state: Any = None
+        self.state: State = None
         self._began = False
         self.metrics: dict[str, float] = {}
         self.time_limit: float | None = None

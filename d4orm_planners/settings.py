@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import cache
 from types import MappingProxyType
-from typing import Annotated, Any, Self, get_type_hints
+from typing import Annotated, Any, Self, SupportsFloat, get_type_hints
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, create_model
@@ -34,11 +34,13 @@ def _whole(value: object) -> object:
         return value
 
 
-def _number(value: Any) -> object:
+def _number(value: object) -> object:
     """Whatever means a number as a ``float``; anything else as it is, for pydantic to judge."""
     value = _truth(value)
+    if isinstance(value, bool) or not isinstance(value, str | SupportsFloat):
+        return value
     try:
-        return value if isinstance(value, bool) else float(value)
+        return float(value)
     except OverflowError:
         return float("inf")
     except (TypeError, ValueError):
@@ -134,7 +136,7 @@ class CheckedSettings:
 
 
 @cache
-def _schema(kind: Any) -> type[BaseModel]:
+def _schema(kind: type[CheckedSettings]) -> type[BaseModel]:
     """The types of all settings, as pydantic checks them."""
     types = get_type_hints(kind, include_extras=True)
     wanted: dict[str, Any] = {field.name: (types[field.name], ...) for field in fields(kind)}

@@ -39,11 +39,11 @@ def main() -> None:
     """Run the loop, print the throughput and write the table and the animation."""
     parser = argument_parser(__doc__)
     parser.add_argument("--minutes", type=float, default=1.0, help="simulated time")
-    parser.add_argument("--robots", type=count, default=16)
+    parser.add_argument("--num-robots", "--robots", type=count, default=16)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--film", type=float, default=20.0, help="seconds of the animation")
     arguments = parser.parse_args()
-    num_robots, minutes, film = arguments.robots, arguments.minutes, arguments.film
+    num_robots, minutes, film = arguments.num_robots, arguments.minutes, arguments.film
     if arguments.quick:
         num_robots, minutes, film = 4, 0.1, 2.0
 

@@ -1,6 +1,6 @@
 """Closed loop against open loop: D4orm-C2F and a plan of D4orm-D, in the same world, under noise on the controls.
 
-    python examples/noisy_control.py --noise 0.5
+    python examples/noisy_control.py --control-noise-std 0.5
 
 The loop is written by hand: what a controller of your own has to do is ``reset(env)`` once and ``act`` at every step.
 """
@@ -98,12 +98,12 @@ def draw(problem: Problem, executions: dict[str, Execution], noise: float, out: 
 def main() -> None:
     """Execute both, print what came of it, and draw them."""
     parser = argument_parser(__doc__)
-    parser.add_argument("--robots", type=count, default=8)
-    parser.add_argument("--noise", type=float, default=0.5, help="standard deviation [m/s^2]")
+    parser.add_argument("--num-robots", "--robots", type=count, default=8)
+    parser.add_argument("--control-noise-std", "--noise", type=float, default=0.5, help="standard deviation [m/s^2]")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    num_robots = min(arguments.robots, 4) if arguments.quick else arguments.robots
-    executions = {name: execute(name, num_robots, arguments.noise, arguments.seed) for name in POLICIES}
+    num_robots = min(arguments.num_robots, 4) if arguments.quick else arguments.num_robots
+    executions = {name: execute(name, num_robots, arguments.control_noise_std, arguments.seed) for name in POLICIES}
     rows = [
         {
             "policy": name,
@@ -119,7 +119,7 @@ def main() -> None:
     ]
     save_table(rows, arguments.out / "noisy_control.csv")
     problem = navigation_v0.parallel_env(scenario="circle", num_robots=num_robots).problem
-    draw(problem, executions, arguments.noise, arguments.out)
+    draw(problem, executions, arguments.control_noise_std, arguments.out)
 
 
 if __name__ == "__main__":

@@ -57,7 +57,7 @@ def main() -> int:
     """Start the robots, run the world, write tables, timeline and animation."""
     parser = argument_parser(__doc__)
     parser.add_argument("--minutes", type=float, default=2.0, help="simulated time")
-    parser.add_argument("--robots", type=count, default=6)
+    parser.add_argument("--num-robots", "--robots", type=count, default=6)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--speed", type=float, default=1.0, help="simulated seconds per second at most")
     parser.add_argument("--samples", type=count, default=576, help="of all robots together")
@@ -66,7 +66,7 @@ def main() -> int:
     parser.add_argument("--film", type=float, default=30.0, help="seconds of the animation")
     arguments = parser.parse_args()
     require("zenoh", "zenoh")
-    robots, minutes = arguments.robots, arguments.minutes
+    robots, minutes = arguments.num_robots, arguments.minutes
     if arguments.quick:
         robots, minutes = 3, 0.1
     for robot, _ in arguments.kill:

@@ -1,6 +1,6 @@
 """Read what `d4orm evaluate` stored with pandas: a table by policy and scenario, and success by deadline for planning.
 
-    d4orm evaluate --policy d4orm,orca --scenario circle,random --robots 8 --seeds 20 --out evaluation
+    d4orm evaluate --policy d4orm,orca --scenario circle,random --num-robots 8 --seeds 20 --out evaluation
     python examples/read_results.py --results evaluation
 
 Without `--results` it makes a small evaluation of its own. `--format` chooses which of the files is read; all hold the
@@ -43,7 +43,7 @@ def summary(trials: pd.DataFrame) -> pd.DataFrame:
         travelled=trials["travel_time"].where(trials["success"].astype(bool)),
         compute=trials["wall_time"] / (trials["steps"] * trials["dt"]),
     )
-    table = trials.groupby(["label", "scenario", "noise"]).agg(
+    table = trials.groupby(["label", "scenario", "control_noise_std"]).agg(
         trials=("seed", "size"),
         success=("success", "mean"),
         travelled=("travelled", "mean"),
@@ -54,7 +54,7 @@ def summary(trials: pd.DataFrame) -> pd.DataFrame:
 
 def draw(folder: Path, out: Path) -> None:
     """Success against the time for planning, computed from the histories of the solves."""
-    trials = [trial for trial in TrialStore.existing(folder).trials() if trial.noise == 0]
+    trials = [trial for trial in TrialStore.existing(folder).trials() if trial.control_noise_std == 0]
     deadlines = np.geomspace(0.01, 10, 60)
     figure, axes = plt.subplots(figsize=(5.2, 3.4), layout="constrained")
     for label in sorted({trial.label for trial in trials}):
@@ -86,7 +86,7 @@ def main() -> None:
         {
             "policy": row.label,
             "scenario": row.scenario,
-            "noise": f"{row.noise:g}",
+            "noise": f"{row.control_noise_std:g}",
             "trials": row.trials,
             "success": f"{row.success:.2f}",
             "travel time [s]": "" if np.isnan(row.travelled) else f"{row.travelled:.2f}",

@@ -1,7 +1,7 @@
 """How planning time of D4orm-D grows with the team at constant density.
 
     python examples/scaling.py --seeds 3
-    python examples/scaling.py --seeds 1 --robots 500 --time-limit 600
+    python examples/scaling.py --seeds 1 --num-robots 500 --time-limit 600
 
 Random starts and goals on a square with 1.5625 square metres per robot: 10 m x 10 m for 64 of them.
 """
@@ -40,11 +40,11 @@ def draw(rows: list[dict[str, Any]], out: Any) -> None:
 def main() -> None:
     """Plan for every team size, and write the table and the plot."""
     parser = argument_parser(__doc__)
-    parser.add_argument("--robots", type=count, nargs="+", default=ROBOTS)
+    parser.add_argument("--num-robots", "--robots", type=count, nargs="+", default=ROBOTS)
     parser.add_argument("--seeds", type=count, default=3, help="problems per team size")
     parser.add_argument("--time-limit", type=float, default=120.0, help="seconds per plan")
     arguments = parser.parse_args()
-    sizes, seeds = arguments.robots, arguments.seeds
+    sizes, seeds = arguments.num_robots, arguments.seeds
     if arguments.quick:
         sizes, seeds = (4, 8), 1
     planner = make_planner("d4orm-d", max_iterations=1000)

@@ -19,11 +19,11 @@ from d4orm_planners import make_planner
 def main() -> int:
     """Plan, check and draw; the exit status is 1 if no solution was found."""
     parser = argument_parser(__doc__)
-    parser.add_argument("--robots", type=count, default=64)
+    parser.add_argument("--num-robots", "--robots", type=count, default=64)
     parser.add_argument("--seed", type=int, default=1, help="of the starts and goals, and of the planner")
     parser.add_argument("--time-limit", type=float, default=60.0, help="seconds to plan")
     arguments = parser.parse_args()
-    num_robots = min(arguments.robots, 12) if arguments.quick else arguments.robots
+    num_robots = min(arguments.num_robots, 12) if arguments.quick else arguments.num_robots
     size = 10.0 * (num_robots / 64) ** 0.5
     problem = make_problem("random", num_robots=num_robots, seed=arguments.seed, size=size)
 

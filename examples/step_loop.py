@@ -37,9 +37,9 @@ def run(policy_name: str, num_robots: int, noise: float, seed: int) -> tuple[int
 def main() -> None:
     """Print how both policies do as the noise grows."""
     parser = argument_parser(__doc__)
-    parser.add_argument("--robots", type=int, default=8)
+    parser.add_argument("--num-robots", "--robots", type=int, default=8)
     arguments = parser.parse_args()
-    num_robots = 4 if arguments.quick else arguments.robots
+    num_robots = 4 if arguments.quick else arguments.num_robots
     seeds = range(1 if arguments.quick else 5)
     noises = (0.0, 0.5) if arguments.quick else (0.0, 0.1, 0.2, 0.5, 1.0)
     rows = []

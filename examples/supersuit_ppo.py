@@ -42,16 +42,16 @@ def train(num_robots: int, worlds: int, steps: int, path: Path) -> float:
 
 def main() -> None:
     parser = argument_parser(__doc__)
-    parser.add_argument("--robots", type=count, default=2, help="size of the team")
+    parser.add_argument("--num-robots", "--robots", type=count, default=2, help="size of the team")
     parser.add_argument("--steps", type=count, default=200_000, help="robot-steps to train")
     arguments = parser.parse_args()
     steps = 512 if arguments.quick else arguments.steps
     path = arguments.out / "supersuit_ppo.zip"
-    speed = train(arguments.robots, 2 if arguments.quick else 8, steps, path)
+    speed = train(arguments.num_robots, 2 if arguments.quick else 8, steps, path)
     print(f"{speed:.0f} robot-steps per second; wrote {path}")
     # A zip is unpickled when it is loaded: give make_policy only files that you made yourself or trust.
     policy = make_policy("ppo", path=str(path))
-    env = navigation_v0.parallel_env(scenario="random", num_robots=arguments.robots, randomize_instance=True)
+    env = navigation_v0.parallel_env(scenario="random", num_robots=arguments.num_robots, randomize_instance=True)
     rows = []
     for seed in range(2 if arguments.quick else 10):
         metrics = run_episode(env, policy, seed=seed).metrics

@@ -20,27 +20,27 @@ from d4orm_planners.rl.training import TrainingSettings, train
 
 def main() -> None:
     parser = argument_parser(__doc__)
-    parser.add_argument("--robots", type=count, default=4, help="size of the team")
+    parser.add_argument("--num-robots", "--robots", type=count, default=4, help="size of the team")
     parser.add_argument("--steps", type=count, default=5_000_000, help="robot-steps to train")
     parser.add_argument("--trials", type=count, default=20, help="random instances per policy and level of noise")
     arguments = parser.parse_args()
-    settings = TrainingSettings(robots=arguments.robots, steps=arguments.steps, lessons=20)
+    settings = TrainingSettings(num_robots=arguments.num_robots, steps=arguments.steps, lessons=20)
     noise, trials = (0.0, 0.2, 0.5), arguments.trials
     if arguments.quick:
-        settings = TrainingSettings(robots=2, steps=2048, num_envs=32, lessons=2, validation_worlds=4)
+        settings = TrainingSettings(num_robots=2, steps=2048, num_envs=32, lessons=2, validation_worlds=4)
         noise, trials = (0.0, 0.5), 2
     result = train(settings, arguments.out / "ppo", progress=report)
     policies = {"ppo": {"path": str(result.policy_path)}, "d4orm-c2f": {"refine": "sync"}, "orca": {}}
     folder = arguments.out / "comparison"
     rates = evaluate(
-        policies, "random", out=folder, seeds=range(trials), control_noise_std=noise, num_robots=settings.robots
+        policies, "random", out=folder, seeds=range(trials), control_noise_std=noise, num_robots=settings.num_robots
     )
     for path in write_robustness(folder, rates):
         print(f"wrote {path}")
     rows = [
         {
             "policy": rate.policy,
-            "noise": rate.noise,
+            "control_noise_std": rate.control_noise_std,
             "success": f"{rate.successes} of {rate.trials}",
             "travel time [s]": "" if rate.travel_time is None else f"{rate.travel_time:.2f}",
             "computing [s]": f"{rate.wall_time:.2f}",

@@ -11,14 +11,15 @@ from typing import Any
 
 import pytest
 
+from d4orm_env.core.dynamics import COMMON, MODEL_CODES, NUM_BUILT_IN
 from d4orm_planners import cli
 from d4orm_planners.benchmark import benchmark, report, timing
-from d4orm_planners.benchmark.benchmark import BenchmarkSettings, parts, run_parts
+from d4orm_planners.benchmark.benchmark import MODELS, BenchmarkSettings, parts, run_parts
 from d4orm_planners.benchmark.probes import measure_startup
 from d4orm_planners.benchmark.timing import Spread, measure
 
 TINY: dict[str, Any] = {
-    "robots": (2, 3),
+    "num_robots": (2, 3),
     "models": ("holonomic2d",),
     "num_samples": 64,
     "horizon": 10,
@@ -108,9 +109,16 @@ def test_the_numbers_hang_together(results: dict[str, list[Any]]) -> None:
     assert default["solved"] == default["seeds"] == default["seconds"].count == 2
 
 
+def test_every_model_that_comes_with_the_package_is_measured_and_the_plain_loop_where_it_has_it() -> None:
+    todo = parts(BenchmarkSettings(**{**TINY, "models": MODELS, "engines": ("cpu", "plain")}))
+    measured = {what for section, what, _ in todo if section == "denoising"}
+    assert {what.split()[1] for what in measured} == set(tuple(MODEL_CODES)[:NUM_BUILT_IN])
+    assert {what.split()[1] for what in measured if what.endswith("plain")} == set(COMMON)
+
+
 def test_whole_iterations_that_would_take_too_long_are_left_out(results: dict[str, list[Any]]) -> None:
     assert all(row["iteration"] is not None for row in results["denoising"])
-    settings = BenchmarkSettings(**{**TINY, "engines": ("cpu",), "robots": (2,), "iteration_limit": 1e-6})
+    settings = BenchmarkSettings(**{**TINY, "engines": ("cpu",), "num_robots": (2,), "iteration_limit": 1e-6})
     _, _, work = next(parts(settings))
     row = work()
     assert row["iteration"] is None
@@ -123,7 +131,7 @@ def test_report_files(results: dict[str, list[Any]], tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"bench.json", "bench.md"}
     document = json.loads((tmp_path / "bench.json").read_text())
     assert document["format"] == report.FORMAT
-    assert document["settings"]["robots"] == [2, 3]
+    assert document["settings"]["num_robots"] == [2, 3]
     assert document["machine"]["processor"]
     assert document["machine"]["libraries"]["numba"]
     step = results["denoising"][0]["step"]
@@ -144,10 +152,10 @@ def test_the_command_takes_its_lists(tmp_path: Path, monkeypatch: pytest.MonkeyP
         return [("memory", "one number", lambda: {"num_robots": 1, "imported": 2**20, "peak": 2**21})]
 
     monkeypatch.setattr(benchmark, "parts", pretend)
-    options = ("--robots", "4,8", "--models", "velocity2d", "--engines", "cpu,jax", "--seeds", "3", "--quick")
+    options = ("--num-robots", "4,8", "--models", "velocity2d", "--engines", "cpu,jax", "--seeds", "3", "--quick")
     assert call("bench", "--out", str(tmp_path / "new"), *options) == 0
     (settings,) = seen
-    assert (settings.robots, settings.models, settings.engines) == ((4, 8), ("velocity2d",), ("cpu", "jax"))
+    assert (settings.num_robots, settings.models, settings.engines) == ((4, 8), ("velocity2d",), ("cpu", "jax"))
     assert (settings.seeds, settings.num_steps) == (3, benchmark.QUICK["num_steps"])
     document = json.loads((tmp_path / "new" / "bench.json").read_text())
     assert document["settings"]["seeds"] == 3
@@ -157,8 +165,8 @@ def test_the_command_takes_its_lists(tmp_path: Path, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--robots", "4,x"), "list of whole numbers"),
-        (("--robots", "0"), "robots is 0"),
+        (("--num-robots", "4,x"), "list of whole numbers"),
+        (("--num-robots", "0"), "num_robots is 0"),
         (("--models", "boat"), "boat"),
         (("--engines", "gpu"), "gpu"),
         (("--seeds", "0"), "seeds is 0"),
@@ -196,8 +204,8 @@ def test_after_a_warm_up_nothing_is_left_to_compile(tmp_path: Path) -> None:
     assert " 0 found in the cache" in first
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.nb*")}
     assert before
-    run("-m", "d4orm_planners.cli", "plan", "--robots", "3", "--out", "plan.npz", "--quiet")
-    run("-m", "d4orm_planners.cli", "run", "plan.npz", "--noise", "0.01", "--quiet")
+    run("-m", "d4orm_planners.cli", "plan", "--num-robots", "3", "--out", "plan.npz", "--quiet")
+    run("-m", "d4orm_planners.cli", "run", "plan.npz", "--control-noise-std", "0.01", "--quiet")
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.nb*")} == before
     assert run("-m", "d4orm_planners.cli", "warmup").startswith("0 kernels compiled")
 

@@ -42,7 +42,7 @@ def d4orm(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytes
 
 def test_plan_writes_the_plan_and_its_pictures(d4orm, tmp_path: Path) -> None:
     files = ("--out", "plan.npz", "--picture", "plan.png", "--animation", "plan.gif")
-    outcome = d4orm("plan", "--robots", "2", "--seed", "3", *files)
+    outcome = d4orm("plan", "--num-robots", "2", "--seed", "3", *files)
     assert outcome.status == 0, outcome.err
     plan = Plan.load(tmp_path / "plan.npz")
     assert plan.solved
@@ -54,27 +54,35 @@ def test_plan_writes_the_plan_and_its_pictures(d4orm, tmp_path: Path) -> None:
 
 
 def test_run_executes_a_plan_file(d4orm) -> None:
-    assert d4orm("plan", "--robots", "2", "--out", "plan.npz", "--quiet").status == 0
+    assert d4orm("plan", "--num-robots", "2", "--out", "plan.npz", "--quiet").status == 0
     outcome = d4orm("run", "plan.npz")
     assert outcome.status == 0, outcome.err
     assert "success" in outcome.out
 
 
 def test_run_of_a_policy_that_collides_exits_with_one(d4orm) -> None:
-    outcome = d4orm("run", "--policy", "goal", "--robots", "2")
+    outcome = d4orm("run", "--policy", "goal", "--num-robots", "2")
     assert outcome.status == 1
     assert "robots in contact" in outcome.out
 
 
+@pytest.mark.parametrize(
+    "names", [("--num-robots", "--num-obstacles", "--control-noise-std"), ("--robots", "--obstacles", "--noise")]
+)
+def test_options_have_the_names_of_arguments_and_shorter_ones(d4orm, names: tuple[str, ...]) -> None:
+    outcome = d4orm("run", "--policy", "random", *(part for name in names for part in (name, "2")))
+    assert outcome.status == 1, outcome.err
+
+
 def test_no_solution_in_the_budget_exits_with_one_and_still_writes_the_best_plan(d4orm, tmp_path: Path) -> None:
-    outcome = d4orm("plan", "--robots", "8", *QUICK, "--out", "plan.npz")
+    outcome = d4orm("plan", "--num-robots", "8", *QUICK, "--out", "plan.npz")
     assert outcome.status == 1
     assert outcome.err.startswith("no solution found")
     assert not Plan.load(tmp_path / "plan.npz").solved
 
 
 def test_demo_plans_executes_verifies_and_says_where(d4orm, tmp_path: Path) -> None:
-    outcome = d4orm("demo", "--robots", "3", "--out", "pictures")
+    outcome = d4orm("demo", "--num-robots", "3", "--out", "pictures")
     assert outcome.status == 0, outcome.err
     written = {path.name for path in (tmp_path / "pictures").iterdir()}
     assert written == {"plan.npz", "plan.png", "execution.gif"}
@@ -91,7 +99,7 @@ def test_scenario_file(d4orm, tmp_path: Path) -> None:
 
 def test_arguments_of_a_scenario(d4orm) -> None:
     settings = ("--scenario-set", "diameter=2e0", "--scenario-set", "margin=0.1")
-    assert d4orm("plan", "--robots", "2", *settings, *QUICK, "--out", "plan.npz", "--quiet").status in (0, 1)
+    assert d4orm("plan", "--num-robots", "2", *settings, *QUICK, "--out", "plan.npz", "--quiet").status in (0, 1)
     assert Plan.load(Path("plan.npz")).problem == make_problem("circle", 2, diameter=2.0, margin=0.1)
 
 
@@ -119,8 +127,8 @@ def test_the_settings_of_one_are_listed(d4orm, name: str, listed: set[str], miss
 
 
 BAD = [
-    (("plan", "--robots", "0"), "num_robots is 0"),
-    (("plan", "--robots", "three"), "--robots"),
+    (("plan", "--num-robots", "0"), "num_robots is 0"),
+    (("plan", "--num-robots", "three"), "--num-robots"),
     (("plan", "--planner", "nope"), "planner 'nope' is unknown; choose one of d4orm"),
     (("plan", "--preset", "nope"), "preset 'nope'"),
     (("plan", "--scenario", "nope"), "scenario 'nope' is unknown"),
@@ -129,12 +137,12 @@ BAD = [
     (("run", "--scenario", "map", "--scenario-set", "map=nan.yaml"), "nan.yaml: has no field 'image'"),
     (("plan", "--scenario", "maze", "--scenario-set", "loops"), "--scenario-set 'loops' is not of the form name=value"),
     (("plan", "--scenario", "maze", "--scenario-set", "loop=1"), "takes no argument 'loop'"),
-    (("plan", "--scenario-set", "num_robots=3"), "--scenario-set num_robots is said by --robots; use that"),
-    (("plan", "--scenario", "good.yaml", "--scenario-set", "dt=1"), "--scenario-set dt=1 does not go with a scenario"),
+    (("plan", "--scenario-set", "num_robots=3"), "--scenario-set num_robots is said by --num-robots; use that"),
+    (("plan", "--scenario", "good.yaml", "--scenario-set", "dt=1"), "--scenario-set does not go with a scenario"),
     (("plan", "--scenario", "missing.yaml"), "missing.yaml"),
     (("plan", "--scenario", "nan.yaml"), "finite"),
     (("plan", "--scenario", "overlap.yaml"), "overlap"),
-    (("plan", "--scenario", "good.yaml", "--robots", "4"), "--robots 4 does not go with a scenario file"),
+    (("plan", "--scenario", "good.yaml", "--num-robots", "4"), "--num-robots does not go with a scenario file"),
     (("plan", "--model", "hovercraft"), "model 'hovercraft' is unknown"),
     (("plan", "--engine", "gpu"), "engine 'gpu' is unknown"),
     (("plan", "--set", "num_samples"), "name=value"),
@@ -167,7 +175,7 @@ BAD = [
     *(
         (("run", "whole.npz", option, value), f"{option} does not go with a plan file; whole.npz has a problem")
         for option, value in (
-            ("--scenario", "circle"), ("--robots", "2"), ("--model", "velocity2d"), ("--obstacles", "0"),
+            ("--scenario", "circle"), ("--num-robots", "2"), ("--model", "velocity2d"), ("--num-obstacles", "0"),
             ("--policy", "d4orm"), ("--scenario-set", "diameter=6"),
         )
     ),
@@ -175,11 +183,11 @@ BAD = [
     (("reproduce", "--quick"), "--quick does not go with the list of figures"),
     (("reproduce", "--seeds", "99999999999"), "1000000"),
     (("bench", "--seeds", "99999999999"), "1000000"),
-    (("bench", "--robots", "4,99999"), "robots is 99999; it must be at most 10000"),
-    (("run", "--noise", "-1"), "control_noise_std is -1"),
+    (("bench", "--num-robots", "4,99999"), "num_robots is 99999; it must be at most 10000"),
+    (("run", "--control-noise-std", "-1"), "control_noise_std is -1"),
     (("run", "--policy", "nope"), "policy 'nope' is unknown"),
     (("demo", "--out", "good.yaml"), "good.yaml"),
-    (("demo", "--robots", "500"), "diameter"),
+    (("demo", "--num-robots", "500"), "diameter"),
     (("nonsense",), "nonsense"),
 ]  # fmt: skip
 
@@ -206,15 +214,15 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
 
 @pytest.mark.parametrize("setting", ["beta_start=1e-4", "beta_end=2E-2", "late_steps=7e-1", "late_samples=.5"])
 def test_numbers_may_have_an_exponent_without_a_point(d4orm, setting: str) -> None:
-    default = d4orm("plan", "--robots", "2", *QUICK, "--out", "default.npz", "--quiet")
-    given = d4orm("plan", "--robots", "2", *QUICK, "--set", setting, "--out", "given.npz", "--quiet")
+    default = d4orm("plan", "--num-robots", "2", *QUICK, "--out", "default.npz", "--quiet")
+    given = d4orm("plan", "--num-robots", "2", *QUICK, "--set", setting, "--out", "given.npz", "--quiet")
     assert given.status == default.status
     np.testing.assert_array_equal(Plan.load(Path("given.npz")).controls, Plan.load(Path("default.npz")).controls)
 
 
 def test_settings_have_an_option_of_their_own_or_set(d4orm) -> None:
     settings = ("--set", "engine=cpu", "--set", "preset=paper", "--set", "max_iterations=1")
-    assert d4orm("plan", "--robots", "2", *QUICK[:4], *settings, "--quiet").status in (0, 1)
+    assert d4orm("plan", "--num-robots", "2", *QUICK[:4], *settings, "--quiet").status in (0, 1)
 
 
 def test_version(d4orm) -> None:

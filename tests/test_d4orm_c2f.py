@@ -27,7 +27,7 @@ from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.guide import Guide
 from d4orm_planners.d4orm_c2f.policy import D4ormC2F
 from d4orm_planners.d4orm_c2f.window import Window
-from d4orm_planners.guidance import coarse_problem
+from d4orm_planners.d4orm_c2f.coarse import coarse_problem
 from d4orm_planners.steering import straight_drives
 
 CASES = [

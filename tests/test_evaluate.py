@@ -36,7 +36,14 @@ TINY: dict[str, Any] = {"num_robots": 2, "seeds": range(2), "workers": 1}
 
 
 def trial(seed: int = 0, **changes: Any) -> Trial:
-    values = {"policy": "d4orm", "config": "{}", "problem": "abc", "noise": 0.0, "scenario": "circle", "robots": 2}
+    values = {
+        "policy": "d4orm",
+        "config": "{}",
+        "problem": "abc",
+        "control_noise_std": 0.0,
+        "scenario": "circle",
+        "num_robots": 2,
+    }
     outcome = {"success": True, "verified": True, "arrived": 2, "travel_time": 5.0, "steps": 60, "wall_time": 0.5}
     return Trial(**{**values, "label": "d4orm", "model": "holonomic2d", "dt": 0.1, **outcome, "seed": seed, **changes})
 
@@ -61,7 +68,7 @@ def d4orm(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytes
 def test_a_planners_trial_says_everything(tmp_path: Path) -> None:
     (row,) = evaluate({"d4orm": QUICK}, out=tmp_path, num_robots=2, seeds=[4], workers=1)
     (stored,) = TrialStore(tmp_path / STORE).trials()
-    assert (row.label, row.scenario, row.robots, row.trials, row.successes, row.verified) == (
+    assert (row.label, row.scenario, row.num_robots, row.trials, row.successes, row.verified) == (
         ("d4orm", "circle", 2, 1, 1, 1)
     )  # fmt: skip
     assert stored.problem == make_problem("circle", num_robots=2, seed=4).digest
@@ -246,7 +253,7 @@ def test_what_crashes_dies_or_hangs_is_a_row_and_the_rest_goes_on(tmp_path: Path
     result = program(tmp_path, TROUBLE + EVALUATE.format(policies='"goal"', arguments="workers=2, trial_timeout=8"))
     assert result.stdout == "(6, 3) (6, 3)\n", result.stderr
     stored = TrialStore(tmp_path / "out" / STORE).trials()
-    errors = {(row.seed, row.noise): row.error for row in stored}
+    errors = {(row.seed, row.control_noise_std): row.error for row in stored}
     assert {key for key, error in errors.items() if not error} == {
         (seed, noise) for seed in (0, 4, 5) for noise in (0.0, 0.1)
     }
@@ -290,7 +297,7 @@ def test_a_program_without_a_guard_is_told_so(tmp_path: Path) -> None:
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
 @pytest.mark.parametrize("pause", [0.0, 0.3, 0.7])
 def test_a_killed_evaluation_goes_on_where_it_was(tmp_path: Path, pause: float) -> None:
-    arguments = ["-p", "goal", "-k", "8", "-n", "60", "--noise", "0,0.1", "-j", "2", "-q", "-o", str(tmp_path)]
+    arguments = ["-p", "goal", "-k", "8", "-n", "60", "--control-noise-std", "0,0.1", "-j2", "-q", "-o", str(tmp_path)]
     command = [sys.executable, "-m", "d4orm_planners.cli", "evaluate", *arguments]
     process = subprocess.Popen(command)
     deadline = time.monotonic() + 120
@@ -305,7 +312,9 @@ def test_a_killed_evaluation_goes_on_where_it_was(tmp_path: Path, pause: float) 
     assert 0 < len(first) < 120
     subprocess.run(command, check=True)
     rows = TrialStore(tmp_path / STORE).trials()
-    assert [(row.noise, row.seed) for row in rows] == [(noise, seed) for noise in (0.0, 0.1) for seed in range(60)]
+    assert [(row.control_noise_std, row.seed) for row in rows] == [
+        (noise, seed) for noise in (0.0, 0.1) for seed in range(60)
+    ]
     kept = {row.key: row for row in rows}
     assert all(kept[row.key] == row for row in first)
     assert not list(tmp_path.glob(".*")), "a temporary file was left behind"
@@ -313,12 +322,14 @@ def test_a_killed_evaluation_goes_on_where_it_was(tmp_path: Path, pause: float) 
 
 @pytest.mark.slow
 def test_two_evaluations_may_share_a_store(tmp_path: Path) -> None:
-    arguments = ["-p", "goal", "-k", "4", "--noise", "0,0.1", "-q", "-o", str(tmp_path)]
+    arguments = ["-p", "goal", "-k", "4", "--control-noise-std", "0,0.1", "-q", "-o", str(tmp_path)]
     command = [sys.executable, "-m", "d4orm_planners.cli", "evaluate", *arguments]
     both = [subprocess.Popen([*command, "-n", seeds, "-j", "1"]) for seeds in ("0-29", "10-39")]
     assert [process.wait() for process in both] == [0, 0]
     rows = TrialStore(tmp_path / STORE).trials()
-    assert [(row.noise, row.seed) for row in rows] == [(noise, seed) for noise in (0.0, 0.1) for seed in range(40)]
+    assert [(row.control_noise_std, row.seed) for row in rows] == [
+        (noise, seed) for noise in (0.0, 0.1) for seed in range(40)
+    ]
     assert not any(row.error for row in rows)
     connection = sqlite3.connect(tmp_path / STORE)
     assert connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
@@ -356,7 +367,7 @@ def test_the_files_equal_the_store(d4orm, tmp_path: Path) -> None:
     pandas = pytest.importorskip("pandas")
     pytest.importorskip("pyarrow")
     arguments = ("-p", "goal", "-p", "orca:time_horizon=2", "-s", "circle,random", "-k", "2,3", "-n", "2")
-    status, out, err = d4orm("evaluate", *arguments, "--noise", "0,0.1", "-j", "1", "-o", "here")
+    status, out, err = d4orm("evaluate", *arguments, "--control-noise-std", "0,0.1", "-j", "1", "-o", "here")
     assert (status, err) == (0, "")
     folder = tmp_path / "here"
     stored = TrialStore(folder / STORE).trials()
@@ -367,7 +378,7 @@ def test_the_files_equal_the_store(d4orm, tmp_path: Path) -> None:
     assert parquet.astype(object).where(parquet.notna(), None).to_dict("records") == [asdict(row) for row in stored]
     texts = {field.name: str for field in fields(Trial) if field.type == "str"}
     table = pandas.read_csv(folder / "trials.csv", dtype=texts, keep_default_na=False, na_values={"travel_time": ""})
-    for name in ("seed", "noise", "travel_time", "history", "success", "violation"):
+    for name in ("seed", "control_noise_std", "travel_time", "history", "success", "violation"):
         assert list(table[name]) == [getattr(row, name) for row in stored]
     text = (folder / "table.md").read_text()
     assert "### random, 3 robots, holonomic2d" in text
@@ -380,7 +391,7 @@ def test_ten_thousand_rows_are_exported(tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     store = TrialStore(tmp_path / STORE)
     rows = [
-        trial(seed, noise=seed / 7, verified=[True, False, None][seed % 3], violation='a "b",\nc')
+        trial(seed, control_noise_std=seed / 7, verified=[True, False, None][seed % 3], violation='a "b",\nc')
         for seed in range(10_000)
     ]
     assert store.add(*rows) == 10_000
@@ -392,8 +403,8 @@ def test_ten_thousand_rows_are_exported(tmp_path: Path) -> None:
     assert parquet.read_table(paths[3]).to_pylist() == [asdict(row) for row in stored]
     with paths[2].open(newline="") as file:
         written = list(csv.DictReader(file))
-    assert [(int(row["seed"]), float(row["noise"]), row["verified"]) for row in written] == [
-        (row.seed, row.noise, "" if row.verified is None else str(row.verified)) for row in stored
+    assert [(int(row["seed"]), float(row["control_noise_std"]), row["verified"]) for row in written] == [
+        (row.seed, row.control_noise_std, "" if row.verified is None else str(row.verified)) for row in stored
     ]
     assert {row["violation"] for row in written} == {'a "b",\nc'}
 
@@ -462,7 +473,7 @@ def test_the_leaderboard_holds_everything_in_the_store(d4orm, tmp_path: Path) ->
             0,
             policy="orca",
             label="orca",
-            noise=0.1,
+            control_noise_std=0.1,
             scenario="random",
             problem="b",
             error="ValueError: no",
@@ -472,6 +483,7 @@ def test_the_leaderboard_holds_everything_in_the_store(d4orm, tmp_path: Path) ->
     assert d4orm("leaderboard", ".", "--out", "page.md", "--deadlines", "0.2,1") == (0, "wrote page.md\n", "")
     page = (tmp_path / "page.md").read_text()
     assert page.startswith("# Leaderboard\n")
+    assert page.index("### holonomic2d, no noise") < page.index("### holonomic2d, noise 0.1")
     assert "| policy | circle, 2 robots, holonomic2d | random, 2 robots, holonomic2d |" in page
     assert "| orca | 100% (34% to 100%) | - |" in page
     ranked = [line.split(" | ")[0] for line in page.splitlines() if "%) | " in line and " of " in line]
@@ -527,6 +539,14 @@ SPELLINGS: tuple[dict[str, Any], ...] = (
 )  # fmt: skip
 
 
+def test_several_models_meet_every_scenario_and_team_size(tmp_path: Path) -> None:
+    models = ["velocity2d", None, "differential_drive"]
+    rows = evaluate("goal", ["circle", "random"], out=tmp_path, model=models, num_robots=[1, 2], seeds=[0], workers=1)
+    named = ("velocity2d", "holonomic2d", "differential_drive")
+    expected = [(name, model, size) for name in ("circle", "random") for model in named for size in (1, 2)]
+    assert [(row.scenario, row.model, row.num_robots) for row in rows] == expected
+
+
 # Bad input.
 
 BAD = [
@@ -544,10 +564,10 @@ BAD = [
     (("--scenario-set", "num_robots=3"), "scenario_settings has 'num_robots'; give 'num_robots' itself"),
     (("--scenario-set", "seed=3"), "scenario_settings has 'seed'; give 'seeds' itself"),
     (("-k", "0"), "num_robots is 0"),
-    (("-k", "two"), "--robots 'two'"),
+    (("-k", "two"), "--num-robots 'two'"),
     (("-m", "hovercraft"), "model 'hovercraft' is unknown"),
-    (("--noise", "0,-0.1"), "noise is -0.1"),
-    (("--noise", "much"), "--noise 'much' is not a list of numbers"),
+    (("--control-noise-std", "0,-0.1"), "control_noise_std is -0.1"),
+    (("--control-noise-std", "much"), "--control-noise-std 'much' is not a list of numbers"),
     (("-n", "0"), "seeds is empty"),
     (("-n", "few"), "--seeds 'few' is neither a number"),
     (("-n", "5-1"), "seeds is empty"),
@@ -591,13 +611,13 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
         ({"policies": object()}, "policy <object object at .* is no name; give one of d4orm"),
         ({"policies": [{"policy": "goal"}]}, "policy {'policy': 'goal'} is no name"),
         ({"policies": {3: {}}}, "policy 3 is no name"),
-        ({"scenarios": []}, "scenarios or num_robots is empty"),
-        ({"num_robots": []}, "scenarios or num_robots is empty"),
+        ({"scenarios": []}, "scenarios, num_robots or model is empty"),
+        ({"num_robots": []}, "scenarios, num_robots or model is empty"),
         ({"seeds": []}, "seeds is empty"),
         ({"seeds": 5}, r"seeds is 5; give the seeds themselves, as range\(50\)"),
         ({"seeds": [0.5]}, "seed must be a whole number, not 0.5"),
         ({"seeds": [2**63]}, "seed is 9223372036854775808; a store of trials has room for seeds up to"),
-        ({"control_noise_std": []}, "noise is empty"),
+        ({"control_noise_std": []}, "control_noise_std is empty"),
     ],
 )
 def test_bad_arguments(tmp_path: Path, changes: dict[str, Any], message: str) -> None:

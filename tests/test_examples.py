@@ -355,10 +355,12 @@ def test_a_trained_policy_is_compared_with_planners_under_noise(tmp_path: Path) 
     result = run("train_and_compare", out)
     assert result.returncode == 0, result.stderr
     rows = table(out / "train_and_compare.csv")
-    assert [(row["policy"], row["noise"]) for row in rows] == [
+    assert [(row["policy"], row["control_noise_std"]) for row in rows] == [
         (policy, noise) for policy in ("ppo", "d4orm-c2f", "orca") for noise in ("0.0", "0.5")
     ]
-    assert {row["success"] for row in rows if row["policy"] == "d4orm-c2f" and row["noise"] == "0.0"} == {"2 of 2"}
+    assert {row["success"] for row in rows if row["policy"] == "d4orm-c2f" and row["control_noise_std"] == "0.0"} == {
+        "2 of 2"
+    }
     assert (out / "comparison" / "robustness.png").read_bytes().startswith(PNG)
 
 

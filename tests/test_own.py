@@ -373,15 +373,15 @@ def test_the_command_line_takes_import_paths(
     (tmp_path / "from_here.py").write_text(WRITTEN)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
-    settings = ["--robots", "2", "--workers", "1"]
+    settings = ["--num-robots", "2", "--workers", "1"]
     many = ["--policy", "goal,from_here:f", "--policy", "from_here:Mine:strength=0.5", "--policy", "from_here.py:Mine"]
     for arguments, status in (
         (["evaluate", *many, *settings, "--seeds", "1"], 0),
-        (["robustness", "--policy", "from_here:Mine", *settings, "--trials=1", "--set=from_here:Mine.strength=2"], 0),
-        (["run", "--policy", "from_here:f", "--robots", "2"], 1),
-        (["run", "--policy", "from_here:g", "--robots", "2"], 2),
-        (["plan", "--planner", "test_own:Ahead", "--robots", "2"], 1),
-        (["plan", "--planner", "from_here:f", "--robots", "2"], 2),
+        (["robustness", "--policy", "from_here:Mine", *settings, "--seeds=1", "--set=from_here:Mine.strength=2"], 0),
+        (["run", "--policy", "from_here:f", "--num-robots", "2"], 1),
+        (["run", "--policy", "from_here:g", "--num-robots", "2"], 2),
+        (["plan", "--planner", "test_own:Ahead", "--num-robots", "2"], 1),
+        (["plan", "--planner", "from_here:f", "--num-robots", "2"], 2),
     ):  # fmt: skip
         with pytest.raises(SystemExit, match=str(status)):
             cli.main(arguments)

@@ -24,7 +24,14 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def trial(seed: int = 0, **changes: Any) -> Trial:
-    values = {"policy": "d4orm", "config": "{}", "problem": "abc", "noise": 0.0, "scenario": "circle", "robots": 8}
+    values = {
+        "policy": "d4orm",
+        "config": "{}",
+        "problem": "abc",
+        "control_noise_std": 0.0,
+        "scenario": "circle",
+        "num_robots": 8,
+    }
     values |= {"label": "d4orm", "model": "holonomic2d", "dt": 0.1, "steps": 50, "date": "2026-11-21"}
     outcome = {"success": True, "status": "solved", "wall_time": 3.0, "preparation": 3.0, "travel_time": 6.0}
     outcome |= {"history": "[[0.5,0,0.6],[1.5,1,0.5],[2.5,1,0.7]]", "makespan": 7.0, "mean_squared_jerk": 40.0}
@@ -32,8 +39,8 @@ def trial(seed: int = 0, **changes: Any) -> Trial:
 
 
 def figure(**changes: Any) -> Figure:
-    section = Section(title="Circle", policies={"d4orm": {}}, scenarios=("circle",), robots=(2,))
-    values = {"name": "test", "title": "A test", "source": "nowhere", "sections": (section,), "across": "robots"}
+    section = Section(title="Circle", policies={"d4orm": {}}, scenarios=("circle",), num_robots=(2,))
+    values = {"name": "test", "title": "A test", "source": "nowhere", "sections": (section,), "across": "num_robots"}
     return Figure(**{**values, "metrics": ("success", "runtime"), "plots": ("runtime",), **changes})
 
 
@@ -73,14 +80,14 @@ def test_the_quick_version_writes_its_tables_and_picture_and_is_not_run_twice(d4
     assert all(str(Path("reproduction", folder.name, file)) in out for file in written)
     with (folder / f"{name}.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert [(row["section"], row["scenario"], row["label"], float(row["noise"])) for row in rows] == [
+    assert [(row["section"], row["scenario"], row["label"], float(row["control_noise_std"])) for row in rows] == [
         (section.title, scenario, label, noise)
         for section in chosen.sections
         for _ in section.nodes or (None,)
         for scenario in section.scenarios
-        for _ in section.robots
+        for _ in section.num_robots
         for label in section.policies
-        for noise in section.noise
+        for noise in section.control_noise_std
     ]
     assert not any(row["error"] for row in rows)
     assert any(int(row["successes"]) for row in rows)
@@ -113,8 +120,8 @@ def test_what_a_figure_names_exists(name: str) -> None:
 
 def test_a_call_that_was_broken_off_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     few = {"num_samples": 64, "num_steps": 5, "max_iterations": 1}
-    section = Section(title="Circle", policies={"d4orm": few, "mppi": few}, scenarios=("circle",), robots=(2,))
-    chosen = figure(sections=(section, replace(section, title="Others", robots=(3,))))
+    section = Section(title="Circle", policies={"d4orm": few, "mppi": few}, scenarios=("circle",), num_robots=(2,))
+    chosen = figure(sections=(section, replace(section, title="Others", num_robots=(3,))))
     run_here, ran = evaluate.run_here, []
 
     def stopping(jobs: Any) -> Any:
@@ -139,7 +146,7 @@ def test_d4orm_solves_no_less_than_mppi_and_cem_with_as_many_samples(tmp_path: P
     # 200 steps of 1024 samples; those of the defaults have 256 and, for the last 70 of every 100, 128.
     spent = {"preset": "paper", "max_iterations": 2}
     policies = {"d4orm": {"max_iterations": 12}, "mppi": spent, "cem": spent}
-    section = Section(title="Circle", policies=policies, scenarios=("circle",), robots=(8,))
+    section = Section(title="Circle", policies=policies, scenarios=("circle",), num_robots=(8,))
     rows = [measured(group) for group in reproduce(figure(sections=(section,)), tmp_path, seeds=2)]
     solved = {row.label: row.successes for row in rows}
     # Two seeds and 200 steps are too few for medians, and only the defaults are sure to solve both within them.
@@ -154,9 +161,9 @@ def test_coarser_guidance_and_other_schedules_solve_as_well(tmp_path: Path) -> N
         for refine in ("off", "background")
     }
     schedules = {f"{last}": {"policy": "d4orm", "beta_start": 1e-4, "beta_end": last} for last in (0.01, 0.05)}
-    circle = Section(title="Circle", policies=schedules, scenarios=("circle",), robots=(4,))
+    circle = Section(title="Circle", policies=schedules, scenarios=("circle",), num_robots=(4,))
     sections = (
-        Section(title="Obstacles", policies=coarse, scenarios=("four_obstacles",), robots=(4,)),
+        Section(title="Obstacles", policies=coarse, scenarios=("four_obstacles",), num_robots=(4,)),
         circle,
         replace(circle, title="Drives", model="differential_drive"),
     )
@@ -177,9 +184,9 @@ def test_a_plan_within_the_margin_is_no_solution_although_nobody_touched() -> No
 
 
 def test_under_noise_counts_what_happened() -> None:
-    assert first_solution(trial(noise=0.1, success=False)) is None
-    assert first_solution(trial(noise=0.1, success=True)) == 1.5
-    assert first_solution(trial(noise=0.1, history="[[0.5,0,0.6]]", status="time_limit")) == 3.0
+    assert first_solution(trial(control_noise_std=0.1, success=False)) is None
+    assert first_solution(trial(control_noise_std=0.1, success=True)) == 1.5
+    assert first_solution(trial(control_noise_std=0.1, history="[[0.5,0,0.6]]", status="time_limit")) == 3.0
 
 
 def test_a_controllers_time_is_that_of_its_first_plan() -> None:
@@ -218,7 +225,7 @@ def test_the_best_reward_is_a_staircase() -> None:
 def test_every_policy_is_run_with_every_number_of_nodes(tmp_path: Path) -> None:
     few = {"policy": "d-d4orm", "engine": "cpu", "num_samples": 64, "num_steps": 5, "max_iterations": 1}
     policies = {"top-k": few, "max": {**few, "selection": "max"}}
-    section = Section(title="Circle", policies=policies, scenarios=("circle",), robots=(2,), nodes=(1, 3))
+    section = Section(title="Circle", policies=policies, scenarios=("circle",), num_robots=(2,), nodes=(1, 3))
     chosen = figure(sections=(section,), across="nodes", metrics=("success", "messages"))
     rows = [measured(group) for group in reproduce(chosen, tmp_path, seeds=2)]
     assert [(row.label, row.nodes) for row in rows] == [("top-k", 1), ("max", 1), ("top-k", 3), ("max", 3)]
@@ -246,7 +253,7 @@ def test_what_nodes_sent_is_over_the_successes() -> None:
 def test_the_papers_rows_stand_below_ours_and_its_other_methods_too() -> None:
     paper = {("Circle", "d4orm", "runtime"): {"8": "0.13"}, ("Circle", "rival", "runtime"): {"8": "9.99"}}
     page = markdown(figure(paper=paper), [Group("Circle", "d4orm", [trial()])])
-    assert "|  | robots | 8 |" in page
+    assert "|  | num_robots | 8 |" in page
     ours = page.index("| runtime, s | d4orm | 1.50 (1.50-1.50) |")
     assert ours < page.index("| runtime, s | d4orm (the paper) | 0.13 |")
     assert "| runtime, s | rival (the paper) | 9.99 |" in page
@@ -305,7 +312,7 @@ def test_bad_input_gets_one_line(d4orm, arguments: tuple[str, ...], complaint: s
 
 
 def test_a_planner_that_is_not_there_is_named_before_anything_runs(tmp_path: Path) -> None:
-    section = Section(title="Circle", policies={"d4orm": {}}, scenarios=("circle",), robots=(2,))
+    section = Section(title="Circle", policies={"d4orm": {}}, scenarios=("circle",), num_robots=(2,))
     chosen = figure(sections=(section, replace(section, title="Others", policies={"perfect": {}})))
     with pytest.raises(ValueError, match="policy 'perfect' is unknown"):
         reproduce(chosen, tmp_path)
@@ -314,7 +321,7 @@ def test_a_planner_that_is_not_there_is_named_before_anything_runs(tmp_path: Pat
 
 def test_a_part_of_a_figure() -> None:
     part = find_figure("big-teams").only(["2D Holo Random"], ["d4orm-d, defaults", "d4orm-c2f"])
-    assert [(section.robots, list(section.policies)) for section in part.sections] == [
+    assert [(section.num_robots, list(section.policies)) for section in part.sections] == [
         ((16, 32, 64, 100), ["d4orm-d, defaults", "d4orm-c2f"]),
     ]
     assert find_figure("big-teams").only() == FIGURES["big-teams"]
@@ -326,7 +333,7 @@ def test_a_part_of_a_figure() -> None:
 def test_the_time_before_the_first_action_is_stored(tmp_path: Path) -> None:
     few = {"num_samples": 64, "num_steps": 5, "max_iterations": 1}
     policies = {"d4orm": few, "d4orm-c2f": {"refine": "off", "coarse_iterations": 1, "num_steps": 2}}
-    section = Section(title="Circle", policies=policies, scenarios=("circle",), robots=(2,))
+    section = Section(title="Circle", policies=policies, scenarios=("circle",), num_robots=(2,))
     groups = reproduce(figure(sections=(section,)), tmp_path, seeds=1)
     (plan,), (acting,) = (group.trials for group in groups)
     assert plan.preparation == plan.wall_time

@@ -27,7 +27,7 @@ from d4orm_planners.evaluation import pool as pool_module
 from d4orm_planners.evaluation import store as store_module
 from d4orm_planners.evaluation import trials as trials_module
 from d4orm_planners.evaluation.evaluate import run_study
-from d4orm_planners.evaluation.report import robustness_markdown, write_robustness
+from d4orm_planners.evaluation.report import HEADER, markdown, write_robustness
 from d4orm_planners.evaluation.store import APPLICATION_ID, STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import SuccessRate, success_rate, success_rates, wilson_interval
@@ -44,7 +44,14 @@ def rates_of(
 
 
 def trial(seed: int = 0, **changes: Any) -> Trial:
-    values = {"policy": "goal", "config": "{}", "problem": "abc", "noise": 0.1, "scenario": "circle", "robots": 2}
+    values = {
+        "policy": "goal",
+        "config": "{}",
+        "problem": "abc",
+        "control_noise_std": 0.1,
+        "scenario": "circle",
+        "num_robots": 2,
+    }
     values |= {"label": "goal", "dt": 0.1}
     outcome = {"success": True, "arrived": 2, "travel_time": 5.0, "makespan": 6.0, "steps": 60, "wall_time": 0.5}
     return Trial(**{**values, "model": "holonomic2d", "versions": "{}", **outcome, "seed": seed, **changes})
@@ -113,7 +120,11 @@ def test_a_trial_that_was_over_at_once_has_no_time_of_motion() -> None:
 
 def test_the_store_gives_back_what_was_added(tmp_path: Path) -> None:
     store = TrialStore(tmp_path / "trials.sqlite")
-    rows = [trial(0), trial(1, noise=1 / 3, success=False), trial(2, error="ValueError: no", travel_time=None)]
+    rows = [
+        trial(0),
+        trial(1, control_noise_std=1 / 3, success=False),
+        trial(2, error="ValueError: no", travel_time=None),
+    ]
     assert all(store.add(row) for row in rows)
     again = TrialStore(tmp_path / "trials.sqlite")
     assert sorted(again.trials(), key=lambda row: row.seed) == rows
@@ -133,8 +144,31 @@ def test_the_table_is_that_of_the_files_that_are_out_there(tmp_path: Path) -> No
     TrialStore(tmp_path / "new.sqlite")
     with closing(sqlite3.connect(tmp_path / "new.sqlite")) as connection:
         (made,) = connection.execute("SELECT sql FROM sqlite_schema WHERE name = 'trials'").fetchone()
+    for former, name in (("noise", "control_noise_std"), ("robots", "num_robots")):
+        made = made.replace(name, former)
     # Files that lack this column get it.
     assert made.replace(" stretch REAL,", "").split() == FIRST_SCHEMA.split()
+
+
+def test_a_store_of_the_version_before_is_read_as_it_is_and_goes_on(tmp_path: Path) -> None:
+    TrialStore(tmp_path / "now.sqlite").add(trial(), trial(1))
+    with closing(sqlite3.connect(tmp_path / "now.sqlite")) as connection:
+        columns = [row[1] for row in connection.execute("PRAGMA table_info(trials)") if row[1] != "stretch"]
+        rows = connection.execute(f"SELECT {', '.join(columns)} FROM trials").fetchall()
+    path = tmp_path / "before.sqlite"
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute(FIRST_SCHEMA)
+        places = ", ".join("?" * len(rows[0]))
+        connection.executemany(f"INSERT INTO trials VALUES ({places})", rows)
+        connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+        connection.execute("PRAGMA user_version = 4")
+    content = path.read_bytes()
+    assert TrialStore.existing(path).trials() == [trial(), trial(1)]
+    assert path.read_bytes() == content
+    store = TrialStore(path)
+    assert not store.add(trial())
+    assert store.add(trial(2))
+    assert TrialStore.existing(path).trials() == [trial(), trial(1), trial(2)]
 
 
 FIRST_SCHEMA = """
@@ -146,7 +180,7 @@ makespan REAL, reward REAL, mean_squared_jerk REAL, steps INTEGER NOT NULL, iter
 wall_time REAL, preparation REAL, elapsed REAL, history TEXT NOT NULL, messages INTEGER, message_bytes INTEGER,
 waiting_share REAL, error TEXT NOT NULL, PRIMARY KEY (policy, config, problem, noise, seed)) WITHOUT ROWID
 """
-"""Of version 4, which the files that are out there have."""
+"""Of version 4, whose files are out there; two columns have other names since."""
 
 
 def test_a_seed_that_the_store_has_no_room_for_is_refused(tmp_path: Path) -> None:
@@ -160,8 +194,8 @@ def test_a_seed_that_the_store_has_no_room_for_is_refused(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("column", "value"),
     [
-        ("reward", "much"), ("robots", "many"), ("success", "yes"), ("seed", "first"), ("noise", "some"),
-        ("label", b"x"), ("history", "[[1"), ("history", "[1, 2]"), ("config", "none"), ("travel_time", "soon"),
+        ("reward", "much"), ("num_robots", "many"), ("success", "yes"), ("seed", "first"), ("config", "none"),
+        ("label", b"x"), ("history", "[[1"), ("history", "[1, 2]"), ("control_noise_std", "much"), ("travel_time", "a"),
     ],
 )  # fmt: skip
 def test_what_does_not_belong_in_a_column_is_one_clear_error(tmp_path: Path, column: str, value: Any) -> None:
@@ -306,7 +340,7 @@ def test_a_file_that_is_not_ours_is_refused_and_left_alone(d4orm, tmp_path: Path
 
 def test_success_and_failure_are_counted(tmp_path: Path) -> None:
     rates = rates_of(["goal", "orca"], tmp_path, **TINY)
-    assert [(row.policy, row.noise, row.trials, row.successes, row.contacts) for row in rates] == [
+    assert [(row.policy, row.control_noise_std, row.trials, row.successes, row.contacts) for row in rates] == [
         ("goal", 0.0, 2, 0, 2),
         ("goal", 0.3, 2, 0, 2),
         ("orca", 0.0, 2, 2, 0),
@@ -314,7 +348,7 @@ def test_success_and_failure_are_counted(tmp_path: Path) -> None:
     ]
     stored = TrialStore(tmp_path / STORE).trials()
     assert len(stored) == len({row.key for row in stored}) == 8
-    assert {(row.scenario, row.robots, row.model) for row in stored} == {("circle", 2, "holonomic2d")}
+    assert {(row.scenario, row.num_robots, row.model) for row in stored} == {("circle", 2, "holonomic2d")}
     assert all(row.steps and row.wall_time and '"numpy"' in row.versions for row in stored)
 
 
@@ -346,7 +380,9 @@ def test_resuming_runs_only_what_is_missing(tmp_path: Path, monkeypatch: pytest.
     rates_of(["goal"], tmp_path, **TINY)
     ran: list[tuple[int, tuple[float, ...]]] = []
     run_job = pool_module.run_job
-    monkeypatch.setattr(pool_module, "run_job", lambda job: (ran.append((job.seed, job.noise)), run_job(job))[1])
+    monkeypatch.setattr(
+        pool_module, "run_job", lambda job: (ran.append((job.seed, job.control_noise_std)), run_job(job))[1]
+    )
     before = rates_of(["goal"], tmp_path, **TINY)
     assert ran == []
     counts: list[tuple[int, int]] = []
@@ -377,7 +413,7 @@ def test_an_error_is_a_row_and_is_tried_again(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(trials_module, "make_policy", lambda name, **settings: Unlucky())
     rates = rates_of(["goal"], tmp_path, **TINY)
     assert [(row.trials, row.errors, row.error) for row in rates] == [(2, 1, "RuntimeError: out of luck")] * 2
-    assert "- `goal`: RuntimeError: out of luck" in robustness_markdown(rates)
+    assert "- `goal`: RuntimeError: out of luck" in markdown(rates)
     monkeypatch.undo()
     rates = rates_of(["goal"], tmp_path, **TINY)
     assert [(row.trials, row.errors) for row in rates] == [(2, 0)] * 2
@@ -392,7 +428,18 @@ def test_ctrl_c_keeps_what_was_done(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         return run_job(job)
 
     monkeypatch.setattr(pool_module, "run_job", interrupted)
-    arguments = ("--policies", "goal", "--robots", "2", "--trials", "3", "--noise", "0,0.3", "--workers", "1")
+    arguments = [
+        "--policies",
+        "goal",
+        "--num-robots",
+        "2",
+        "--seeds",
+        "3",
+        "--control-noise-std",
+        "0,0.3",
+        "--workers",
+        "1",
+    ]
     status, _, err = d4orm(*arguments)
     assert status == 130
     assert "the same command goes on from there" in err
@@ -416,7 +463,7 @@ def test_the_number_of_workers_makes_no_difference(tmp_path: Path) -> None:
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, workers: int) -> None:
-    arguments = ["--policies", "goal", "--robots", "8", "--trials", "60", "--noise", "0,0.1", "--out", str(tmp_path)]
+    arguments = f"--policies goal --num-robots 8 --seeds 60 --control-noise-std 0,0.1 --out {tmp_path}".split()
     command = [sys.executable, "-m", "d4orm_planners.cli", "robustness", *arguments, "--workers", str(workers), "-q"]
     process = subprocess.Popen(command)
     deadline = time.monotonic() + 120
@@ -433,7 +480,9 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, workers: int) -> None
     assert TrialStore(tmp_path / STORE).trials() == first, "a worker outlived its parent"
     subprocess.run(command, check=True)
     rows = TrialStore(tmp_path / STORE).trials()
-    assert [(row.noise, row.seed) for row in rows] == [(noise, seed) for noise in (0.0, 0.1) for seed in range(60)]
+    assert [(row.control_noise_std, row.seed) for row in rows] == [
+        (noise, seed) for noise in (0.0, 0.1) for seed in range(60)
+    ]
     kept = {row.key: row for row in rows}
     assert all(kept[row.key] == row for row in first)
 
@@ -442,7 +491,7 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, workers: int) -> None
 def test_closed_loop_survives_noise_that_open_loop_does_not(tmp_path: Path) -> None:
     policies = {"d4orm-c2f": {"refine": "sync"}, "d4orm-d": {}, "goal": {}}
     rates = rates_of(policies, tmp_path, **{**TINY, "num_robots": 4, "control_noise_std": (0.0, 0.5)})
-    rows = {(row.policy, row.noise): row for row in rates}
+    rows = {(row.policy, row.control_noise_std): row for row in rates}
     assert rows["d4orm-d", 0.0].successes == rows["d4orm-c2f", 0.5].successes == 2
     assert rows["d4orm-d", 0.5].successes == 0
     assert rows["goal", 0.0].contacts == 2
@@ -452,8 +501,8 @@ def test_closed_loop_survives_noise_that_open_loop_does_not(tmp_path: Path) -> N
 
 
 def test_the_files(d4orm, tmp_path: Path) -> None:
-    arguments = ("--policies", "goal,orca", "--scenario", "circle,random", "--robots", "2,3", "--trials", "1")
-    status, out, err = d4orm(*arguments, "--noise", "0,0.1", "--workers", "1", "--out", "here")
+    arguments = ("--policies", "goal,orca", "--scenario", "circle,random", "--num-robots", "2,3", "--seeds", "1")
+    status, out, err = d4orm(*arguments, "--control-noise-std", "0,0.1", "--workers", "1", "--out", "here")
     assert status == 0, err
     written = {path.name for path in (tmp_path / "here").iterdir()}
     assert {"robustness.csv", "robustness.md", "robustness.png", STORE} <= written
@@ -470,13 +519,12 @@ def test_the_files(d4orm, tmp_path: Path) -> None:
 
 def test_the_table_row_by_row(tmp_path: Path) -> None:
     rates = [success_rate([trial(0, wall_time=0.25), trial(1, success=False, collided=2)])]
-    assert robustness_markdown(rates).splitlines() == [
+    assert markdown(rates).splitlines() == [
         "### circle, 2 robots, holonomic2d",
         "",
-        "| policy | noise | success | 95% interval | contact | not in time | errors | travel time, s | stretch | "
-        "planning, s |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-        "| goal | 0.1 | 1 of 2 (50%) | 9% to 91% | 1 | 0 | 0 | 5.00 | - | 0.38 |",
+        f"| {' | '.join(HEADER)} |",
+        f"|{'---|' * len(HEADER)}",
+        "| goal | 0.1 | 1 of 2 (50%) | 9% to 91% | 0 | 1 | 0 | 0 | 5.00 | - | 0.38 | 0.062 (-0.202 to 0.327) |",
     ]
     paths = write_robustness(tmp_path, rates)
     assert sorted(path.name for path in paths) == sorted(path.name for path in tmp_path.iterdir())
@@ -523,14 +571,15 @@ def test_settings_reach_the_policies_that_have_them(d4orm, monkeypatch: pytest.M
     [
         (("--policies", "gaol"), "policy 'gaol' is unknown"),
         (("--scenario", "square"), "scenario 'square' is unknown"),
-        (("--robots", "0"), "num_robots is 0"),
-        (("--robots", "two"), "--robots 'two'"),
+        (("--num-robots", "0"), "num_robots is 0"),
+        (("--num-robots", "two"), "--num-robots 'two'"),
         (("--model", "hovercraft"), "model 'hovercraft' is unknown"),
-        (("--noise", "0,-0.1"), "noise is -0.1"),
-        (("--noise", "0,nan"), "noise is nan"),
-        (("--noise", "none"), "--noise 'none' is not a list of numbers"),
-        (("--trials", "0"), "trials is 0"),
-        (("--trials", "99999999999"), "1000000"),
+        (("--control-noise-std", "0,-0.1"), "control_noise_std is -0.1"),
+        (("--control-noise-std", "0,nan"), "control_noise_std is nan"),
+        (("--control-noise-std", "none"), "--control-noise-std 'none' is not a list of numbers"),
+        (("--seeds", "0"), "seeds is empty"),
+        (("--trials", "0"), "seeds is empty"),
+        (("--seeds", "99999999999"), "1000000"),
         (("--workers", "0"), "workers is 0"),
         (("--set", "speed=1"), "'speed' is a setting of none of the policies goal"),
         (("--set", "orca.time_horizon=1"), "'orca' is not among the policies"),
@@ -560,7 +609,9 @@ def test_a_library_that_is_missing_is_named_before_anything_runs(d4orm, monkeypa
 
 
 @pytest.mark.parametrize(
-    "options", [("--policies", ""), ("--scenario", ""), ("--robots", ""), ("--noise", "")], ids=lambda given: given[0]
+    "options",
+    [("--policies", ""), ("--scenario", ""), ("--num-robots", ""), ("--control-noise-std", "")],
+    ids=lambda given: given[0],
 )
 def test_nothing_to_do_is_refused(d4orm, tmp_path: Path, options: tuple[str, str]) -> None:
     status, _, err = d4orm("--policies", "goal", *options)

@@ -48,7 +48,7 @@ def test_lessons_grow_and_mix_scenarios() -> None:
 def test_lessons_take_whole_updates_and_all_of_them() -> None:
     lessons = make_lessons(2, "random", steps=1001, unit=100, count=4, gradual=False)
     assert [lesson.steps for lesson in lessons] == [200, 300, 300, 300]
-    assert {lesson.robots for lesson in lessons} == {2}
+    assert {lesson.num_robots for lesson in lessons} == {2}
     assert len(make_lessons(2, "random", steps=1, unit=100, count=4, gradual=True)) == 1
 
 
@@ -56,7 +56,7 @@ pytest.importorskip("stable_baselines3")
 from d4orm_planners.rl.training import TrainingSettings, train  # noqa: E402
 
 TINY = TrainingSettings(
-    robots=2, steps=4 * 16 * 32, num_envs=16, lessons=4, validation_worlds=3, seed=5, curriculum=True
+    num_robots=2, steps=4 * 16 * 32, num_envs=16, lessons=4, validation_worlds=3, seed=5, curriculum=True
 )
 TINY_SAC = replace(TINY, algorithm="sac", steps=4 * 256)
 
@@ -109,7 +109,7 @@ def test_a_training_that_was_broken_off_goes_on_to_the_same_end(
 
 @pytest.mark.slow
 def test_a_training_that_is_killed_goes_on(tmp_path: Path) -> None:
-    arguments = ["train", "ppo", "--robots", "2", "--steps", "5120", "--num-envs", "16", "--lessons", "10"]
+    arguments = ["train", "ppo", "--num-robots", "2", "--steps", "5120", "--num-envs", "16", "--lessons", "10"]
     command = [sys.executable, "-m", "d4orm_planners.cli", *arguments, "--out", str(tmp_path)]
     process = subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"})
     deadline = time.monotonic() + 120
@@ -205,7 +205,7 @@ def test_other_settings_in_the_same_folder_are_refused(trained: tuple[TrainingSe
     ("change", "message"),
     [
         ({"algorithm": "dqn"}, "algorithm 'dqn' is unknown; choose one of ppo, sac"),
-        ({"robots": 0}, "robots"),
+        ({"num_robots": 0}, "num_robots"),
         ({"steps": 0}, "steps"),
         ({"scenario": "labyrinth"}, "labyrinth"),
         ({"num_envs": -1}, "num_envs"),
@@ -213,8 +213,8 @@ def test_other_settings_in_the_same_folder_are_refused(trained: tuple[TrainingSe
         ({"steps": 10**400}, "steps is about 1e400; it must be at most"),
         ({"steps": 1e6}, "steps must be a whole number, not 1000000.0"),
         ({"seed": 2**64}, "seed is about 1e19"),
-        ({"scenario_settings": {"num_robots": 3}}, "scenario_settings has 'num_robots'; give 'robots'"),
-        ({"scenario_settings": {"seed": 3}}, "scenario_settings has 'seed'; give 'seed'"),
+        ({"scenario_settings": {"num_robots": 3}}, "scenario_settings has 'num_robots'; give it itself, --num-robots"),
+        ({"scenario_settings": {"seed": 3}}, "scenario_settings has 'seed'; give it itself, --seed"),
         ({"scenario_settings": [3]}, "scenario_settings"),
     ],
 )
@@ -230,7 +230,7 @@ def test_bad_settings_are_refused(change: dict, message: str) -> None:
         (("--steps", "nan"), "--steps is nan; it must be"),
         (("--steps", "1e300"), "steps is about 1e300; it must be at most"),
         (("--steps", "0.5"), "--steps is 0.5"),
-        (("--set", "num_robots=3"), "give 'robots' (--robots) itself instead"),
+        (("--scenario-set", "num_robots=3"), "give it itself, --num-robots"),
         (("--num-envs", "99999999999"), "num_envs is 99999999999; it must be at most 100000"),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -86,12 +87,23 @@ def frozen_per_robot(value: ArrayLike, name: str, num_robots: int) -> FloatArray
     return array
 
 
-def restore_frozen(instance: object, state: Mapping[str, object]) -> None:
-    """Set the attributes of a frozen dataclass from a pickle; NumPy brings its read-only arrays back writable."""
-    for name, value in state.items():
-        if isinstance(value, np.ndarray):
-            value.setflags(write=False)
-        object.__setattr__(instance, name, value)
+@dataclass(frozen=True, eq=False, init=False)
+class Frozen:
+    """Data that are set once. Copies, unpickled ones too, have read-only arrays and make anew what is cached."""
+
+    def _set(self, **values: object) -> None:
+        for name, value in values.items():
+            parts = value.values() if isinstance(value, Mapping) else value if isinstance(value, tuple) else (value,)
+            for array in parts:
+                if isinstance(array, np.ndarray):
+                    array.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    def __getstate__(self) -> dict[str, object]:
+        return {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        self._set(**state)
 
 
 LARGEST_NUMBER = 1e18

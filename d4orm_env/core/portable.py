@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, wraps
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,8 +24,9 @@ from numpy.typing import ArrayLike, NDArray
 from d4orm_env.core.robot_model import Ops
 
 Floats = NDArray[np.float64]
-Function = Callable[..., Any]
-"""Of arrays or numbers; it gives float32 or float64, arrays or numbers, as it is given them."""
+Real: TypeAlias = Any
+"""An array or a number, float32 or float64, whichever the arguments are."""
+Function = Callable[..., Real]
 
 _TWO_OVER_PI = 6.36619772367581382433e-01
 _HALF_PI = (
@@ -111,7 +112,7 @@ def _in_float64(function: Function) -> Function:
     """Compute in float64, in silence, and round to float32 what came in float32."""
 
     @wraps(function)
-    def wrapper(*arguments: ArrayLike) -> Any:
+    def wrapper(*arguments: ArrayLike) -> Real:
         arrays = [np.asarray(argument) for argument in arguments]
         single = all(array.dtype == np.float32 for array in arrays)
         with np.errstate(all="ignore"):
@@ -123,12 +124,12 @@ def _in_float64(function: Function) -> Function:
     return wrapper
 
 
-def sin(x: ArrayLike) -> Any:
+def sin(x: ArrayLike) -> Real:
     """Sine of ``x`` [rad]."""
     return sin_cos(x)[0]
 
 
-def cos(x: ArrayLike) -> Any:
+def cos(x: ArrayLike) -> Real:
     """Cosine of ``x`` [rad]."""
     return sin_cos(x)[1]
 

@@ -15,9 +15,9 @@ from d4orm_env.core.arrays import (
     LARGEST,
     SMALLEST,
     FloatArray,
+    Frozen,
     frozen_array,
     positive_number,
-    restore_frozen,
     shown,
     whole_number,
 )
@@ -50,7 +50,7 @@ def check_arrival(value: object) -> None:
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class Problem:
+class Problem(Frozen):
     """A multi-robot trajectory planning problem (paper, section III-A), checked on construction.
 
     Two problems are equal when everything but their names is equal to the bit; they hash accordingly.
@@ -113,19 +113,19 @@ class Problem:
         if goal_speed is not None:
             goal_speed = positive_number(goal_speed, "goal_speed", zero_allowed=True, most=LARGEST)
         check_arrival(arrival)
-        restore_frozen(self, {
-            "team": team,
-            "start": frozen_array(start, "start", (team.num_robots, team.state_size), largest=LARGEST),
-            "goal": frozen_array(goal, "goal", (team.num_robots, team.dimension), largest=LARGEST),
-            "world": world,
-            "dt": positive_number(dt, "dt", least=MIN_TIME_STEP, most=MAX_TIME_STEP),
-            "horizon": whole_number(horizon, "horizon", 1, MAX_HORIZON),
-            "margin": positive_number(margin, "margin", zero_allowed=True, most=LARGEST),
-            "goal_radius": positive_number(goal_radius, "goal_radius", least=SMALLEST, most=LARGEST),
-            "goal_speed": goal_speed,
-            "name": name,
-            "arrival": arrival,
-        })  # fmt: skip
+        self._set(
+            team=team,
+            start=frozen_array(start, "start", (team.num_robots, team.state_size), largest=LARGEST),
+            goal=frozen_array(goal, "goal", (team.num_robots, team.dimension), largest=LARGEST),
+            world=world,
+            dt=positive_number(dt, "dt", least=MIN_TIME_STEP, most=MAX_TIME_STEP),
+            horizon=whole_number(horizon, "horizon", 1, MAX_HORIZON),
+            margin=positive_number(margin, "margin", zero_allowed=True, most=LARGEST),
+            goal_radius=positive_number(goal_radius, "goal_radius", least=SMALLEST, most=LARGEST),
+            goal_speed=goal_speed,
+            name=name,
+            arrival=arrival,
+        )
         self._check()
 
     def _check(self) -> None:
@@ -250,13 +250,6 @@ class Problem:
             sha.update(self.arrival.encode())
         return sha.hexdigest()
 
-    def __getstate__(self) -> dict[str, object]:
-        # What is cached is made anew in a copy.
-        return {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
-
-    def __setstate__(self, state: dict[str, object]) -> None:
-        restore_frozen(self, state)
-
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Problem) and self.digest == other.digest
 
@@ -292,5 +285,5 @@ class Problem:
 
     def _unchecked(self, **changes: object) -> Problem:
         copy: Problem = object.__new__(Problem)
-        restore_frozen(copy, self.__getstate__() | changes)
+        copy._set(**{**self.__getstate__(), **changes})
         return copy

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.errors import describe
 
-T = TypeVar("T")
+T = TypeVar("T", covariant=True)
 
 FORMS = "package.module:Name or folder/file.py:Name"
 
@@ -145,7 +145,7 @@ class Registry(Mapping[str, T]):
         return found
 
 
-def load_reference(text: str) -> Any:
+def load_reference(text: str) -> object:
     """What ``"package.module:Name"`` or ``"folder/file.py:Name"`` names; modules of the present folder are found too.
 
     Raises:

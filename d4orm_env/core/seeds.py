@@ -32,6 +32,7 @@ class Stream(IntEnum):
     TRAINING_WORLDS = 15  # by lesson
     TRAINING = 16  # first weights (0), then exploration and minibatches by lesson (from 1)
     TAKEOVER = 17  # the seeds of the plans that a team makes on the way, by takeover
+    GUIDANCE = 18  # ties of path finding, by try, and which robots are replanned, by iteration
 
 
 def derived_seed(seed: int, stream: Stream, *key: int) -> int:

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import FloatArray, frozen_per_robot, restore_frozen, shown
+from d4orm_env.core.arrays import FloatArray, Frozen, frozen_per_robot, shown
 from d4orm_env.core.dynamics import get_model
 from d4orm_env.core.robot_model import STANDARD_LIMITS, Limit, Model
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class Team:
+class Team(Frozen):
     """The robots, in order. Teams may mix models; all must move in the same number of dimensions.
 
     Single numbers are given to every robot. All lie from 1e-7 to 1e6, where float32 holds what is computed of them.
@@ -58,11 +58,11 @@ class Team:
             raise ValueError("a team needs at least one robot; models is empty")
         if len({get_model(name).dimension for name in models}) > 1:
             raise ValueError(f"models {sorted(set(models))} mix 2D and 3D robots; a team moves in one dimension")
-        restore_frozen(self, {"models": tuple(models)})
+        self._set(models=tuple(models))
         for name, value in zip(STANDARD_LIMITS, (max_speed, max_acceleration, max_turn_rate), strict=True):
-            restore_frozen(self, {name: frozen_per_robot(value, name, len(models))})
-        own = self._complete_own_limits(own_limits)
-        restore_frozen(self, {"radius": frozen_per_robot(radius, "radius", len(models)), "own_limits": own})
+            self._set(**{name: frozen_per_robot(value, name, len(models))})
+        self._set(radius=frozen_per_robot(radius, "radius", len(models)))
+        self._set(own_limits=self._complete_own_limits(own_limits))
 
     def _complete_own_limits(self, given: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
         if not isinstance(given, Mapping):
@@ -76,15 +76,6 @@ class Team:
                     f"it has {', '.join(names) or 'none of its own'}"
                 )
         return {name: _per_robot(name, given.get(name), [limits.get(name) for limits in known]) for name in names}
-
-    def __getstate__(self) -> dict[str, object]:
-        # What is cached is looked up anew in a copy.
-        return {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
-
-    def __setstate__(self, state: dict[str, object]) -> None:
-        restore_frozen(self, state)
-        for array in self.own_limits.values():
-            array.setflags(write=False)
 
     @property
     def num_robots(self) -> int:

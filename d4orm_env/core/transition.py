@@ -8,11 +8,14 @@ problem says that who has arrived may be moved again: then it has arrived for as
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 from d4orm_env.core.robot_model import ModelFunctions, Number, Ops, TimeStep, Truth, Vector
 
 __all__ = ["TimeStep", "advance", "arrives"]
+
+Flag: TypeAlias = Any
+"""A :class:`Truth` as the library of the numbers has it."""
 
 
 def advance(model: ModelFunctions, x: Vector, u: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
@@ -22,11 +25,11 @@ def advance(model: ModelFunctions, x: Vector, u: Vector, limits: Vector, h: Time
 
 def arrives(
     squared_distance: Number, squared_speed: Number, squared_goal_radius: Number, squared_goal_speed: Number
-) -> Any:
+) -> Flag:
     """Whether a robot at this distance from its goal, at this speed, docks there."""
     return (squared_distance <= squared_goal_radius) & (squared_speed <= squared_goal_speed)
 
 
-def stands(arrived: Truth, docks: Truth) -> Any:
+def stands(arrived: Truth, docks: Truth) -> Flag:
     """Whether a robot that has arrived stays where it is, whatever its control; ``docks`` says whether any does."""
     return arrived & docks

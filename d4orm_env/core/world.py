@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import LARGEST, FloatArray, frozen_array, restore_frozen
+from d4orm_env.core.arrays import LARGEST, FloatArray, Frozen, frozen_array
 from d4orm_env.core.polygon import check_polygon, triangulate
 from d4orm_env.core.shapes import Shapes
 from d4orm_env.core.world_index import WorldIndex, build_index, nearest_distance
@@ -22,7 +22,7 @@ there are no more than so many: with more it takes too long to make, and robots 
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class World:
+class World(Frozen):
     """Obstacles and bounds of a planar or spatial world; all numbers are at most 1e6 in magnitude.
 
     Attributes:
@@ -80,7 +80,7 @@ class World:
             frozen_array(given, f"polygons[{index}]", (None, 2), largest=LARGEST)
             for index, given in enumerate(polygons)
         )
-        restore_frozen(self, {"dimension": dimension, **tables, "polygons": corners, **bounds})
+        self._set(dimension=dimension, polygons=corners, **tables, **bounds)
         self._check()
 
     def _check(self) -> None:
@@ -100,15 +100,6 @@ class World:
             check_polygon(corners, f"polygons[{index}]")
         if self.lower is not None and self.upper is not None and (self.lower >= self.upper).any():
             raise ValueError(f"bounds lower {self.lower.tolist()} must lie below upper {self.upper.tolist()}")
-
-    def __getstate__(self) -> dict[str, object]:
-        # What is cached is made anew in a copy.
-        return {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
-
-    def __setstate__(self, state: dict[str, object]) -> None:
-        restore_frozen(self, state)
-        for corners in self.polygons:
-            corners.setflags(write=False)
 
     @property
     def num_obstacles(self) -> int:

@@ -30,7 +30,7 @@ _WORDS = {"": None, "~": None, "null": None, "Null": None, "NULL": None} | {
 }
 
 
-def read_yaml(path: str | os.PathLike[str]) -> Any:
+def read_yaml(path: str | os.PathLike[str]) -> object:
     """The content of a YAML file: text, numbers, lists and mappings.
 
     Raises:
@@ -39,7 +39,7 @@ def read_yaml(path: str | os.PathLike[str]) -> Any:
     return parse_yaml(_read_text(Path(path)))
 
 
-def parse_yaml(text: str) -> Any:
+def parse_yaml(text: str) -> object:
     """The one document of a YAML text.
 
     Raises:

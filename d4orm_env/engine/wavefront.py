@@ -594,3 +594,20 @@ def look(space: Any, lattice: Any, reach: Any, front: Any, places: Any, target: 
                             length[b], anchor[b] = bent, a
                             target[b, 0], target[b, 1], target[b, 2] = place
             ring += 1
+
+
+@compiled
+def is_free_line(space: Any, reach: Any, tail: Any, head: Any) -> Any:
+    """Whether a body of this reach moves freely straight from one place to another.
+
+    An end that lies nearer than that to something is left and reached on a line that comes no nearer.
+    """
+    p, q = (tail[0], tail[1], tail[2]), (head[0], head[1], head[2])
+    return _sees(space, reach, p, _clearance(space, p[0], p[1], p[2]), q, _clearance(space, q[0], q[1], q[2]))
+
+
+@cached_kernel(SOURCES, variant="lines", **OPTIONS)
+def free_lines(space: Any, reach: Any, tails: Any, heads: Any, free: Any) -> None:
+    """:func:`is_free_line` of many, from ``tails`` ``(Q, 3)`` to ``heads`` ``(Q, 3)``; ``free`` ``(Q,)`` is output."""
+    for b in range(tails.shape[0]):
+        free[b] = is_free_line(space, reach, tails[b], heads[b])

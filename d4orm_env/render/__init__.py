@@ -6,7 +6,7 @@ The drawing functions load matplotlib, so they are imported on first use and ``i
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from d4orm_env.render.animation import save_animation
@@ -24,7 +24,7 @@ _HOMES = {
 __all__ = ["FrameRenderer", "WindowRenderer", "plot_trajectory", "save_animation", "save_picture"]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

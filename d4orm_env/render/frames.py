@@ -7,9 +7,11 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.backend_bases import FigureManagerBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.registry import backend_registry
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.problem import Problem
@@ -162,8 +164,8 @@ class WindowRenderer:
     def __init__(self, problem: Problem, size: tuple[int, int] = (480, 480)) -> None:
         self._frames = FrameRenderer(problem, size)
         self._period = problem.dt
-        self._manager: Any = None
-        self._image: Any = None
+        self._manager: FigureManagerBase | None = None
+        self._image: AxesImage
         self._last = -np.inf
         self._open_window(problem, size)
 

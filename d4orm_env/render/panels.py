@@ -16,6 +16,7 @@ import numpy as np
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.gridspec import SubplotSpec
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import ArrayLike
 
@@ -101,7 +102,7 @@ class Panel:
         right, up: ``(2,)`` or ``(3,)`` unit vectors that span the plane of the picture.
     """
 
-    def __init__(self, figure: Figure, place: Any, problem: Problem, limits: Array, view: str) -> None:
+    def __init__(self, figure: Figure, place: SubplotSpec | int, problem: Problem, limits: Array, view: str) -> None:
         self.spatial = view == "space"
         self.limits = limits if self.spatial else limits[:, :2]
         self.axes: Any = figure.add_subplot(place, projection="3d" if self.spatial else None)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -130,19 +130,17 @@ def _outcome(problem: Problem, trajectory: Trajectory) -> str:
 
 def _legend(problem: Problem, trajectory: Trajectory) -> list[Line2D]:
     collided = np.asarray(trajectory.collided)
-    entries: list[tuple[bool, str, dict[str, Any]]] = [
-        (True, "start", {"marker": "o", "mfc": "none", "mec": INK, "ms": 8}),
-        (True, "goal", {"marker": "D", "mfc": "none", "mec": INK, "ms": 7}),
-        (True, "end", {"marker": "o", "mfc": "#9CA3AF", "mec": INK, "ms": 8}),
-        (problem.world.num_obstacles > 0, "obstacle", {"marker": "s", "mfc": OBSTACLE, "mec": OBSTACLE_EDGE, "ms": 8}),
-        (bool(collided.any()), "contact", {"marker": (8, 1, 0), "mfc": CONTACT, "mec": CONTACT, "ms": 9}),
-        (
-            bool((np.asarray(trajectory.margin_violated) & ~collided).any()),
-            "margin violated",
-            {"marker": "o", "mfc": MARGIN, "mec": MARGIN, "ms": 6},
-        ),
+    missed = np.asarray(trajectory.margin_violated) & ~collided
+    mark = partial(Line2D, [], [], linestyle="none")
+    entries = [
+        (True, mark(label="start", marker="o", mfc="none", mec=INK, ms=8)),
+        (True, mark(label="goal", marker="D", mfc="none", mec=INK, ms=7)),
+        (True, mark(label="end", marker="o", mfc="#9CA3AF", mec=INK, ms=8)),
+        (problem.world.num_obstacles > 0, mark(label="obstacle", marker="s", mfc=OBSTACLE, mec=OBSTACLE_EDGE, ms=8)),
+        (collided.any(), mark(label="contact", marker=(8, 1, 0), mfc=CONTACT, mec=CONTACT, ms=9)),
+        (missed.any(), mark(label="margin violated", marker="o", mfc=MARGIN, mec=MARGIN, ms=6)),
     ]
-    return [Line2D([], [], linestyle="none", label=label, **style) for shown, label, style in entries if shown]
+    return [line for shown, line in entries if shown]
 
 
 def save_picture(problem: Problem, trajectory: Trajectory, path: str | Path, *, title: str | None = None) -> Path:
@@ -157,7 +155,7 @@ def save_picture(problem: Problem, trajectory: Trajectory, path: str | Path, *, 
     """
     path = Path(path)
     kind = path.suffix.lower()[1:]
-    undated: dict[str, dict[str, Any]] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
+    undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
     with replaced_when_done(path, PICTURE_SUFFIXES) as temporary:
         figure = plot_trajectory(problem, trajectory, title=title)
         with mpl.rc_context({"svg.hashsalt": "d4orm", "pdf.fonttype": 42}):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from d4orm_env.scenarios.maps import load_map
 from d4orm_env.scenarios.problems import make_problem
@@ -18,7 +18,7 @@ __all__ = [
 ]  # fmt: skip
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Import the file schema on first use only: building it takes as long as importing everything else."""
     if name in ("load_problem", "save_problem"):
         return getattr(import_module("d4orm_env.scenarios.files"), name)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -54,14 +53,14 @@ def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:
         ) from error
 
 
-def _format(content: dict[str, Any]) -> str:
+def _format(content: dict[str, object]) -> str:
     """One line for each robot and obstacle."""
     lines = []
     for key, value in content.items():
-        if key == "robots":
-            lines += ["robots:", *(f"  - {_flow(robot)}" for robot in value)]
-        elif key == "world":
-            lines += ["world:" if value else "world: {}"]
+        if isinstance(value, list):
+            lines += [f"{key}:", *(f"  - {_flow(entry)}" for entry in value)]
+        elif isinstance(value, dict):
+            lines += [f"{key}:" if value else f"{key}: {{}}"]
             for part, entries in value.items():
                 if part == "bounds":
                     lines += [f"  bounds: {_flow(entries)}"]
@@ -73,11 +72,9 @@ def _format(content: dict[str, Any]) -> str:
 
 
 def _flow(value: object) -> str:
-    if isinstance(value, str):
-        return _dump(value, default_style='"')
-    return _dump(value, default_flow_style=True)
-
-
-def _dump(value: object, **style: Any) -> str:
-    text: str = yaml.safe_dump(value, width=2**31 - 1, sort_keys=False, explicit_end=False, **style)
+    """On one line; text in quotes."""
+    style = '"' if isinstance(value, str) else None
+    text: str = yaml.safe_dump(
+        value, width=2**31 - 1, sort_keys=False, explicit_end=False, default_style=style, default_flow_style=True
+    )
     return text.removesuffix("...\n").strip()

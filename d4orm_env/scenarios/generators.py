@@ -12,7 +12,7 @@ from d4orm_env.core.portable import cos, root, sin
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.layout import Layout, build, in_space
-from d4orm_env.scenarios.placement import Points, round_up, scatter
+from d4orm_env.scenarios.placement import Area, Points, round_up, scatter
 from d4orm_env.scenarios.settings import JITTER, Settings, bounded
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
@@ -48,8 +48,8 @@ def sphere(settings: Settings, *, diameter: float = 5.0) -> Problem:
     if needed >= diameter:
         raise _too_small(settings, "diameter", diameter, needed)
     starts, goals = _antipodal(points * (diameter / 2))
-    half_extent = np.full(3, diameter / 2)
-    return build(settings, Layout(starts, goals, World(dimension=3), diameter, half_extent, is_round=True))
+    area = Area(np.full(3, diameter / 2), is_round=True)
+    return build(settings, Layout(starts, goals, World(dimension=3), diameter, area))
 
 
 def random(settings: Settings, *, size: float | None = None) -> Problem:
@@ -68,8 +68,8 @@ def random(settings: Settings, *, size: float | None = None) -> Problem:
         size = max(5.0, 1.25 * root(settings.num_robots, dimension))
     size = bounded(size, "size")
     starts, goals = scatter(settings, size)
-    half_extent = np.full(dimension, size / 2)
-    return build(settings, Layout(starts, goals, World(dimension=dimension), size * math.sqrt(dimension), half_extent))
+    area = Area(np.full(dimension, size / 2))
+    return build(settings, Layout(starts, goals, World(dimension=dimension), size * math.sqrt(dimension), area))
 
 
 def four_obstacles(settings: Settings, *, diameter: float = 5.0, obstacle_distance: float = 1.0) -> Problem:
@@ -137,8 +137,8 @@ def swap(settings: Settings, *, distance: float = 5.0, spacing: float | None = N
     x = np.where(np.arange(settings.num_robots) < first, -distance / 2, distance / 2)
     dimension = settings.team.dimension
     starts, goals = (in_space(np.column_stack([side, y]), dimension) for side in (x, -x))
-    half_extent = in_space([distance / 2, first * spacing / 2], dimension)[0]
-    return build(settings, Layout(starts, goals, World(dimension=dimension), distance, half_extent))
+    area = Area(in_space([distance / 2, first * spacing / 2], dimension)[0])
+    return build(settings, Layout(starts, goals, World(dimension=dimension), distance, area))
 
 
 def amswarm_1(settings: Settings, *, jitter: float = 0.0) -> Problem:
@@ -203,8 +203,8 @@ def _antipodal_circle(settings: Settings, diameter: float) -> Layout:
     angle = 2 * math.pi * np.arange(count) / count
     points = diameter / 2 * np.column_stack([cos(angle), sin(angle)])
     starts, goals = _antipodal(in_space(points, dimension))
-    half_extent = in_space([diameter / 2, diameter / 2], dimension)[0]
-    return Layout(starts, goals, World(dimension=dimension), diameter, half_extent, is_round=True)
+    area = Area(in_space([diameter / 2, diameter / 2], dimension)[0], is_round=True)
+    return Layout(starts, goals, World(dimension=dimension), diameter, area)
 
 
 def _antipodal(points: Points) -> tuple[Points, Points]:

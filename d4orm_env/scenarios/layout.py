@@ -12,7 +12,7 @@ from d4orm_env.core.portable import arctan2
 from d4orm_env.core.problem import MAX_HORIZON, Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.placement import Points, with_random_obstacles
+from d4orm_env.scenarios.placement import Area, Points, with_random_obstacles
 from d4orm_env.scenarios.settings import Settings
 
 MIN_HORIZON = 100
@@ -29,16 +29,14 @@ class Layout:
         world: Obstacles and bounds of the scenario itself.
         travel: The distance the horizon is made for [m]: the same for every seed, so that problems that differ in
             their seed alone have the same shapes.
-        half_extent: ``(d,)`` half the sides of the box around the origin that random obstacles are placed in [m].
-        is_round: Whether random obstacles keep to the ellipse inside that box.
+        area: Where random obstacles are placed; ``None`` where ``world`` has them already.
     """
 
     starts: Points
     goals: Points
     world: World
     travel: float
-    half_extent: Points
-    is_round: bool = False
+    area: Area | None = None
 
 
 def build(settings: Settings, layout: Layout) -> Problem:
@@ -50,11 +48,14 @@ def build(settings: Settings, layout: Layout) -> Problem:
     team = settings.team
     places = np.vstack([layout.starts, layout.goals])
     horizon = settings.horizon
+    world = layout.world
+    if layout.area is not None:
+        world = with_random_obstacles(settings, world, places, layout.area)
     problem = Problem(
         team=team,
         start=start_states(team, layout.starts, layout.goals),
         goal=layout.goals,
-        world=with_random_obstacles(settings, layout.world, places, layout.half_extent, is_round=layout.is_round),
+        world=world,
         dt=settings.dt,
         horizon=default_horizon(team, settings.dt, layout.travel) if horizon is None else horizon,
         margin=settings.margin,

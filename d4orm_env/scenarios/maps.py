@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TypeAlias
@@ -86,7 +85,7 @@ def map(
         return populate(settings, grid.world, step, space.longest_way, remedy)
     starts, goals, travel = _listed_places(settings, grid, space, Path(scenario_file))
     world = with_obstacles(settings, grid.world, np.vstack([starts, goals]))
-    return build(replace(settings, num_obstacles=0), Layout(starts, goals, world, travel, np.zeros(2)))
+    return build(settings, Layout(starts, goals, world, travel))
 
 
 def _listed_places(settings: Settings, grid: GridMap, space: FreeSpace, path: Path) -> tuple[Points, Points, float]:

@@ -24,19 +24,7 @@ def parse_map(content: bytes, cell: float) -> GridMap:
         ValueError: If it is none; one line without the file's name.
     """
     lines = content.splitlines()
-    header: dict[bytes, bytes] = {}
-    while len(header) < len(lines) and lines[len(header)].strip() != b"map":
-        name, _, value = lines[len(header)].partition(b" ")
-        if name not in (b"type", b"height", b"width") or name in header:
-            break
-        header[name] = value.strip()
-    if len(header) < 3 or len(lines) == 3 or lines[3].strip() != b"map":
-        raise ValueError(
-            "is not a Moving AI map; it must begin with lines 'type octile', 'height ...', 'width ...', 'map'"
-        )
-    height, width = (_count(header[name], name.decode()) for name in (b"height", b"width"))
-    if height * width > MAX_CELLS:
-        raise ValueError(f"has {height} x {width} cells; at most {MAX_CELLS} are read")
+    height, width = _size(lines)
     rows = [row.rstrip() for row in lines[4:]]
     while rows and not rows[-1]:
         rows.pop()
@@ -55,6 +43,24 @@ def parse_map(content: bytes, cell: float) -> GridMap:
             f"{' '.join(PASSABLE.decode())} (free) and {' '.join(BLOCKED.decode())} (blocked)"
         )
     return GridMap(blocked, cell)
+
+
+def _size(lines: list[bytes]) -> tuple[int, int]:
+    """Rows and columns that the first lines of a map tell."""
+    header: dict[bytes, bytes] = {}
+    while len(header) < len(lines) and lines[len(header)].strip() != b"map":
+        name, _, value = lines[len(header)].partition(b" ")
+        if name not in (b"type", b"height", b"width") or name in header:
+            break
+        header[name] = value.strip()
+    if len(header) < 3 or len(lines) == 3 or lines[3].strip() != b"map":
+        raise ValueError(
+            "is not a Moving AI map; it must begin with lines 'type octile', 'height ...', 'width ...', 'map'"
+        )
+    height, width = (_count(header[name], name.decode()) for name in (b"height", b"width"))
+    if height * width > MAX_CELLS:
+        raise ValueError(f"has {height} x {width} cells; at most {MAX_CELLS} are read")
+    return height, width
 
 
 class Task(NamedTuple):

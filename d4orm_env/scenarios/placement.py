@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,28 @@ DENSITY = {2: 0.4, 3: 0.25}
 """Share of the area (volume) that random placement fills without fail; it jams at 0.547 (0.384)."""
 
 
+class Area(NamedTuple):
+    """Where points are drawn from: a box, or the ellipse (ellipsoid) inside it.
+
+    Attributes:
+        half_extent: ``(d,)`` half the sides of the box [m].
+        is_round: Whether it is the ellipse.
+        centre: ``(d,)`` [m].
+    """
+
+    half_extent: Points
+    is_round: bool = False
+    centre: Points | float = 0.0
+
+    def contains(self, points: Points) -> NDArray[np.bool_]:
+        """``(C,)`` which of ``(C, d)`` points of the box belong to it."""
+        if not self.is_round:
+            return np.full(len(points), True)
+        extent = np.maximum(self.half_extent, np.finfo(np.float64).tiny)
+        inside: NDArray[np.bool_] = (((points - self.centre) / extent) ** 2).sum(axis=1) <= 1
+        return inside
+
+
 def scatter(settings: Settings, size: float) -> tuple[Points, Points]:
     """Random starts and goals in the square (cube) of side ``size`` around the origin.
 
@@ -36,13 +59,13 @@ def scatter(settings: Settings, size: float) -> tuple[Points, Points]:
     """
     count, dimension = settings.num_robots, settings.team.dimension
     random = settings.generator(STARTS_AND_GOALS)
-    half_extent = np.full(dimension, size / 2)
+    area = Area(np.full(dimension, size / 2))
     needed = max(size_for(count, settings.spacing, dimension), 3 * settings.goal_radius)
     starts, goals = np.empty((0, dimension)), np.empty((0, dimension))
     for robot in range(count if needed <= size else 0):
-        starts = _with_another(random, half_extent, starts, settings.spacing)
+        starts = _with_another(random, area, starts, settings.spacing)
         own = (starts[robot:], settings.goal_radius)
-        goals = _with_another(random, half_extent, goals, settings.spacing, own)
+        goals = _with_another(random, area, goals, settings.spacing, own)
         if min(len(starts), len(goals)) == robot:
             break
     if min(len(starts), len(goals)) < count:
@@ -60,15 +83,7 @@ def size_for(count: int, spacing: float, dimension: int) -> float:
     return root(count * ball / DENSITY[dimension], dimension) if count > 1 else 0.0
 
 
-def with_random_obstacles(
-    settings: Settings,
-    world: World,
-    places: Points,
-    half_extent: Points,
-    *,
-    is_round: bool,
-    centre: Points | float = 0.0,
-) -> World:
+def with_random_obstacles(settings: Settings, world: World, places: Points, area: Area) -> World:
     """The world and ``settings.num_obstacles`` random circles, or spheres in space.
 
     They keep more than the margin to every start and goal, and leave the largest robot a passage with its margin on
@@ -78,9 +93,7 @@ def with_random_obstacles(
         settings: Number and radius of obstacles, team, seed.
         world: The world they are added to.
         places: ``(., d)`` starts, then goals, or none where these are drawn later [m].
-        half_extent: ``(d,)`` half the sides of the box that they are drawn from [m].
-        is_round: Whether they keep to the ellipse inside that box.
-        centre: ``(d,)`` centre of that box [m].
+        area: Where they are drawn from.
 
     Raises:
         ValueError: If so many do not fit; the message says how many do.
@@ -91,17 +104,15 @@ def with_random_obstacles(
     size = float(np.float32(settings.obstacle_radius))
     passage = 2 * (float(np.max(settings.team.radius)) + settings.margin)
     reach = np.tile(np.float64(settings.team.radius), 2) + size + settings.margin
-    extent = np.maximum(half_extent, np.finfo(np.float64).tiny)
     balls: Points = np.empty((0, world.dimension))
 
     def is_free(centres: Points) -> NDArray[np.bool_]:
-        inside = (((centres - centre) / extent) ** 2).sum(axis=1) <= 1 if is_round else np.full(len(centres), True)
         apart = _gaps(centres, places, reach) > 0
         passable = (world.clearance(centres) > size + passage) & (_gaps(centres, balls, 2 * size + passage) > 0)
-        return np.asarray(inside & apart & passable)
+        return np.asarray(apart & passable)
 
     for index in range(settings.num_obstacles):
-        ball = _first(random, half_extent, is_free, centre)
+        ball = _first(random, area, is_free)
         if ball is None:
             raise _too_many(settings, index, size)
         balls = np.vstack([balls, ball])
@@ -123,7 +134,7 @@ def round_up(value: float) -> str:
 
 def _with_another(
     random: np.random.Generator,
-    half_extent: Points,
+    area: Area,
     points: Points,
     spacing: float,
     avoid: tuple[Points, float] | None = None,
@@ -134,22 +145,18 @@ def _with_another(
         free = _gaps(candidates, points, spacing) > 0
         return free if avoid is None else free & (_gaps(candidates, *avoid) > 0)
 
-    place = _first(random, half_extent, is_free)
+    place = _first(random, area, is_free)
     return points if place is None else np.vstack([points, place])
 
 
-def _first(
-    random: np.random.Generator,
-    half_extent: Points,
-    is_free: Callable[[Points], NDArray[np.bool_]],
-    centre: Points | float = 0.0,
-) -> Points | None:
-    """The first uniform random point that is free, or ``None`` if none of many was."""
+def _first(random: np.random.Generator, area: Area, is_free: Callable[[Points], NDArray[np.bool_]]) -> Points | None:
+    """The first uniform random point of an area that is free, or ``None`` if none of many was."""
+    half = area.half_extent
     for attempt in range(ROUNDS):
-        points = centre + random.uniform(-half_extent, half_extent, (min(FEW << attempt, MANY), len(half_extent)))
+        points = area.centre + random.uniform(-half, half, (min(FEW << attempt, MANY), len(half)))
         # Rounded as the problem will hold them, so that what is checked is what is used.
         points = points.astype(np.float32).astype(np.float64)
-        free = is_free(points)
+        free = area.contains(points) & is_free(points)
         if free.any():
             first: Points = points[np.argmax(free)]
             return first

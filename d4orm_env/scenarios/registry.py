@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial
 
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.problem import Problem
@@ -36,21 +36,21 @@ def register_scenario(name: str, generator: Callable[..., Problem]) -> None:
     SCENARIOS.add(name, generator)
 
 
-_IN_SPACE: dict[str, Any] = {"model": "holonomic3d"}
-_AMSWARM: dict[str, Any] = {**_IN_SPACE, "num_robots": 10, "radius": 0.29, "margin": 0.05}
+_in_space = partial(BuiltIn, model="holonomic3d")
+_amswarm = partial(_in_space, num_robots=10, radius=0.29, margin=0.05)
 
 for _scenario in (
     BuiltIn(generators.circle),
-    BuiltIn(generators.sphere, **_IN_SPACE),
+    _in_space(generators.sphere),
     BuiltIn(generators.random, draws=True),
     BuiltIn(generators.four_obstacles),
     BuiltIn(generators.heterogeneous, model=None, max_acceleration=None),
     BuiltIn(generators.swap),
-    BuiltIn(generators.amswarm_1, **_AMSWARM),
-    BuiltIn(generators.amswarm_2, **_AMSWARM),
-    BuiltIn(generators.amswarm_3, **_AMSWARM),
-    BuiltIn(generators.amswarm_4, **_AMSWARM),
-    BuiltIn(generators.amswarm_5, **_AMSWARM),
+    _amswarm(generators.amswarm_1),
+    _amswarm(generators.amswarm_2),
+    _amswarm(generators.amswarm_3),
+    _amswarm(generators.amswarm_4),
+    _amswarm(generators.amswarm_5),
     BuiltIn(rooms.rooms, draws=True),
     BuiltIn(maze.maze, draws=True),
     BuiltIn(warehouse.warehouse, draws=True),

@@ -101,15 +101,10 @@ class RoundEntry(Entry):
         return [*self.center, self.radius]
 
 
-class SphereEntry(Entry):
+class SphereEntry(RoundEntry):
     """A sphere: centre x, y, z and radius [m]."""
 
     center: SpatialPlace
-    radius: Number
-
-    @property
-    def row(self) -> list[float]:
-        return [*self.center, self.radius]
 
 
 class BoxEntry(Entry):

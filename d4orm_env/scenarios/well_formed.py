@@ -9,18 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.portable import root
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.free_space import FreeSpace, Mask, free_space
 from d4orm_env.scenarios.layout import Layout, build
-from d4orm_env.scenarios.placement import Points, round_up, with_random_obstacles
+from d4orm_env.scenarios.placement import Area, Points, round_up, with_random_obstacles
 from d4orm_env.scenarios.settings import STARTS_AND_GOALS, Settings
 
 RESERVE = 1e-3
@@ -127,7 +125,7 @@ def reach_of(settings: Settings) -> float:
     return float(np.max(settings.team.radius)) + settings.margin + RESERVE
 
 
-def lattice_step(settings: Settings, sides: Any, passage: tuple[str, float] | None = None) -> float:
+def lattice_step(settings: Settings, sides: ArrayLike, passage: tuple[str, float] | None = None) -> float:
     """Step of a lattice that is fine enough for the robots, and for the narrowest passage wherever it is [m].
 
     Args:
@@ -138,7 +136,8 @@ def lattice_step(settings: Settings, sides: Any, passage: tuple[str, float] | No
     Raises:
         ValueError: If the passage is too narrow; the message says what would do.
     """
-    step = max(settings.spacing / 4, root(float(np.prod(sides)) / ENOUGH_POINTS, len(sides)))
+    lengths = np.asarray(sides)
+    step = max(settings.spacing / 4, root(float(lengths.prod()) / ENOUGH_POINTS, len(lengths)))
     if passage is None:
         return step
     (name, width), reach = passage, reach_of(settings)
@@ -174,14 +173,14 @@ def populate(
     """
     world = with_obstacles(settings, world)
     starts, goals = draw_team(settings, free_space(world, reach_of(settings), step), remedy, exchange)
-    return build(replace(settings, num_obstacles=0), Layout(starts, goals, world, travel, np.zeros(world.dimension)))
+    return build(settings, Layout(starts, goals, world, travel))
 
 
 def with_obstacles(settings: Settings, world: World, places: Points | None = None) -> World:
     """A world with bounds and the random obstacles asked for, clear of starts and goals if they are known."""
     low, high = world.bounds.astype(np.float64)
     places = np.empty((0, world.dimension)) if places is None else places
-    return with_random_obstacles(settings, world, places, (high - low) / 2, is_round=False, centre=(low + high) / 2)
+    return with_random_obstacles(settings, world, places, Area((high - low) / 2, centre=(low + high) / 2))
 
 
 def draw_team(

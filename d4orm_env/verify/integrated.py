@@ -6,11 +6,11 @@ Runge-Kutta in many sub-steps of a control step, with the same bits on every pro
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core import portable
 from d4orm_env.verify.geometry import Floats, norm
@@ -92,7 +92,7 @@ class Integrated:
     def _slope(self, x: Floats, u: Floats) -> Floats:
         return self._call(self._model.functions.derivative, x, u)
 
-    def _call(self, function: Callable[..., Any], *arguments: Floats) -> Floats:
+    def _call(self, function: Callable[..., Iterable[ArrayLike]], *arguments: Floats) -> Floats:
         """A function of the model over arrays whose first axis is the component; it may return single numbers too."""
         result = function(*map(tuple, arguments), self._limits, _ops())
         rows: Floats = np.stack([np.broadcast_to(part, arguments[0].shape[1:]) for part in result])

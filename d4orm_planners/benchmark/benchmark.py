@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.dynamics import get_model
+from d4orm_env.core.dynamics import COMMON, get_model
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.base import SamplingTask
 from d4orm_env.engine.choice import get_engine
@@ -24,7 +24,7 @@ from d4orm_planners.registry import make_planner
 from d4orm_planners.settings import CheckedSettings, Count, Positive, Samples, Steps, Whole
 
 ENGINES = ("cpu", "jax", "plain")
-MODELS = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive")
+MODELS = (*COMMON, "unicycle", "car")
 PRESETS = (None, "paper")
 
 Robots = Annotated[Count, Field(le=10_000)]
@@ -36,9 +36,9 @@ class BenchmarkSettings(CheckedSettings):
     """What to measure, and how long.
 
     Attributes:
-        robots: Team sizes.
+        num_robots: Team sizes.
         models: Robot models.
-        engines: Of :data:`ENGINES`; ``"plain"`` is :mod:`d4orm_planners.benchmark.plain`.
+        engines: Of :data:`ENGINES`; ``"plain"`` is :mod:`d4orm_planners.benchmark.plain`, which has the common models.
         num_samples: ``M``.
         horizon: ``H``.
         num_steps: Denoising steps in an iteration.
@@ -60,7 +60,7 @@ class BenchmarkSettings(CheckedSettings):
         ValueError: If a value makes no sense; the message names it.
     """
 
-    robots: tuple[Robots, ...] = (4, 8, 16, 32, 64, 100)
+    num_robots: tuple[Robots, ...] = (4, 8, 16, 32, 64, 100)
     models: tuple[str, ...] = MODELS
     engines: tuple[str, ...] = ENGINES
     num_samples: Samples = 1024
@@ -90,7 +90,7 @@ class BenchmarkSettings(CheckedSettings):
 
 
 QUICK: Mapping[str, object] = {
-    "robots": (4, 8),
+    "num_robots": (4, 8),
     "models": ("holonomic2d", "differential_drive"),
     "num_steps": 20,
     "repetitions": 3,
@@ -130,9 +130,10 @@ def diameter(num_robots: int) -> float:
 def parts(settings: BenchmarkSettings) -> Iterator[Part]:
     """``(section, what, measurement)`` for everything that the settings ask for."""
     for model in settings.models:
-        for num_robots in settings.robots:
+        for num_robots in settings.num_robots:
             for engine in settings.engines:
-                if engine != "cpu" and num_robots > settings.most_robots_slow:
+                slow = engine != "cpu" and num_robots > settings.most_robots_slow
+                if slow or (engine == "plain" and model not in COMMON):
                     continue
                 # The default planner's weights, by robot and with a cut-off, on the engine that it is meant for.
                 for preset in PRESETS if engine == "cpu" else ("paper",):

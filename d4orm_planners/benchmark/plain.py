@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.dynamics import COMMON
 from d4orm_env.core.problem import Problem
 
 
@@ -42,11 +43,13 @@ def plain_team(problem: Problem) -> tuple[str, PlainTeam]:
     """The model's name and the arrays of a problem.
 
     Raises:
-        ValueError: If the team mixes models, which this formulation does not cover.
+        ValueError: If the team mixes models, or has one that this formulation does not cover.
     """
     models = sorted(set(problem.team.models))
     if len(models) > 1:
         raise ValueError(f"the plain formulation moves one model at a time, not {' and '.join(models)}; use an engine")
+    if models[0] not in COMMON:
+        raise ValueError(f"the plain formulation has {', '.join(COMMON)}, not {models[0]}; use an engine")
     team, world = problem.team, problem.world
     arrays = PlainTeam(
         start=problem.start,

@@ -10,10 +10,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from d4orm_env.core.files import replaced_when_done
+from d4orm_planners._machine import describe_machine, versions
 from d4orm_planners.benchmark.benchmark import BenchmarkSettings
 from d4orm_planners.benchmark.timing import Row, Spread
 from d4orm_planners.evaluation.report import table
-from d4orm_planners.machine import describe_machine, versions
 
 FORMAT = "d4orm-bench-1"
 LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "gymnasium", "pettingzoo")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -17,7 +17,9 @@ def bench(
         "bench"
     ),
     quick: Annotated[bool, typer.Option("--quick", help="Small sizes and few repetitions, about a minute.")] = False,
-    robots: Annotated[str | None, typer.Option("--robots", "-k", help="Team sizes, as 4,8,16.")] = None,
+    num_robots: Annotated[
+        str | None, typer.Option("--num-robots", "--robots", "-k", help="Team sizes, as 4,8,16.")
+    ] = None,
     models: Annotated[str | None, typer.Option("--models", help="Robot models, separated by commas.")] = None,
     engines: Annotated[str | None, typer.Option("--engines", help="Of cpu, jax and plain, with commas.")] = None,
     seeds: Annotated[
@@ -30,14 +32,14 @@ def bench(
     from d4orm_planners.benchmark.report import circumstances, write_report
     from d4orm_planners.commands.progress import parts_progress
 
-    given: dict[str, Any] = {
-        "robots": numbers("--robots", robots),
+    given = {
+        "num_robots": numbers("--num-robots", num_robots),
         "models": names(models),
         "engines": names(engines),
         "seeds": seeds,
     }
     chosen = {name: value for name, value in given.items() if value is not None}
-    settings = BenchmarkSettings(**{**(QUICK if quick else {}), **chosen})
+    settings = BenchmarkSettings.from_keywords({**(QUICK if quick else {}), **chosen}, "the benchmark")
     make_folder(out)
     begun = circumstances(" ".join(["d4orm", *sys.argv[1:]]))
     with parts_progress(enabled=not quiet) as progress:

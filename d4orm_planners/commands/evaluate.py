@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from d4orm_planners.commands.dataclass_options import takes
-from d4orm_planners.commands.inputs import (
-    MOST_SEEDS,
-    decimals,
-    make_folder,
-    names,
-    numbers,
-    parse_settings,
-)
-from d4orm_planners.commands.options import Model, Quiet, ScenarioSettings, TimeLimit
+from d4orm_planners.commands.inputs import MOST_SEEDS, decimals, make_folder, names, numbers, parse_settings
+from d4orm_planners.commands.options import Quiet, ScenarioSettings, TimeLimit
 
 if TYPE_CHECKING:
     from d4orm_planners.evaluation.summary import SuccessRate
 
-Noise = Annotated[str, typer.Option("--noise", help="Standard deviations of the execution noise, as 0,0.1.")]
+NoiseLevels = Annotated[
+    str,
+    typer.Option("--control-noise-std", "--noise", help="Standard deviations of the execution noise, as 0,0.1."),
+]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to, and to go on from.")]
 
 
@@ -44,12 +39,18 @@ class StudyOptions:
     scenario: Annotated[
         str, typer.Option("--scenario", "--scenarios", "-s", help="Scenarios or YAML files, separated by commas.")
     ] = "circle"
-    robots: Annotated[
-        str | None, typer.Option("--robots", "-k", help="Team sizes, as 4,8; the scenario's own by default.")
+    num_robots: Annotated[
+        str | None,
+        typer.Option("--num-robots", "--robots", "-k", help="Team sizes, as 4,8; the scenario's own by default."),
     ] = None
-    model: Model = None
+    model: Annotated[
+        str | None, typer.Option("--model", "-m", help="Robot models, as car,unicycle; the scenario's own by default.")
+    ] = None
     scenario_settings: ScenarioSettings = None
-    noise: Noise = "0"
+    seeds: Annotated[
+        str, typer.Option("--seeds", "--trials", "-n", help="How many, or which: 50 for 0 to 49, 10-19, or 3,5,8.")
+    ] = "50"
+    control_noise_std: NoiseLevels = "0"
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="A setting of all policies that have it, or of one, as orca.time_horizon=2."),
@@ -65,7 +66,7 @@ class StudyOptions:
     out: Out = Path("evaluation")
     quiet: Quiet = False
 
-    def run(self, seeds: Iterable[int]) -> list[SuccessRate]:
+    def run(self) -> list[SuccessRate]:
         """Run the trials that are not stored yet, and sum all up.
 
         Raises:
@@ -79,35 +80,28 @@ class StudyOptions:
         study = Study(
             policies=_with_settings(_policies(self.policies or ["d4orm,goal"]), parse_settings(self.settings)),
             scenarios=names(self.scenario) or (),
-            seeds=seeds,
-            control_noise_std=decimals("--noise", self.noise),
-            num_robots=numbers("--robots", self.robots) or (None,),
-            model=self.model,
+            seeds=_seeds(self.seeds),
+            control_noise_std=decimals("--control-noise-std", self.control_noise_std),
+            num_robots=numbers("--num-robots", self.num_robots) or (None,),
+            model=names(self.model),
             scenario_settings=parse_settings(self.scenario_settings, "--scenario-set"),
             time_limit=self.time_limit,
         )
         make_folder(self.out)
-        how: dict[str, Any] = {"trial_timeout": self.trial_timeout, "workers": self.workers, "ray": self.ray}
         with resumable(f"the finished trials are kept in {self.out}", enabled=not self.quiet) as progress:
-            return success_rates(run_study(study, self.out, **how, progress=progress))
+            trials = run_study(
+                study, self.out, trial_timeout=self.trial_timeout, workers=self.workers, ray=self.ray, progress=progress
+            )
+        return success_rates(trials)
 
 
-@dataclass(frozen=True, kw_only=True)
-class EvaluateOptions(StudyOptions):
-    """Those of ``d4orm evaluate``."""
-
-    seeds: Annotated[
-        str, typer.Option("--seeds", "-n", help="How many, or which: 50 for 0 to 49, 10-19, or 3,5,8.")
-    ] = "50"
-
-
-@takes(EvaluateOptions)
-def evaluate(options: EvaluateOptions) -> None:
+@takes(StudyOptions)
+def evaluate(options: StudyOptions) -> None:
     """Compare policies on scenarios, team sizes, seeds and levels of noise; goes on where it was stopped."""
     from d4orm_planners.commands.progress import tell_results
     from d4orm_planners.evaluation.report import PARQUET_HINT, markdown, write_results
 
-    rates = options.run(_seeds(options.seeds))
+    rates = options.run()
     written = write_results(options.out, rates)
     if not options.quiet:
         tell_results(markdown(rates), written)
@@ -141,11 +135,11 @@ def _policies(texts: list[str]) -> dict[str, dict[str, object]]:
     return chosen
 
 
-def _with_settings(chosen: dict[str, dict[str, Any]], settings: dict[str, Any]) -> dict[str, dict[str, object]]:
+def _with_settings(chosen: dict[str, dict[str, object]], settings: dict[str, object]) -> dict[str, dict[str, object]]:
     """Add what ``--set`` says: ``orca.time_horizon`` to one policy, ``num_samples`` to all that have it."""
     from d4orm_planners.registry import setting_names
 
-    policies = {label: given.get("policy", label) for label, given in chosen.items()}
+    policies = {label: str(given.get("policy", label)) for label, given in chosen.items()}
     known = {
         label: setting_names(
             own, {name.removeprefix(f"{own}."): value for name, value in settings.items()} | chosen[label]

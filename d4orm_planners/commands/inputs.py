@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -12,7 +13,7 @@ MOST_SEEDS = 1_000_000
 """Trials of one policy at most: a slip of the finger must not fill the memory."""
 
 
-def parse_settings(settings: list[str] | None, option: str = "--set") -> dict[str, object]:
+def parse_settings(settings: list[str] | None, option: str = "--set") -> dict[str, Any]:
     """``name=value`` texts, given to an option, as a dictionary, the values read as YAML 1.2.
 
     Raises:
@@ -20,7 +21,7 @@ def parse_settings(settings: list[str] | None, option: str = "--set") -> dict[st
     """
     from d4orm_env.core.yaml_text import parse_yaml
 
-    values: dict[str, object] = {}
+    values = {}
     for setting in settings or []:
         name, separator, text = setting.partition("=")
         if not separator or not name:

@@ -57,6 +57,7 @@ def load_node(path: str | os.PathLike[str]) -> NodeTask:
 
 def _task(content: object, folder: Path) -> NodeTask:
     from d4orm_env.core.arrays import duration, whole_number
+    from d4orm_planners.d_d4orm.planner import DD4orm
     from d4orm_planners.registry import make_planner
 
     fields = _mapping("the file", content)
@@ -78,12 +79,13 @@ def _task(content: object, folder: Path) -> NodeTask:
     network = {"transport": "zenoh", "mode": "async", "zenoh": zenoh}
     if not isinstance(fields["out"], str):
         raise ValueError(f"out must be a path, not {fields['out']!r}")
-    planner: Any = make_planner(
+    planner = make_planner(
         "d-d4orm",
         node=whole_number(fields["node"], "node", 0),
         nodes=whole_number(fields["nodes"], "nodes", 1),
         **{"max_iterations": ENDLESS, **settings, **network},
     )
+    assert isinstance(planner, DD4orm)
     return NodeTask(
         planner=planner,
         problem=_problem(fields["problem"], folder),

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
 if TYPE_CHECKING:
-    from d4orm_env.core.problem import Problem
-    from d4orm_env.core.trajectory import Trajectory
     from d4orm_planners.episode import Episode
     from d4orm_planners.plan import Plan
 
@@ -54,16 +51,6 @@ def print_table(title: str, rows: list[tuple[str, str]]) -> None:
     for row in rows:
         table.add_row(*row)
     Console().print(table)
-
-
-def draw(problem: Problem, trajectory: Trajectory, picture: Path | None, animation: Path | None) -> None:
-    """Write the pictures that were asked for."""
-    from d4orm_env.render import save_animation, save_picture
-
-    if picture is not None:
-        save_picture(problem, trajectory, picture)
-    if animation is not None:
-        save_animation(problem, trajectory, animation)
 
 
 def require_solved(plan: Plan) -> None:

@@ -23,7 +23,7 @@ class TrainOptions:
 
     algorithm: Annotated[str, typer.Argument(help="ppo or sac.")]
     scenario: Annotated[str, typer.Option("--scenario", "-s", help="What to learn.")] = "random"
-    robots: Annotated[int, typer.Option("--robots", "-k", help="Size of the full team.")] = 4
+    num_robots: Annotated[int, typer.Option("--num-robots", "--robots", "-k", help="Size of the full team.")] = 4
     steps: Annotated[float, typer.Option("--steps", help="Robot-steps, as 5e6.")] = 5e6
     seed: Annotated[int, typer.Option("--seed", help="Of everything that is drawn.")] = 0
     model: Model = None
@@ -32,7 +32,10 @@ class TrainOptions:
     ] = None
     curriculum: Annotated[bool, typer.Option(help="Begin with smaller teams.")] = False
     lessons: Annotated[int, typer.Option("--lessons", help="Parts with a checkpoint and an evaluation each.")] = 50
-    settings: Annotated[list[str] | None, typer.Option("--set", help="An argument of the scenario, as size=4.")] = None
+    scenario_settings: Annotated[
+        list[str] | None,
+        typer.Option("--scenario-set", "--set", help="An argument of the scenario, as size=4; repeatable."),
+    ] = None
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Folder to write to, and to go on from; runs/ALGORITHM by default."),
@@ -47,11 +50,11 @@ def train(options: TrainOptions) -> None:
     steps = options.steps
     if not (math.isfinite(steps) and steps == int(steps) >= 1):
         raise ValueError(f"--steps is {steps:g}; it must be a whole number of at least 1")
-    same = ("algorithm", "scenario", "robots", "seed", "model", "num_envs", "curriculum", "lessons")
+    same = ("algorithm", "scenario", "num_robots", "seed", "model", "num_envs", "curriculum", "lessons")
     settings = training.TrainingSettings(
         **{name: getattr(options, name) for name in same},
         steps=int(steps),
-        scenario_settings=parse_settings(options.settings),
+        scenario_settings=parse_settings(options.scenario_settings, "--scenario-set"),
     )
     folder = options.out or Path("runs") / options.algorithm
     make_folder(folder)

@@ -11,10 +11,7 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.base import Engine
 from d4orm_env.joint_state import JointState
 from d4orm_planners.d4orm_c2f.background import Background
-from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
-from d4orm_planners.d4orm_d.planner import D4ormD
-from d4orm_planners.d4orm_d.settings import D4ormDConfig
-from d4orm_planners.guidance import (
+from d4orm_planners.d4orm_c2f.coarse import (
     Guidance,
     coarse_problem,
     interpolate,
@@ -23,6 +20,9 @@ from d4orm_planners.guidance import (
     rest_of,
     subgoal_indices,
 )
+from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
+from d4orm_planners.d4orm_d.planner import D4ormD
+from d4orm_planners.d4orm_d.settings import D4ormDConfig
 from d4orm_planners.search import Search
 from d4orm_planners.steering import straight_drives
 

@@ -13,10 +13,10 @@ from d4orm_env.core.seeds import Stream, derived_seed, generator
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_planners.d4orm_c2f.background import Background
+from d4orm_planners.d4orm_c2f.coarse import Guidance
 from d4orm_planners.d4orm_c2f.guide import Guide
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.d4orm_c2f.window import Prediction, Window
-from d4orm_planners.guidance import Guidance
 from d4orm_planners.policy import StatePolicy
 from d4orm_planners.settings import CheckedSettings
 

@@ -14,12 +14,23 @@ from d4orm_planners.d4orm_d.repairs import Repairs
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
 from d4orm_planners.d4orm_d.team import TeamPaths
 from d4orm_planners.grouping import conflicts
+from d4orm_planners.guidance.planner import (
+    Guide,
+    GuidedConfig,
+    better_ways,
+    first_ways,
+    guided_iteration,
+)
 from d4orm_planners.planner import Iteration
 from d4orm_planners.search import Search
 from d4orm_planners.steering import prepare_drives, straight_drives
 
-State = Groups | Repairs
-"""What is kept between iterations, by the way of decoupling."""
+State = Groups | Repairs | Guide
+"""What is kept between iterations, by the way of decoupling, or once ways have been found on a roadmap."""
+
+GUIDED = GuidedConfig()
+GUIDED_AFTER = 6
+"""Iterations without a solution after which ways are looked for on a roadmap."""
 
 
 class D4ormD(D4orm):
@@ -49,6 +60,13 @@ class D4ormD(D4orm):
 
     def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
         """See :meth:`Planner.iterate`: the whole team at first and once nobody fails, the failed robots in between."""
+        if isinstance(state, Guide):
+            state = better_ways(search, state, GUIDED.neighbours, GUIDED.replannings)
+            return state, guided_iteration(search, state)
+        if self.is_guided(search):
+            guide = first_ways(search)
+            if isinstance(guide, Guide):
+                return guide, guided_iteration(search, guide)
         if search.iteration == 0 and not search.current.controls.any():
             drives = self.straight_start(search.problem)
             return self.whole_team(search, state) if drives is None else (state, Iteration(drives))
@@ -58,13 +76,24 @@ class D4ormD(D4orm):
         state = state.replan(team) if isinstance(state, Groups) else state.repair(team, self.config)
         return state, team.iteration()
 
+    def is_guided(self, search: Search) -> bool:
+        """Whether this iteration is to find ways on a roadmap: the first, or one after some without a solution."""
+        if search.iteration == 0:
+            return super().is_guided(search)
+        stuck = search.iteration == GUIDED_AFTER and not search.best.solved and search.problem.world.num_obstacles > 0
+        return stuck and self.config.start == "auto"
+
     def whole_team(self, search: Search, state: State) -> tuple[State, Iteration]:
         """Deform everybody's controls at once; unless in groups, then straight home from wherever that is as good."""
         iteration = self.run(search)
-        if isinstance(state, Groups):
+        if not isinstance(state, Repairs):
             return state, iteration
         team = TeamPaths(self, search, search.engine.rollout(search.problem, iteration.controls))
         return state.shorten(team), replace(iteration, controls=team.controls)
+
+    def is_patient(self, search: Search) -> bool:
+        """See :meth:`D4orm.is_patient`: repairs are what helps here."""
+        return False
 
     def num_samples(self, search: Search) -> int:
         """See :meth:`SamplingPlanner.num_samples`."""

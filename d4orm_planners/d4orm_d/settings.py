@@ -9,7 +9,7 @@ from d4orm_planners.d4orm import D4ormConfig
 from d4orm_planners.settings import Count, Positive, Samples, Steps, one_of
 
 Decoupling = Annotated[str, one_of(("independent", "groups"))]
-Start = Annotated[str, one_of(("auto", "team", "straight"))]
+Start = Annotated[str, one_of(("auto", "team", "straight", "guided"))]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,8 +25,10 @@ class D4ormDConfig(D4ormConfig):
             ``"independent"`` replans robots that have no conflict with each other at once, each by its own reward,
             around all others, and takes over only what is no worse.
         start: What the first iteration does without initial controls. ``"team"`` deforms the whole team at once;
-            ``"straight"`` sends everybody straight to its goal and leaves the rest to repairs; ``"auto"`` does the
-            second where robots so meet less than half of the others on average.
+            ``"straight"`` sends everybody straight to its goal and leaves the rest to repairs; ``"guided"`` finds ways
+            on a roadmap and goes on making them better (:mod:`d4orm_planners.guidance`). ``"auto"`` is guided where
+            obstacles lead somebody far round, or repairs have not helped for some time; else it is straight where
+            robots so meet less than half of the others on average.
         first_collisions: Whether the first iteration over the whole team minds collisions.
         repair_samples: ``M`` of an independent repair. A few are better than many: their error is a search of its own.
         repair_steps: ``N`` of an independent repair.

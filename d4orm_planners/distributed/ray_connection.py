@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from types import ModuleType
 
 PATIENCE = 10.0
 """Seconds to wait for the head of a cluster to answer."""
@@ -13,7 +13,7 @@ PATIENCE = 10.0
 LOOPBACK = ("127.0.0.1", "::1")
 
 
-def import_ray(what: str) -> Any:
+def import_ray(what: str) -> ModuleType:
     """Ray, or an ``ImportError`` that says what needs it and how to install it."""
     try:
         import ray

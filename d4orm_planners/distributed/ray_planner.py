@@ -9,6 +9,7 @@ from math import ceil
 from types import ModuleType
 from typing import Any, NamedTuple
 
+from d4orm_env.core.errors import first_line
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.threads import available_cores
@@ -122,7 +123,7 @@ class RayPlanner(Planner):
             raise error.cause from error
         except (self._ray.exceptions.RayError, TimeoutError) as error:
             raise ConnectionError(
-                f"the actor of node {self._node} does not start ({_first_line(error)}); "
+                f"the actor of node {self._node} does not start ({first_line(error)}); "
                 "check that d4orm-env is installed on every machine of the cluster"
             ) from error
 
@@ -157,7 +158,7 @@ class RayPlanner(Planner):
         except self._ray.exceptions.RayTaskError as error:
             raise error.cause from error
         except self._ray.exceptions.RayError as error:
-            raise ChildProcessError(f"its actor was lost for good ({_first_line(error)})") from error
+            raise ChildProcessError(f"its actor was lost for good ({first_line(error)})") from error
         return outcome
 
 
@@ -196,7 +197,3 @@ def _message(node: int, search: Search) -> bytes:
     candidate = search.current
     message = Message(node, search.iteration, candidate.planned, candidate.reward, bool(candidate.solved))
     return encode(message, search.problem)
-
-
-def _first_line(error: BaseException) -> str:
-    return next(iter(str(error).splitlines()), type(error).__name__)

@@ -12,7 +12,6 @@ import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from types import ModuleType
-from typing import Any
 
 from d4orm_env.core.arrays import duration
 from d4orm_planners.distributed.messages import MAX_BYTES
@@ -194,7 +193,7 @@ def _import_zenoh() -> ModuleType:
     return zenoh
 
 
-def _config(zenoh: ModuleType, settings: ZenohSettings) -> Any:
+def _config(zenoh: ModuleType, settings: ZenohSettings) -> object:
     """Zenoh's own configuration."""
     config = plain = zenoh.Config()
     if settings.config_file is not None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from itertools import count
-from typing import Any
 
 from d4orm_env.core.errors import describe
 from d4orm_planners.distributed.ray_connection import RayConnection
@@ -38,7 +37,7 @@ class RayPool:
         self._size = size or QUEUED * max(cores, 1)
         # A generator's results come back one by one, so that what is done is not lost with the process.
         self._task = self._ray.remote(num_cpus=1, max_retries=0)(_work)
-        self._jobs: dict[object, int] = {}
+        self._jobs: dict[Iterator[object], int] = {}
         self._tickets = count()
 
     def free(self) -> bool:
@@ -64,7 +63,7 @@ class RayPool:
             self._ray.cancel(task, force=True)
         self._connection.close()
 
-    def _next(self, task: Any) -> Trial | Sign | Lost:
+    def _next(self, task: Iterator[object]) -> Trial | Sign | Lost:
         try:
             content: Trial | Sign = self._ray.get(next(task))
         except (self._ray.exceptions.RayError, StopIteration) as error:

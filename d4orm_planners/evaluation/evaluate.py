@@ -32,7 +32,7 @@ def evaluate(
     seeds: Iterable[int] = range(50),
     control_noise_std: float | Iterable[float] = 0.0,
     num_robots: int | Iterable[int | None] | None = None,
-    model: str | None = None,
+    model: str | Iterable[str | None] | None = None,
     scenario_settings: Mapping[str, object] | None = None,
     time_limit: float | None = None,
     trial_timeout: float | None = None,
@@ -58,7 +58,7 @@ def evaluate(
         seeds: Each seeds the scenario, the policy and the noise of a trial.
         control_noise_std: Standard deviations of the Gaussian noise added to the controls, in their units.
         num_robots: Team sizes for scenarios by name; ``None`` is the scenario's own.
-        model: Robot model for scenarios by name; ``None`` is the scenario's own.
+        model: Robot models for scenarios by name; ``None`` is the scenario's own.
         scenario_settings: Further arguments of the scenarios by name, as ``{"corridor_width": 0.8}``; every one of them
             must take all of these. The results name them behind the scenario.
         time_limit: Seconds for planning, for planners without a ``time_limit`` of their own.
@@ -69,7 +69,7 @@ def evaluate(
         progress: Called as ``progress(what, trials done, trials in all)``.
 
     Returns:
-        One row per scenario, team size, policy and level of noise, in that order.
+        One row per scenario, model, team size, policy and level of noise, in that order.
 
     Raises:
         ValueError: For an unknown name, a number that makes no sense, a policy of your own that worker processes cannot
@@ -108,8 +108,8 @@ def run_study(
     For the arguments and errors see :func:`evaluate`.
 
     Returns:
-        Trials, one per seed, behind the policy's label, for every scenario, team size, policy and level of noise, in
-        that order.
+        Trials, one per seed, behind the policy's label, for every scenario, model, team size, policy and level of
+        noise, in that order.
     """
     if trial_timeout is not None:
         trial_timeout = duration(trial_timeout, "trial_timeout")
@@ -125,7 +125,7 @@ def run_study(
     return [
         (group[0].policy.label, [stored[job.key(level)] for job in group])
         for group in groups
-        for level in group[0].noise
+        for level in group[0].control_noise_std
     ]
 
 
@@ -135,13 +135,13 @@ def _missing(jobs: Sequence[Job], store: TrialStore) -> tuple[list[Job], int, in
     wanted: set[TrialKey] = set()
     missing = []
     for job in jobs:
-        keys = {level: job.key(level) for level in job.noise}
+        keys = {level: job.key(level) for level in job.control_noise_std}
         # The same problem may be asked for under two names.
         left = tuple(level for level, key in keys.items() if key not in finished and key not in wanted)
         wanted.update(keys.values())
         if left:
-            missing.append(replace(job, noise=left))
-    return missing, len(wanted) - sum(len(job.noise) for job in missing), len(wanted)
+            missing.append(replace(job, control_noise_std=left))
+    return missing, len(wanted) - sum(len(job.control_noise_std) for job in missing), len(wanted)
 
 
 def _run(
@@ -168,6 +168,6 @@ def _store(running: Generator[list[Trial]], store: TrialStore, done: int, total:
             written = writer.submit(store.add, *trials)
             done += len(trials)
             last = trials[-1]
-            progress(f"{last.label}, {last.scenario}, {last.robots} robots", done, total)
+            progress(f"{last.label}, {last.scenario}, {last.num_robots} robots", done, total)
     if written is not None:
         written.result()

@@ -41,7 +41,7 @@ def leaderboard(trials: Sequence[Trial], deadlines: Sequence[float] = ()) -> str
     blocks = [INTRODUCTION, "## Success", *_matrices(rates), "## Scenario by scenario"]
     for title, panel in panels(rates).items():
         # The best first, at every level of noise.
-        ranked = sorted(panel, key=lambda rate: (rate.noise, -rate.rate, rate.travel_time or float("inf")))
+        ranked = sorted(panel, key=lambda rate: (rate.control_noise_std, -rate.rate, rate.travel_time or float("inf")))
         blocks.append(table(title, HEADER, [cells(rate) for rate in ranked]))
     if deadlines:
         blocks += ["## Success within a deadline for planning", WITHIN, *_deadlines(groups, deadlines)]
@@ -54,7 +54,8 @@ def _groups(trials: Sequence[Trial]) -> dict[tuple[str, str, int, str, float], l
     groups: dict[tuple[str, str, int, str, float], list[Trial]] = {}
     for trial in trials:
         label = labels[trial.label, trial.config]
-        groups.setdefault((label, trial.scenario, trial.robots, trial.model, trial.noise), []).append(trial)
+        key = (label, trial.scenario, trial.num_robots, trial.model, trial.control_noise_std)
+        groups.setdefault(key, []).append(trial)
     return {key: groups[key] for key in sorted(groups, key=lambda key: (*key[1:], key[0]))}
 
 
@@ -74,21 +75,22 @@ def _labels(trials: Iterable[Trial]) -> dict[tuple[str, str], str]:
 
 
 def _matrices(rates: Sequence[SuccessRate]) -> list[str]:
-    """Policies against scenarios, one table per level of noise."""
-    columns = panels(rates)
+    """Policies against scenarios, one table per robot model and level of noise."""
     blocks = []
-    for noise in sorted({rate.noise for rate in rates}):
+    for model, noise in sorted({(rate.model, rate.control_noise_std) for rate in rates}):
+        columns = panels(rate for rate in rates if rate.model == model)
         found = {
             (rate.label, title): share(rate)
             for title, panel in columns.items()
             for rate in panel
-            if rate.noise == noise
+            if rate.control_noise_std == noise
         }
         rows = [
             (label, *(found.get((label, title), "-") for title in columns))
             for label in sorted({label for label, _ in found})
         ]
-        blocks.append(table("No noise" if noise == 0 else f"Noise {noise:g}", ("policy", *columns), rows))
+        title = f"{model}, noise {noise:g}" if noise else f"{model}, no noise"
+        blocks.append(table(title, ("policy", *columns), rows))
     return blocks
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
@@ -56,7 +56,7 @@ def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate
     paths = [Path(folder, f"robustness.{kind}") for kind in ("csv", "md", "png")]
     _write_rates(paths[0], rates)
     with target(paths[1]) as path:
-        path.write_text(robustness_markdown(rates), encoding="utf-8")
+        path.write_text(markdown(rates), encoding="utf-8")
     with target(paths[2]) as path:
         _draw(path, rates)
     return paths
@@ -122,22 +122,7 @@ def target(path: Path) -> Iterator[Path]:
 
 def markdown(rates: Sequence[SuccessRate]) -> str:
     """One table per scenario and team, with errors below. Intervals of means stand in brackets."""
-    return _tables(rates, HEADER, cells)
-
-
-def robustness_markdown(rates: Sequence[SuccessRate]) -> str:
-    """:func:`markdown` without the verdicts, the intervals of means and computing."""
-    header = (*HEADER[:4], *HEADER[5:-1])
-
-    def row(rate: SuccessRate) -> tuple[str, ...]:
-        cell = cells(rate)
-        return *cell[:4], *cell[5:8], cell[8].partition(" ")[0], *cell[9:11]
-
-    return _tables(rates, header, row)
-
-
-def _tables(rates: Sequence[SuccessRate], header: Sequence[str], row: Callable[[SuccessRate], tuple[str, ...]]) -> str:
-    blocks = [table(title, header, [row(rate) for rate in group]) for title, group in panels(rates).items()]
+    blocks = [table(title, HEADER, [cells(rate) for rate in group]) for title, group in panels(rates).items()]
     return "\n\n".join([*blocks, *errors((rate.label, rate.error) for rate in rates)]) + "\n"
 
 
@@ -145,7 +130,7 @@ def cells(rate: SuccessRate) -> tuple[str, ...]:
     """A row under :data:`HEADER`."""
     return (
         rate.label,
-        f"{rate.noise:g}",
+        f"{rate.control_noise_std:g}",
         f"{rate.successes} of {rate.trials} ({rate.rate:.0%})",
         f"{rate.lower:.0%} to {rate.upper:.0%}",
         *(str(count) for count in (rate.verified, rate.contacts, rate.late, rate.errors)),
@@ -186,7 +171,7 @@ def panels(rates: Iterable[SuccessRate]) -> dict[str, list[SuccessRate]]:
     """Rates by scenario, team size and models, as titles, in order of appearance."""
     groups: dict[str, list[SuccessRate]] = {}
     for rate in rates:
-        groups.setdefault(f"{rate.scenario}, {rate.robots} robots, {rate.model}", []).append(rate)
+        groups.setdefault(f"{rate.scenario}, {rate.num_robots} robots, {rate.model}", []).append(rate)
     return groups
 
 
@@ -210,8 +195,8 @@ def _draw(path: Path, rates: Sequence[SuccessRate]) -> None:
         ax.set_visible(False)
     for ax, (title, group) in zip(axes, groups.items()):
         for policy in dict.fromkeys(rate.label for rate in group):
-            line = sorted((rate for rate in group if rate.label == policy), key=lambda rate: rate.noise)
-            noise = [rate.noise for rate in line]
+            line = sorted((rate for rate in group if rate.label == policy), key=lambda rate: rate.control_noise_std)
+            noise = [rate.control_noise_std for rate in line]
             (drawn,) = ax.plot(noise, [rate.rate for rate in line], marker="o", label=policy, clip_on=False)
             lower, upper = [rate.lower for rate in line], [rate.upper for rate in line]
             ax.fill_between(noise, lower, upper, color=drawn.get_color(), alpha=0.15, linewidth=0)

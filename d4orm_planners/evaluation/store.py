@@ -15,7 +15,9 @@ from typing import Any, NamedTuple
 
 APPLICATION_ID = 0x64346F72
 """Marks the file as one of ours, in its header ("d4or")."""
-VERSION = 4
+VERSION = 5
+READABLE = (4, VERSION)
+"""Of version 4 some columns have other names, and one is missing."""
 STORE = "trials.sqlite"
 """Name of the file in a folder of results."""
 LARGEST_NUMBER = 2**63 - 1
@@ -31,14 +33,14 @@ class TrialKey(NamedTuple):
         policy: Registry name.
         config: All settings of the policy, as JSON with sorted keys.
         problem: :attr:`d4orm_env.core.problem.Problem.digest`.
-        noise: Standard deviation of the execution noise, in the controls' units.
+        control_noise_std: Standard deviation of the execution noise, in the controls' units.
         seed: Seed of the episode: of the policy and of the noise.
     """
 
     policy: str
     config: str
     problem: str
-    noise: float
+    control_noise_std: float
     seed: int
 
 
@@ -51,7 +53,7 @@ class Trial:
     Attributes:
         label: What the policy with these settings was called.
         scenario: Name of the scenario, with the arguments that it was given.
-        robots: Team size.
+        num_robots: Team size.
         model: Model names of the team, each once, joined by ``+``.
         dt: Time step [s].
         versions: Versions of the libraries, as JSON; ``{}`` where the process was lost.
@@ -86,11 +88,11 @@ class Trial:
     policy: str
     config: str
     problem: str
-    noise: float
+    control_noise_std: float
     seed: int
     label: str
     scenario: str
-    robots: int
+    num_robots: int
     model: str
     dt: float
     versions: str = "{}"
@@ -120,11 +122,13 @@ class Trial:
 
     @property
     def key(self) -> TrialKey:
-        return TrialKey(self.policy, self.config, self.problem, self.noise, self.seed)
+        return TrialKey(self.policy, self.config, self.problem, self.control_noise_std, self.seed)
 
 
 _NAMES = tuple(field.name for field in fields(Trial))
 _KEY = ", ".join(TrialKey._fields)
+_FORMER = {"num_robots": "robots", "control_noise_std": "noise"}
+"""Columns that had other names in version 4."""
 _TRUTHS = ("success", "verified")
 _JSON = {"config": dict, "versions": dict, "machine": dict, "history": list}
 _SQL = {"str": "TEXT", "int": "INTEGER", "float": "REAL", "bool": "INTEGER"}
@@ -169,7 +173,6 @@ class TrialStore:
                 self._make(connection)
             self._check(connection)
             if not read_only:
-                _add_columns(connection)
                 _use_wal(connection)
 
     @classmethod
@@ -208,9 +211,10 @@ class TrialStore:
     def trials(self) -> list[Trial]:
         """All trials, in order of key."""
         with self._connection() as connection:
-            missing = _missing_columns(connection)
-            columns = (f"NULL AS {name}" if name in missing else name for name in _NAMES)
-            rows = connection.execute(f"SELECT {', '.join(columns)} FROM trials ORDER BY {_KEY}").fetchall()
+            there = _columns(connection)
+            former = {name: name if name in there else _FORMER.get(name, "NULL") for name in _NAMES}
+            columns = ", ".join(f"{column} AS {name}" for name, column in former.items())
+            rows = connection.execute(f"SELECT {columns} FROM trials ORDER BY {_KEY}").fetchall()
         return [self._trial(number, dict(zip(_NAMES, row))) for number, row in enumerate(rows)]
 
     def _trial(self, number: int, values: dict[str, Any]) -> Trial:
@@ -258,7 +262,7 @@ class TrialStore:
         return sqlite3.connect(name, uri=True, timeout=PATIENCE, isolation_level=None)
 
     def _make(self, connection: sqlite3.Connection) -> None:
-        """Make the table in a new file."""
+        """Make the table in a new file, or give one from before the columns of now."""
         if _pragma(connection, "application_id") != APPLICATION_ID:
             # One transaction, so that of two processes that find no file one makes the table.
             connection.execute("BEGIN IMMEDIATE")
@@ -267,12 +271,20 @@ class TrialStore:
                 connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
                 connection.execute(f"PRAGMA user_version = {VERSION}")
             connection.execute("COMMIT")
+        elif _pragma(connection, "user_version") in READABLE and set(_NAMES) - _columns(connection):
+            connection.execute("BEGIN IMMEDIATE")
+            for name in set(_NAMES) - _columns(connection):
+                former = _FORMER.get(name)
+                change = f"RENAME COLUMN {former} TO {name}" if former else f"ADD COLUMN {_COLUMNS[name]}"
+                connection.execute(f"ALTER TABLE trials {change}")
+            connection.execute(f"PRAGMA user_version = {VERSION}")
+            connection.execute("COMMIT")
 
     def _check(self, connection: sqlite3.Connection) -> None:
         """Refuse a file of another kind or version, which stays untouched."""
         if _pragma(connection, "application_id") != APPLICATION_ID:
             raise self._foreign("it is another program's database")
-        if (version := _pragma(connection, "user_version")) != VERSION:
+        if (version := _pragma(connection, "user_version")) not in READABLE:
             raise self._foreign(f"it has version {version}, and this program reads version {VERSION}")
 
     def _foreign(self, reason: str) -> ValueError:
@@ -284,17 +296,8 @@ class TrialStore:
         )
 
 
-def _missing_columns(connection: sqlite3.Connection) -> set[str]:
-    """Columns that the table lacks, because an older version made it."""
-    return set(_NAMES) - {row[1] for row in connection.execute("PRAGMA table_info(trials)")}
-
-
-def _add_columns(connection: sqlite3.Connection) -> None:
-    if _missing_columns(connection):
-        connection.execute("BEGIN IMMEDIATE")
-        for name in _missing_columns(connection):
-            connection.execute(f"ALTER TABLE trials ADD COLUMN {_COLUMNS[name]}")
-        connection.execute("COMMIT")
+def _columns(connection: sqlite3.Connection) -> set[str]:
+    return {row[1] for row in connection.execute("PRAGMA table_info(trials)")}
 
 
 def _use_wal(connection: sqlite3.Connection) -> None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 from d4orm_env.core.arrays import duration, positive_number, shown, whole_number
 from d4orm_env.core.problem import Problem
@@ -15,6 +16,8 @@ from d4orm_env.scenarios.problems import is_scenario_file
 from d4orm_planners.evaluation.store import LARGEST_NUMBER
 from d4orm_planners.evaluation.trials import Configuration, Job
 from d4orm_planners.registry import PolicyLike, is_brought, list_policies, make_policy, origin
+
+T = TypeVar("T")
 
 Policies: TypeAlias = PolicyLike | Iterable[PolicyLike] | Mapping[str, PolicyLike | Mapping[str, object]]
 Scenario: TypeAlias = str | os.PathLike[str] | Problem | Callable[..., Problem]
@@ -34,21 +37,23 @@ class Study:
     seeds: Iterable[int] = range(50)
     control_noise_std: float | Iterable[float] = 0.0
     num_robots: int | Iterable[int | None] | None = None
-    model: str | None = None
+    model: str | Iterable[str | None] | None = None
     scenario_settings: Mapping[str, object] = field(default_factory=dict)
     time_limit: float | None = None
 
     def groups(self) -> list[list[Job]]:
-        """A list of jobs per scenario, team size and policy, in that order, with one for every seed.
+        """A list of jobs per scenario, model, team size and policy, in that order, with one for every seed.
 
         Raises:
             ValueError: For an unknown name or setting, a number that makes no sense, or nothing to do.
             ImportError: If a policy needs a library that is not installed.
         """
-        given = (positive_number(level, "noise", zero_allowed=True) for level in _several(self.control_noise_std))
-        levels = tuple(dict.fromkeys(given))
+        noise = (
+            positive_number(std, "control_noise_std", zero_allowed=True) for std in _several(self.control_noise_std)
+        )
+        levels = tuple(dict.fromkeys(noise))
         if not levels:
-            raise ValueError("noise is empty; give at least one level")
+            raise ValueError("control_noise_std is empty; give at least one level")
         policies, seeds = self.configurations(), _checked_seeds(self.seeds)
         return [
             [Job(policy, problem, scenario, seed, levels) for seed, problem in zip(seeds, problems)]
@@ -84,15 +89,17 @@ class Study:
         return choice
 
     def _problems(self, seeds: Sequence[int]) -> list[tuple[str, list[Problem]]]:
-        """A name and a list per scenario and team size, with a problem for every seed."""
-        sizes = tuple(dict.fromkeys(_several(self.num_robots)))
+        """A name and a list per scenario, model and team size, with a problem for every seed."""
         for name, own in (("num_robots", "num_robots"), ("model", "model"), ("seed", "seeds")):
             if name in self.scenario_settings:
                 raise ValueError(f"scenario_settings has {name!r}; give {own!r} itself instead")
         said = ", ".join(f"{name}={value}" for name, value in self.scenario_settings.items())
+        sizes = dict.fromkeys(_several(self.num_robots))
+        models: tuple[str | None, ...] = _several(self.model)
         cells = []
         named = False
-        for scenario in dict.fromkeys(_several(self.scenarios)):
+        scenarios: tuple[Scenario, ...] = _several(self.scenarios)
+        for scenario in dict.fromkeys(scenarios):
             if isinstance(scenario, Problem):
                 cells.append((scenario.name, [scenario] * len(seeds)))
             elif is_scenario_file(scenario):
@@ -100,15 +107,14 @@ class Study:
                 cells.append((problem.name, [problem] * len(seeds)))
             else:
                 named = True
-                for size in sizes:
+                for model, size in product(dict.fromkeys(models), sizes):
                     problems = [
-                        make_problem(scenario, num_robots=size, seed=seed, model=self.model, **self.scenario_settings)
-                        for seed in seeds
+                        make_problem(scenario, size, seed, model=model, **self.scenario_settings) for seed in seeds
                     ]
                     cells.append((f"{problems[0].name} ({said})" if said else problems[0].name, problems))
         if not cells:
-            raise ValueError("scenarios or num_robots is empty; give at least one of each")
-        if not named and (self.model is not None or self.scenario_settings or any(size is not None for size in sizes)):
+            raise ValueError("scenarios, num_robots or model is empty; give at least one of each")
+        if not named and (said or any(given is not None for given in (*models, *sizes))):
             raise ValueError(
                 "num_robots, model and scenario_settings do not go with scenario files; change them in the files"
             )
@@ -120,7 +126,8 @@ def _labelled(policies: Policies) -> dict[str, tuple[PolicyLike, dict[str, objec
     if isinstance(policies, Mapping):
         return {_checked_label(label): _checked(label, given) for label, given in policies.items()}
     labelled: dict[str, tuple[PolicyLike, dict[str, object]]] = {}
-    for policy in _several(policies):
+    several: tuple[PolicyLike, ...] = _several(policies)
+    for policy in several:
         label = policy if isinstance(policy, str) else getattr(policy, "__name__", type(policy).__name__)
         if not (isinstance(policy, str) or is_brought(policy)):
             _checked_label(policy)
@@ -174,7 +181,8 @@ def _checked_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
     return checked
 
 
-def _several(values: Any) -> tuple[Any, ...]:
+def _several(values: T | Iterable[T]) -> tuple[T, ...]:
     """One value, or several."""
-    alone = isinstance(values, str | os.PathLike) or not isinstance(values, Iterable)
-    return (values,) if alone else tuple(values)
+    if isinstance(values, str | os.PathLike) or not isinstance(values, Iterable):
+        return (values,)
+    return tuple(values)

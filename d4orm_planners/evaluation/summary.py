@@ -12,25 +12,70 @@ from d4orm_env.core.arrays import positive_number
 from d4orm_planners.evaluation.store import Trial
 
 
-@dataclass(frozen=True)
-class SuccessRate:
-    """How often a policy succeeded at one level of noise, and how long it took. Intervals are those of 95% confidence.
+@dataclass(frozen=True, kw_only=True)
+class Compared:
+    """How often a policy succeeded on one scenario, model and team size, at one level of noise.
 
     Attributes:
         label: What the policy with its settings was called.
         policy: Registry name.
         scenario: Scenario name.
-        robots: Team size.
+        num_robots: Team size.
         model: Models of the team.
-        noise: Standard deviation of the execution noise, in the controls' units.
+        control_noise_std: Standard deviation of the execution noise, in the controls' units.
         trials: Trials, those with an error included.
-        successes: Those in which everyone arrived in time and none was ever in contact.
-        verified: Those with whose executed controls :func:`d4orm_env.verify` found no fault.
+        successes: Those that succeeded.
+        lower: Lower end of the 95% confidence interval of the success rate (Wilson).
+        upper: Upper end.
+        errors: Trials that raised an error; they count as failures.
+        error: The first error.
+    """
+
+    label: str
+    policy: str
+    scenario: str
+    num_robots: int
+    model: str
+    control_noise_std: float
+    trials: int
+    successes: int
+    lower: float
+    upper: float
+    errors: int
+    error: str
+
+    @property
+    def rate(self) -> float:
+        return self.successes / self.trials
+
+    @staticmethod
+    def of(trials: Sequence[Trial], successes: int, label: str) -> Compared:
+        """What the trials, at least one, have in common, so many of which succeeded."""
+        first, errors = trials[0], [trial.error for trial in trials if trial.error]
+        lower, upper = wilson_interval(successes, len(trials))
+        same = ("policy", "scenario", "num_robots", "model", "control_noise_std")
+        return Compared(
+            label=label,
+            **{name: getattr(first, name) for name in same},
+            trials=len(trials),
+            successes=successes,
+            lower=lower,
+            upper=upper,
+            errors=len(errors),
+            error=errors[0] if errors else "",
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuccessRate(Compared):
+    """How often everyone arrived in time and none was ever in contact, and how long it took.
+
+    Intervals are of 95% confidence.
+
+    Attributes:
+        verified: Trials with whose executed controls :func:`d4orm_env.verify` found no fault.
         contacts: Those in which robots touched something.
         late: Those in which somebody did not arrive in time.
-        errors: Those that raised an error; they count as failures.
-        lower: Lower end of the interval of the success rate (Wilson).
-        upper: Upper end.
         travel_time: Mean over the successes of the mean arrival time [s]; ``None`` without any.
         travel_time_lower: Lower end of its interval (Student's t); ``None`` with fewer than two successes.
         travel_time_upper: Upper end.
@@ -39,23 +84,11 @@ class SuccessRate:
         compute: Mean seconds of planning, or of choosing actions, per second of motion, likewise.
         compute_lower: Lower end of its interval (Student's t); ``None`` with fewer than two trials.
         compute_upper: Upper end.
-        error: The first error.
     """
 
-    label: str
-    policy: str
-    scenario: str
-    robots: int
-    model: str
-    noise: float
-    trials: int
-    successes: int
     verified: int
     contacts: int
     late: int
-    errors: int
-    lower: float
-    upper: float
     travel_time: float | None
     travel_time_lower: float | None
     travel_time_upper: float | None
@@ -64,11 +97,6 @@ class SuccessRate:
     compute: float | None
     compute_lower: float | None
     compute_upper: float | None
-    error: str
-
-    @property
-    def rate(self) -> float:
-        return self.successes / self.trials
 
 
 @dataclass(frozen=True)
@@ -141,29 +169,16 @@ def success_rate(trials: Sequence[Trial], label: str | None = None) -> SuccessRa
         trials: The trials.
         label: What to call the policy; by default what the first trial calls it.
     """
-    first, count = trials[0], len(trials)
     successes = [trial for trial in trials if trial.success]
-    errors = [trial.error for trial in trials if trial.error]
-    lower, upper = wilson_interval(len(successes), count)
     travel = mean_interval([trial.travel_time for trial in successes if trial.travel_time is not None])
     stretch = [trial.stretch for trial in successes if trial.stretch is not None]
     timed = [(trial.wall_time, trial.steps * trial.dt) for trial in trials if trial.wall_time is not None]
     compute = mean_interval([seconds / motion for seconds, motion in timed if motion > 0])
     return SuccessRate(
-        label=first.label if label is None else label,
-        policy=first.policy,
-        scenario=first.scenario,
-        robots=first.robots,
-        model=first.model,
-        noise=first.noise,
-        trials=count,
-        successes=len(successes),
+        **vars(Compared.of(trials, len(successes), trials[0].label if label is None else label)),
         verified=sum(trial.verified is True for trial in trials),
         contacts=sum(trial.collided > 0 for trial in trials),
-        late=sum(not trial.error and trial.arrived < trial.robots for trial in trials),
-        errors=len(errors),
-        lower=lower,
-        upper=upper,
+        late=sum(not trial.error and trial.arrived < trial.num_robots for trial in trials),
         travel_time=travel[0],
         travel_time_lower=travel[1],
         travel_time_upper=travel[2],
@@ -172,7 +187,6 @@ def success_rate(trials: Sequence[Trial], label: str | None = None) -> SuccessRa
         compute=compute[0],
         compute_lower=compute[1],
         compute_upper=compute[2],
-        error=errors[0] if errors else "",
     )
 
 

@@ -17,9 +17,9 @@ from d4orm_env import navigation_v0, verify
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.errors import UnknownKeywordError, describe
 from d4orm_env.core.problem import Problem
+from d4orm_planners._machine import describe_machine, versions
 from d4orm_planners.episode import run_episode
 from d4orm_planners.evaluation.store import Trial, TrialKey
-from d4orm_planners.machine import describe_machine, versions
 from d4orm_planners.plan import IterationRecord, Plan
 from d4orm_planners.policy import Actions, Observations, OpenLoop, Policy
 from d4orm_planners.registry import is_planned, make_policy, policy_settings
@@ -83,14 +83,14 @@ class Job:
         problem: The problem.
         scenario: What it is called in the results.
         seed: Of the policy and of the noise.
-        noise: Standard deviations of the execution noise, in the controls' units.
+        control_noise_std: Standard deviations of the execution noise, in the controls' units.
     """
 
     policy: Configuration
     problem: Problem
     scenario: str
     seed: int
-    noise: tuple[float, ...]
+    control_noise_std: tuple[float, ...]
 
     def key(self, noise: float) -> TrialKey:
         """Of the trial at one level of noise."""
@@ -102,7 +102,7 @@ class Job:
             **self.key(noise)._asdict(),
             label=self.policy.label,
             scenario=self.scenario,
-            robots=self.problem.num_robots,
+            num_robots=self.problem.num_robots,
             model="+".join(sorted(set(self.problem.team.models))),
             dt=self.problem.dt,
             date=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -119,7 +119,7 @@ def run_job(job: Job) -> Iterator[Trial]:
         KeyboardInterrupt: If Ctrl-C was pressed meanwhile.
     """
     timed: _TimedPolicy | None = None
-    for noise in job.noise:
+    for noise in job.control_noise_std:
         begin = time.perf_counter()
         error, outcome = "", {}
         try:

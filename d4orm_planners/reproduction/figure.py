@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Literal
 
 from d4orm_env.core.arrays import whole_number
 from d4orm_planners.evaluation.evaluate import Progress, run_study
@@ -15,7 +15,7 @@ from d4orm_planners.evaluation.study import Study
 
 PaperNumbers = Mapping[tuple[str, str, str], Mapping[str, str]]
 """By section, label and metric: what the paper says, by column."""
-Across = Literal["robots", "nodes", "scenario", "noise", "policy"]
+Across = Literal["num_robots", "nodes", "scenario", "control_noise_std", "policy"]
 
 _FEW: dict[str, object] = {"num_samples": 64, "num_steps": 10, "max_iterations": 3}
 QUICK_SETTINGS: Mapping[str, Mapping[str, object]] = MappingProxyType({
@@ -34,59 +34,46 @@ QUICK_TIME_LIMIT = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Section:
-    """Policies that meet the same problems: a panel of a figure, or a table.
+class Section(Study):
+    """A study whose policies meet the same problems: a panel of a figure, or a table.
 
     Attributes:
         title: The paper's name of it.
-        policies: Settings by label, see :func:`~d4orm_planners.evaluation.evaluate.evaluate`.
-        scenarios: Scenario names.
-        robots: Team sizes; ``None`` is the scenario's own.
-        quick_robots: Those of the quick version.
-        model: Robot model; ``None`` is the scenario's own.
+        quick_robots: Team sizes of the quick version.
         nodes: Numbers of nodes that every policy is run with; none leaves it to their other settings.
-        noise: Standard deviations of the execution noise, in the controls' units.
-        time_limit: Seconds after which planners begin no further iteration; ``None`` leaves it to their other settings.
     """
 
     title: str
-    policies: Mapping[str, Mapping[str, Any]]
+    policies: Mapping[str, Mapping[str, object]]
     scenarios: tuple[str, ...]
-    robots: tuple[int | None, ...] = (None,)
+    num_robots: tuple[int | None, ...] = (None,)
+    control_noise_std: tuple[float, ...] = (0.0,)
     quick_robots: tuple[int | None, ...] = (2,)
-    model: str | None = None
     nodes: tuple[int, ...] = ()
-    noise: tuple[float, ...] = (0.0,)
-    time_limit: float | None = None
 
     def studies(self, seeds: int) -> list[Study]:
         """One study with the policies, or one for every number of nodes."""
+        variants = [{"nodes": number} for number in self.nodes] or [{}]
         return [
-            Study(
-                policies={label: {**settings, **nodes} for label, settings in self.policies.items()},
-                scenarios=self.scenarios,
-                seeds=range(seeds),
-                control_noise_std=self.noise,
-                num_robots=self.robots,
-                model=self.model,
-                time_limit=self.time_limit,
+            replace(
+                self, seeds=range(seeds), policies={label: {**own, **nodes} for label, own in self.policies.items()}
             )
-            for nodes in ([{"nodes": number} for number in self.nodes] or [{}])
+            for nodes in variants
         ]
 
     def quick(self) -> Section:
         """The same in a few seconds: tiny teams, few samples; of scenarios, nodes and levels of noise two at most."""
         policies = {
-            label: {**settings, **QUICK_SETTINGS.get(settings.get("policy", label), {})}
+            label: {**settings, **QUICK_SETTINGS.get(str(settings.get("policy", label)), {})}
             for label, settings in self.policies.items()
         }
         return replace(
             self,
             policies=policies,
             scenarios=self.scenarios[:2],
-            robots=self.quick_robots,
+            num_robots=self.quick_robots,
             nodes=self.nodes[:2],
-            noise=tuple(dict.fromkeys((self.noise[0], self.noise[-1]))),
+            control_noise_std=tuple(dict.fromkeys((self.control_noise_std[0], self.control_noise_std[-1]))),
             time_limit=None if self.time_limit is None else min(self.time_limit, QUICK_TIME_LIMIT),
         )
 

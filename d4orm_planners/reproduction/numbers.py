@@ -10,27 +10,16 @@ from types import MappingProxyType
 import numpy as np
 
 from d4orm_planners.evaluation.store import Trial
-from d4orm_planners.evaluation.summary import wilson_interval
+from d4orm_planners.evaluation.summary import Compared
 from d4orm_planners.reproduction.figure import Figure, Group
 
 
 @dataclass(frozen=True, kw_only=True)
-class Measured:
-    """One policy on one scenario, team size and level of noise. All but counts and reward is over the successes.
+class Measured(Compared):
+    """One policy on one problem. All but counts and reward is over the successes, see :func:`first_solution`.
 
     Attributes:
         section: Title of the section.
-        label: What the policy is called.
-        policy: Registry name.
-        scenario: Scenario name.
-        robots: Team size.
-        model: Models of the team.
-        noise: Standard deviation of the execution noise, in the controls' units.
-        trials: Trials.
-        successes: See :func:`first_solution`; with noise, trials in which all arrived and none touched anything.
-        lower: Lower end of the 95% confidence interval of the success rate (Wilson).
-        upper: Upper end.
-        errors: Trials that raised an error; they count as failures.
         runtime: Median seconds to the first solution; ``None`` without successes, as all below.
         runtime_lower: Lower quartile.
         runtime_upper: Upper quartile.
@@ -47,21 +36,9 @@ class Measured:
         message_bytes: Mean of their length together.
         waiting_share: Mean share of the nodes' time that they waited for each other.
         step_time: Mean seconds of a control loop; ``None`` for policies that execute a plan.
-        error: The first error.
     """
 
     section: str
-    label: str
-    policy: str
-    scenario: str
-    robots: int
-    model: str
-    noise: float
-    trials: int
-    successes: int
-    lower: float
-    upper: float
-    errors: int
     runtime: float | None
     runtime_lower: float | None
     runtime_upper: float | None
@@ -77,11 +54,6 @@ class Measured:
     message_bytes: float | None
     waiting_share: float | None
     step_time: float | None
-    error: str
-
-    @property
-    def rate(self) -> float:
-        return self.successes / self.trials
 
 
 def first_solution(trial: Trial) -> float | None:
@@ -92,60 +64,51 @@ def first_solution(trial: Trial) -> float | None:
     there was one. For a policy that plans under way the time is that before its first action.
     """
     times = (seconds for seconds, solved, _ in json.loads(trial.history) if solved)
-    if trial.error or (not trial.success and (trial.noise > 0 or not trial.status)):
+    if trial.error or (not trial.success and (trial.control_noise_std > 0 or not trial.status)):
         return None
     if not trial.status:
         return trial.preparation
-    return next(times, trial.wall_time if trial.noise > 0 else None)
+    return next(times, trial.wall_time if trial.control_noise_std > 0 else None)
 
 
 def measured(group: Group) -> Measured:
     """Sum a group up."""
-    trials, first = group.trials, group.trials[0]
+    trials = group.trials
     solved = [(trial, seconds) for trial in trials if (seconds := first_solution(trial)) is not None]
-    lower, upper = wilson_interval(len(solved), len(trials))
     rewards = [history[-1][2] for trial in trials if (history := json.loads(trial.history))]
-    errors = [trial.error for trial in trials if trial.error]
+    lower, runtime, upper, average, deviation = _runtimes([seconds for _, seconds in solved])
 
     def mean(name: str) -> float | None:
         values = [value for trial, _ in solved if (value := getattr(trial, name)) is not None]
         return float(np.mean(values)) if values else None
 
     return Measured(
+        **vars(Compared.of(trials, len(solved), group.label)),
         section=group.section,
-        label=group.label,
-        policy=first.policy,
-        scenario=first.scenario,
-        robots=first.robots,
-        model=first.model,
-        noise=first.noise,
-        trials=len(trials),
-        successes=len(solved),
-        lower=lower,
-        upper=upper,
-        errors=len(errors),
-        **_runtimes([seconds for _, seconds in solved]),
+        runtime=runtime,
+        runtime_lower=lower,
+        runtime_upper=upper,
+        runtime_mean=average,
+        runtime_deviation=deviation,
         iterations=mean("iterations"),
         reward=float(np.mean(rewards)) if rewards else None,
         travel_time=mean("travel_time"),
         makespan=mean("makespan"),
         jerk=mean("mean_squared_jerk"),
-        nodes=_nodes(first),
+        nodes=_nodes(trials[0]),
         messages=mean("messages"),
         message_bytes=mean("message_bytes"),
         waiting_share=mean("waiting_share"),
         step_time=_step_time([trial for trial, _ in solved]),
-        error=errors[0] if errors else "",
     )
 
 
-def _runtimes(seconds: Sequence[float]) -> dict[str, float | None]:
-    """Median, quartiles, mean and standard deviation; ``None`` each where nothing was solved."""
-    names = ("runtime_lower", "runtime", "runtime_upper", "runtime_mean", "runtime_deviation")
+def _runtimes(seconds: Sequence[float]) -> tuple[float | None, ...]:
+    """Quartiles, mean and standard deviation; ``None`` each where nothing was solved."""
     if not seconds:
-        return dict.fromkeys(names)
+        return (None,) * 5
     deviation = np.std(seconds, ddof=min(len(seconds) - 1, 1))
-    return dict(zip(names, map(float, (*np.percentile(seconds, (25, 50, 75)), np.mean(seconds), deviation))))
+    return tuple(map(float, (*np.percentile(seconds, (25, 50, 75)), np.mean(seconds), deviation)))
 
 
 def _step_time(trials: Sequence[Trial]) -> float | None:
@@ -159,7 +122,7 @@ def _step_time(trials: Sequence[Trial]) -> float | None:
 
 def _nodes(trial: Trial) -> int:
     nodes = json.loads(trial.config).get("nodes", 1)
-    return trial.robots if nodes is None else int(nodes)
+    return trial.num_robots if nodes is None else int(nodes)
 
 
 @dataclass(frozen=True)

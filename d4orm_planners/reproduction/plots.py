@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 NUMERIC: Mapping[str, str] = MappingProxyType(
-    {"robots": "robots", "nodes": "nodes", "noise": "standard deviation of the noise"}
+    {"num_robots": "robots", "nodes": "nodes", "control_noise_std": "standard deviation of the noise"}
 )
 """What may vary from left to right as a number, and what to write below."""
 INSTANTS = 200
@@ -95,7 +95,7 @@ def _metric(ax: Axes, figure: Figure, shown: Shown, *, value: str, ends: tuple[s
                 ax.vlines(places, low, high, color=f"C{i}", alpha=0.5)
     if not numeric:
         ax.set_xticks(range(len(columns)), columns, rotation=60 if figure.across == "policy" else 20, ha="right")
-    elif figure.across != "noise":
+    elif figure.across != "control_noise_std":
         ax.set_xticks([int(name) for name in columns])
     ax.set_xlabel(NUMERIC.get(figure.across, ""))
     ax.set_ylabel(label)
@@ -130,8 +130,8 @@ def _anytime(ax: Axes, figure: Figure, shown: Shown) -> None:
 
     A curve begins when half of the trials have a plan.
     """
-    largest = max(row.robots for _, row in shown)
-    for i, (group, row) in enumerate((group, row) for group, row in shown if row.robots == largest):
+    largest = max(row.num_robots for _, row in shown)
+    for i, (group, row) in enumerate((group, row) for group, row in shown if row.num_robots == largest):
         histories = [json.loads(trial.history) for trial in group.trials]
         times = [time for history in histories for time, _, _ in history]
         if not times:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from d4orm_planners.evaluation.leaderboard import origin
 from d4orm_planners.evaluation.report import deadline_table, errors, table, target, write_csv
-from d4orm_planners.evaluation.summary import success_by
+from d4orm_planners.evaluation.summary import SuccessWithin, success_by
 from d4orm_planners.reproduction.figure import Figure, Group
 from d4orm_planners.reproduction.numbers import METRICS, Measured, column, measured
 from d4orm_planners.reproduction.plots import draw
@@ -67,7 +66,7 @@ def _transposed(figure: Figure, title: str, rows: Sequence[Measured]) -> str:
         for name in figure.metrics:
             line += [METRICS[name].text(row)] + [_said(figure, row, name)] * (name in known)
         lines.append(line)
-    return table(f"{title}, {rows[0].robots} robots", header, lines)
+    return table(f"{title}, {rows[0].num_robots} robots", header, lines)
 
 
 def _said(figure: Figure, row: Measured, metric: str) -> str:
@@ -76,10 +75,10 @@ def _said(figure: Figure, row: Measured, metric: str) -> str:
 
 
 def _deadlines(figure: Figure, groups: Sequence[Group]) -> list[str]:
-    blocks: dict[str, list[tuple[str, Any]]] = {}
+    blocks: dict[str, list[tuple[str, list[SuccessWithin]]]] = {}
     for group in groups:
         first = group.trials[0]
-        title = f"{group.section}, {first.robots} robots: success within a deadline for planning"
+        title = f"{group.section}, {first.num_robots} robots: success within a deadline for planning"
         blocks.setdefault(title, []).append((group.label, [success_by(group.trials, s) for s in figure.deadlines]))
     return [deadline_table(title, lines) for title, lines in blocks.items()]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import stable_baselines3
@@ -22,12 +22,14 @@ class Algorithm:
     """One of Stable-Baselines3's algorithms.
 
     Attributes:
+        buffer: Attribute in which a model keeps what it learns from.
         num_envs: Robots that act at once, unless configured otherwise.
         steps_per_update: Steps that each of them takes between two updates.
         learning_rate: At the beginning; it falls linearly to a tenth.
         gamma: Discount per step.
     """
 
+    buffer: ClassVar[str]
     num_envs: ClassVar[int]
     steps_per_update: ClassVar[int]
     learning_rate: ClassVar[float] = 3e-4
@@ -37,15 +39,11 @@ class Algorithm:
         """A new model, whose first weights are drawn from the global random state."""
         raise NotImplementedError
 
-    def buffer(self, model: Any) -> MaskedRolloutBuffer | MaskedReplayBuffer:
-        """Where a model keeps what it learns from."""
-        raise NotImplementedError
-
     def prepare(self, model: BaseAlgorithm, robots: RobotVecEnv, seed: int) -> None:
         """Tell the model's buffer which robots act, and seed whatever the model draws."""
         set_random_seed(seed)
         model.action_space.seed(seed)
-        buffer = self.buffer(model)
+        buffer = getattr(model, self.buffer)
         buffer.source, buffer.random = robots, np.random.default_rng(seed)
 
     def set_learning_rate(self, model: BaseAlgorithm, remaining: float) -> None:
@@ -54,6 +52,7 @@ class Algorithm:
 
 
 class _PPO(Algorithm):
+    buffer = "rollout_buffer"
     num_envs = 1024
     steps_per_update = 32
 
@@ -72,11 +71,9 @@ class _PPO(Algorithm):
             device="cpu",
         )
 
-    def buffer(self, model: Any) -> MaskedRolloutBuffer:
-        return model.rollout_buffer
-
 
 class _SAC(Algorithm):
+    buffer = "replay_buffer"
     num_envs = 64
     steps_per_update = 1
     learning_rate = 1e-3
@@ -99,9 +96,6 @@ class _SAC(Algorithm):
             replay_buffer_class=MaskedReplayBuffer,
             device="cpu",
         )
-
-    def buffer(self, model: Any) -> MaskedReplayBuffer:
-        return model.replay_buffer
 
 
 ALGORITHMS: Mapping[str, Algorithm] = MappingProxyType({"ppo": _PPO(), "sac": _SAC()})

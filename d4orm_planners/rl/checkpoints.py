@@ -16,6 +16,7 @@ from stable_baselines3.common.save_util import load_from_zip_file, recursive_set
 from stable_baselines3.common.vec_env import VecNormalize
 
 from d4orm_env.core.archives import ArrayArchive
+from d4orm_env.core.errors import first_line
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.rl.curve import Evaluation
 from d4orm_planners.rl.network import SUFFIX, Network, load_network
@@ -171,9 +172,8 @@ def _readable(folder: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # a damaged archive makes zipfile, NumPy and torch raise errors of a dozen kinds
-        reason = next(iter(str(error).splitlines()), type(error).__name__)
         raise ValueError(
-            f"checkpoint {folder} cannot be read ({reason}); remove it to go on from the one before"
+            f"checkpoint {folder} cannot be read ({first_line(error)}); remove it to go on from the one before"
         ) from error
 
 

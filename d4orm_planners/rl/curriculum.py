@@ -13,19 +13,19 @@ class Lesson:
     """One part of a training, at whose end there is a checkpoint.
 
     Attributes:
-        robots: Team size.
+        num_robots: Team size.
         scenario: Scenario name.
         steps: Robot-steps to take.
     """
 
-    robots: int
+    num_robots: int
     scenario: str
     steps: int
 
 
-def team_sizes(robots: int) -> tuple[int, ...]:
-    """1, 2, 4, ... below ``robots``, and ``robots``."""
-    return (*(2**i for i in range((robots - 1).bit_length())), robots)
+def team_sizes(num_robots: int) -> tuple[int, ...]:
+    """1, 2, 4, ... below ``num_robots``, and ``num_robots``."""
+    return (*(2**i for i in range((num_robots - 1).bit_length())), num_robots)
 
 
 def common_batch(sizes: tuple[int, ...], wanted: int) -> int:
@@ -34,14 +34,16 @@ def common_batch(sizes: tuple[int, ...], wanted: int) -> int:
     return max(wanted // unit, 1) * unit
 
 
-def make_lessons(robots: int, scenario: str, steps: int, unit: int, count: int, gradual: bool) -> tuple[Lesson, ...]:
+def make_lessons(
+    num_robots: int, scenario: str, steps: int, unit: int, count: int, gradual: bool
+) -> tuple[Lesson, ...]:
     """The lessons of a training.
 
     Teams grow, and every size gets as many steps of whole worlds as any other. Instances are random ones; where another
     scenario is asked for, every other lesson of the full team is about that.
 
     Args:
-        robots: Size of the full team.
+        num_robots: Size of the full team.
         scenario: What is to be learned.
         steps: Robot-steps in all, rounded up to whole units.
         unit: Robot-steps that are taken between two updates.
@@ -50,12 +52,12 @@ def make_lessons(robots: int, scenario: str, steps: int, unit: int, count: int, 
     """
     units = math.ceil(steps / unit)
     count = min(count, units)
-    sizes = team_sizes(robots) if gradual else (robots,)
+    sizes = team_sizes(num_robots) if gradual else (num_robots,)
     turns = np.cumsum(sizes) / sum(sizes)
     lessons = []
     for index in range(count):
         size = sizes[int(np.searchsorted(turns, (index + 0.5) / count))]
-        name = scenario if size == robots and index % 2 == 0 else "random"
+        name = scenario if size == num_robots and index % 2 == 0 else "random"
         length = units * (index + 1) // count - units * index // count
         lessons.append(Lesson(size, name, length * unit))
     return tuple(lessons)

@@ -20,7 +20,7 @@ class Evaluation:
 
     Attributes:
         steps: Robot-steps trained.
-        robots: Size of the team trained last.
+        num_robots: Size of the team trained last.
         scenario: Scenario trained last.
         success_rate: Share of the validation episodes in which all arrived and none ever touched anything.
         travel_time: Their mean arrival time [s], with the whole episode for robots that did not arrive.
@@ -29,7 +29,7 @@ class Evaluation:
     """
 
     steps: int
-    robots: int
+    num_robots: int
     scenario: str
     success_rate: float
     travel_time: float

@@ -8,9 +8,9 @@ scales that resolve it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.observation_layout import ObservationSlices
@@ -128,26 +128,25 @@ class Features:
         return features
 
 
-def _scales(gap: Any) -> tuple[FloatArray, FloatArray]:
+def _scales(gap: NDArray[np.floating]) -> tuple[FloatArray, FloatArray]:
     """Two functions of a distance [m], one that resolves metres and one that resolves centimetres."""
-    return 1 / (1 + gap), np.exp(-4 * gap)
+    return np.divide(1, 1 + gap), np.exp(-4 * gap)
 
 
-def _dot(one: Any, two: Any) -> FloatArray:
+def _dot(one: NDArray[np.floating], two: NDArray[np.floating]) -> FloatArray:
     """``(..., 1)`` products of ``(..., d)``; several times quicker than a sum over the short last axis."""
     products: FloatArray = np.einsum("...i,...i->...", one, two)[..., None]
     return products
 
 
-def _norm(vectors: Any) -> FloatArray:
+def _norm(vectors: NDArray[np.floating]) -> FloatArray:
     """``(..., 1)`` lengths of ``(..., d)``."""
     return np.sqrt(_dot(vectors, vectors))
 
 
-def _unit(vectors: Any) -> FloatArray:
+def _unit(vectors: NDArray[np.floating]) -> FloatArray:
     """``(..., d)`` of length one; zero stays zero."""
-    units: FloatArray = vectors / np.maximum(_norm(vectors), 1e-6)
-    return units
+    return np.divide(vectors, np.maximum(_norm(vectors), 1e-6))
 
 
 def _into(frame: FloatArray, vectors: FloatArray) -> FloatArray:

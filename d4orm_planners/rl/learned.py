@@ -58,11 +58,8 @@ class LearnedPolicy(Policy):
     def __init__(self, config: LearnedConfig | None = None) -> None:
         self.config = config or LearnedConfig()
         path = Path(self.config.path or SHIPPED / f"{self.name}{SUFFIX}")
-        self._actor: _NetworkActor | _ZipActor
-        if path.suffix == ".zip":
-            self._actor = _ZipActor(self.name, path)
-        else:
-            self._actor = _NetworkActor(self.name, path)
+        kind = _ZipActor if path.suffix == ".zip" else _NetworkActor
+        self._actor: _NetworkActor | _ZipActor = kind(self.name, path)
 
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:
         super().reset(env, seed)
@@ -74,9 +71,8 @@ class LearnedPolicy(Policy):
         if not observations:
             return {}
         seen = np.stack([np.asarray(observation, np.float32) for observation in observations.values()])
-        return dict(
-            zip(observations, self._actor.controls(seen, self.problem.team.control_limits[robot_indices(observations)]))
-        )
+        limits = self.problem.team.control_limits[robot_indices(observations)]
+        return dict(zip(observations, self._actor.controls(seen, limits)))
 
 
 class PPO(LearnedPolicy):

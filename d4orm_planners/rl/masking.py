@@ -3,33 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Generator
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
+from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples, RolloutBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 
 
-class MaskedRolloutBuffer(RolloutBuffer):
-    """A rollout buffer that hands out only the steps in which :attr:`RobotVecEnv.acted` was true.
+class _MaskedBuffer(BaseBuffer):
+    """Keeps in which steps :attr:`RobotVecEnv.acted` was true, and hands out only those.
 
-    Set :attr:`source`, and :attr:`random`, which shuffles, before the first step.
+    Set :attr:`source`, and :attr:`random`, by which steps are drawn, before the first step.
     """
 
     source: RobotVecEnv
     random: np.random.Generator
 
-    def reset(self) -> None:
-        super().reset()
-        self.acted = np.zeros((self.buffer_size, self.n_envs), np.bool_)
+    @cached_property
+    def acted(self) -> np.ndarray:
+        """``(T, B)`` which robots acted in which steps."""
+        return np.zeros((self.buffer_size, self.n_envs), np.bool_)
 
     def add(self, *args: Any, **kwargs: Any) -> None:
         self.acted[self.pos] = self.source.acted
         super().add(*args, **kwargs)
+
+
+class MaskedRolloutBuffer(_MaskedBuffer, RolloutBuffer):
+    """A rollout buffer without the steps in which a robot did nothing."""
 
     def get(self, batch_size: int | None = None) -> Generator[RolloutBufferSamples, None, None]:
         assert self.full
@@ -44,19 +50,8 @@ class MaskedRolloutBuffer(RolloutBuffer):
             yield self._get_samples(indices[begin : begin + size])
 
 
-class MaskedReplayBuffer(ReplayBuffer):
-    """A replay buffer likewise. Set :attr:`source`, and :attr:`random`, which samples, before the first step."""
-
-    source: RobotVecEnv
-    random: np.random.Generator
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.acted = np.zeros((self.buffer_size, self.n_envs), np.bool_)
-
-    def add(self, *args: Any, **kwargs: Any) -> None:
-        self.acted[self.pos] = self.source.acted
-        super().add(*args, **kwargs)
+class MaskedReplayBuffer(_MaskedBuffer, ReplayBuffer):
+    """A replay buffer likewise."""
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
         rows, slots = self._acted_steps(batch_inds)

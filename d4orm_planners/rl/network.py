@@ -57,7 +57,7 @@ class Header(BaseModel):
     activation: str
     squashed: bool
     layers: int = Field(ge=1, le=16)
-    training: dict[str, Any]
+    training: dict[str, object]
 
 
 @dataclass(frozen=True, eq=False)

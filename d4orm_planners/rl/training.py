@@ -50,7 +50,7 @@ class TrainingSettings(CheckedSettings):
     Attributes:
         algorithm: ``"ppo"`` or ``"sac"``.
         scenario: What is to be learned. Instances of ``random`` are practised along with any other scenario.
-        robots: Size of the full team.
+        num_robots: Size of the full team.
         steps: Robot-steps, rounded up to whole updates.
         seed: Of everything that is drawn.
         model: Robot model; ``None`` is the scenario's own.
@@ -66,7 +66,7 @@ class TrainingSettings(CheckedSettings):
 
     algorithm: Annotated[str, one_of(ALGORITHMS)] = "ppo"
     scenario: str = "random"
-    robots: Many = 4
+    num_robots: Many = 4
     steps: Annotated[Count, Field(le=10**15)] = 5_000_000
     seed: Seed = 0
     model: str | None = None
@@ -78,18 +78,18 @@ class TrainingSettings(CheckedSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, own in (("num_robots", "robots"), ("seed", "seed"), ("model", "model")):
+        for name in ("num_robots", "seed", "model"):
             if name in self.scenario_settings:
-                raise ValueError(f"scenario_settings has {name!r}; give {own!r} (--{own}) itself instead")
+                raise ValueError(f"scenario_settings has {name!r}; give it itself, --{name.replace('_', '-')}")
         complaint = unknown_argument(self.scenario, self.scenario_settings)
         if complaint:
             raise ValueError(f"scenario_settings: {complaint}")
-        make_problem(self.scenario, num_robots=self.robots, model=self.model, **self.scenario_settings)
+        make_problem(self.scenario, num_robots=self.num_robots, model=self.model, **self.scenario_settings)
 
     @property
     def batch(self) -> int:
         """Robots that act at once."""
-        sizes = team_sizes(self.robots) if self.curriculum else (self.robots,)
+        sizes = team_sizes(self.num_robots) if self.curriculum else (self.num_robots,)
         return common_batch(sizes, self.num_envs or ALGORITHMS[self.algorithm].num_envs)
 
 
@@ -141,13 +141,13 @@ class _Run:
         self._algorithm: Algorithm = ALGORITHMS[settings.algorithm]
         unit = settings.batch * self._algorithm.steps_per_update
         self.lessons = make_lessons(
-            settings.robots, settings.scenario, settings.steps, unit, settings.lessons, settings.curriculum
+            settings.num_robots, settings.scenario, settings.steps, unit, settings.lessons, settings.curriculum
         )
         self._total = sum(lesson.steps for lesson in self.lessons)
         self._model: BaseAlgorithm | None = None
         # First of all, because it refuses what cannot be learned, and nothing is to be written then.
         self._validation = self._worlds(
-            Lesson(settings.robots, settings.scenario, 0), _VALIDATION_SEED, validation=True
+            Lesson(settings.num_robots, settings.scenario, 0), _VALIDATION_SEED, validation=True
         )
         self.checkpoints = Checkpoints(out, asdict(settings))
         self._checkpoint = self.checkpoints.latest()
@@ -168,7 +168,7 @@ class _Run:
         seconds = time.perf_counter() - begin
         network = network_of(self._header(index), model, normalized)
         evaluation = Evaluation(
-            done + lesson.steps, lesson.robots, lesson.scenario,
+            done + lesson.steps, lesson.num_robots, lesson.scenario,
             *evaluate_network(network, self._validation, _VALIDATION_SEED), seconds, robots.seconds / seconds,
         )  # fmt: skip
         best = _best(self.evaluations)
@@ -184,11 +184,11 @@ class _Run:
         kwargs = dict(settings.scenario_settings) if lesson.scenario == settings.scenario else {}
         drawn = _differs(lesson, settings.model, kwargs)
         count = settings.validation_worlds if drawn else 1
-        worlds = count if validation else settings.batch // lesson.robots
+        worlds = count if validation else settings.batch // lesson.num_robots
         if drawn:
             pool = None if validation else min(_INSTANCES, 2 * worlds)
             kwargs |= {"randomize_instance": True, "num_instances": pool}
-        return RobotVecEnv(worlds, lesson.robots, lesson.scenario, seed=seed, model=settings.model, **kwargs)
+        return RobotVecEnv(worlds, lesson.num_robots, lesson.scenario, seed=seed, model=settings.model, **kwargs)
 
     def _restored(self, env: VecNormalize) -> BaseAlgorithm:
         """The model with the state of the last checkpoint, in a new environment."""
@@ -245,12 +245,12 @@ def _best(evaluations: list[Evaluation]) -> Evaluation | None:
 
 def _describe(lesson: Lesson, evaluations: list[Evaluation]) -> str:
     last = f"; success {evaluations[-1].success_rate:.0%}" if evaluations else ""
-    return f"{lesson.scenario}, {lesson.robots} robots{last}"
+    return f"{lesson.scenario}, {lesson.num_robots} robots{last}"
 
 
 def _differs(lesson: Lesson, model: str | None, kwargs: Mapping[str, object]) -> bool:
     """Whether instances of the scenario differ."""
     first, second = (
-        make_problem(lesson.scenario, num_robots=lesson.robots, seed=seed, model=model, **kwargs) for seed in (0, 1)
+        make_problem(lesson.scenario, num_robots=lesson.num_robots, seed=seed, model=model, **kwargs) for seed in (0, 1)
     )
     return first != second

@@ -44,8 +44,8 @@ VALUES: dict[str, Any] = {
 """Of options that take more than a number; all others get text of any kind."""
 
 SMALL: dict[str, list[str]] = {
-    "plan": ["--quiet", "--robots=2", "--max-iterations=1", "--set=num_samples=8", "--set=num_steps=1"],
-    "run": ["--quiet", "--robots=2", "--policy=goal"],
+    "plan": ["--quiet", "--num-robots=2", "--max-iterations=1", "--set=num_samples=8", "--set=num_steps=1"],
+    "run": ["--quiet", "--num-robots=2", "--policy=goal"],
     "scenarios": [],
     "planners": [],
     "leaderboard": [],

@@ -46,6 +46,8 @@ CASES = {
     "unicycles": Case("d4orm", {}, "circle", {"num_robots": 4, "model": "unicycle"}),
     "cars": Case("d4orm", {}, "circle", {"num_robots": 4, "model": "car"}),
     "in space": Case("d4orm", {}, "sphere", {"num_robots": 8}),
+    "among walls": Case("d4orm-d", {"improve": True}, "rooms", {"num_robots": 8}, 3),
+    "through a corridor": Case("guided", {"improve": True}, "corridor", {"num_robots": 6}, 2),
 }
 
 QUICK = ("d4orm", "d4orm-d", "mppi", "cem", "mixed models")

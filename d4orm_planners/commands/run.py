@@ -1,0 +1,74 @@
+"""``d4orm run``: an episode of a plan or a policy in the environment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from d4orm_planners.commands.dataclass_options import takes
+from d4orm_planners.commands.inputs import refuse_options
+from d4orm_planners.commands.options import PictureOptions, ProblemOptions
+from d4orm_planners.commands.outputs import episode_rows, print_table
+
+if TYPE_CHECKING:
+    from d4orm_env.core.problem import Problem
+    from d4orm_planners.episode import Episode
+    from d4orm_planners.policy import Policy
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(PictureOptions, ProblemOptions):
+    """What to run, and where."""
+
+    plan_file: Annotated[Path | None, typer.Argument(help="Plan to execute; plans anew without one.")] = None
+    policy: Annotated[str, typer.Option("--policy", "-p", help="Planner, policy or package.module:Name.")] = "d4orm"
+    control_noise_std: Annotated[
+        float, typer.Option("--control-noise-std", "--noise", help="Standard deviation of the execution noise.")
+    ] = 0.0
+
+    def chosen(self) -> tuple[Problem, Policy]:
+        """The problem, and what acts in it.
+
+        Raises:
+            ValueError: For an option that makes no sense, or does not go with a plan file.
+        """
+        from d4orm_planners.plan import Plan
+        from d4orm_planners.policy import OpenLoop
+        from d4orm_planners.registry import make_policy
+
+        if self.plan_file is None:
+            return self.problem(), make_policy(self.policy)
+        refuse_options(
+            self.context,
+            {"policy", *(field.name for field in fields(ProblemOptions) if field.name != "seed")},
+            f"does not go with a plan file; {self.plan_file} has a problem and controls of its own",
+        )
+        plan = Plan.load(self.plan_file)
+        return plan.problem, OpenLoop(plan=plan)
+
+
+@takes(RunOptions)
+def run(options: RunOptions) -> None:
+    """Run a plan or a policy in the environment, step by step, and judge what happened."""
+    options.check_pictures()
+    problem, policy = options.chosen()
+    episode = execute(problem, policy, options.seed, options.control_noise_std)
+    options.draw(problem, episode.trajectory)
+    if not options.quiet:
+        print_table("Execution", episode_rows(episode))
+    if not episode.metrics["success"]:
+        raise typer.Exit(1)
+
+
+def execute(problem: Problem, policy: Policy, seed: int, control_noise_std: float = 0.0) -> Episode:
+    """An episode of a policy on a problem."""
+    from d4orm_env import navigation_v0
+    from d4orm_planners.episode import run_episode
+
+    env = navigation_v0.parallel_env(problem=problem, control_noise_std=control_noise_std)
+    episode = run_episode(env, policy, seed=seed)
+    env.close()
+    return episode

@@ -1,0 +1,129 @@
+"""What is near what among many points, compiled with numba: points sorted into cells."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from d4orm_env.engine import tiles
+from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.tiles import OPTIONS, compiled, inlined
+
+SOURCES = fingerprint((tiles,))
+
+
+class Cells(NamedTuple):
+    """Points by the cell that they lie in.
+
+    Attributes:
+        points: ``(N, 3)`` [m].
+        low: ``(3,)`` lowest corner [m].
+        size: ``(3,)`` int64 cells along each axis.
+        width: Of a cell [m].
+        first: ``(C + 1,)`` int64 where the points of each cell begin in ``items``.
+        items: ``(N,)`` int64 numbers of the points, cell by cell.
+    """
+
+    points: Any
+    low: Any
+    size: Any
+    width: float
+    first: Any
+    items: Any
+
+
+def sort_into_cells(points: Any, width: float) -> Cells:
+    """Cells of this width, or larger ones where there would be many more of them than points.
+
+    Args:
+        points: ``(N, 3)`` float64 [m].
+        width: [m].
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    while np.floor((high - low) / width + 1).prod() > 4 * len(points) + 64:
+        width *= 1.25
+    size = np.floor((high - low) / width).astype(np.int64) + 1
+    index = np.minimum(((points - low) / width).astype(np.int64), size - 1)
+    cell = (index[:, 0] * size[1] + index[:, 1]) * size[2] + index[:, 2]
+    first = np.zeros(size.prod() + 1, np.int64)
+    first[1:] = np.cumsum(np.bincount(cell, minlength=size.prod()))
+    return Cells(points, low, size, width, first, np.argsort(cell, kind="stable"))
+
+
+@inlined
+def cell_range(cells: Any, axis: Any, lowest: Any, highest: Any) -> Any:
+    """The first cell along an axis that a stretch touches, and the one after its last."""
+    first = np.int64(np.floor((lowest - cells.low[axis]) / cells.width))
+    last = np.int64(np.floor((highest - cells.low[axis]) / cells.width))
+    return max(first, 0), min(last, cells.size[axis] - 1) + 1
+
+
+@compiled
+def squared_gap(points: Any, u: Any, tails: Any, v: Any, heads: Any, w: Any) -> Any:
+    """Squared distance of point ``u`` to the line from ``tails[v]`` to ``heads[w]``."""
+    ax, ay, az = heads[w, 0] - tails[v, 0], heads[w, 1] - tails[v, 1], heads[w, 2] - tails[v, 2]
+    ox, oy, oz = points[u, 0] - tails[v, 0], points[u, 1] - tails[v, 1], points[u, 2] - tails[v, 2]
+    square = ax * ax + ay * ay + az * az
+    share = 0.0
+    if square > 0.0:
+        share = min(max((ox * ax + oy * ay + oz * az) / square, 0.0), 1.0)
+    dx, dy, dz = ox - share * ax, oy - share * ay, oz - share * az
+    return dx * dx + dy * dy + dz * dz
+
+
+@cached_kernel(SOURCES, variant="near", **OPTIONS)
+def near_lines(cells: Any, tails: Any, heads: Any, reach: Any, first: Any, items: Any, after: Any) -> Any:
+    """Which points come within ``reach`` of lines.
+
+    Args:
+        cells: The ``N`` points.
+        tails: ``(Q, 3)`` ends of the lines.
+        heads: ``(Q, 3)``.
+        reach: [m].
+        first: ``(Q + 1,)`` int64 where those of each line begin in ``items``, output.
+        items: ``(room,)`` int32 numbers of points, ascending per line, output as far as there is room.
+        after: Whether only points with numbers greater than that of the line are wanted.
+
+    Returns:
+        How many there are.
+    """
+    count = 0
+    for q in range(tails.shape[0]):
+        first[q] = count
+        low_i, high_i = cell_range(
+            cells, 0, min(tails[q, 0], heads[q, 0]) - reach, max(tails[q, 0], heads[q, 0]) + reach
+        )
+        low_j, high_j = cell_range(
+            cells, 1, min(tails[q, 1], heads[q, 1]) - reach, max(tails[q, 1], heads[q, 1]) + reach
+        )
+        low_k, high_k = cell_range(
+            cells, 2, min(tails[q, 2], heads[q, 2]) - reach, max(tails[q, 2], heads[q, 2]) + reach
+        )
+        for i in range(low_i, high_i):
+            for j in range(low_j, high_j):
+                for k in range(low_k, high_k):
+                    cell = (i * cells.size[1] + j) * cells.size[2] + k
+                    for number in range(cells.first[cell], cells.first[cell + 1]):
+                        point = cells.items[number]
+                        if after and point <= q:
+                            continue
+                        if squared_gap(cells.points, point, tails, q, heads, q) < reach * reach:
+                            if count < items.shape[0]:
+                                items[count] = point
+                            count += 1
+        if count <= items.shape[0]:
+            items[first[q] : count].sort()
+    first[tails.shape[0]] = count
+    return count
+
+
+def find_near(cells: Cells, tails: Any, heads: Any, reach: float, after: bool = False) -> tuple[Any, Any]:
+    """``(first, items)`` of :func:`near_lines`."""
+    first, room = np.empty(len(tails) + 1, np.int64), 16 * len(tails)
+    while True:
+        items = np.empty(room, np.int32)
+        count = near_lines(cells, tails, heads, reach, first, items, after)
+        if count <= room:
+            return first, items[:count]
+        room = count
