@@ -24,10 +24,10 @@ from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Episode, make_policy, run_episode
 from d4orm_planners.d4orm_c2f.background import Background
+from d4orm_planners.d4orm_c2f.coarse import coarse_problem
 from d4orm_planners.d4orm_c2f.guide import Guide
 from d4orm_planners.d4orm_c2f.policy import D4ormC2F
 from d4orm_planners.d4orm_c2f.window import Window
-from d4orm_planners.d4orm_c2f.coarse import coarse_problem
 from d4orm_planners.steering import straight_drives
 
 CASES = [
