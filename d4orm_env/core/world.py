@@ -15,8 +15,10 @@ from d4orm_env.core.polygon import check_polygon, triangulate
 from d4orm_env.core.shapes import Shapes
 from d4orm_env.core.world_index import WorldIndex, build_index, nearest_distance
 
-_LEVELS = 3
-"""Grids of an index that finds obstacles for robots wherever they drive; the last is 16 times as wide as the first."""
+_LEVELS, _FEW = 3, 2048
+"""Grids of an index that finds obstacles for robots wherever they drive, the last 16 times as wide as the first, where
+there are no more than so many: with more it takes too long to make, and robots beyond the first grid look at all.
+"""
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -143,7 +145,7 @@ class World(Frozen):
         return Shapes(boxes, angular)
 
     @cached_property
-    def _indices(self) -> dict[tuple[float, int, float], WorldIndex]:
+    def _indices(self) -> dict[tuple[float, int, float, int], WorldIndex]:
         return {}
 
     def index(self, reach: float, nearest: int = 1, places: FloatArray | None = None) -> WorldIndex:
@@ -160,8 +162,8 @@ class World(Frozen):
         if places is not None and self.shapes.count:
             lower, upper = self.shapes.extent()
             margin = _rounded_up(max(reach, float(np.max([lower - places, places - upper]))))
-            levels = _LEVELS
-        key = (reach, nearest, margin)
+            levels = _LEVELS if self.shapes.count <= _FEW else 1
+        key = (reach, nearest, margin, levels)
         if key not in self._indices:
             # Cells of a quarter of a reach leave few points undecided.
             self._indices[key] = build_index(self.shapes, reach / 4, margin, nearest, levels)
