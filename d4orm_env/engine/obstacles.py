@@ -81,11 +81,15 @@ def touches_static(arrays: Any, reach: Any, place: Any) -> Any:
             return True
     if index.clearance.shape[0] == 0:
         return False
-    x, y, z = place[0], place[1], place[place.shape[0] - 1]
-    clearance = index.clearance[_cell(index, x, y, z)]
+    cell = np.int64(0)
+    for axis in range(place.shape[0]):
+        steps = np.int64(max((place[axis] - index.low[axis]) * index.scale, ZERO))
+        cell = cell * index.size[axis] + min(steps, np.int64(index.size[axis]) - 1)
+    clearance = index.clearance[cell]
     if clearance > reach + index.slack or clearance <= reach - index.slack:
         return clearance <= reach
-    return _touches(index, arrays.boxes, arrays.triangles, reach, x, y, z)
+    x, y, z = place[0], place[1], place[place.shape[0] - 1]
+    return _touches(index, arrays.boxes, arrays.triangles, cell, reach, x, y, z)
 
 
 @compiled
