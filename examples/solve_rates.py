@@ -13,6 +13,8 @@ counted; with ``--improve`` the search goes on from there until so many seconds 
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -43,6 +45,7 @@ BIG: list[tuple[str, str, dict[str, Any], int]] = [
     *((f"AMSwarm {i}, 10", f"amswarm_{i}", {"num_robots": 10}, 200) for i in range(1, 6)),
 ]
 WALLS: list[tuple[str, str, dict[str, Any], int]] = [
+    *((f"map of 32 x 32 cells, {num}", "map", {"num_robots": num, "cell": 0.6}, 200) for num in (10, 40, 80)),
     *((f"rooms, {num}", "rooms", {"num_robots": num}, 200) for num in (10, 20, 40)),
     *((f"maze, {num}", "maze", {"num_robots": num}, 200) for num in (10, 20)),
     *((f"warehouse, {num}", "warehouse", {"num_robots": num}, 200) for num in (40, 100)),
@@ -56,7 +59,14 @@ JITTER = 0.005
 
 
 def instance(scenario: str, settings: dict[str, Any], seed: int) -> Problem:
-    """The problem of that seed."""
+    """The problem of that seed; of a map, one of 32 x 32 cells of which a fifth is blocked."""
+    if scenario == "map":
+        blocked = np.random.default_rng(seed).random((32, 32)) < 0.2
+        rows = ["".join("@" if cell else "." for cell in row) for row in blocked]
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "cells.map"
+            path.write_text("\n".join(["type octile", "height 32", "width 32", "map", *rows, ""]))
+            return make_problem(scenario, **settings, map=path, seed=seed)
     problem = make_problem(scenario, **settings, seed=seed)
     if not scenario.startswith("amswarm"):
         return problem
