@@ -16,10 +16,9 @@ from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, Credit
 from d4orm_planners.search import Search
 from d4orm_planners.settings import Samples, Share, ShareOrNone, Steps, one_of
 
-PATIENT_AFTER = 4
-"""Iterations without a solution after which the default goes on by the paper's rules: team credit, unclipped, ..."""
-PATIENT_SAMPLES = 1024
-"""... and with so many samples."""
+PATIENT_AFTER, PATIENT_SAMPLES = 8, 4
+"""Iterations without a solution after which the default weights by the team's reward, as the paper does, and how many
+times as many samples it then draws."""
 Start = Annotated[str, one_of(("auto", "team", "guided"))]
 
 
@@ -79,10 +78,10 @@ class D4orm(DenoisingPlanner):
     def num_samples(self, search: Search) -> int:
         """See :meth:`SamplingPlanner.num_samples`."""
         samples = self.config.num_samples
-        return max(samples, PATIENT_SAMPLES) if self.is_patient(search) else samples
+        return PATIENT_SAMPLES * samples if self.is_patient(search) else samples
 
     def is_patient(self, search: Search) -> bool:
-        """Whether it goes on as the paper does: what finds its way soonest may never find it among many."""
+        """Whether it goes on with more patience: what finds its way soonest may never find it among many."""
         hasty = self.config.credit == "alternate"
         return hasty and search.iteration >= PATIENT_AFTER and not search.best.solved
 
@@ -110,7 +109,7 @@ class D4orm(DenoisingPlanner):
 
     def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
         """See :meth:`SamplingPlanner.initial`."""
-        base = search.current.planned if self.is_patient(search) else self.config.continued(search.current)
+        base = self.config.continued(search.current)
         return base, self.start(search, base)
 
     def start(self, search: Search, base: FloatArray, number: int = 0) -> FloatArray:

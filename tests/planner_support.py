@@ -24,6 +24,7 @@ CHEAP = {
     "num_steps": 5,
     "max_iterations": 2,
     "start": "team",
+    "reroute": False,
     "repair_samples": 64,
     "repair_steps": 5,
     "refine": "sync",

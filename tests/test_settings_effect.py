@@ -29,16 +29,19 @@ ELSEWHERE = {
 """Settings of D-D4orm that need other processes, a network or time, and the tests that show what they do."""
 
 
-@pytest.fixture(autouse=True)
-def _nobody_finds_a_way(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Problems as small as these are solved by rerouting alone, which would leave nothing to sample."""
-    monkeypatch.setattr("d4orm_planners.d4orm_d.rerouting.reroute", lambda _: None)
-
-
-SMALL: dict[str, Any] = {"engine": "cpu", "num_samples": 32, "num_steps": 6, "max_iterations": 2, "improve": True}
+SMALL: dict[str, Any] = {
+    "engine": "cpu",
+    "num_samples": 32,
+    "num_steps": 6,
+    "max_iterations": 2,
+    "improve": True,
+    "reroute": False,
+}
 IPOPT: dict[str, Any] = {"engine": "cpu", "max_iterations": 1, "rounds": 1, "solver_iterations": 15, "improve": True}
 
-REPAIRING: dict[str, Any] = {"start": "straight", "max_iterations": 6, "repair_samples": 64, "repair_steps": 20}
+REPAIRING: dict[str, Any] = {
+    "start": "straight", "reroute": False, "max_iterations": 6, "repair_samples": 64, "repair_steps": 20,
+}  # fmt: skip
 
 TEAM: dict[str, Any] = {"start": "team", "num_samples": 128, "num_steps": 20}
 
@@ -62,6 +65,7 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "sigma_floor": (0.9, {"adapt_variance": True}),
     "big_team": (1, TEAM),
     "decoupling": ("groups", REPAIRING),
+    "reroute": (True, REPAIRING),
     "start": ("guided", {"start": "team"}),
     "neighbours": (1, {"max_iterations": 4}),
     "replannings": (1, {"max_iterations": 4}),

@@ -65,6 +65,8 @@ class Guide:
                 num_steps=config.coarse_steps,
                 repair_steps=config.coarse_repair_steps,
                 improve=True,
+                # Ways that fit between others to the centimetre are no guidance: fine plans cannot keep to them.
+                reroute=False,
             )
         )
 

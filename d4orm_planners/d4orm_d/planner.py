@@ -61,7 +61,8 @@ class D4ormD(D4orm):
             prepare_drives(search.problem)
             if self.config.decoupling == "groups":
                 return Groups()
-            prepare_rerouting(TeamPaths(self, search, search.current.trajectory))
+            if self.config.reroute:
+                prepare_rerouting(TeamPaths(self, search, search.current.trajectory))
         return Repairs.of(search.problem.num_robots)
 
     def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:

@@ -61,7 +61,8 @@ class _Repair:
         from d4orm_planners.d4orm_d.rerouting import reroute
 
         everybody = np.arange(self.problem.num_robots)
-        reroute(self.team)
+        if config.reroute:
+            reroute(self.team)
         failed, _ = self.team.faults(everybody)
         if failed.any() and not self.search.should_stop():
             self.deform(np.flatnonzero(failed), config)

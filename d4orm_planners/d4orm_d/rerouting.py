@@ -49,6 +49,7 @@ def prepare_rerouting(team: TeamPaths) -> None:
         robots = np.array(list(firsts.values()))
         team.faults(robots)
         _search(team, robots, np.zeros(len(robots), int), 0.0, REROUTE_RULES.contact)
+        team.index.move(robots, team.positions[:, robots])
 
 
 def _search(team: TeamPaths, robots: IntArray, blocks: IntArray, swing: float, contact: float) -> IntArray:

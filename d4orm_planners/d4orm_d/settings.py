@@ -24,6 +24,7 @@ class D4ormDConfig(D4ormConfig):
         decoupling: ``"groups"`` replans every group of robots that conflict, the team's reward within it (the paper).
             ``"independent"`` replans robots that have no conflict with each other at once, each by its own reward,
             around all others, and takes over only what is no worse.
+        reroute: Whether robots that fail look for ways among all others' before they are repaired independently.
         start: What the first iteration does without initial controls. ``"team"`` deforms the whole team at once;
             ``"straight"`` sends everybody straight to its goal and leaves the rest to repairs; ``"guided"`` finds ways
             on a roadmap and goes on making them better (:mod:`d4orm_planners.guidance`). ``"auto"`` is guided where
@@ -37,6 +38,7 @@ class D4ormDConfig(D4ormConfig):
     """
 
     big_team: Count | None = 32
+    reroute: bool = True
     decoupling: Decoupling = "independent"
     start: Start = "auto"
     first_collisions: bool = True

@@ -145,8 +145,14 @@ def test_a_plan_file_with_other_members_is_refused(tmp_path: Path, plan: bytes, 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("store") / "trials.sqlite"
-    common: dict[str, Any] = {"policy": "goal", "config": "{}", "problem": "abc", "noise": 0.0, "label": "goal"}
-    common |= {"scenario": "circle", "robots": 2, "model": "holonomic2d", "dt": 0.1, "success": True, "steps": 60}
+    common: dict[str, Any] = {
+        "policy": "goal",
+        "config": "{}",
+        "problem": "abc",
+        "control_noise_std": 0.0,
+        "label": "goal",
+    }
+    common |= {"scenario": "circle", "num_robots": 2, "model": "holonomic2d", "dt": 0.1, "success": True, "steps": 60}
     TrialStore(path).add(*(Trial(seed=seed, **common) for seed in range(3)))
     with contextlib.closing(sqlite3.connect(path)) as connection:
         connection.execute("PRAGMA journal_mode=DELETE")
@@ -175,7 +181,19 @@ def test_a_damaged_store_is_read_or_refused(tmp_path: Path, store: Path, data: s
 
 
 CELL = st.one_of(st.none(), st.integers(-(2**63), 2**63 - 1), st.floats(), st.text(max_size=5), st.binary(max_size=5))
-COLUMNS = ("noise", "seed", "robots", "dt", "success", "verified", "wall_time", "steps", "config", "history", "error")
+COLUMNS = (
+    "control_noise_std",
+    "seed",
+    "num_robots",
+    "dt",
+    "success",
+    "verified",
+    "wall_time",
+    "steps",
+    "config",
+    "history",
+    "error",
+)
 
 
 @few(60)
