@@ -21,6 +21,8 @@ FINENESS = (1.6, 1.25, 1.0, 2.2, 3.0)
 """How fine the roadmaps are that are tried; see :func:`~d4orm_planners.guidance.roadmap.lay_roadmap`."""
 TURNS = 30
 """Ways that are planned per robot before path finding for all at once is tried."""
+MAX_ROBOT_STEPS = 4_000_000
+"""Most steps of all robots together, whose drives are kept several times over."""
 ROUND = 1.25
 """How many times as long as straight a way is that leads far round; on a lattice any may be 1.1 times as long."""
 STEPS = 3000
@@ -110,6 +112,8 @@ def first_ways(search: Search) -> Guide | NoWays:
     from d4orm_planners.guidance.team import Replanning, drive_moves
 
     problem, best = search.problem, None
+    if problem.num_robots * problem.horizon > MAX_ROBOT_STEPS:
+        return NoWays(f"more than {MAX_ROBOT_STEPS} steps of all robots together are too many to look for ways")
     with search.watch.paused():
         compile_guidance(problem)
     random = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE))

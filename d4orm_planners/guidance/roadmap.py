@@ -22,7 +22,8 @@ WALL_SLACK = 0.15
 """The same for obstacles, as a share of radius and margin."""
 REPLACED = 0.35
 """Share of the step within which a start or goal takes the place of a node of the lattice."""
-MAX_NODES = 200_000
+MAX_NODES, MAX_CELLS = 200_000, 2**25
+"""Most nodes, and most of them times robots, or times steps; lattices are coarser where there would be more."""
 PAD = 3
 """Steps beyond starts, goals and obstacles that nodes reach."""
 
@@ -117,7 +118,8 @@ def _numbers(nodes: Any, places: Any) -> Any:
 
 def _lattice_nodes(problem: Problem, space: Space | None, reach: float, step: float) -> Any:
     """``(N, 3)`` free places of a lattice wherever ways may lead."""
-    lattice = lay_lattice(problem, space, reach, step, MAX_NODES, pad=PAD * step)
+    most = min(MAX_NODES, MAX_CELLS // max(problem.num_robots, problem.horizon))
+    lattice = lay_lattice(problem, space, reach, step, most, pad=PAD * step)
     return lattice.places[lattice.free]
 
 
