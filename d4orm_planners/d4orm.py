@@ -16,9 +16,9 @@ from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, Credit
 from d4orm_planners.search import Search
 from d4orm_planners.settings import Samples, Share, ShareOrNone, Steps, one_of
 
-PATIENT_AFTER, PATIENT_SAMPLES = 8, 4
-"""Iterations without a solution after which the default weights by the team's reward, as the paper does, and how many
-times as many samples it then draws."""
+SPELL, PATIENT_SAMPLES = 8, 4
+"""Iterations without a solution after which the default weights by the team's reward for as many, as the paper does, and so
+on in turn; and how many times as many samples it draws meanwhile."""
 Start = Annotated[str, one_of(("auto", "team", "guided"))]
 
 
@@ -83,7 +83,7 @@ class D4orm(DenoisingPlanner):
     def is_patient(self, search: Search) -> bool:
         """Whether it goes on with more patience: what finds its way soonest may never find it among many."""
         hasty = self.config.credit == "alternate"
-        return hasty and search.iteration >= PATIENT_AFTER and not search.best.solved
+        return hasty and search.iteration // SPELL % 2 == 1 and not search.best.solved
 
     def is_guided(self, search: Search) -> bool:
         """Whether the first iteration is to find ways on a roadmap."""
