@@ -17,8 +17,8 @@ from d4orm_planners.search import Search
 from d4orm_planners.settings import Samples, Share, ShareOrNone, Steps, one_of
 
 SPELL, PATIENT_SAMPLES = 8, 4
-"""Iterations without a solution after which the default weights by the team's reward for as many, and so on in turn; and
-how many times as many samples it draws meanwhile."""
+"""Iterations without a solution after which the default weights by the team's reward for as many, in turn; and how many
+times as many samples it draws meanwhile."""
 Start = Annotated[str, one_of(("auto", "team", "guided"))]
 
 
