@@ -233,7 +233,7 @@ def test_what_is_replanned_is_better_for_all_together_or_left() -> None:
     driven, random = drive_moves(problem, roadmap, moves.moves), np.random.default_rng(0)
     replanning, kept = Replanning(problem, roadmap), 0
     for _ in range(20):
-        better = replanning.better(driven, replanning.neighbours(driven, random, 4), random)
+        better = replanning.better(driven, replanning.neighbours(driven, random, 4), random, lambda: False)
         if better is not None:
             assert better.cost(problem.horizon) < driven.cost(problem.horizon)
             driven, kept = better, kept + 1

@@ -27,8 +27,6 @@ LOOKAHEAD = 0.05
 """Of the point of its route that a robot heads for, beyond what it drives in a step and a half [m]."""
 BRAKING = 0.5
 """Share of its acceleration that a robot counts on before corners and in them."""
-
-
 FACING, CREEP = np.float32(0.8), np.float32(0.01)
 """Cosine of the angle between heading and way from which on a robot drives, and share of its speed before that."""
 REACHED = 4e-4
@@ -60,9 +58,25 @@ class Progress(NamedTuple):
 
 
 @compiled
-def _square(points: Any, i: Any, position: Any) -> Any:
-    dx, dy, dz = points[i, 0] - position[0], points[i, 1] - position[1], points[i, 2] - position[2]
+def square_to(points: Any, i: Any, place: Any) -> Any:
+    """Squared distance of a point from a place."""
+    dx, dy, dz = points[i, 0] - place[0], points[i, 1] - place[1], points[i, 2] - place[2]
     return dx * dx + dy * dy + dz * dz
+
+
+@compiled
+def point_reached(points: Any, arcs: Any, at: Any, last: Any, place: Any) -> Any:
+    """The point that a robot has come to that was at ``at``: as far on as each next one is nearer, or reached."""
+    following = at
+    while following < last:
+        following += 1
+        # Where two arcs join, points coincide but for rounding.
+        if arcs[following] - arcs[at] > 0.01 or following == last:
+            gap = square_to(points, following, place)
+            if gap > square_to(points, at, place) and gap > REACHED:
+                break
+            at = following
+    return at
 
 
 @cached_kernel(SOURCES, variant="direct", **OPTIONS)
@@ -81,16 +95,7 @@ def direct(routes: Any, paces: Any, dt: Any, beyond: Any, positions: Any, standi
     points, arcs, num_robots = routes.points, routes.arcs, routes.first.shape[0] - 1
     for k in range(num_robots):
         first, last = routes.first[k], routes.first[k + 1] - 1
-        i, here = first + progress.at[k], positions[k]
-        following = i
-        while following < last:
-            following += 1
-            # Where two arcs join, points coincide but for rounding.
-            if arcs[following] - arcs[i] > 0.01 or following == last:
-                gap = _square(points, following, here)
-                if gap > _square(points, i, here) and gap > REACHED:
-                    break
-                i = following
+        i = point_reached(points, arcs, first + progress.at[k], last, positions[k])
         progress.at[k] = (last if standing[k] else i) - first
     for k in range(num_robots):
         first, last = routes.first[k], routes.first[k + 1] - 1
@@ -105,7 +110,7 @@ def direct(routes: Any, paces: Any, dt: Any, beyond: Any, positions: Any, standi
         target, slowest = min(i + 1, limit), paces[i]
         while target < limit and (
             (arcs[target] - arcs[i] < LOOKAHEAD + 1.5 * dt * slowest and routes.bends[target] > 0.0)
-            or _square(points, target, here) < REACHED
+            or square_to(points, target, here) < REACHED
         ):
             target += 1
             slowest = min(slowest, paces[target])
@@ -113,7 +118,7 @@ def direct(routes: Any, paces: Any, dt: Any, beyond: Any, positions: Any, standi
         progress.targets[k, 2] = points[target, 2]
         room = RESERVE * (arcs[limit] - arcs[i])
         if limit - i <= 1:
-            room = np.sqrt(_square(points, limit, here))
+            room = np.sqrt(square_to(points, limit, here))
         progress.room[k] = room + (beyond if limit == last else 0.0)
         progress.pace[k] = paces[i]
 

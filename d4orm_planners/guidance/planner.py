@@ -1,4 +1,4 @@
-"""Path finding on a roadmap, driven by precedence and made better robot by robot: no sampling at all."""
+"""Path finding on a roadmap, driven under the robots' dynamics and made better by and by: no sampling at all."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def better_ways(search: Search, guide: Guide, neighbours: int, replannings: int)
         if search.should_stop():
             break
         robots = guide.replanning.neighbours(driven, random, neighbours)
-        driven = guide.replanning.better(driven, robots, random) or driven
+        driven = guide.replanning.better(driven, robots, random, search.should_stop) or driven
     return replace(guide, driven=driven)
 
 
@@ -130,13 +130,15 @@ def first_ways(search: Search) -> Guide | NoWays:
         driven = replanning.one_by_one(random, search.should_stop, TURNS * problem.num_robots)
         if driven is not None:
             return Guide(roadmap, replanning, driven)
+        if search.should_stop():
+            break
         seed = search.iteration_seed(Stream.GUIDANCE, number + 1)
         found = find_moves(problem, roadmap, seed, search.should_stop, STEPS)
         if found is not None and (best is None or found.arrived.sum() > best[1].arrived.sum()):
             best = Guide(roadmap, replanning, drive_moves(problem, roadmap, found.moves)), found
         if search.should_stop() or (found is not None and found.arrived.all()):
             break
-    return best[0] if best else NoWays("no ways found on the roadmaps")
+    return best[0] if best else NoWays("no ways found on the roadmaps in time")
 
 
 def compile_roadmap(problem: Problem) -> None:
@@ -176,4 +178,4 @@ def compile_guidance(problem: Problem) -> None:
         found = find_moves(alone, roadmap, 0, lambda: False, STEPS)
         if found is not None:
             driven = drive_moves(alone, roadmap, found.moves)
-            Replanning(alone, roadmap).better(driven, np.zeros(1, np.int64), np.random.default_rng(0))
+            Replanning(alone, roadmap).better(driven, np.zeros(1, np.int64), np.random.default_rng(0), lambda: False)

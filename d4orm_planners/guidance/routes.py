@@ -16,15 +16,16 @@ from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import IntArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.caching import cached_kernel
+from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS
-from d4orm_planners.guidance.nearness import SOURCES, Cells, cell_range, sort_into_cells
+from d4orm_planners.guidance import nearness
+from d4orm_planners.guidance.nearness import Cells, cell_range, sort_into_cells
 from d4orm_planners.guidance.roadmap import Roadmap
+
+SOURCES = fingerprint((nearness,))
 
 SPACING = 0.04
 """Distance between the points of a route [m], at most."""
-
-
 CUTS = (1.0, 0.5, 0.25)
 """Shares of the allowed cut that corners are rounded by; the first that leaves room at walls."""
 ARC_POINTS, ARC_CHECKS, ARC_SLACK = 9, 17, 0.01

@@ -113,14 +113,17 @@ class Replanning:
         gaps[robot] = -1.0
         return random.permutation(np.argsort(gaps)[: random.integers(1, min(len(delay), most) + 1)])
 
-    def better(self, driven: Driven, robots: IntArray, random: np.random.Generator) -> Driven | None:
-        """The team with new ways for some robots, in their order, if that is better for all together."""
+    def better(
+        self, driven: Driven, robots: IntArray, random: np.random.Generator, should_stop: Callable[[], bool]
+    ) -> Driven | None:
+        """The team with new ways for some robots, in their order, if that is better for all together, and in time."""
         last = int(driven.arrivals.max())
         changed = Driven(driven.controls[:last].copy(), driven.places[: last + 1].copy(), driven.arrivals.copy())
         changed.places[:, robots] = FAR
         latest = np.minimum(driven.arrivals + LATER, last)
-        if not all(self.replan_one(changed, robot, int(latest[robot]), random) for robot in robots.tolist()):
-            return None
+        for robot in robots.tolist():
+            if should_stop() or not self.replan_one(changed, robot, int(latest[robot]), random):
+                return None
         return changed if changed.cost(self.problem.horizon) < driven.cost(self.problem.horizon) else None
 
     def one_by_one(self, random: np.random.Generator, should_stop: Callable[[], bool], most: int) -> Driven | None:

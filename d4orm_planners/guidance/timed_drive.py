@@ -12,9 +12,9 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.tiles import OPTIONS, ZERO, compiled, make_stepper, models_key, to_fixed_tuple
+from d4orm_env.engine.tiles import OPTIONS, ZERO, make_stepper, models_key, to_fixed_tuple
 from d4orm_planners.guidance import execution
-from d4orm_planners.guidance.execution import BEYOND, LOOKAHEAD, REACHED, RESERVE, steering
+from d4orm_planners.guidance.execution import BEYOND, LOOKAHEAD, REACHED, RESERVE, point_reached, square_to, steering
 from d4orm_planners.guidance.routes import Route
 
 SOURCES = execution.SOURCES + fingerprint((execution,))
@@ -40,12 +40,6 @@ class Timed(NamedTuple):
     corners: Any
     departs: Any
     arrives: Any
-
-
-@compiled
-def _square(points: Any, i: Any, x: Any, y: Any, z: Any) -> Any:
-    dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
-    return dx * dx + dy * dy + dz * dz
 
 
 @cache
@@ -82,15 +76,8 @@ def timed_kernel(name: str) -> Any:
         for i in range(d):
             places[0, i] = x[i]
         for step in range(steps):
-            px, py, pz = places[step, 0], places[step, 1], places[step, 2]
-            following = at
-            while following < last:
-                following += 1
-                if arcs[following] - arcs[at] > 0.01 or following == last:
-                    gap = _square(points, following, px, py, pz)
-                    if gap > _square(points, at, px, py, pz) and gap > REACHED:
-                        break
-                    at = following
+            here = places[step]
+            at = point_reached(points, arcs, at, last, here)
             while corner < last_corner and arcs[at] >= route.corners[corner] - 0.02:
                 corner += 1
             # It stays where it waits until it may set out, and stops there only if it has to.
@@ -111,7 +98,7 @@ def timed_kernel(name: str) -> Any:
                 and arcs[target] < stop
                 and (
                     (arcs[target] - arcs[at] < LOOKAHEAD + 1.5 * dt[0] * slowest and route.bends[target] > 0.0)
-                    or _square(points, target, px, py, pz) < REACHED
+                    or square_to(points, target, here) < REACHED
                 )
             ):
                 target += 1
@@ -122,7 +109,7 @@ def timed_kernel(name: str) -> Any:
             if stop == route.corners[last_corner]:
                 room += beyond
             elif room < 0.1:
-                room = np.sqrt(_square(points, target, px, py, pz))
+                room = np.sqrt(square_to(points, target, here))
             for i in range(d):
                 target_place[i] = points[target, i]
             standing = transition.stands(there, docks)
