@@ -72,7 +72,8 @@ class Shapes:
         outside = np.maximum(below, above)
         # Within a box its nearest face decides.
         nearest_face = np.arange(d) == outside.argmax(axis=1)[:, None]
-        away = np.where((outside > 0).any(axis=1)[:, None], np.maximum(outside, 0.0), nearest_face)
+        beyond = outside.max(axis=1, keepdims=True) > 0
+        away = np.where(beyond, np.maximum(outside, 0.0), nearest_face)
         slope: Floats = np.where(above > below, away, -away) / np.linalg.norm(away, axis=1)[:, None]
         return slope
 
