@@ -61,7 +61,9 @@ def make_planner(name: str | type[Planner] = RECOMMENDED, *, preset: str | None 
     settings = {} if preset is None else kind.presets[preset]
     known = kind.config_class.setting_names({**settings, **config})
     applying = {name: value for name, value in settings.items() if name in known}
-    return kind(kind.config_class.from_keywords({**applying, **config}, owner))
+    planner = kind(kind.config_class.from_keywords({**applying, **config}, owner))
+    planner.preset = preset
+    return planner
 
 
 def make_policy(name: PolicyLike, **config: Any) -> Policy:
