@@ -12,7 +12,7 @@ from d4orm_planners.d4orm import D4orm
 from d4orm_planners.d4orm_d.groups import Groups
 from d4orm_planners.d4orm_d.repairs import Repairs
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
-from d4orm_planners.d4orm_d.team import TeamPaths
+from d4orm_planners.d4orm_d.team import DeformedTeam
 from d4orm_planners.grouping import conflicts
 from d4orm_planners.guidance.planner import (
     Guide,
@@ -22,6 +22,7 @@ from d4orm_planners.guidance.planner import (
     guided_iteration,
 )
 from d4orm_planners.planner import Iteration
+from d4orm_planners.refinement.team import TeamPaths
 from d4orm_planners.search import Search
 from d4orm_planners.steering import prepare_drives, straight_drives
 
@@ -55,14 +56,14 @@ class D4ormD(D4orm):
     def init(self, search: Search) -> State:
         """See :meth:`Planner.init`."""
         # Here, because importing numba takes long.
-        from d4orm_planners.d4orm_d.rerouting import prepare_rerouting
+        from d4orm_planners.refinement.beams import prepare_beams
 
         with search.watch.paused():
             prepare_drives(search.problem)
             if self.config.decoupling == "groups":
                 return Groups()
             if self.config.reroute:
-                prepare_rerouting(TeamPaths(self, search, search.current.trajectory))
+                prepare_beams(TeamPaths(search, search.current.trajectory))
         return Repairs.of(search.problem.num_robots)
 
     def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
@@ -79,7 +80,7 @@ class D4ormD(D4orm):
             return self.whole_team(search, state) if drives is None else (state, Iteration(drives))
         if not search.current.failed.any() or (isinstance(state, Groups) and search.best.solved):
             return self.whole_team(search, state)
-        team = TeamPaths(self, search, search.current.trajectory)
+        team = DeformedTeam(self, search, search.current.trajectory)
         state = state.replan(team) if isinstance(state, Groups) else state.repair(team, self.config)
         return state, team.iteration()
 
@@ -95,7 +96,7 @@ class D4ormD(D4orm):
         iteration = self.run(search)
         if not isinstance(state, Repairs):
             return state, iteration
-        team = TeamPaths(self, search, search.engine.rollout(search.problem, iteration.controls))
+        team = DeformedTeam(self, search, search.engine.rollout(search.problem, iteration.controls))
         return state.shorten(team), replace(iteration, controls=team.controls)
 
     def is_patient(self, search: Search) -> bool:
