@@ -62,7 +62,14 @@ class D4orm(DenoisingPlanner):
     name: ClassVar[str] = "d4orm"
     config_class = D4ormConfig
     presets: ClassVar = {
-        "paper": {**PAPER, "credit": "team", "late_samples": 1.0, "refine": False, "start": "team", "random_start": False}
+        "paper": {
+            **PAPER,
+            "credit": "team",
+            "late_samples": 1.0,
+            "refine": False,
+            "start": "team",
+            "random_start": False,
+        }
     }
     config: D4ormConfig
 

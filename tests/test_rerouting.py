@@ -66,6 +66,13 @@ def test_who_cannot_pass_waits() -> None:
     assert team.faults([0, 1])[0].tolist() == [0, 0]
 
 
+def test_two_that_face_each_other_make_way_together() -> None:
+    """Robots 0 and 1 start 4 mm apart: nothing that one of them does helps while the other comes on at once."""
+    problem = make_problem("random", num_robots=16, model="differential_drive", seed=4)
+    plan = make_planner("d4orm-d", engine="cpu").solve(problem, seed=4, max_iterations=10)
+    assert plan.solved
+
+
 def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = make_problem("random", num_robots=40, size=7.0, seed=0)
     teams = []

@@ -63,6 +63,7 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "elite_fraction": (0.3, {}),
     "adapt_variance": (True, {}),
     "sigma_floor": (0.9, {"adapt_variance": True}),
+    "refine": (False, {"max_iterations": 30, "num_samples": 128, "num_steps": 20, "late_steps": None}),
     "big_team": (1, TEAM),
     "decoupling": ("groups", REPAIRING),
     "reroute": (True, REPAIRING),

@@ -283,7 +283,7 @@ def search_kernel(name: str) -> Any:
                             for axis in range(d):
                                 gap = goal[axis] - (state[axis] + _AHEAD * velocity[axis])
                                 rest2 += gap * gap
-                            cost = last * dt[0] + np.sqrt(rest2) / limits[SPEED]
+                            cost = end * dt[0] + max(np.sqrt(rest2) - goal_radius, ZERO) / limits[SPEED]
                         if rules.contact * faults + cost >= best:
                             continue
                         faults += count_near(table, robot, without, path, first, block)

@@ -10,9 +10,13 @@ from d4orm_env.core.seeds import Stream
 from d4orm_env.engine.beam_search import BeamRules
 from d4orm_env.engine.path_index import BLOCK
 from d4orm_planners.d4orm_d.settings import REROUTE_RULES
-from d4orm_planners.refinement.beams import Manner, find_ways
+from d4orm_planners.grouping import components
+from d4orm_planners.refinement.beams import Company, Manner, find_ways
 from d4orm_planners.refinement.team import TeamPaths
 from d4orm_planners.steering import drives, standing
+
+AWAY = np.float32(1e6)
+"""Where a robot is that is in nobody's way [m]."""
 
 
 def reroute(team: TeamPaths) -> None:
@@ -46,6 +50,34 @@ def reroute(team: TeamPaths) -> None:
                 lost = robots[~ways.arrived[:, 0]]
                 if len(lost):
                     _try_detours(team, lost, random)
+    for pair in components(team.conflicts()):
+        if len(pair) == 2 and not team.search.should_stop():
+            _reroute_pair(team, np.array(pair), manner, rules)
+
+
+def _reroute_pair(team: TeamPaths, pair: IntArray, manner: Manner, rules: BeamRules) -> None:
+    """Let two that meet only each other look for ways from the start, one after the other, if that is better.
+
+    Where they face each other at once, nothing that one of them does helps while the other comes on.
+    """
+    problem = team.problem
+    faults, radius = team.faults(pair)[0].sum(), np.asarray(problem.team.radius, np.float64)
+    present = team.controls[:, pair], team.states[:, pair], team.arrived[pair]
+    for first, second in (pair, pair[::-1]):
+        # Who goes second stays where it is as long as the first may need to get away.
+        beside = np.full((1, 1, problem.horizon + 1, problem.dimension), AWAY, np.float32)
+        beside[:, :, : REROUTE_RULES.standing * BLOCK + 1] = problem.start[second, : problem.dimension]
+        ways = []
+        for robot, other in ((first, second), (second, first)):
+            company = Company(pair[None], beside, radius[[[other]]])
+            ways.append(find_ways(team, np.array([robot]), 0, manner, rules, company=company))
+            beside = np.ascontiguousarray(np.moveaxis(ways[-1].positions, 0, 2))
+        controls = np.concatenate([way.controls[:, :, 0] for way in ways], axis=1)
+        states = np.concatenate([way.states[:, :, 0] for way in ways], axis=1)
+        team.move([first, second], controls, states, [way.arrived[0, 0] for way in ways])
+        if team.faults(pair)[0].sum() < faults:
+            return
+        team.move(pair, *present)
 
 
 def _try_detours(team: TeamPaths, robots: IntArray, random: np.random.Generator) -> None:

@@ -64,6 +64,8 @@ class RerouteRules:
         angles: By which a robot turns off from the way to its goal [degrees]; in space up and down as well.
         swing: From one sweep to the next all of them change by up to so much either way [degrees].
         paces: Shares of its speed with which a robot heads for its goal: waiting has no direction.
+        standing: Blocks for which, of two robots that meet only each other, the second is taken to stay where it starts
+            while the first looks for a way.
         detours: Random points by which it tries to drive if it has found no way.
     """
 
@@ -77,6 +79,7 @@ class RerouteRules:
     angles: tuple[float, ...] = (30.0, 60.0, 90.0, 135.0, 180.0)
     swing: float = 14.0
     paces: tuple[float, ...] = (1.0, 0.5, 0.0)
+    standing: int = 4
     detours: int = 32
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core import portable
-from d4orm_env.core.arrays import FloatArray, IntArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.core.robot_model import Model
 from d4orm_env.engine.beam_search import BeamRules, Moves, Seekers, search_kernel
 from d4orm_env.engine.path_index import BLOCK
 from d4orm_env.engine.threads import Threads, available_cores
@@ -107,16 +108,21 @@ def find_ways(
                 company.beside[mine], company.radius[mine],
             )  # fmt: skip
             moves = manner.moves(problem.dimension, has_heading=model.heading_index is not None)
-            own_u, own_x, found, search = u[mine], x[mine], np.zeros(len(mine), bool), search_kernel(model.name)
-            Threads(available_cores()).over(
-                len(mine),
-                lambda part: search(  # noqa: B023
-                    problem.arrays, team.index.table, moves, rules, seekers, part, own_u, own_x, found  # noqa: B023
-                ),
-            )
-            u[mine], x[mine], arrived[mine] = own_u, own_x, found
+            u[mine], x[mine], arrived[mine] = _search(team, model, moves, rules, seekers, u[mine], x[mine])
     u, x = (rows.swapaxes(0, 1)[:, :, None] for rows in (u, x))
     return Drives(u, x, arrived[:, None], problem.dimension)
+
+
+def _search(
+    team: TeamPaths, model: Model, moves: Moves, rules: BeamRules, seekers: Seekers, u: FloatArray, x: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Controls ``(R, H, m)``, states ``(R, H+1, n)`` and who arrives, of robots of one model that did as given."""
+    found, search = np.zeros(len(u), bool), search_kernel(model.name)
+    arrays, table = team.problem.arrays, team.index.table
+    Threads(available_cores()).over(
+        len(u), lambda part: search(arrays, table, moves, rules, seekers, part, u, x, found)
+    )
+    return u, x, found
 
 
 def prepare_beams(team: TeamPaths) -> None:

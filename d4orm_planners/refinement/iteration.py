@@ -22,8 +22,7 @@ def refined_iteration(search: Search) -> Iteration:
     team = TeamPaths(search, search.best.trajectory)
     with search.watch.paused():
         prepare_beams(team)
-    shorten_ways(team, search.iteration_seed(Stream.NEIGHBOURHOODS), ROUNDS)
-    return Iteration(team.controls)
+    return Iteration(shorten_ways(team, search.iteration_seed(Stream.NEIGHBOURHOODS), ROUNDS))
 
 
 def shorten_first_ways(team: TeamPaths) -> None:

@@ -1,6 +1,7 @@
-"""Large-neighbourhood search: a few robots at a time find faster ways around all others, as drives not as cells.
+"""Large-neighbourhood search: a few robots at a time find faster ways around all others, under their own dynamics.
 
-After MAPF-LNS (J. Li, Z. Chen, D. Harabor, P. J. Stuckey and S. Koenig, IJCAI 2021), accepting as simulated annealing does.
+After MAPF-LNS (J. Li, Z. Chen, D. Harabor, P. J. Stuckey and S. Koenig, IJCAI 2021); what is worse is accepted as in
+simulated annealing.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ class NeighbourhoodRules:
 RULES = NeighbourhoodRules()
 
 
-def shorten_ways(team: TeamPaths, seed: int, rounds: int, temperature: float = RULES.temperature) -> None:
+def shorten_ways(team: TeamPaths, seed: int, rounds: int, temperature: float = RULES.temperature) -> FloatArray:
     """Let groups of robots look for faster ways, so many rounds, as long as there is time.
 
     What counts is the sum of all arrival times and of all distances left over time, each as a share of the robot's
@@ -69,12 +70,19 @@ def shorten_ways(team: TeamPaths, seed: int, rounds: int, temperature: float = R
         seed: Of what is tried.
         rounds: How often :attr:`NeighbourhoodRules.groups` groups try.
         temperature: See :attr:`NeighbourhoodRules.temperature`; it falls to zero with the rounds.
+
+    Returns:
+        ``(H, K, m)`` controls of the best that there has been; at a temperature of zero that is what the team does.
     """
     search = _Neighbourhoods(team, np.random.default_rng(seed))
+    best, least = team.controls.copy(), search.cost
     for number in range(rounds):
         if team.search.should_stop():
             break
         search.run(temperature * (1 - number / rounds))
+        if search.cost < least:
+            best, least = team.controls.copy(), search.cost
+    return best
 
 
 class _Neighbourhoods:
@@ -89,12 +97,18 @@ class _Neighbourhoods:
         self.soonest, _ = self.costs(everybody, straight.positions[:, :, 0])
         self.arrival, self.lag = self.costs(everybody, team.states[..., : self.problem.dimension])
 
+    @property
+    def cost(self) -> float:
+        """Of all together [s]."""
+        return float((self.arrival + self.lag).sum())
+
     def costs(self, robots: IntArray, places: FloatArray) -> tuple[Floats, Floats]:
         """``(R,)`` arrival times of robots at places ``(H+1, R, d)``, and their distances left over time [s]."""
         still = (places[1:] == places[:-1]).all(axis=2)
-        gap = np.linalg.norm(places[1:] - self.problem.goal[robots], axis=2).sum(axis=0)
-        lag = gap / np.maximum(self.distance[robots], self.problem.goal_radius)
-        return self.problem.dt * arrival_steps(np.concatenate([still, still[-1:] | True])), self.problem.dt * lag
+        gap = np.linalg.norm(places[1:] - self.problem.goal[robots], axis=2).sum(axis=0, dtype=np.float64)
+        lag: Floats = self.problem.dt * gap / np.maximum(self.distance[robots], self.problem.goal_radius)
+        # Who does not move from one step to the next has arrived by the first of the two.
+        return self.problem.dt * arrival_steps(np.concatenate([still, np.ones_like(still[:1])])).astype(float), lag
 
     def run(self, temperature: float) -> None:
         """One round."""
