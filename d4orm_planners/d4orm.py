@@ -36,7 +36,7 @@ class D4ormConfig(ContinuationSettings, DenoisingConfig):
             in the rollout only.
         late_steps: Share of the steps, the last ones, at which the noise is small enough for fewer samples.
         late_samples: Share of the samples that these steps draw.
-        refine: Whether, once there is a solution, groups of robots look for faster ways around all others, rather than
+        shorten: Whether, once there is a solution, groups of robots look for faster ways around all others, rather than
             the whole team being deformed again (:mod:`d4orm_planners.refinement`).
         start: What the first iteration does without initial controls. ``"team"`` deforms standing still, as in the
             paper; ``"guided"`` drives on ways found on a roadmap (:mod:`d4orm_planners.guidance`), which later
@@ -51,7 +51,7 @@ class D4ormConfig(ContinuationSettings, DenoisingConfig):
     clip_between_iterations: bool = True
     late_steps: ShareOrNone = 0.7
     late_samples: Share = 0.5
-    refine: bool = True
+    shorten: bool = True
     start: Start = "auto"
     random_start: bool = False
 
@@ -66,7 +66,7 @@ class D4orm(DenoisingPlanner):
             **PAPER,
             "credit": "team",
             "late_samples": 1.0,
-            "refine": False,
+            "shorten": False,
             "start": "team",
             "random_start": False,
         }
@@ -79,7 +79,7 @@ class D4orm(DenoisingPlanner):
             guide = first_ways(search)
             if isinstance(guide, Guide):
                 return state, guided_iteration(search, guide)
-        if self.config.refine and search.best.solved:
+        if self.config.shorten and search.best.solved:
             return state, refined_iteration(search)
         return super().iterate(search, state)
 

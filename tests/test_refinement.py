@@ -28,7 +28,7 @@ STRAIGHT, STRICT = Manner((45.0, 90.0), (1.0, 0.5, 0.0)), BeamRules(32, 1e6, 0.1
 
 def solved_team(problem: Problem, seed: int = 0) -> TeamPaths:
     """A first solution, as it was found."""
-    search = Search(make_planner("d4orm-d", engine="cpu", refine=False), problem, seed)
+    search = Search(make_planner("d4orm-d", engine="cpu", shorten=False), problem, seed)
     while not search.best.solved:
         search.advance()
     return TeamPaths(search, search.best.trajectory)

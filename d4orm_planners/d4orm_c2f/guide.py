@@ -67,7 +67,7 @@ class Guide:
                 improve=True,
                 # Ways that fit between others to the centimetre are no guidance: fine plans cannot keep to them.
                 reroute=False,
-                refine=False,
+                shorten=False,
             )
         )
 

@@ -65,7 +65,7 @@ class D4ormD(D4orm):
             prepare_drives(search.problem)
             if self.config.decoupling == "groups":
                 return Groups()
-            if self.config.reroute or self.config.refine:
+            if self.config.reroute or self.config.shorten:
                 prepare_beams(TeamPaths(search, search.current.trajectory))
         return Repairs.of(search.problem.num_robots)
 
@@ -81,7 +81,7 @@ class D4ormD(D4orm):
         if search.iteration == 0 and not search.current.controls.any():
             drives = self.straight_start(search.problem)
             return self.whole_team(search, state) if drives is None else (state, Iteration(drives))
-        if self.config.refine and search.best.solved:
+        if self.config.shorten and search.best.solved:
             return state, refined_iteration(search)
         if not search.current.failed.any() or (isinstance(state, Groups) and search.best.solved):
             return self.whole_team(search, state)
@@ -111,7 +111,7 @@ class D4ormD(D4orm):
 
     def shorten_first(self, team: DeformedTeam) -> None:
         """Let the ways of a team in which nobody fails any more become shorter."""
-        if self.config.refine and not team.faults(np.arange(team.problem.num_robots))[0].any():
+        if self.config.shorten and not team.faults(np.arange(team.problem.num_robots))[0].any():
             shorten_first_ways(team)
 
     def is_patient(self, search: Search) -> bool:
