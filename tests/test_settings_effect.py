@@ -68,8 +68,8 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "decoupling": ("groups", REPAIRING),
     "reroute": (True, REPAIRING),
     "start": ("guided", {"start": "team"}),
-    "neighbours": (1, {"max_iterations": 25}),
-    "replannings": (1, {"max_iterations": 25}),
+    "neighbours": (1, {"max_iterations": 4}),
+    "replannings": (1, {"max_iterations": 4}),
     "first_collisions": (False, TEAM),
     "repair_samples": (16, REPAIRING),
     "repair_steps": (9, REPAIRING),
@@ -90,9 +90,9 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
 """By setting, another value, and the settings beside which it means something."""
 
 
-def crossing() -> Problem:
-    """Four robots that meet in the middle."""
-    return make_problem("circle", num_robots=4, diameter=3.0, horizon=50)
+def crossing(num_robots: int = 4) -> Problem:
+    """Robots that meet in the middle."""
+    return make_problem("circle", num_robots=num_robots, diameter=3.0, horizon=50)
 
 
 def planner_settings() -> list[Any]:
@@ -111,7 +111,8 @@ def base_settings(name: str, setting: str) -> dict[str, Any]:
 
 def outcome(name: str, settings: dict[str, Any]) -> Any:
     """What a solve gives and says, but for its time, and who worked on it."""
-    search = Search(make_planner(name, **settings), crossing(), 1)
+    # The first plan of four robots that are guided is hard to make better.
+    search = Search(make_planner(name, **settings), crossing(8 if name == "guided" else 4), 1)
     try:
         for _ in range(settings["max_iterations"]):
             search.advance()
