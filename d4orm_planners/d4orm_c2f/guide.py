@@ -75,6 +75,7 @@ class Guide:
                     repair_steps=config.coarse_repair_steps,
                     improve=True,
                     reroute=reroute,
+                    shorten=False,
                 )
             )
             for reroute in (False, True)
