@@ -139,10 +139,10 @@ def test_mixed_team_example_solves_a_scenario_and_draws_it(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_walled_worlds_are_drawn(tmp_path: Path) -> None:
-    completed("walled_worlds", tmp_path / "out")
+def test_scenarios_are_drawn(tmp_path: Path) -> None:
+    completed("scenario_pictures", tmp_path / "out")
     pictures = sorted((tmp_path / "out").iterdir())
-    assert [path.name for path in pictures] == ["scenario_maze.png", "scenario_rooms.png"]
+    assert [path.name for path in pictures] == ["scenario_paper_circle.png", "scenario_paper_sphere.png"]
     assert all(path.read_bytes().startswith(PNG) for path in pictures)
 
 
