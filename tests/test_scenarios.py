@@ -266,7 +266,7 @@ class TestPaper:
         assert make_problem("paper_random", 64).goal[-1].tolist() == [5, 5]
 
     def test_random_has_no_room_for_a_hundred(self) -> None:
-        with pytest.raises(ValueError, match="100 robots of radius 0.15 m found no room.*use fewer robots"):
+        with pytest.raises(ValueError, match=r"100 robots of radius 0\.15 m found no room.*use fewer robots"):
             make_problem("paper_random", 100)
 
     def test_heterogeneous(self) -> None:
