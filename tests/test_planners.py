@@ -30,6 +30,7 @@ from d4orm_planners.registry import PLANNERS, describe_planner
 from d4orm_planners.sampling.optimizer import SamplingPlanner, standard_normal
 from d4orm_planners.sampling.schedule import alpha_bar, annealed
 from d4orm_planners.search import Search
+from d4orm_planners.steering import straight_drives
 
 ALL = pytest.mark.parametrize("name", list_planners())
 SAMPLING = tuple(name for name in list_planners() if issubclass(PLANNERS[name], SamplingPlanner))
@@ -724,6 +725,19 @@ def test_the_noise_of_the_reference_is_standard_normal() -> None:
     assert draws.mean() == pytest.approx(0, abs=1e-6)
     assert draws.std() == pytest.approx(1, abs=0.01)
     assert np.abs(draws).max() < 6
+
+
+@pytest.mark.parametrize("name", ["d4orm", "mppi", "cem"])
+def test_credit_by_groups_is_that_of_those_in_conflict(name: str) -> None:
+    problem = make_problem("circle", num_robots=4)
+    drives = straight_drives(problem).controls[:, :, 0]  # everybody meets in the middle
+    for start, same in ((None, "robot"), (drives, "team")):
+        controls = []
+        for credit in ("group", same):
+            search = Search(cheap_planner(name, credit=credit), problem, 0, start)
+            search.advance()
+            controls.append(search.current.controls)
+        np.testing.assert_allclose(*controls, atol=1e-3)
 
 
 def test_the_methods_sample_with_the_papers_deviation() -> None:
