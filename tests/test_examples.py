@@ -44,8 +44,8 @@ def table(path: Path) -> list[dict[str, str]]:
     return rows
 
 
-def completed(name: str, out: Path) -> None:
-    result = run(name, out)
+def completed(name: str, out: Path, *arguments: str) -> None:
+    result = run(name, out, *arguments)
     assert result.returncode == 0, result.stderr
     assert not [path for path in out.iterdir() if path.name.startswith(".")], "a temporary file was left behind"
 
@@ -144,6 +144,29 @@ def test_scenarios_are_drawn(tmp_path: Path) -> None:
     pictures = sorted((tmp_path / "out").iterdir())
     assert [path.name for path in pictures] == ["scenario_paper_circle.png", "scenario_paper_sphere.png"]
     assert all(path.read_bytes().startswith(PNG) for path in pictures)
+
+
+@pytest.mark.slow
+def test_rivals_are_tuned_and_a_second_call_runs_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("tune_rivals", out, "--method", "cem")
+    rows = table(out / "tuning.csv")
+    assert [(row["round"], row["trials"]) for row in rows] == [("3", "16"), ("2", "8"), ("1", "4"), ("1", "4")]
+    assert sum(row["settings"] == "preset paper" for row in rows) in (1, 3)
+    trials = (out / "trials.sqlite").read_bytes()
+    completed("tune_rivals", out, "--method", "cem")
+    assert table(out / "tuning.csv") == rows
+    assert (out / "trials.sqlite").read_bytes() == trials
+
+
+@pytest.mark.slow
+def test_credit_and_update_are_crossed(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("credit_by_update", out)
+    rows = table(out / "credit_by_update.csv")
+    assert len({(row["update"], row["credit"]) for row in rows}) == len(rows) == 20
+    assert all(row["p (steps)"] == "1" for row in rows if row["update"] == "d4orm")
+    assert (out / "credit_by_update.png").read_bytes().startswith(PNG)
 
 
 def test_gradient_ascent_through_the_dynamics_raises_the_reward(tmp_path: Path) -> None:

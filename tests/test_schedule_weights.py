@@ -205,4 +205,5 @@ def test_a_group_weights_by_the_sum_of_its_rewards(rule: Any, xp: Any) -> None:
     alone = GroupWeights(rule, ((0,), (1,), (2,), (3,)))(xp.asarray(rewards), xp)
     np.testing.assert_array_equal(alone, rule(xp.asarray(rewards), xp))
     team = np.asarray(GroupWeights(rule, ((0, 1, 2, 3),))(xp.asarray(rewards), xp))
-    np.testing.assert_allclose(team, np.tile(rule(xp.asarray(rewards.mean(axis=0, keepdims=True)), xp), (4, 1)), rtol=1e-4)
+    mean = xp.asarray(rewards.mean(axis=0, keepdims=True))
+    np.testing.assert_allclose(team, np.tile(rule(mean, xp), (4, 1)), rtol=1e-4)

@@ -30,8 +30,8 @@ class SamplingConfig(PlannerConfig):
         num_steps: ``N``, steps per iteration.
         credit: ``"team"`` weights samples by the team's mean reward, as in the paper; ``"robot"`` weights each robot's
             part of a sample by the robot's own reward, which keeps the signal from diluting with the number of robots;
-            ``"alternate"`` does the second in the first iteration, the first in the next, and so on; ``"group"`` weights
-            by the reward of those that a robot is in conflict with, directly or by others, in the last iteration's plan.
+            ``"alternate"`` does the second in the first iteration, the first in the next, and so on; ``"group"``
+            weights by the reward of those that a robot was in conflict with, directly or by others, in the last plan.
     """
 
     num_samples: Samples = 1024
