@@ -62,25 +62,28 @@ class Swarm:
         velocities = np.zeros((problem.num_robots, problem.dimension))
         for control in controls:
             stands = arrived & problem.docks
-            if stands.all() or should_stop():
+            if stands.all() or not self._replan(states, velocities, stands, should_stop):
                 break
-            self._replan(states[:, : problem.dimension].astype(np.float64), velocities, stands)
             control[:] = track_velocities(problem, states, self._wanted(states))
             step = engine.step(problem.arrays, states, arrived, control)
             states, arrived = step.states, step.arrived
             velocities = present_velocities(problem, states, step.controls).astype(np.float64)
         return controls
 
-    def _replan(self, places: Floats, velocities: Floats, stands: BoolArray) -> None:
-        """Every robot's motion from here, around where the others are predicted to be."""
+    def _replan(
+        self, states: FloatArray, velocities: Floats, stands: BoolArray, should_stop: Callable[[], bool]
+    ) -> bool:
+        """Every robot's motion from here, around where the others are predicted to be; whether there was time for it."""
         config, problem, method = self._config, self._problem, self._method
-        duration = config.lookahead * problem.dt
+        places, duration = states[:, : problem.dimension].astype(np.float64), config.lookahead * problem.dt
         moved = self._random.uniform(-config.perturbation, config.perturbation, self._guesses.place.shape)
         predicted = np.where(stands[:, None, None], places[:, None], self._guesses.place)
         bodies = Bodies(predicted, self._radius, problem.margin + config.clearance, self._boxes, self._bounds)
         begins = first_coefficients(config.degree, duration, places, velocities, self._accelerations)
         guesses = Guess(predicted + moved, self._guesses.velocity.copy(), self._guesses.acceleration.copy())
         for robot in np.flatnonzero(~stands):
+            if should_stop():
+                return False
             motion, fixed = self._motions[robot], self._fixed[robot]
             motion[:fixed] = begins[:fixed, robot]
             own = Guess(*(samples[robot] for samples in guesses))
@@ -89,6 +92,7 @@ class Swarm:
         self._first = guesses.place[:, 0], guesses.velocity[:, 0]
         self._accelerations = _shortened(guesses.acceleration[:, 0], self._limits[:, 1])
         self._guesses = _one_step_on(guesses, problem.dt)
+        return True
 
     def _wanted(self, states: FloatArray) -> FloatArray:
         """``(K, d)`` velocities that lead along the motions for a step [m/s]."""
