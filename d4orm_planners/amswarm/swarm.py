@@ -73,7 +73,7 @@ class Swarm:
     def _replan(
         self, states: FloatArray, velocities: Floats, stands: BoolArray, should_stop: Callable[[], bool]
     ) -> bool:
-        """Every robot's motion from here, around where the others are predicted to be; whether there was time for it."""
+        """Every robot's motion from here, around where the others are predicted to be; whether time sufficed."""
         config, problem, method = self._config, self._problem, self._method
         places, duration = states[:, : problem.dimension].astype(np.float64), config.lookahead * problem.dt
         moved = self._random.uniform(-config.perturbation, config.perturbation, self._guesses.place.shape)
