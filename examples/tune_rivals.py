@@ -7,20 +7,24 @@ with the same seeds; the better third meets twice as many, and a third of that f
 K. Jamieson and A. Talwalkar, AISTATS 2016). A trial has a budget of denoising steps of 1024 samples. What counts is the
 mean number of steps to the first solution, a trial without one counting twice the budget (PAR-2). Seeds are 100 and up:
 evaluations use those below. Trials are stored in the folder, and a call that was broken off goes on from there.
+`--trials FILE` makes the table of trials that are in a Parquet file, such as those in `data/`.
 """
 
 from __future__ import annotations
 
+import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from outputs import argument_parser, count, save_table
 
+from d4orm_planners.evaluation.comparison import penalised_steps, steps_to_solution
 from d4orm_planners.evaluation.evaluate import run_study
-from d4orm_planners.evaluation.store import Trial
+from d4orm_planners.evaluation.report import read_parquet, write_parquet
+from d4orm_planners.evaluation.store import Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
 
 TEAMS = (("paper_circle", 8), ("paper_random", 16), ("paper_heterogeneous", 8), ("paper_obstacles", 8))
@@ -82,11 +86,6 @@ def policy(method: str, settings: Settings, budget: int) -> Settings:
     return {**chosen, "max_iterations": budget // chosen["num_steps"]}
 
 
-def steps_needed(trial: Trial, num_steps: int, budget: int) -> int:
-    """Denoising steps to the first solution; twice the budget without one."""
-    return trial.iterations * num_steps if trial.status == "solved" and trial.iterations else 2 * budget
-
-
 def scores(method: str, chosen: Sequence[Settings], seeds: int, budget: int, out: Path) -> list[float]:
     """Of each of these settings the mean number of steps needed, over all teams and seeds."""
     policies = {f"{method} {index}": policy(method, settings, budget) for index, settings in enumerate(chosen)}
@@ -96,24 +95,38 @@ def scores(method: str, chosen: Sequence[Settings], seeds: int, budget: int, out
             policies=policies, scenarios=(scenario,), num_robots=num_robots, seeds=range(FIRST_SEED, FIRST_SEED + seeds)
         )
         for label, trials in run_study(study, out, workers=1):
-            needed[label] += [steps_needed(trial, policies[label]["num_steps"], budget) for trial in trials]
+            needed[label] += map(penalised_steps, trials)
     return [float(np.mean(values)) for values in needed.values()]
 
 
-def tune(method: str, number: int, seeds: int, budget: int, out: Path) -> list[dict[str, Any]]:
-    """A row for each candidate in each round that it came to, the best of the last round first."""
-    chosen, rows = candidates(method, number), []
+def tune(method: str, number: int, seeds: int, budget: int, out: Path) -> None:
+    """Run all rounds of a method."""
+    chosen = candidates(method, number)
     for turn in range(ROUNDS):
         found = scores(method, chosen, seeds << turn, budget, out)
         order = np.argsort(found, kind="stable")
-        rows[:0] = [
-            {"method": method, "round": turn + 1, "trials": len(TEAMS) * (seeds << turn), "steps": round(found[i], 1),
-             "settings": ", ".join(f"{name}={value}" for name, value in chosen[i].items()) or "preset paper"}
-            for i in order
-        ]  # fmt: skip
-        print(f"{method}, round {turn + 1}: {rows[0]['steps']} steps with {rows[0]['settings']}", flush=True)
+        print(
+            f"{method}, round {turn + 1}: {found[order[0]]:g} steps with {chosen[order[0]] or 'the preset'}", flush=True
+        )
         chosen = [chosen[i] for i in order[: max(1, round(KEPT * len(chosen)))]]
-    return rows
+
+
+def rows_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:
+    """A row per method and settings: those that came furthest first, and of these the best."""
+    groups: dict[tuple[str, str], list[Trial]] = {}
+    for trial in trials:
+        groups.setdefault((trial.policy, trial.config), []).append(trial)
+    rows = []
+    for (method, config), group in groups.items():
+        settings = json.loads(config)
+        steps = float(np.mean([penalised_steps(trial) for trial in group]))
+        solved = sum(steps_to_solution(trial) is not None for trial in group)
+        rows.append(
+            {"method": method, "trials": len(group), "solved": solved, "steps": round(steps, 1),
+             "settings": ", ".join(f"{name}={settings[name]}" for name in SPACES[method])}
+        )  # fmt: skip
+    order = list(SPACES)
+    return sorted(rows, key=lambda row: (order.index(row["method"]), -row["trials"], row["steps"], row["settings"]))
 
 
 def main() -> int:
@@ -122,12 +135,17 @@ def main() -> int:
     parser.add_argument("--candidates", type=count, default=27, help="settings tried per method, the preset included")
     parser.add_argument("--seeds", type=count, default=4, help="seeds of the first round")
     parser.add_argument("--method", action="append", choices=SPACES, help="only this one; repeatable")
+    parser.add_argument("--trials", type=Path, help="run nothing; a Parquet file of trials")
     arguments = parser.parse_args()
-    number, seeds, budget = (2, 1, TINY) if arguments.quick else (arguments.candidates, arguments.seeds, BUDGET)
-    rows = []
-    for method in arguments.method or SPACES:
-        rows += tune(method, number, seeds, budget, arguments.out)
-    save_table(rows, arguments.out / "tuning.csv")
+    if arguments.trials is None:
+        number, seeds, budget = (2, 1, TINY) if arguments.quick else (arguments.candidates, arguments.seeds, BUDGET)
+        for method in arguments.method or SPACES:
+            tune(method, number, seeds, budget, arguments.out)
+        trials = TrialStore.existing(arguments.out).trials()
+        write_parquet(arguments.out / "tuning.parquet", trials)
+    else:
+        trials = read_parquet(arguments.trials)
+    save_table(rows_of(trials), arguments.out / "tuning.csv")
     return 0
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from d4orm_planners.evaluation.comparison import paired, survival
+from d4orm_planners.evaluation.comparison import paired, penalised_steps, steps_to_solution, survival
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import wilson_interval
 
@@ -80,3 +80,11 @@ def test_who_is_compared_with_itself_differs_in_nothing(costs: list[tuple[int | 
     found = paired(first, second, spent)
     assert 0 <= found.success_p <= 1
     assert 0 <= found.cost_p <= 1
+
+
+def test_steps_are_those_of_the_iterations() -> None:
+    config = '{"num_steps": 50, "max_iterations": 20}'
+    (found,) = trials([1.0], config=config, status="solved", iterations=3)
+    (missed,) = trials([None], config=config, status="iteration_limit", iterations=20)
+    assert (steps_to_solution(found), penalised_steps(found)) == (150, 150)
+    assert (steps_to_solution(missed), penalised_steps(missed)) == (None, 2000)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -70,6 +71,19 @@ def paired(first: Sequence[Trial], second: Sequence[Trial], cost: Callable[[Tria
 
 def _circumstances(trial: Trial) -> tuple[str, float, int]:
     return trial.problem, trial.control_noise_std, trial.seed
+
+
+def steps_to_solution(trial: Trial) -> int | None:
+    """Denoising steps of a sampling planner's solve that ended with its first solution; ``None`` if it found none."""
+    if trial.status != "solved" or not trial.iterations:
+        return None
+    return trial.iterations * int(json.loads(trial.config)["num_steps"])
+
+
+def penalised_steps(trial: Trial) -> int:
+    """:func:`steps_to_solution`, and twice all the steps that there were where it found none (PAR-2)."""
+    steps, config = steps_to_solution(trial), json.loads(trial.config)
+    return 2 * int(config["num_steps"] * config["max_iterations"]) if steps is None else steps
 
 
 @dataclass(frozen=True, eq=False)
