@@ -173,6 +173,15 @@ def test_credit_and_update_are_crossed(tmp_path: Path) -> None:
     assert table(tmp_path / "again" / "credit_by_update.csv") == rows
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("program", "name"), [("tune_rivals", "tuning"), ("credit_by_update", "credit_by_update")])
+def test_the_tables_of_the_docs_are_those_of_the_data(tmp_path: Path, program: str, name: str) -> None:
+    completed(program, tmp_path / "out", "--trials", str(ROOT / "data" / f"{name}.parquet"))
+    for kind in ("csv", "md"):
+        committed = ROOT / "docs" / "tables" / f"{name}.{kind}"
+        assert (tmp_path / "out" / f"{name}.{kind}").read_bytes() == committed.read_bytes()
+
+
 def test_gradient_ascent_through_the_dynamics_raises_the_reward(tmp_path: Path) -> None:
     out = tmp_path / "out"
     completed("jax_functional", out)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import itertools
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,6 +31,7 @@ from d4orm_planners import IterationRecord, Plan, list_planners, make_planner
 from d4orm_planners.registry import PLANNERS, describe_planner
 from d4orm_planners.sampling.optimizer import SamplingPlanner, standard_normal
 from d4orm_planners.sampling.schedule import alpha_bar, annealed
+from d4orm_planners.sampling.tuned import TUNED
 from d4orm_planners.search import Search
 from d4orm_planners.steering import straight_drives
 
@@ -487,6 +490,17 @@ def test_a_preset_says_nothing_of_what_no_planner_has(name: str) -> None:
     known = {setting for kind in PLANNERS.values() for setting in kind.config_class.setting_names()}
     known |= set(PLANNERS["d-d4orm"].config_class.setting_names({"planner": "d4orm-d"}))
     assert all(preset.keys() <= known for preset in PLANNERS[name].presets.values())
+
+
+def test_the_tuned_presets_are_the_best_of_the_tuning() -> None:
+    with (Path(__file__).parents[1] / "docs" / "tables" / "tuning.csv").open(newline="") as file:
+        best = {row["method"]: row["settings"] for row in reversed(list(csv.DictReader(file)))}
+    assert best.keys() == TUNED.keys()
+    for name, found in best.items():
+        config = make_planner(name, preset="tuned").config.keywords()
+        settings = dict(part.split("=") for part in found.split(", "))
+        assert {setting: str(config[setting]) for setting in settings} == settings
+        assert (config["num_samples"], config["credit"]) == (1024, "team")
 
 
 def test_the_paper_presets_of_the_methods_own_parameters() -> None:
