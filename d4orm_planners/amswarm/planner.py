@@ -77,21 +77,26 @@ class AMSwarm(Planner):
         from d4orm_planners.amswarm.swarm import Swarm
 
         _refuse_polygons(search.problem)
-        with search.watch.paused():
-            self._compile(search)
+        if search.iteration == 0:
+            with search.watch.paused():
+                self._compile(search)
         random = np.random.default_rng(search.iteration_seed(Stream.PERTURBATION))
         swarm = Swarm(search.problem, self.config, random)
         controls = swarm.run(search.engine, search.should_stop)
         return state, Iteration(controls, note=f"largest violation planned: {swarm.violation:.3f}")
 
     def _compile(self, search: Search) -> None:
-        """Compile the alternation, if it is not yet."""
+        """Compile the alternation and the step of such a team, if they are not yet."""
         from d4orm_planners.amswarm.alternation import alternate
         from d4orm_planners.amswarm.swarm import Swarm
 
+        problem, engine = search.problem, search.engine
+        arrived, controls = np.zeros(problem.num_robots, bool), search.current.controls[0]
+        engine.step(problem.arrays, np.asarray(problem.start), arrived, controls)
         if not alternate.signatures:
-            alone = search.problem.select([0]).replace(horizon=1)
-            Swarm(alone, self.config, np.random.default_rng(0)).run(search.engine, lambda: False)
+            alone = problem.select([0])
+            step = alone.resumed_at(alone.start, alone.goal, horizon=1)
+            Swarm(step, self.config, np.random.default_rng(0)).run(engine, lambda: False)
 
 
 def _refuse_polygons(problem: Problem) -> None:
