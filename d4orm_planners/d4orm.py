@@ -14,12 +14,22 @@ from d4orm_planners.planner import Iteration, State
 from d4orm_planners.refinement.iteration import refined_iteration
 from d4orm_planners.sampling.optimizer import DenoisingPlanner, standard_normal
 from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, Credit, DenoisingConfig
+from d4orm_planners.sampling.tuned import TUNED
 from d4orm_planners.search import Search
 from d4orm_planners.settings import Samples, Share, ShareOrNone, Steps, one_of
 
 SPELL, PATIENT_SAMPLES = 8, 4
 """Iterations without a solution after which the default weights by the team's reward for as many, in turn; and how many
 times as many samples it draws meanwhile."""
+
+PAPER_DEFORMATION = {
+    **PAPER,
+    "credit": "team",
+    "late_samples": 1.0,
+    "shorten": False,
+    "start": "team",
+    "random_start": False,
+}
 Start = Annotated[str, one_of(("auto", "team", "guided"))]
 
 
@@ -61,16 +71,7 @@ class D4orm(DenoisingPlanner):
 
     name: ClassVar[str] = "d4orm"
     config_class = D4ormConfig
-    presets: ClassVar = {
-        "paper": {
-            **PAPER,
-            "credit": "team",
-            "late_samples": 1.0,
-            "shorten": False,
-            "start": "team",
-            "random_start": False,
-        }
-    }
+    presets: ClassVar = {"paper": PAPER_DEFORMATION, "tuned": {**PAPER_DEFORMATION, **TUNED["d4orm"]}}
     config: D4ormConfig
 
     def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:

@@ -86,6 +86,13 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "tolerance": (10.0, {"solver_iterations": 200}),
     "barrier": (1e-2, {}),
     "solver_iterations": (20, {}),
+    "lookahead": (20, {}),
+    "degree": (9, {}),
+    "goal_steps": (10, {}),
+    "goal_weight": (2.0, {}),
+    "smoothness": (0.1, {}),
+    "growth": (1.5, {}),
+    "alternations": (5, {}),
 }
 """By setting, another value, and the settings beside which it means something."""
 
