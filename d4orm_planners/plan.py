@@ -18,11 +18,13 @@ from d4orm_env.core.errors import first_line
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.metrics import mean_stretch, trajectory_metrics
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.summary import Row, count, outcome_rows
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.rollout import rollout
 from d4orm_env.scenarios.schema import describe, parse
 from d4orm_env.verify import verify
 from d4orm_planners.grouping import conflicts
+from d4orm_planners.shown import Shown
 
 Status = Literal["solved", "iteration_limit", "time_limit", "stopped", "interrupted", "refuted"]
 """How a search ended; see :class:`Plan`."""
@@ -70,8 +72,8 @@ class IterationRecord:
     note: str = ""
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
+@dataclass(frozen=True, eq=False, repr=False)
+class Plan(Shown):
     """Controls for a whole team, how they were found and what they lead to.
 
     Attributes:
@@ -147,6 +149,17 @@ class Plan:
             if faults:
                 reasons[f"robot_{robot}"] = "; ".join(faults)
         return reasons
+
+    @property
+    def title(self) -> str:
+        """What was planned by what, and how that ended."""
+        spent = f"{count(self.iterations, 'iteration')}, {self.wall_time:.2f} s"
+        return f"{self.problem.name}, {self.problem.num_robots} robots by {self.planner}: {self.status} after {spent}"
+
+    @property
+    def key_figures(self) -> list[Row]:
+        """What the plan leads to."""
+        return outcome_rows(self.metrics, self.problem.num_robots)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the plan, its problem and its trajectory to an ``.npz`` file.

@@ -1,0 +1,98 @@
+"""Pages in a real browser, headless Chromium: they load without complaint and do what is asked of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser_support import Page, browser, missing
+
+from d4orm_env import make_problem
+from d4orm_planners import make_planner
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(missing()), reason=missing())]
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with browser(tmp_path_factory.mktemp("profile")) as page:
+        yield page
+
+
+@pytest.fixture(scope="module")
+def replay(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    problem = make_problem("circle", num_robots=4, seed=0).replace(name="<b>circle</b> & friends")
+    return make_planner().solve(problem, seed=0).to_html(tmp_path_factory.mktemp("replay") / "plan.html")
+
+
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+@pytest.mark.parametrize("width", [400, 1300])
+def test_a_replay_plays_without_a_network(page: Page, replay: Path, width: int, dark: bool) -> None:
+    page.offline()
+    page.look(width, 800, dark)
+    page.requests.clear()
+    page.open(replay.as_uri())
+    assert page.evaluate("document.documentElement.dataset.theme") == ("dark" if dark else "light")
+    assert "<b>circle</b> & friends" in page.evaluate("document.querySelector('h1').textContent")
+    page.evaluate("document.getElementById('play').click()")
+    page.until("player.time > 0.3")
+    page.evaluate("document.getElementById('play').click()")
+    time, frames = page.evaluate("[player.time, player.frames]")
+    assert frames > 3
+    page.evaluate("new Promise((done) => setTimeout(done, 200))")
+    assert page.evaluate("player.time") == time, "pause pauses"
+    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), "nothing sticks out"
+    assert page.complaints == []
+    assert [address for address in page.requests if not address.startswith(("file:", "data:"))] == []
+
+
+def test_keys_and_the_slider_go_through_a_replay(page: Page, replay: Path) -> None:
+    page.look()
+    page.open(replay.as_uri())
+    duration, dt = page.evaluate("[player.duration, player.dt]")
+    page.press("End")
+    assert page.evaluate("player.time") == pytest.approx(duration)
+    page.press("Home")
+    page.press("ArrowRight")
+    assert page.evaluate("player.time") == pytest.approx(dt)
+    page.press("+")
+    assert page.evaluate("player.speed") == 2
+    page.press(" ")
+    page.until("player.playing && player.time > 1")
+    page.press(" ")
+    assert not page.evaluate("player.playing")
+    page.evaluate("const s = document.getElementById('scrub'); s.value = 500; s.dispatchEvent(new Event('input'))")
+    assert page.evaluate("player.time") == pytest.approx(duration / 2)
+    page.press("]")
+    page.until("document.querySelector('.robot').textContent.startsWith('robot_0 (holonomic2d): speed')")
+    assert page.complaints == []
+
+
+def test_a_robot_under_the_pointer_tells_about_itself(page: Page, replay: Path) -> None:
+    page.look()
+    page.open(replay.as_uri())
+    x, y = page.evaluate(
+        "(() => { const { painter, scene } = shows[0], box = painter.canvas.getBoundingClientRect();"
+        "const place = scene.place(scene.moment(player.time), 2);"
+        "return [box.left + painter.view.x(place), box.top + painter.view.y(place)]; })()"
+    )
+    page.mouse("Moved", x, y)
+    text = page.until("document.querySelector('.robot').textContent")
+    assert text.startswith("robot_2 (holonomic2d): speed 0.0")
+    assert "clearance" in text
+
+
+def test_a_hundred_robots_play_smoothly(page: Page, tmp_path: Path) -> None:
+    from d4orm_env.render.replay import Replay, motion
+    from d4orm_env.rollout import rollout
+
+    problem = make_problem("circle", num_robots=100, diameter=24)
+    trajectory = rollout(problem, np.full((problem.horizon, 100, 2), 0.05, np.float32))
+    page.look()
+    page.open(Replay("many", (motion(problem, trajectory, "many"),)).save(tmp_path / "many.html").as_uri())
+    page.evaluate("play(true)")
+    page.until("player.frames > 60 || player.time > 8")
+    assert page.evaluate("player.frames > 60"), "more than seven frames a second, on however loaded a machine"
+    assert page.complaints == []
