@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from math import prod
 from pathlib import Path
@@ -56,6 +56,8 @@ class IterationRecord:
         excluded: Samples of this iteration that were left out because their reward was not finite.
         note: What the method itself says of how the iteration ended; ``ipopt`` has IPOPT's return status here,
             ``d-d4orm`` the nodes that were lost and the messages that were dropped.
+        controls: ``(H, K, m)`` of this iteration's candidate, for callbacks; ``None`` in a plan's history.
+        trajectory: Where they lead, likewise.
     """
 
     iteration: int
@@ -70,6 +72,8 @@ class IterationRecord:
     best_solved: bool
     excluded: int = 0
     note: str = ""
+    controls: FloatArray | None = field(default=None, repr=False, compare=False)
+    trajectory: Trajectory | None = field(default=None, repr=False, compare=False)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -172,7 +176,7 @@ class Plan(Shown):
         header = {
             "format": FORMAT,
             "problem": describe(self.problem),
-            "history": [asdict(record) for record in self.history],
+            "history": [{name: getattr(record, name) for name in _RECORDED} for record in self.history],
             **{name: getattr(self, name) for name in _SCALARS},
         }
         arrays = {field.name: getattr(self.trajectory, field.name) for field in fields(Trajectory)}
@@ -198,7 +202,7 @@ class Plan(Shown):
                     raise ValueError("written by another version")
                 problem = parse(header.pop("problem"))
                 claimed = _checked_trajectory(problem, archive)
-            history = tuple(IterationRecord(**record) for record in header.pop("history"))
+            history = tuple(_read_record(record) for record in header.pop("history"))
             return cls._judged(problem, history, claimed, _checked(header))
         except FileNotFoundError:
             raise FileNotFoundError(f"there is no plan at {source}") from None
@@ -235,6 +239,7 @@ def failed_robots(trajectory: Trajectory) -> BoolArray:
     return failed
 
 
+_RECORDED = tuple(field.name for field in fields(IterationRecord) if field.compare)
 _ARRAYS = tuple(field.name for field in fields(Trajectory))
 _NUMBERS = ("states", "positions", "controls", "rewards")
 _SCALARS = ("planner", "seed", "solved", "status", "iterations", "denoising_steps", "wall_time", "metrics")
@@ -245,6 +250,12 @@ def _npz_path(path: str | os.PathLike[str]) -> Path:
     if target.suffix != ".npz":
         raise ValueError(f"plan file {str(target)!r} must end in .npz")
     return target
+
+
+def _read_record(record: dict[str, Any]) -> IterationRecord:
+    if not record.keys() <= set(_RECORDED):
+        raise ValueError(f"its history has {', '.join(sorted(record.keys() - set(_RECORDED)))}")
+    return IterationRecord(**record)
 
 
 def _checked(header: dict[str, Any]) -> dict[str, object]:

@@ -12,6 +12,7 @@ from d4orm_env.core.trajectory import Trajectory
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from d4orm_env.render.denoising import Denoising
     from d4orm_env.render.replay import Motion, Replay
 
 
@@ -24,7 +25,7 @@ class _HasMotion(Protocol):
     def title(self) -> str: ...
     @property
     def key_figures(self) -> list[Row]: ...
-    def motion(self, title: str | None = None) -> Motion: ...
+    def motion(self, title: str | None = None, denoising: Denoising | None = None) -> Motion: ...
     def animate(self) -> Replay: ...
 
 
@@ -55,17 +56,19 @@ class Shown:
 
         return plot(self.problem, self.trajectory, axes)
 
-    def motion(self: _HasMotion, title: str | None = None) -> Motion:
+    def motion(self: _HasMotion, title: str | None = None, denoising: Denoising | None = None) -> Motion:
         """What a replay shows; :class:`d4orm_env.render.replay.Replay` puts several side by side.
 
         Args:
             title: What to call it there; by default what it is called everywhere.
+            denoising: How a plan came about, shown before the motion; see :mod:`d4orm_planners.denoising`.
         """
         from d4orm_env.render.replay import motion
 
         title = self.title if title is None else title
         goals = getattr(self, "goals", None)
-        return motion(self.problem, self.trajectory, title, joined(self.key_figures), goals=goals)
+        figures = joined(self.key_figures)
+        return motion(self.problem, self.trajectory, title, figures, goals=goals, denoising=denoising)
 
     def animate(self: _HasMotion) -> Replay:
         """A replay that notebooks show where it is the last value of a cell."""

@@ -115,10 +115,17 @@ def test_demo_plans_executes_verifies_and_says_where(d4orm, tmp_path: Path) -> N
     outcome = d4orm("demo", "--num-robots", "3", "--out", "pictures")
     assert outcome.status == 0, outcome.err
     written = {path.name for path in (tmp_path / "pictures").iterdir()}
-    assert written == {"plan.npz", "plan.png", "execution.gif"}
+    assert written == {"plan.npz", "plan.png", "execution.gif", "execution.html"}
     assert "verified" in outcome.out
     for name in written:
         assert name in outcome.out
+
+
+def test_demo_shows_the_denoising(d4orm, tmp_path: Path) -> None:
+    outcome = d4orm("demo", "--denoising", "--num-robots", "3", "--out", "pictures")
+    assert outcome.status == 0, outcome.err
+    assert {path.name for path in (tmp_path / "pictures").iterdir()} == {"denoising.png", "denoising.html"}
+    assert "denoising step 100 of" in (tmp_path / "pictures" / "denoising.html").read_text(encoding="utf-8")
 
 
 def test_scenario_file(d4orm, tmp_path: Path) -> None:

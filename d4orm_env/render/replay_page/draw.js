@@ -139,7 +139,8 @@ class Painter {
   draw(time, chosen, theme) {
     const box = this.canvas.getBoundingClientRect(), ratio = Math.min(window.devicePixelRatio || 1, 2);
     const width = Math.max(Math.round(box.width), 1), height = Math.max(Math.round(box.height), 1);
-    const state = [width, height, ratio, theme.name, this.view.version].join();
+    const denoising = time < this.scene.prelude;
+    const state = [width, height, ratio, theme.name, this.view.version, denoising].join();
     if (state !== this.drawn) {
       for (const canvas of [this.canvas, this.still]) {
         canvas.width = width * ratio;
@@ -148,7 +149,7 @@ class Painter {
       this.view.fit(width, height);
       this.theme = theme;
       this.colors = this.scene.colors.map((color) => readable(color, theme.dark));
-      this.paintStill(ratio);
+      this.paintStill(ratio, !denoising);
       this.drawn = state;
     }
     const pen = this.pen = this.canvas.getContext("2d");
@@ -156,8 +157,8 @@ class Painter {
     pen.clearRect(0, 0, this.canvas.width, this.canvas.height);
     pen.drawImage(this.still, 0, 0);
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-    if (time < this.scene.prelude) this.paintDenoising(time);
-    this.paintTeam(this.scene.moment(time), time < this.scene.prelude, chosen);
+    if (denoising) this.paintDenoising(time);
+    this.paintTeam(this.scene.moment(time), denoising, chosen);
   }
 
   trace(points) {
@@ -179,8 +180,8 @@ class Painter {
     if (edge) { this.pen.strokeStyle = edge; this.pen.stroke(); }
   }
 
-  /** What does not move: bounds, obstacles, and the whole ways, faintly. */
-  paintStill(ratio) {
+  /** What does not move: bounds, obstacles, and the whole ways, faintly, if they are to be seen. */
+  paintStill(ratio, ways) {
     const { scene, theme } = this, pen = this.pen = this.still.getContext("2d");
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.clearRect(0, 0, this.still.width, this.still.height);
@@ -200,7 +201,7 @@ class Painter {
       else this.fill(part.corners, theme.obstacle, theme.edge);
     }
     pen.globalAlpha = 0.25;
-    for (let robot = 0; robot < scene.robots; robot++) {
+    for (let robot = 0; ways && robot < scene.robots; robot++) {
       pen.strokeStyle = this.colors[robot];
       this.trace(this.way(robot, 0, scene.moments - 1));
       pen.stroke();
@@ -232,9 +233,9 @@ class Painter {
     };
     for (let robot = 0; robot < scene.robots; robot++) {
       for (let sample = 0; sample < denoising.kept; sample++) {
-        stroke(this.samples, (step * denoising.kept + sample) * size, robot, denoising.alpha[step][sample], 0.8);
+        stroke(scene.samples, (step * denoising.kept + sample) * size, robot, denoising.alpha[step][sample], 0.8);
       }
-      stroke(this.paths, step * size, robot, 0.95, 1.8);
+      stroke(scene.paths, step * size, robot, 0.95, 1.8);
     }
     pen.globalAlpha = 1;
   }
