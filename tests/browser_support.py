@@ -6,10 +6,11 @@ import base64
 import json
 import os
 import shutil
+import signal
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -93,9 +94,10 @@ class Page:
         self.call("Page.navigate", url=address)
         self.until(f"location.href.startsWith({address[:30]!r}) && document.readyState === 'complete'")
 
-    def offline(self) -> None:
-        """Take the network away."""
-        self.call("Network.emulateNetworkConditions", offline=True, latency=0, downloadThroughput=0, uploadThroughput=0)
+    def offline(self, offline: bool = True) -> None:
+        """Take the network away, or give it back."""
+        rates = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+        self.call("Network.emulateNetworkConditions", offline=offline, **rates)
 
     def look(self, width: int = 1200, height: int = 800, dark: bool = False) -> None:
         """Choose the window's size and the scheme of colours."""
@@ -152,12 +154,10 @@ def browser(folder: Path) -> Iterator[Page]:
             finally:
                 page.close()
         finally:
-            process.terminate()
-            try:
-                process.wait(PATIENCE)
-            except subprocess.TimeoutExpired:
-                os.killpg(process.pid, 9)
-                process.wait()
+            # It has processes of its own, which would go on writing into the folder.
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
 
 
 def _address(folder: Path, process: subprocess.Popen[bytes]) -> str:

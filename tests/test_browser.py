@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from browser_support import Page, browser, missing
+from browser_support import PATIENCE, Page, browser, missing
 
 from d4orm_env import make_problem
 from d4orm_planners import make_planner
@@ -96,3 +99,80 @@ def test_a_hundred_robots_play_smoothly(page: Page, tmp_path: Path) -> None:
     page.until("player.frames > 60 || player.time > 8")
     assert page.evaluate("player.frames > 60"), "more than seven frames a second, on however loaded a machine"
     assert page.complaints == []
+
+
+@pytest.fixture
+def playground() -> Iterator[Any]:
+    pytest.importorskip("viser")
+    from d4orm_planners.play.playground import Playground
+
+    playground = Playground(make_problem("circle", num_robots=4, seed=0))
+    thread = threading.Thread(target=playground.run, daemon=True)
+    thread.start()
+    yield playground
+    playground.stop()
+    thread.join()
+    playground.close()
+
+
+def pixel(playground: Any, place: Sequence[float]) -> tuple[float, float]:
+    """Where on the page a place of the plane is."""
+    from viser import transforms
+
+    camera = next(iter(playground.clients.values())).camera
+    x, y, z = transforms.SO3(np.asarray(camera.wxyz)).inverse() @ (np.array([*place, 0.0]) - camera.position)
+    scale = 0.5 * camera.image_height / np.tan(camera.fov / 2)
+    return camera.image_width / 2 + scale * x / z, camera.image_height / 2 + scale * y / z
+
+
+def tick(page: Page, label: str) -> None:
+    """Click on the check box with a label, as a mouse does."""
+    place = f"""(() => {{
+      let row = [...document.querySelectorAll('label')].find((part) => part.textContent === {label!r});
+      while (!row.querySelector('input[type=checkbox]')) row = row.parentElement;
+      const box = row.querySelector('input[type=checkbox]').getBoundingClientRect();
+      return [box.x + box.width / 2, box.y + box.height / 2];
+    }})()"""
+    before, (x, y) = None, page.evaluate(place)
+    while before != (x, y):  # the page is still making itself up
+        time.sleep(1.0)
+        before, (x, y) = (x, y), page.evaluate(place)
+    for kind in ("Moved", "Pressed", "Released"):
+        page.mouse(kind, x, y)
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_the_playground_pauses_and_a_dragged_goal_replans(page: Page, playground: Any, tmp_path: Path) -> None:
+    session = playground.session
+    page.look()
+    page.offline(False)
+    page.complaints.clear()
+    page.open(playground.address)
+    page.until("document.body.textContent.includes('circle, 4 robots, d4orm-c2f')")
+    tick(page, "Paused")
+    wait_for(lambda: session.frame.state == "paused")
+    page.until("document.body.textContent.includes('d4orm-c2f: paused')")
+    number = session.frame.number
+    page.evaluate("new Promise((done) => setTimeout(done, 500))")
+    assert session.frame.number == number, "pause pauses"
+
+    wait_for(lambda: len(playground.clients) == 1)
+    goal = session.frame.goals[0]
+    # By the corner of the diamond: a robot may stand on its middle.
+    page.drag(pixel(playground, goal + np.array([0.0, 0.19])), pixel(playground, (0.4, 0.6)))
+    wait_for(lambda: not np.array_equal(session.frame.goals[0], goal))
+    assert np.abs(session.frame.goals[0] - [0.4, 0.6]).max() < 0.25
+    assert session.frame.state == "paused"
+    tick(page, "Paused")
+    wait_for(lambda: session.frame.arrived[0])
+    assert np.linalg.norm(session.frame.states[0, :2] - session.frame.goals[0]) < 0.1
+    assert session.failure is None
+    page.screenshot(tmp_path / "play.png")
+    assert (tmp_path / "play.png").stat().st_size > 10_000
+    assert [line for line in page.complaints if "passive event listener" not in line] == [], "but for viser's own"

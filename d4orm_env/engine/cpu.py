@@ -242,7 +242,7 @@ class Sampling:
         return -(samples.sum(axis=0, keepdims=True) if self.task.credit == "team" else samples)
 
     def first_noise(self, count: int) -> FloatArray:
-        """``(S, H, K, m)`` noise of the first samples of the last step, at most ``count``: drawn ones, not turned ones."""
+        """``(S, H, K, m)`` noise of the first samples of the last step, ``count`` at most: those not turned."""
         count = min(count, self.rewards.shape[1], DRAWS)
         draws = np.moveaxis(self.kept[0, ..., :count], -1, 0)
         pairs = draws.reshape(count, *draws.shape[1:3], -1)[..., : self.base.shape[2]]

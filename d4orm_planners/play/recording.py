@@ -1,0 +1,58 @@
+"""The last minutes of a session, to be kept as a replay."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.summary import count
+from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.render.replay import Replay, motion
+
+MOST_STEPS = 6000
+"""Ten minutes at the usual time step; what is older is forgotten."""
+
+
+class _Moment(NamedTuple):
+    states: FloatArray
+    goals: FloatArray
+    arrived: BoolArray
+    collided: BoolArray
+    violated: BoolArray
+
+
+class Recording:
+    """What happened since team or world last changed."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
+        self._moments: deque[_Moment] = deque(maxlen=MOST_STEPS)
+
+    def __len__(self) -> int:
+        return len(self._moments)
+
+    def add(self, *moment: np.ndarray) -> None:
+        """Remember states ``(K, n)``, goals ``(K, d)``, and ``(K,)`` who has arrived, collided and come too close."""
+        self._moments.append(_Moment(*moment))
+
+    def replay(self, policy: str) -> Replay:
+        """A page that plays it."""
+        problem, moments = self._problem, list(self._moments)
+        states = np.stack([moment.states for moment in moments])
+        steps = len(moments) - 1
+        trajectory = Trajectory(
+            states=states,
+            positions=states[..., : problem.dimension],
+            controls=np.zeros((steps, problem.num_robots, problem.control_size), np.float32),
+            rewards=np.zeros((steps, problem.num_robots), np.float32),
+            arrived=np.stack([moment.arrived for moment in moments]),
+            collided=np.stack([moment.collided for moment in moments]),
+            margin_violated=np.stack([moment.violated for moment in moments]),
+        )
+        title = f"{problem.name}, {count(problem.num_robots, 'robot')} by {policy}, {steps * problem.dt:.1f} s"
+        goals = np.stack([moment.goals for moment in moments])
+        return Replay(title, (motion(problem, trajectory, title, goals=goals),))
