@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from d4orm_env.render.denoising import Denoising
-    from d4orm_env.render.replay import Motion, Replay
+    from d4orm_env.render.replay import Replay, ReplayMotion
 
 
 class _HasMotion(Protocol):
@@ -25,7 +25,7 @@ class _HasMotion(Protocol):
     def title(self) -> str: ...
     @property
     def key_figures(self) -> list[Row]: ...
-    def motion(self, title: str | None = None, denoising: Denoising | None = None) -> Motion: ...
+    def motion(self, title: str | None = None, denoising: Denoising | None = None) -> ReplayMotion: ...
     def animate(self) -> Replay: ...
 
 
@@ -56,7 +56,7 @@ class Shown:
 
         return plot(self.problem, self.trajectory, axes)
 
-    def motion(self: _HasMotion, title: str | None = None, denoising: Denoising | None = None) -> Motion:
+    def motion(self: _HasMotion, title: str | None = None, denoising: Denoising | None = None) -> ReplayMotion:
         """What a replay shows; :class:`d4orm_env.render.replay.Replay` puts several side by side.
 
         Args:

@@ -23,7 +23,7 @@ from d4orm_env.render.denoising import Denoising
 from d4orm_env.render.panels import robot_colors, view_limits
 from d4orm_env.render.pictures import checked_trajectory
 
-__all__ = ["REPLAY_SUFFIXES", "Motion", "Replay", "motion"]
+__all__ = ["REPLAY_SUFFIXES", "Replay", "ReplayMotion", "motion"]
 
 REPLAY_SUFFIXES = (".html",)
 
@@ -35,7 +35,7 @@ _NO_CLEARANCE = 1e9
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class ReplayMotion:
     """One team's motion, ready for a page.
 
     Attributes:
@@ -53,7 +53,7 @@ def motion(
     *,
     goals: ArrayLike | None = None,
     denoising: Denoising | None = None,
-) -> Motion:
+) -> ReplayMotion:
     """Take what a replay shows of a motion: up to a second after the last robot has arrived, or to its end.
 
     Args:
@@ -94,7 +94,7 @@ def motion(
         "world_clearance": _clearance(problem, trajectory.positions[:end]),
         "flags": _text(flags[:end].astype(np.uint8)),
     }
-    return Motion(content if denoising is None else content | {"denoising": _denoising(denoising)})
+    return ReplayMotion(content if denoising is None else content | {"denoising": _denoising(denoising)})
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,7 @@ class Replay:
     """
 
     title: str
-    motions: tuple[Motion, ...]
+    motions: tuple[ReplayMotion, ...]
     autoplay: bool = False
 
     @property
