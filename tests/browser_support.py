@@ -92,7 +92,8 @@ class Page:
     def open(self, address: str) -> None:
         """Go to an address, and wait until it is loaded."""
         self.call("Page.navigate", url=address)
-        self.until(f"location.href.startsWith({address[:30]!r}) && document.readyState === 'complete'")
+        begin = address if address.startswith(("file:", "about:")) else "/".join(address.split("/")[:3])
+        self.until(f"location.href.startsWith({begin!r}) && document.readyState === 'complete'")
 
     def offline(self, offline: bool = True) -> None:
         """Take the network away, or give it back."""

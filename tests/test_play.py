@@ -200,6 +200,18 @@ def test_another_scene_is_loaded(session: Session) -> None:
     assert session.frame.problem.num_robots == 2
 
 
+def test_a_scene_that_the_policy_cannot_drive_in_is_left(session: Session) -> None:
+    pytest.importorskip("pyrvo")
+    session.choose("orca")
+    until(lambda: session.policy == "orca")
+    session.load(lambda: make_problem("sphere", num_robots=2))
+    until(lambda: session.frame.message)
+    assert "orca" in session.frame.message
+    moment = session.frame.time
+    until(lambda: session.frame.time > moment + 0.3)
+    assert session.frame.problem.dimension == 2
+
+
 def test_scenes_go_through_files(scene: Problem, random: np.random.Generator) -> None:
     panel = pytest.importorskip("d4orm_planners.play.panel")
     changed = edits.add_obstacle(edits.add_robot(scene, random), "box", random)

@@ -40,7 +40,9 @@ class Gate:
         self.port = self._socket.getsockname()[1]
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._serve, name="d4orm-gate", daemon=True)
+        self._ready = threading.Event()
         self._thread.start()
+        self._ready.wait()
 
     def close(self) -> None:
         """Hang up and stop listening."""
@@ -51,12 +53,10 @@ class Gate:
     def _serve(self) -> None:
         asyncio.set_event_loop(self._loop)
         server = self._loop.run_until_complete(asyncio.start_server(self._pass, sock=self._socket, limit=_HEAD))
+        self._loop.call_soon(self._ready.set)
         self._loop.run_forever()
         server.close()
-        tasks = asyncio.all_tasks(self._loop)
-        for task in tasks:
-            task.cancel()
-        self._loop.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))
+        self._loop.run_until_complete(_hang_up())
         self._loop.close()
 
     async def _pass(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -68,16 +68,18 @@ class Gate:
                 await writer.drain()
                 return
             behind, ahead = await asyncio.open_connection("127.0.0.1", self._target)
+            pumps = [asyncio.create_task(_pump(reader, ahead)), asyncio.create_task(_pump(behind, writer))]
             try:
                 ahead.write(head)
-                await asyncio.wait(
-                    [asyncio.create_task(_pump(reader, ahead)), asyncio.create_task(_pump(behind, writer))],
-                    return_when=asyncio.FIRST_COMPLETED,
-                )
+                await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
             finally:
+                for pump in pumps:
+                    pump.cancel()
                 ahead.close()
         except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             pass  # whoever it was has gone, or speaks something else
+        except asyncio.CancelledError:
+            pass  # the gate closes; Python 3.11 complains of connections that end otherwise
         finally:
             writer.close()
 
@@ -111,6 +113,15 @@ class Gate:
 def _response(status: str, headers: str, body: bytes = b"") -> bytes:
     top = f"HTTP/1.1 {status}\r\n{headers}Content-Type: text/plain\r\nContent-Length: {len(body)}\r\n"
     return f"{top}Connection: close\r\n\r\n".encode() + body
+
+
+async def _hang_up() -> None:
+    """End what is under way, and let its connections close."""
+    tasks = asyncio.all_tasks() - {asyncio.current_task()}
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    await asyncio.sleep(0.01)
 
 
 async def _pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

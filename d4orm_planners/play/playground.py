@@ -16,7 +16,7 @@ from d4orm_planners.play.panel import THEME, Panel
 from d4orm_planners.play.session import Session
 from d4orm_planners.play.view import View, look_at
 
-FRAMES_PER_SECOND = 30
+FRAMES_PER_SECOND = 33
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 

@@ -102,9 +102,14 @@ class Session:
         """Begin anew with another scene."""
 
         def make() -> None:
-            scene = make_scene()
-            self._scene, self._seed = scene, seed
-            self._begin(scene, new_scene=True)
+            scene, former = make_scene(), self._seed
+            self._seed = seed
+            try:
+                self._begin(scene, new_scene=True)
+            except Exception:
+                self._seed = former
+                raise
+            self._scene = scene
 
         self._post(make)
 
@@ -123,7 +128,6 @@ class Session:
                 self._begin(self.scene, new_scene=False)
             except Exception:
                 self._policy_name = former
-                self._begin(self.scene, new_scene=False)
                 raise
 
         self._post(make)
@@ -214,7 +218,12 @@ class Session:
             self._frame = replace(self._frame, state="planning")
         begin = time.perf_counter()
         policy = self._policies[self._policy_name]
-        policy.reset(env, seed=self._seed)
+        try:
+            policy.reset(env, seed=self._seed)
+        except Exception:
+            if self._number:  # what drove until now may have forgotten where it was
+                self._policy.reset(self._env, seed=self._seed)
+            raise
         self._replanned, self._loop = time.perf_counter() - begin, 0.0
         self._env, self._observations, self._policy = env, observations, policy
         if new_scene:
