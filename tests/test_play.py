@@ -19,6 +19,7 @@ import pytest
 
 from d4orm_env import World, make_problem
 from d4orm_env.core.problem import Problem
+from d4orm_env.render.replay import Replay
 from d4orm_env.scenarios.files import scenario_text
 from d4orm_planners.play import edits
 from d4orm_planners.play.frame import closest_approach
@@ -210,6 +211,30 @@ def test_a_scene_that_the_policy_cannot_drive_in_is_left(session: Session) -> No
     moment = session.frame.time
     until(lambda: session.frame.time > moment + 0.3)
     assert session.frame.problem.dimension == 2
+
+
+def test_policies_are_compared_on_the_scene_that_was_loaded(session: Session, scene: Problem) -> None:
+    replays: list[Replay] = []
+    session.edit(lambda scene: edits.move_goal(scene, 0, [0.7, 0.9]))
+    session.compare(("goal", "random"), replays.append)
+    until(lambda: replays)
+    assert [motion.content["title"] for motion in replays[0].motions] == ["goal", "random"]
+    until(lambda: session.frame.state == "running")
+
+
+def test_a_policy_that_predicts_looks_as_far_as_it_is_told(scene: Problem) -> None:
+    session = Session(scene, "d4orm-c2f")
+    session.start()
+    session.set_horizon(7)
+    until(lambda: session.frame.number > 2)
+    session.choose("goal")
+    until(lambda: session.policy == "goal" and session.frame.guidance is None)
+    session.set_horizon(0)
+    session.choose("d4orm-c2f")
+    until(lambda: session.frame.message)
+    assert "predict_horizon" in session.frame.message
+    session.close()
+    assert session.failure is None
 
 
 def test_scenes_go_through_files(scene: Problem, random: np.random.Generator) -> None:

@@ -30,6 +30,7 @@ class Frame:
         replanned: Seconds that it took to plan after the last change.
         closest: Least distance between surfaces [m], negative in contact.
         guidance: ``(P, K, d)`` where the policy leads the team from here, if it says so.
+        subgoals: ``(K, d)`` what it heads for next, likewise.
         state: ``"running"``, ``"paused"``, ``"planning"`` or ``"arrived"``.
         message: What went wrong last, for people.
     """
@@ -49,6 +50,7 @@ class Frame:
     replanned: float
     closest: float
     guidance: FloatArray | None
+    subgoals: FloatArray | None
     state: str
     message: str
 

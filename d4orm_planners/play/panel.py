@@ -22,6 +22,8 @@ from d4orm_planners.play.session import Session
 from d4orm_planners.play.view import View
 
 POLICIES = ("d4orm-c2f", "orca", "ppo", "sac", "goal", "d4orm-d", "guided")
+COMPARED = ("d4orm-c2f", "d4orm-d", "goal")
+"""Policies that need no extra, and no model of their own."""
 MODELS = ("scenario's own", "holonomic2d", "velocity2d", "differential_drive", "unicycle", "car", "holonomic3d")
 OWN_MODEL = MODELS[0]
 STATUS_EVERY = 0.2
@@ -82,6 +84,8 @@ class Panel:
         speed.on_update(lambda _: self._session.set_speed(speed.value))
         policy = self._gui.add_dropdown("Policy", tuple(dict.fromkeys((self._session.policy, *POLICIES))))
         policy.on_update(lambda _: self._session.choose(policy.value))
+        horizon = self._gui.add_slider("Look ahead", 5, 50, 1, 20, hint="Steps that D4orm-C2F predicts.")
+        horizon.on_update(lambda _: self._session.set_horizon(int(horizon.value)))
         lifelong = self._gui.add_checkbox("Lifelong goals", False)
         lifelong.on_update(lambda _: self._session.set_lifelong(lifelong.value))
 
@@ -131,6 +135,7 @@ class Panel:
 
     def _add_files(self) -> None:
         scene, replay = self._gui.add_button("Save scene"), self._gui.add_button("Save replay")
+        compare = self._gui.add_button("Compare policies", hint="From the beginning, with the same seed, as a replay.")
         load = self._gui.add_upload_button("Load scene", mime_type=".yaml,.yml")
 
         def save_scene(event: Any) -> None:
@@ -141,6 +146,13 @@ class Panel:
                 page = self._session.recording.replay(self._session.policy).html
             event.client.send_file_download("replay.html", page.encode())
 
+        def save_comparison(event: Any) -> None:
+            client = event.client
+            self._session.compare(
+                COMPARED, lambda replay: client.send_file_download("compare.html", replay.html.encode())
+            )
+
+        compare.on_click(save_comparison)
         scene.on_click(save_scene)
         replay.on_click(save_replay)
         load.on_upload(lambda _: self._session.load(partial(read_scene, load.value.content)))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,15 +19,21 @@ from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.errors import first_line
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.summary import count
 from d4orm_env.joint_state import JointState, split_state
+from d4orm_env.render.replay import Replay
+from d4orm_planners.episode import run_episode
 from d4orm_planners.play.edits import Edit
 from d4orm_planners.play.frame import Frame, closest_approach
 from d4orm_planners.play.recording import Recording
 from d4orm_planners.policy import Policy
-from d4orm_planners.registry import make_policy
+from d4orm_planners.registry import make_policy, setting_names
 
 MOST_CYCLES = 10_000_000
 _IDLE = 0.1
+
+HORIZON = "predict_horizon"
+"""Setting of policies that look ahead."""
 
 
 class Session:
@@ -45,12 +51,15 @@ class Session:
 
     def __init__(self, problem: Problem, policy: str = "d4orm-c2f", seed: int = 0, lifelong: bool = False) -> None:
         self._scene, self._policy_name, self._seed, self._lifelong = problem, policy, seed, lifelong
-        self._policies: dict[str, Policy] = {policy: make_policy(policy)}
+        self._policies: dict[tuple[str, int | None], Policy] = {}
+        self._horizon: int | None = None
         self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._wake, self._closing = threading.Event(), threading.Event()
         self._paused, self._steps_wanted, self._speed = False, 0, 1.0
         self._generation = self._number = 0
         self._frame: Frame
+        self._env: navigation_v0.parallel_env
+        self._policy: Policy
         self._message = ""
         self.failure: BaseException | None = None
         self._thread = threading.Thread(target=self._live, name="d4orm-play", daemon=True)
@@ -121,14 +130,44 @@ class Session:
         """Let another policy drive on from here."""
 
         def make() -> None:
-            if policy not in self._policies:
-                self._policies[policy] = make_policy(policy)
             former, self._policy_name = self._policy_name, policy
             try:
                 self._begin(self.scene, new_scene=False)
             except Exception:
                 self._policy_name = former
                 raise
+
+        self._post(make)
+
+    def set_horizon(self, steps: int) -> None:
+        """How many steps a policy that predicts looks ahead; others have no such setting."""
+
+        def make() -> None:
+            former, self._horizon = self._horizon, steps
+            try:
+                self._begin(self.scene, new_scene=False)
+            except Exception:
+                self._horizon = former
+                raise
+
+        self._post(make)
+
+    def compare(self, policies: Sequence[str], done: Callable[[Replay], object]) -> None:
+        """Let several policies do the scene that was loaded last, with the same seed; the clock waits meanwhile.
+
+        Args:
+            policies: Names.
+            done: What is called with them side by side.
+        """
+
+        def make() -> None:
+            self._frame = replace(self._frame, state="planning")
+            motions, scene = [], self._scene
+            for name in policies:
+                env = navigation_v0.parallel_env(problem=scene)
+                motions.append(run_episode(env, make_policy(name), seed=self._seed).motion(name))
+            self._show(self._frame.before, state=self._state)
+            done(Replay(f"{scene.name}, {count(scene.num_robots, 'robot')}", tuple(motions)))
 
         self._post(make)
 
@@ -217,7 +256,7 @@ class Session:
         if self._number:
             self._frame = replace(self._frame, state="planning")
         begin = time.perf_counter()
-        policy = self._policies[self._policy_name]
+        policy = self._driver()
         try:
             policy.reset(env, seed=self._seed)
         except Exception:
@@ -233,6 +272,15 @@ class Session:
         self._problem = scene
         self._remember()
         self._show(scene.start[:, : scene.dimension], state=self._state)
+
+    def _driver(self) -> Policy:
+        """The policy that drives, made when it is first needed: some hold threads, so there is one of each."""
+        name = self._policy_name
+        horizon = self._horizon if HORIZON in setting_names(name) else None
+        if (name, horizon) not in self._policies:
+            settings = {} if horizon is None else {HORIZON: horizon}
+            self._policies[name, horizon] = make_policy(name, **settings)
+        return self._policies[name, horizon]
 
     def _advance(self) -> None:
         """One step of the policy and of the world."""
@@ -276,6 +324,7 @@ class Session:
             replanned=self._replanned,
             closest=closest_approach(self._problem, joint.states),
             guidance=_guidance(self._policy, joint.steps),
+            subgoals=getattr(self._policy, "subgoals", None),
             state=state,
             message=self._message,
         )

@@ -36,12 +36,12 @@ class View:
         session: What is shown, and changed by dragging.
 
     Attributes:
-        shown: Which of ``"plans"``, ``"trails"`` and ``"margins"`` are shown.
+        shown: Which of ``"plans"``, ``"trails"``, ``"subgoals"`` and ``"margins"`` are shown.
     """
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._server, self._session = server, session
-        self.shown = {"plans": True, "trails": True, "margins": False}
+        self.shown = {"plans": True, "trails": True, "subgoals": False, "margins": False}
         self._generation, self._number, self._lines_at = -1, -1, 0.0
         self._nodes: dict[str, Any] = {}
         self._held: dict[tuple[str, int], Points] = {}
@@ -61,6 +61,9 @@ class View:
             self._nodes["robots"].batched_positions = places
             self._nodes["goals"].batched_positions = self._with_held("goal", in_space(frame.goals))
             self._nodes["margins"].visible = self.shown["margins"]
+            self._nodes["subgoals"].visible = self.shown["subgoals"] and frame.subgoals is not None
+            if frame.subgoals is not None:
+                self._nodes["subgoals"].batched_positions = in_space(frame.subgoals)
             if self.shown["margins"]:
                 self._nodes["margins"].batched_positions = places
             if now - self._lines_at > LINES_EVERY:
@@ -104,6 +107,8 @@ class View:
         mark = radius if flat else np.float32(1.4) * radius
         shapes = {"robots": (body, radius, height, 1.0), "goals": (diamond, mark, mark, 0.6 if flat else 0.35)}
         shapes["margins"] = (body, radius + np.float32(problem.margin), 0.2 * height if flat else height, 0.25)
+        dot = np.float32(0.35) * radius
+        shapes["subgoals"] = (trimesh.creation.icosphere(subdivisions=1), dot, dot, 0.9)
         for name, (mesh, wide, high, opacity) in shapes.items():
             self._nodes[name] = scene.add_batched_meshes_simple(
                 f"/{name}", np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32), upright,
