@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,9 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from d4orm_env import Problem, Team, World, make_problem, navigation_v0
 from d4orm_env.core.trajectory import Trajectory
@@ -93,12 +97,24 @@ def test_sixteen_robots_take_less_than_three_megabytes(tmp_path: Path) -> None:
     assert len(Replay("long", (motion(problem, trajectory, "long"),)).html) < 3e6
 
 
-def test_rounding_is_to_a_65535th_of_the_range() -> None:
-    values = np.random.default_rng(0).normal(size=(50, 4, 3))
-    values[..., 2] = 7.0
+@given(arrays(np.float32, st.tuples(st.integers(1, 20), st.integers(1, 4)), elements=st.floats(-1e6, 1e6, width=32)))
+def test_rounding_is_to_a_65535th_of_the_range(values: np.ndarray) -> None:
     part = rounded(values)
     back = np.frombuffer(base64.b64decode(part["data"]), "<u2").reshape(values.shape) * part["step"] + part["low"]
-    assert np.abs(back - values).max() <= 0.51 * max(part["step"][:2])
+    span = np.ptp(values.astype(np.float64), axis=0)
+    assert (np.abs(back - values) <= 0.51 * span / 65535 + 1e-9).all()
+
+
+def test_the_replays_that_the_pages_show_are_made() -> None:
+    docs = Path(__file__).resolve().parents[1] / "docs"
+    made = runpy.run_path(str(docs / "replays.py"))["REPLAYS"]
+    shown = {name for page in docs.rglob("*.md") for name in re.findall(r"replays/(\w+)\.html", page.read_text())}
+    assert shown == set(made)
+
+
+def test_a_replay_of_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match="has no motion"):
+        Replay("nothing", ())
 
 
 def test_changing_goals_are_shown(episode: Episode) -> None:

@@ -74,21 +74,13 @@ def motion(
         raise ValueError(f"goals have shape {places.shape}; they must be finite and of shape (T+1, K, d) = {shape}")
     if (places == places[0]).all():
         places = places[:1]
-    models, end = problem.team.robot_models, _end(problem, trajectory)
+    end = _end(problem, trajectory)
     flags = trajectory.arrived * 1 + trajectory.collided * 2 + trajectory.margin_violated * 4
     content = {
         "title": title,
         "figures": figures,
-        "dimension": problem.dimension,
-        "dt": problem.dt,
         "limits": _in_space(view_limits(problem, np.concatenate([trajectory.positions, places])).tolist()),
-        "bounds": None if problem.world.lower is None else problem.world.bounds.tolist(),
-        "world": _obstacles(problem),
-        "radius": np.asarray(problem.team.radius).tolist(),
-        "models": [model.name for model in models],
-        "names": [list(model.state_names) for model in models],
-        "heading": [model.heading_index for model in models],
-        "colors": [to_hex(color) for color in robot_colors(problem.num_robots)],
+        **_setting(problem),
         "states": rounded(trajectory.states[:end]),
         "goals": rounded(places[:end]),
         "world_clearance": _clearance(problem, trajectory.positions[:end]),
@@ -105,11 +97,18 @@ class Replay:
         title: What the page is called.
         motions: What it shows, one or more.
         autoplay: Whether it plays when it is opened.
+
+    Raises:
+        ValueError: If there is none.
     """
 
     title: str
     motions: tuple[ReplayMotion, ...]
     autoplay: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.motions:
+            raise ValueError(f"the replay {self.title!r} has no motion; give one or more")
 
     @property
     def html(self) -> str:
@@ -120,6 +119,7 @@ class Replay:
         parts = {
             "title": escape(self.title),
             "style": _file("style.css"),
+            "view": _file("view.js"),
             "draw": _file("draw.js"),
             "player": _file("player.js"),
             "data": data,
@@ -156,6 +156,22 @@ def rounded(array: ArrayLike) -> dict[str, Any]:
     step = np.where(high > low, (high - low) / 65535, 1.0)
     data = np.round((flat - low) / step).astype("<u2")
     return {"low": low.tolist(), "step": step.tolist(), "data": _text(data)}
+
+
+def _setting(problem: Problem) -> dict[str, Any]:
+    """Team and world, which do not change."""
+    models = problem.team.robot_models
+    return {
+        "dimension": problem.dimension,
+        "dt": problem.dt,
+        "bounds": None if problem.world.lower is None else problem.world.bounds.tolist(),
+        "world": _obstacles(problem),
+        "radius": np.asarray(problem.team.radius).tolist(),
+        "models": [model.name for model in models],
+        "names": [list(model.state_names) for model in models],
+        "heading": [model.heading_index for model in models],
+        "colors": [to_hex(color) for color in robot_colors(problem.num_robots)],
+    }
 
 
 def _denoising(denoising: Denoising) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,6 +12,10 @@ from d4orm_planners.commands.options import Engine, Seed
 from d4orm_planners.commands.outputs import episode_rows, print_plan, print_table, require_solved
 from d4orm_planners.commands.plan import solving
 from d4orm_planners.commands.run import execute
+
+if TYPE_CHECKING:
+    from d4orm_planners.episode import Episode
+    from d4orm_planners.plan import Plan
 
 
 def demo(
@@ -28,7 +32,6 @@ def demo(
         show_denoising(out, num_robots, seed, engine)
         return
     from d4orm_env import make_problem, verify
-    from d4orm_env.render import save_animation, save_picture
     from d4orm_planners.policy import OpenLoop
     from d4orm_planners.registry import make_planner
 
@@ -44,6 +47,16 @@ def demo(
     verdict = "yes" if report.ok else "no: " + "; ".join(map(str, report.violations[:3]))
     rows = [("verified", verdict), ("closest approach", f"{report.min_separation * 100:.1f} cm between surfaces")]
     print_table("Executed in the environment", [*episode_rows(episode), *rows])
+    _tell(_write(plan, episode, out))
+    if not episode.metrics["success"]:
+        raise typer.Exit(1)
+
+
+def _write(plan: Plan, episode: Episode, out: Path) -> dict[str, Path]:
+    """The plan, and its execution as picture, animation and replay."""
+    from d4orm_env.render import save_animation, save_picture
+
+    problem, trajectory = plan.problem, episode.trajectory
     files = {
         "plan": out / "plan.npz",
         "picture": out / "plan.png",
@@ -51,13 +64,11 @@ def demo(
         "replay": out / "execution.html",
     }
     plan.save(files["plan"])
-    episode.to_html(files["replay"])
     title = f"{problem.num_robots} robots in a warehouse, planned in {plan.wall_time:.2f} s"
-    save_picture(problem, episode.trajectory, files["picture"], title=title)
-    save_animation(problem, episode.trajectory, files["animation"])
-    _tell(files)
-    if not episode.metrics["success"]:
-        raise typer.Exit(1)
+    save_picture(problem, trajectory, files["picture"], title=title)
+    save_animation(problem, trajectory, files["animation"])
+    episode.to_html(files["replay"])
+    return files
 
 
 def show_denoising(out: Path, num_robots: int, seed: int, engine: str) -> None:

@@ -68,3 +68,11 @@ def closest_approach(problem: Problem, states: FloatArray) -> float:
     gaps = np.linalg.norm(places[:, None] - places, axis=2) - radius[:, None] - radius
     gaps[np.diag_indices(len(places))] = np.inf
     return min(least, float(gaps.min()))
+
+
+def guidance(policy: object, steps: int) -> FloatArray | None:
+    """``(P, K, d)`` where a policy that follows a coarse plan, or executes one, leads the team after so many steps."""
+    coarse, plan = getattr(policy, "guidance", None), getattr(policy, "plan", None)
+    if coarse is not None:
+        return np.asarray(coarse.path, np.float32)
+    return None if plan is None else np.asarray(plan.trajectory.positions[steps:], np.float32)

@@ -1,17 +1,21 @@
-"""The last minutes of a session, to be kept as a replay."""
+"""Replays of a session: its last minutes, and how several policies do its scene."""
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary import count
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.render.replay import Replay, motion
+from d4orm_planners.episode import run_episode
+from d4orm_planners.registry import make_policy
 
 MOST_STEPS = 6000
 """Ten minutes at the usual time step; what is older is forgotten."""
@@ -56,3 +60,12 @@ class Recording:
         title = f"{problem.name}, {count(problem.num_robots, 'robot')} by {policy}, {steps * problem.dt:.1f} s"
         goals = np.stack([moment.goals for moment in moments])
         return Replay(title, (motion(problem, trajectory, title, goals=goals),))
+
+
+def compared(scene: Problem, policies: Sequence[str], seed: int) -> Replay:
+    """Several policies side by side, from the same start with the same seed."""
+    motions = []
+    for name in policies:
+        env = navigation_v0.parallel_env(problem=scene)
+        motions.append(run_episode(env, make_policy(name), seed=seed).motion(name))
+    return Replay(f"{scene.name}, {count(scene.num_robots, 'robot')}", tuple(motions))

@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -19,13 +18,11 @@ from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.errors import first_line
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.summary import count
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_env.render.replay import Replay
-from d4orm_planners.episode import run_episode
 from d4orm_planners.play.edits import Edit
-from d4orm_planners.play.frame import Frame, closest_approach
-from d4orm_planners.play.recording import Recording
+from d4orm_planners.play.frame import Frame, closest_approach, guidance
+from d4orm_planners.play.recording import Recording, compared
 from d4orm_planners.policy import Policy
 from d4orm_planners.registry import make_policy, setting_names
 
@@ -162,12 +159,9 @@ class Session:
 
         def make() -> None:
             self._frame = replace(self._frame, state="planning")
-            motions, scene = [], self._scene
-            for name in policies:
-                env = navigation_v0.parallel_env(problem=scene)
-                motions.append(run_episode(env, make_policy(name), seed=self._seed).motion(name))
+            replay = compared(self._scene, policies, self._seed)
             self._show(self._frame.before, state=self._state)
-            done(Replay(f"{scene.name}, {count(scene.num_robots, 'robot')}", tuple(motions)))
+            done(replay)
 
         self._post(make)
 
@@ -323,16 +317,8 @@ class Session:
             loop=self._loop,
             replanned=self._replanned,
             closest=closest_approach(self._problem, joint.states),
-            guidance=_guidance(self._policy, joint.steps),
+            guidance=guidance(self._policy, joint.steps),
             subgoals=getattr(self._policy, "subgoals", None),
             state=state,
             message=self._message,
         )
-
-
-def _guidance(policy: Any, steps: int) -> FloatArray | None:
-    """``(P, K, d)`` what a policy that follows a coarse plan, or executes one, is about to do."""
-    guidance, plan = getattr(policy, "guidance", None), getattr(policy, "plan", None)
-    if guidance is not None:
-        return np.asarray(guidance.path, np.float32)
-    return None if plan is None else np.asarray(plan.trajectory.positions[steps:], np.float32)
