@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from browser_support import PATIENCE, Page, browser, missing
 
-from d4orm_env import Problem, make_problem
+from d4orm_env import Problem, World, load_problem, make_problem
 from d4orm_planners import make_planner
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(missing()), reason=missing())]
@@ -151,6 +151,14 @@ def tick(page: Page, label: str) -> None:
         page.mouse(kind, x, y)
 
 
+def click(page: Page, text: str) -> None:
+    """Click on a button, or open a folder, as soon as it is there."""
+    find = f"[...document.querySelectorAll('button, div')].findLast((part) => part.textContent.trim() === {text!r})"
+    page.until(f"!!{find}")
+    time.sleep(0.5)
+    page.evaluate(f"{find}.click()")
+
+
 def wait_for(condition: Callable[[], object]) -> None:
     end = time.monotonic() + PATIENCE
     while not condition():
@@ -192,6 +200,32 @@ def pause_and_drag(page: Page, playground: Any, tmp_path: Path) -> None:
     page.screenshot(tmp_path / "play.png")
     assert (tmp_path / "play.png").stat().st_size > 10_000
     assert [line for line in page.complaints if "passive event listener" not in line] == [], "but for viser's own"
+
+
+@viser_leaves_loops
+def test_obstacles_are_dragged_and_scenes_and_replays_saved(page: Page, tmp_path: Path) -> None:
+    world = World(boxes=[[-0.2, -0.2, 0.2, 0.2]])
+    problem = make_problem("circle", num_robots=2, seed=0)
+    with running(problem.resumed_at(problem.start, problem.goal, world=world), "goal") as playground:
+        session = playground.session
+        page.look()
+        page.offline(False)
+        page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+        page.open(playground.address)
+        page.until("document.body.textContent.includes('circle, 2 robots, goal')")
+        tick(page, "Paused")
+        wait_for(lambda: session.frame.state == "paused" and len(playground.clients) == 1)
+        page.drag(pixel(playground, (0, 0)), pixel(playground, (0.9, 0.9)))
+        wait_for(lambda: session.frame.problem.world.boxes[0, 0] > 0)
+        assert np.abs(session.frame.problem.world.boxes[0] - [0.7, 0.7, 1.1, 1.1]).max() < 0.3
+
+        click(page, "Files")
+        for button, name in (("Save scene", "scene.yaml"), ("Save replay", "replay.html")):
+            click(page, button)
+            wait_for((tmp_path / name).exists)
+        saved = load_problem(tmp_path / "scene.yaml")
+        np.testing.assert_array_equal(saved.world.boxes, session.frame.problem.world.boxes)
+        assert "circle, 2 robots by goal" in (tmp_path / "replay.html").read_text(encoding="utf-8")
 
 
 @viser_leaves_loops

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
 from functools import partial
@@ -44,7 +43,6 @@ class Panel:
     def __init__(self, server: viser.ViserServer, session: Session, view: View) -> None:
         self._gui, self._session, self._view = server.gui, session, view
         self._random = np.random.default_rng(0)
-        self._lock = threading.Lock()
         self._status_at = 0.0
         self._text = ""
         self._status = self._gui.add_markdown("")
@@ -139,18 +137,14 @@ class Panel:
         load = self._gui.add_upload_button("Load scene", mime_type=".yaml,.yml")
 
         def save_scene(event: Any) -> None:
-            event.client.send_file_download("scene.yaml", scenario_text(at_rest(self._session.scene)).encode())
+            _send(event.client, "scene.yaml", scenario_text(at_rest(self._session.scene)))
 
         def save_replay(event: Any) -> None:
-            with self._lock:
-                page = self._session.recording.replay(self._session.policy).html
-            event.client.send_file_download("replay.html", page.encode())
+            _send(event.client, "replay.html", self._session.recording.replay(self._session.policy).html)
 
         def save_comparison(event: Any) -> None:
             client = event.client
-            self._session.compare(
-                COMPARED, lambda replay: client.send_file_download("compare.html", replay.html.encode())
-            )
+            self._session.compare(COMPARED, lambda replay: _send(client, "compare.html", replay.html))
 
         compare.on_click(save_comparison)
         scene.on_click(save_scene)
@@ -159,6 +153,11 @@ class Panel:
 
 
 THEME: dict[str, Any] = {"show_logo": False, "show_share_button": False, "control_width": "medium"}
+
+
+def _send(client: viser.ClientHandle, name: str, text: str) -> None:
+    """Let a browser save a file."""
+    client.send_file_download(name, text.encode(), save_immediately=True)
 
 
 def status_text(frame: Frame, policy: str) -> str:

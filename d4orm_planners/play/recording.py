@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -30,22 +31,25 @@ class _Moment(NamedTuple):
 
 
 class Recording:
-    """What happened since team or world last changed."""
+    """What happened since team or world last changed; one thread may add while others make replays."""
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
         self._moments: deque[_Moment] = deque(maxlen=MOST_STEPS)
+        self._lock = threading.Lock()
 
     def __len__(self) -> int:
         return len(self._moments)
 
     def add(self, *moment: np.ndarray) -> None:
         """Remember states ``(K, n)``, goals ``(K, d)``, and ``(K,)`` who has arrived, collided and come too close."""
-        self._moments.append(_Moment(*moment))
+        with self._lock:
+            self._moments.append(_Moment(*moment))
 
     def replay(self, policy: str) -> Replay:
         """A page that plays it."""
-        problem, moments = self._problem, list(self._moments)
+        with self._lock:
+            problem, moments = self._problem, list(self._moments)
         states = np.stack([moment.states for moment in moments])
         steps = len(moments) - 1
         trajectory = Trajectory(
