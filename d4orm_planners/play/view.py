@@ -19,6 +19,7 @@ from d4orm_planners.play.frame import Frame
 from d4orm_planners.play.session import Session
 
 CONTACT, OBSTACLE, BOUND, MARGIN = (208, 2, 27), (150, 156, 166), (90, 98, 110), (200, 60, 60)
+INK, NOTHING = (20, 24, 30), np.zeros((0, 2, 3), np.uint8)
 TRAIL_STEPS = 30
 """Steps that a robot's trail goes back."""
 
@@ -57,8 +58,9 @@ class View:
             self._trail = [*self._trail[-TRAIL_STEPS:], frame.states[:, : frame.problem.dimension]]
             self._color(frame)
         places = self._with_held("robot", in_space(frame.positions(now)))
-        with self._server.atomic():
+        with self._server.atomic():  # what has not changed is not sent
             self._nodes["robots"].batched_positions = places
+            self._nodes["heading"].points = self._headings(frame, places)
             self._nodes["goals"].batched_positions = self._with_held("goal", in_space(frame.goals))
             self._nodes["margins"].visible = self.shown["margins"]
             self._nodes["subgoals"].visible = self.shown["subgoals"] and frame.subgoals is not None
@@ -88,9 +90,9 @@ class View:
             self._colors = 255 * robot_colors(problem.num_robots)
             self._add_team(problem, in_space(frame.states[:, : problem.dimension]), in_space(frame.goals))
             self._add_world(problem)
-            for name in ("heading", "plans", "trails"):
+            for name, colors in (("heading", INK), ("plans", NOTHING), ("trails", NOTHING)):
                 self._nodes[name] = scene.add_line_segments(
-                    f"/{name}", np.zeros((0, 2, 3), np.float32), np.zeros((0, 2, 3), np.uint8),
+                    f"/{name}", np.zeros((0, 2, 3), np.float32), colors,
                     thickness=2.0, thickness_units="screen",
                 )  # fmt: skip
         self._generation, self._number = frame.generation, -1
@@ -189,12 +191,11 @@ class View:
         self._nodes["robots"].batched_colors = _linear(colors)
 
     def _draw_lines(self, frame: Frame) -> None:
-        nothing = np.zeros((0, 2, 3), np.float32), np.zeros((0, 2, 3), np.uint8)
+        nothing = np.zeros((0, 2, 3), np.float32), NOTHING
         trail = np.stack(self._trail) if len(self._trail) > 1 else None
         lines = {
             "trails": nothing if trail is None or not self.shown["trails"] else self._polylines(trail, fading=True),
             "plans": nothing,
-            "heading": self._headings(frame),
         }
         if frame.guidance is not None and len(frame.guidance) > 1 and self.shown["plans"]:
             lines["plans"] = self._polylines(frame.guidance, fading=False)
@@ -210,15 +211,16 @@ class View:
         both = np.repeat(np.broadcast_to(colors, (*points.shape[:2], 3))[:, :, None], 2, axis=2)
         return points.reshape(-1, 2, 3), _linear(both.reshape(-1, 2, 3))
 
-    def _headings(self, frame: Frame) -> tuple[Points, NDArray[np.uint8]]:
+    def _headings(self, frame: Frame, places: Points) -> Points:
+        """``(N, 2, 3)`` lines from the centre to the front of robots that have one."""
         models, radius = frame.problem.team.robot_models, np.asarray(frame.problem.team.radius)
         drives = [(robot, model.heading_index) for robot, model in enumerate(models) if model.heading_index is not None]
         points = np.zeros((len(drives), 2, 3), np.float32)
         for row, (robot, index) in enumerate(drives):
             angle = frame.states[robot, index]
-            points[row] = in_space(frame.states[robot, :2]) + np.array([0, 0, radius[robot]])
+            points[row] = places[robot] + np.array([0, 0, radius[robot]])
             points[row, 1, :2] += radius[robot] * np.array([np.cos(angle), np.sin(angle)])
-        return points, np.full(points.shape, 20, np.uint8)
+        return points
 
 
 def look_at(server: viser.ViserServer, problem: Problem) -> None:
