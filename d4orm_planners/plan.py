@@ -158,7 +158,8 @@ class Plan(Shown):
     def title(self) -> str:
         """What was planned by what, and how that ended."""
         spent = f"{count(self.iterations, 'iteration')}, {self.wall_time:.2f} s"
-        return f"{self.problem.name}, {self.problem.num_robots} robots by {self.planner}: {self.status} after {spent}"
+        team = f"{self.problem.name}, {count(self.problem.num_robots, 'robot')}"
+        return f"{team} by {self.planner}: {self.status.replace('_', ' ')} after {spent}"
 
     @property
     def key_figures(self) -> list[Row]:

@@ -168,6 +168,19 @@ def test_a_change_that_is_refused_leaves_the_scene_and_says_why(session: Session
     assert session.failure is None
 
 
+def test_a_step_that_fails_pauses_and_says_why(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(actions: object) -> None:
+        raise RuntimeError("no room for a goal")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(session._env, "step", fail)
+        until(lambda: session.frame.message)
+    assert session.frame.message == "no room for a goal"
+    assert session.frame.state == "paused"
+    session.pause(False)
+    until(lambda: session.frame.state == "running" and not session.frame.message)
+
+
 def test_everybody_arrives_and_is_sent_on(session: Session) -> None:
     session.set_speed(50)
     until(lambda: session.frame.state == "arrived")
@@ -350,7 +363,8 @@ def test_ctrl_c_leaves_no_process_and_no_port() -> None:
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**environment, "PYTHONUNBUFFERED": "1"}
     ) as process:
         assert process.stdout is not None
-        port = int(re.search(r"http://127\.0\.0\.1:(\d+)/", process.stdout.readline())[1])  # type: ignore[index]
+        told = "".join(process.stdout.readline() for _ in range(2))
+        port = int(re.search(r"http://127\.0\.0\.1:(\d+)/", told)[1])  # type: ignore[index]
         page = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)
         page.request("GET", "/")
         assert b"<html" in page.getresponse().read()

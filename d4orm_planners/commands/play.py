@@ -34,7 +34,7 @@ def play(options: PlayOptions) -> None:
     except ImportError as error:
         raise ImportError('d4orm play needs viser; install it with pip install "d4orm-env[viz]"') from error
 
-    typer.echo("getting ready; the first time this compiles for a while ...", err=True)
+    typer.echo("getting ready; the first time this compiles for a while ...")
     playground = Playground(options.problem(), options.policy, options.seed, options.host, options.port)
     try:
         typer.echo(f"open {playground.address}\nCtrl-C ends it")

@@ -48,9 +48,9 @@ class Playground:
     def __init__(
         self, problem: Problem, policy: str = "d4orm-c2f", seed: int = 0, host: str = LOOPBACK[0], port: int = 0
     ) -> None:
-        self.session = Session(problem, policy, seed)
         local = host in LOOPBACK
         chosen = _free_port(host, port)
+        self.session = Session(problem, policy, seed)
         with contextlib.redirect_stdout(io.StringIO()):  # its own words on where it is
             self._server = _Server(
                 host="127.0.0.1", port=chosen if local else _free_port("127.0.0.1", 0), verbose=False

@@ -217,9 +217,17 @@ class Session:
                     continue
                 self._steps_wanted = 0
                 due = max(due, time.perf_counter() - self._pace) + self._pace
-                self._advance()
+                self._advance_or_pause()
         except BaseException as error:
             self.failure = error
+
+    def _advance_or_pause(self) -> None:
+        """One step; where there is none, such as without room for a lifelong goal, a pause that says why."""
+        try:
+            self._advance()
+        except (ValueError, RuntimeError) as error:
+            self._message, self._paused = first_line(error), True
+            self._show(self._frame.before, state=self._state)
 
     def _obey(self) -> bool:
         """Do what was asked for meanwhile; whether there was anything."""
