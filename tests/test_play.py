@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import http.client
 import os
 import re
@@ -352,6 +353,18 @@ def test_without_the_extra_one_line_names_it() -> None:
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert result.returncode == 2
     assert result.stderr == 'd4orm: d4orm play needs viser; install it with pip install "d4orm-env[viz]"\n'
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # viser leaves a loop open
+def test_a_page_cannot_ask_for_a_tunnel_to_elsewhere(scene: Problem) -> None:
+    playground = pytest.importorskip("d4orm_planners.play.playground").Playground(scene, "goal")
+    server = playground._server
+    assert server.get_host() == "127.0.0.1"
+    assert server.request_share_url() is None
+    assert server._share_tunnel is None
+    playground.close()
+    del playground, server
+    gc.collect()
 
 
 @pytest.mark.slow
