@@ -14,7 +14,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine import noise, sampling
-from d4orm_env.engine.base import SamplingResult, SamplingRules, SamplingTask, StepResult, checked_controls
+from d4orm_env.engine.base import SamplingResult, SamplingRules, SamplingTask, Sight, StepResult, checked_controls
 from d4orm_env.engine.lanes import TILE
 from d4orm_env.engine.noise import DRAWS, TURNS
 from d4orm_env.engine.proximity import body_boxes, bound_boxes, make_scratch
@@ -61,22 +61,24 @@ class CpuEngine:
         time_left: float,
     ) -> FloatArray:
         """See :meth:`d4orm_env.engine.base.WorldEngine.observe`."""
-        out: FloatArray = np.empty((1, len(states), layout.size), np.float32)
-        arrays = _typed(arrays)
-        _kernels(arrays).observe_world(
-            arrays,
-            _single(arrays)[0],
+        sight = Sight(
+            np.array(arrays.goal, np.float32)[None],
             np.array(states, np.float32)[None],
             np.array(controls, np.float32)[None],
             np.array(arrived, bool)[None],
-            time_left,
-            layout.bounds,
-            layout.num_neighbors,
-            layout.num_obstacles,
-            out,
+            np.empty((1, 0, 2 * layout.dimension + 1), np.float32),
+            np.array([time_left], np.float32),
         )
+        out: FloatArray = np.empty((1, len(states), layout.size), np.float32)
+        self.observe_worlds(arrays, layout, sight, out)
         seen: FloatArray = out[0]
         return seen
+
+    def observe_worlds(self, arrays: ProblemArrays, layout: ObservationLayout, sight: Sight, out: FloatArray) -> None:
+        """See :meth:`d4orm_env.engine.base.WorldEngine.observe_worlds`."""
+        arrays = _typed(arrays)
+        kernel, shown = _kernels(arrays).observe_worlds, (layout.bounds, layout.num_neighbors, layout.num_obstacles)
+        self._threads.over(-(-len(out) // TILE), lambda part: kernel(arrays, *sight, *shown, part, out))
 
     def advance(
         self,
