@@ -76,7 +76,7 @@ class DisturbedBatch:
         if not self._disturbed.bodies.shape[1]:
             return
         worlds = self._worlds
-        touched, near = self._disturbed.touched(worlds.state[..., : worlds.goal.shape[-1]])
+        touched, near = self._disturbed.touched(worlds.state)
         worlds.contacts[moved] += (touched & ~worlds.collided)[moved]
         worlds.violations[moved] += (near & ~worlds.violated)[moved]
         worlds.rewards[moved] -= near[moved]
@@ -89,18 +89,18 @@ class DisturbedBatch:
         """What there is to see of these worlds now, or is believed to be."""
         from d4orm_env.engine.base import Sight
 
-        every = len(worlds) == len(self._worlds.steps)
-        seen = self._disturbed.see(self._scene, None if every else worlds)
-        if every:
-            self._seen = Seen(*map(np.array, seen))
+        batch = self._worlds
+        rows: Worlds | slice = slice(None) if len(worlds) == len(batch.steps) else worlds
+        seen = self._disturbed.see(self._scene, None if isinstance(rows, slice) else worlds)
+        if isinstance(rows, slice):
+            self._seen = Seen(*(np.array(part) for part in seen))
         else:
             assert self._seen is not None
             for past, new in zip(self._seen, seen):
                 past[worlds] = new
-        steps, batch = self._worlds.steps[worlds], self._worlds
-        time_left = np.maximum(0.0, 1.0 - steps / self._cycles).astype(np.float32)
-        states, controls, bodies = (np.ascontiguousarray(part[worlds]) for part in self._seen)
-        return Sight(batch.goal[worlds], states, controls, batch.docked[worlds], bodies, time_left)
+        states, controls, bodies = (part[rows] for part in self._seen)
+        time_left = np.maximum(0.0, 1.0 - batch.steps[rows] / self._cycles).astype(np.float32)
+        return Sight(batch.goal[rows], states, controls, batch.docked[rows], bodies, time_left)
 
     def observe(self, observations: FloatArray, layout: ObservationLayout) -> FloatArray:
         """``(b, K, D)`` observations of what is seen, as robots make them."""

@@ -84,7 +84,11 @@ class Simulation:
         low, high = (frozen_array(bound, "bounds", (None,)) for bound in (self.layout.low, self.layout.high))
         self.layout = replace(self.layout, low=low, high=high)
         if self._running:
-            self._set_goals(self.arrays.goal, self.arrays.inverse_initial_distance)
+            for array in (*self.arrays, *self.arrays.grid):
+                if isinstance(array, np.ndarray):
+                    array.setflags(write=False)
+            if self._disturbed is not None:
+                self._true_limits.setflags(write=False)
 
     @property
     def state_bounds(self) -> tuple[FloatArray, FloatArray]:
@@ -172,7 +176,8 @@ class Simulation:
         if self._disturbed is not None:
             acted = self._disturbed.act(self._scene(), controls[None])
             states, controls = acted[0][0], acted[1][0]
-            arrays = arrays._replace(limits=self._true_limits)
+            if self._disturbed.alters_limits:
+                arrays = arrays._replace(limits=self._true_limits)
         if self.lifelong:
             # A goal radius that nothing is within: a robot under way to its next goal neither docks nor stops.
             arrays = arrays._replace(squared_goal_radius=np.float32(-1))
@@ -250,23 +255,22 @@ class Simulation:
 
     def _scene(self) -> Scene:
         assert self._disturbed is not None
-        goal, steps = self.arrays.goal[None], np.array([self.steps])
-        start, states, controls, arrived = self.problem.start, self.states, self.controls, self.arrived
-        return self._disturbed.scene(start[None], goal, states[None], controls[None], arrived[None], steps)
+        start, goal, steps = self.problem.start[None], self.arrays.goal[None], np.array([self.steps])
+        return self._disturbed.scene(start, goal, self.states[None], self.controls[None], self.arrived[None], steps)
 
     def _contacts(self) -> tuple[BoolArray, BoolArray]:
         """``(K,)`` who is in contact, and who within the margin, where all stand now."""
         collided, violated = self._engine.contacts(self.arrays, self.states)
         if self._disturbed is None or not self._disturbed.bodies.shape[1]:
             return collided, violated
-        touched, near = self._disturbed.touched(self.states[None, :, : self._dimension])
+        touched, near = self._disturbed.touched(np.array(self.states)[None])
         return collided | touched[0], violated | near[0]
 
     def _met(self, result: StepResult) -> StepResult:
         """The result of a step with what robots met that is none."""
         if self._disturbed is None or not self._disturbed.bodies.shape[1]:
             return result
-        touched, near = self._disturbed.touched(result.states[None, :, : self._dimension])
+        touched, near = self._disturbed.touched(result.states[None])
         return result._replace(
             collided=result.collided | touched[0],
             margin_violated=result.margin_violated | near[0],

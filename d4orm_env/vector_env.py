@@ -298,7 +298,8 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
     def _look(self, worlds: NDArray[np.intp], out: FloatArray) -> None:
         """Fill ``out`` ``(B, K, D)`` with what robots of these worlds see where something alters that."""
         sight, layout = self._disturbances.look(worlds), self.layout
-        seen: FloatArray = np.empty((len(worlds), *out.shape[1:]), np.float32)
+        every = len(worlds) == len(out)
+        seen: FloatArray = out if every else np.empty((len(worlds), *out.shape[1:]), np.float32)
         if not self._apart:
             self._engine.observe_worlds(self._arrays[0], layout, sight, seen)
         for row, world in enumerate(worlds if self._apart else ()):
@@ -306,7 +307,9 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             self._engine.observe_worlds(self._arrays[world], layout, sight.of(one), seen[one])
         if layout.observed_way:
             self._observe_ways(worlds, sight.states, seen)
-        out[worlds] = self._disturbances.observe(seen, layout)
+        seen = self._disturbances.observe(seen, layout)
+        if seen is not out:
+            out[worlds] = seen
 
     def _observe_ways(self, worlds: NDArray[np.intp], states: FloatArray, out: FloatArray) -> None:
         """Add the ways of some worlds, from ``states`` ``(b, K, n)``, to what is seen there, ``(b, K, D)``."""

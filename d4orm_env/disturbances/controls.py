@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import LARGEST, FloatArray, positive_number, shown, whole_number
 from d4orm_env.core.problem import Problem
@@ -151,7 +150,7 @@ class Quantisation(Disturbance[Memory]):
 
 
 class Queue(NamedTuple):
-    """The last commands, in a ring: ``values`` ``(B, L, K, m)``; command ``t`` has place ``t mod L``."""
+    """The last commands, the newest first: ``values`` ``(B, L, K, m)``."""
 
     values: FloatArray
 
@@ -188,13 +187,12 @@ class Delay(Disturbance[Queue]):
 
     def command(self, controls: FloatArray, memory: Queue, scene: Scene, draws: Draws) -> FloatArray:
         least, most = self._range
-        worlds, length = np.arange(len(controls)), most + 1
-        memory.values[worlds, scene.steps % length] = controls
+        memory.values[:, 1:] = memory.values[:, :-1]
+        memory.values[:, 0] = controls
         if least == most:
-            return memory.values[worlds, (scene.steps - least) % length]
-        robots = np.arange(controls.shape[1])
-        late: NDArray[np.int64] = draws.whole(least, most, len(robots))
-        return memory.values[worlds[:, None], (scene.steps[:, None] - late) % length, robots]
+            return memory.values[:, most].copy()
+        worlds, robots = np.arange(len(controls))[:, None], np.arange(controls.shape[1])
+        return memory.values[worlds, draws.whole(least, most, len(robots)), robots]
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ class _Purpose(IntEnum):
     SEE = 3
 
 
-@dataclass
+@dataclass(eq=False)
 class _Running:
     """A disturbance at work: its stream of random numbers, and what it remembers."""
 
@@ -83,9 +83,10 @@ class DisturbedWorlds:
         self._commanding, self._moving, self._seeing, self._observing, self._effective = (
             [one for one in self._all if one.has(method)] for method in ("command", "move", "see", "observe", "effect")
         )
-        self._weaker = any(one.has("limits") for one in self._all)
+        self.alters_limits = any(one.has("limits") for one in self._all)
         self._keys: Keys = np.zeros((num_worlds, 2), np.uint32)
         self._bodies: FloatArray = np.zeros((num_worlds, 0, 2 * problem.dimension + 1), np.float32)
+        self._bringing: list[_Running] = []
         self._begun = False
 
     @property
@@ -101,7 +102,7 @@ class DisturbedWorlds:
     @property
     def alters_sight(self) -> bool:
         """Whether what is seen is not simply what there is of the robots."""
-        return bool(self._seeing or self._observing or self._bodies.shape[1] or self._weaker)
+        return bool(self._seeing or self._observing or self._bodies.shape[1] or self.alters_limits)
 
     def true_limits(self, limits: FloatArray) -> FloatArray:
         """``(K, L)`` what limits truly are, read-only."""
@@ -143,10 +144,13 @@ class DisturbedWorlds:
             one.remember(memory, worlds, first=not self._begun)
             bodies = one.disturbance.effect(memory, scene).bodies
             if bodies is not None:
+                if not self._begun:
+                    self._bringing.append(one)
                 scene = scene._replace(bodies=np.concatenate([scene.bodies, bodies], axis=1))
         if not self._begun:
-            self._bodies = scene.bodies.copy()
-        self._bodies[worlds] = scene.bodies
+            self._bodies = scene.bodies
+        else:
+            self._bodies[worlds] = scene.bodies
         self._begun = True
 
     def act(self, scene: Scene, controls: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -170,8 +174,9 @@ class DisturbedWorlds:
         if states is not scene.states and scene.standing.any():
             states = np.where(scene.standing[..., None], scene.states, states)
         if self._bodies.shape[1]:
-            effects = (one.disturbance.effect(one.memory, scene).bodies for one in self._effective)
-            self._bodies = np.concatenate([bodies for bodies in effects if bodies is not None], axis=1)
+            effects = (one.disturbance.effect(one.memory, scene).bodies for one in self._bringing)
+            there = [bodies for bodies in effects if bodies is not None]
+            self._bodies = there[0] if len(there) == 1 else np.concatenate(there, axis=1)
         return states, controls
 
     def effect(self, scene: Scene) -> Effect:
@@ -184,16 +189,19 @@ class DisturbedWorlds:
             bodies=self._bodies,
         )
 
-    def touched(self, positions: FloatArray) -> tuple[BoolArray, BoolArray]:
-        """Which robots at ``positions`` ``(B, K, d)`` touch a body that is none, and which are near one.
+    def touched(self, states: FloatArray) -> tuple[BoolArray, BoolArray]:
+        """Which robots in ``states`` ``(B, K, n)`` touch a body that is none, and which are near one.
 
         Returns:
             Two arrays ``(B, K)`` bool; near is within the margin.
         """
-        d, radius = self.problem.dimension, np.asarray(self.problem.team.radius, np.float32)
-        offsets = positions[:, :, None] - self._bodies[:, None, :, :d]
-        gaps = np.sqrt((offsets * offsets).sum(axis=-1)) - (radius[:, None] + self._bodies[:, None, :, -1])
-        return (gaps <= 0).any(axis=-1), (gaps <= np.float32(self.problem.margin)).any(axis=-1)
+        # Here, because importing the compiler takes longer than importing all the rest of the package.
+        from d4orm_env.engine.bodies import meet_bodies
+
+        touched, near = np.empty((2, *states.shape[:2]), np.bool_)
+        margin = self.problem.arrays.margin
+        meet_bodies(states, self.problem.team.radius, self._bodies, margin, touched, near)
+        return touched, near
 
     def see(self, scene: Scene, worlds: Worlds | None = None) -> Seen:
         """What is seen of all worlds, or of some, as they stand in ``scene``, which is always of all.
@@ -207,7 +215,12 @@ class DisturbedWorlds:
             memory = one.memory if worlds is None else one.memory_of(worlds)
             draws = Draws(self._keys if worlds is None else self._keys[worlds], part.steps, one.stream, _Purpose.SEE)
             changed = one.disturbance.see(seen, memory, part, draws)
-            seen = Seen(*(_checked(new, old.shape, one, "see") for new, old in zip(changed, seen, strict=True)))
+            states, controls, bodies = changed
+            seen = Seen(
+                _checked(states, seen.states.shape, one, "see"),
+                _checked(controls, seen.controls.shape, one, "see"),
+                _checked(bodies, seen.bodies.shape, one, "see"),
+            )
             if worlds is not None:
                 one.remember(memory, worlds)
         return seen

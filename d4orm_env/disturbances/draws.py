@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +13,21 @@ from d4orm_env.core.arrays import FloatArray
 
 Keys = NDArray[np.uint32]
 Steps = NDArray[np.int64]
+Kernel = Callable[..., Any]
 
 
 def episode_keys(seeds: Sequence[int]) -> Keys:
     """``(B, 2)`` keys of episodes, of the 63 bits that each draws from its environment's generator."""
     words = np.array(seeds, np.uint64)
     return np.stack([words & np.uint64(0xFFFFFFFF), words >> np.uint64(32)], axis=1).astype(np.uint32)
+
+
+@cache
+def _kernels() -> tuple[Kernel, Kernel]:
+    # Here, because importing the compiler takes longer than importing all the rest of the package.
+    from d4orm_env.engine.draws import draw_normals, draw_uniforms
+
+    return draw_normals, draw_uniforms
 
 
 class Draws:
@@ -44,15 +55,11 @@ class Draws:
 
     def normal(self, *shape: int) -> FloatArray:
         """``(B, *shape)`` independent standard normals."""
-        from d4orm_env.engine.draws import draw_normals
-
-        return self._filled(draw_normals, shape)
+        return self._filled(_kernels()[0], shape)
 
     def uniform(self, *shape: int) -> FloatArray:
         """``(B, *shape)`` independent numbers, uniform between 0 and 1, neither of which occurs."""
-        from d4orm_env.engine.draws import draw_uniforms
-
-        return self._filled(draw_uniforms, shape)
+        return self._filled(_kernels()[1], shape)
 
     def whole(self, low: int, high: int, *shape: int) -> NDArray[np.int64]:
         """``(B, *shape)`` independent whole numbers, uniform from ``low`` to ``high``, both included."""
@@ -66,9 +73,9 @@ class Draws:
         directions: FloatArray = vectors / np.maximum(length, np.float32(1e-12))
         return directions
 
-    def _filled(self, kernel: object, shape: tuple[int, ...]) -> FloatArray:
+    def _filled(self, kernel: Kernel, shape: tuple[int, ...]) -> FloatArray:
         worlds = len(self._keys)
         out: FloatArray = np.empty((worlds, *shape), np.float32)
-        kernel(self._keys, self._steps, self._stream, np.uint32(self._call), out.reshape(worlds, -1))  # type: ignore[operator] # compiled
+        kernel(self._keys, self._steps, self._stream, np.uint32(self._call), out.reshape(worlds, -1))
         self._call += 1
         return out

@@ -19,14 +19,12 @@ _TRIES = 16
 
 
 class Courses(NamedTuple):
-    """Straight ways ``(B, N, .)``: where they begin [m], their unit direction, their length [m], and how far the body
-    has come [m].
+    """Bodies ``(B, N, 2 d + 1)``, as in :class:`~d4orm_env.disturbances.Seen`, and how long ``(B, N)`` each still takes
+    to leave the area [s].
     """
 
-    origin: FloatArray
-    direction: FloatArray
-    length: FloatArray
-    along: FloatArray
+    bodies: FloatArray
+    time: FloatArray
 
 
 @dataclass(frozen=True)
@@ -70,27 +68,27 @@ class Intruder(Disturbance[Courses]):
         return self.radius + float(problem.team.radius.max()) + 2 * problem.margin
 
     def begin(self, scene: Scene, draws: Draws) -> Courses:
-        courses = self._courses(scene, draws)
-        courses.along[:] = courses.length * draws.uniform(self.count)
-        return courses
+        bodies, time = self._courses(scene, draws)
+        gone, d = time * draws.uniform(self.count), scene.problem.dimension
+        bodies[..., :d] += gone[..., None] * bodies[..., d : 2 * d]
+        return Courses(bodies, time - gone)
 
     def move(
         self, states: FloatArray, controls: FloatArray, memory: Courses, scene: Scene, draws: Draws
     ) -> tuple[FloatArray, FloatArray]:
-        memory.along[:] += np.float32(self.speed * scene.problem.dt)
-        out = memory.along > memory.length
-        worlds = np.flatnonzero(out.any(axis=1))
-        if len(worlds):
+        d, dt = scene.problem.dimension, np.float32(scene.problem.dt)
+        memory.bodies[..., :d] += dt * memory.bodies[..., d : 2 * d]
+        memory.time[:] -= dt
+        out = memory.time < 0
+        if out.any():
+            worlds = np.flatnonzero(out.any(axis=1))
             left = out[worlds]
             for past, fresh in zip(memory, self._courses(scene.of(worlds), draws.of(worlds))):
                 past[out] = fresh[left]
         return states, controls
 
     def effect(self, memory: Courses, scene: Scene) -> Effect:
-        places = memory.origin + memory.along[..., None] * memory.direction
-        velocities = np.float32(self.speed) * memory.direction
-        radius = np.full((*memory.along.shape, 1), self.radius, np.float32)
-        return Effect(bodies=np.concatenate([places, velocities, radius], axis=-1))
+        return Effect(bodies=memory.bodies)
 
     def _courses(self, scene: Scene, draws: Draws) -> Courses:
         """New lines for all worlds, their bodies at the beginning."""
@@ -109,8 +107,10 @@ class Intruder(Disturbance[Courses]):
         offset = centre[:, None] - through
         middle = (offset * heading).sum(axis=-1)
         half_chord = np.sqrt(np.maximum(reach[:, None] ** 2 - (offset * offset).sum(axis=-1) + middle * middle, 0))
-        origin = through + (middle - half_chord)[..., None] * heading
-        return Courses(origin, heading, 2 * half_chord, np.zeros_like(half_chord))
+        places = through + (middle - half_chord)[..., None] * heading
+        speed, radius = np.float32(self.speed), np.full((*places.shape[:-1], 1), self.radius, np.float32)
+        time = 2 * half_chord / np.maximum(speed, np.float32(1e-6))
+        return Courses(np.concatenate([places, speed * heading, radius], axis=-1), time)
 
 
 def _distances(points: FloatArray, through: FloatArray, heading: FloatArray) -> FloatArray:

@@ -21,8 +21,15 @@ _FARTHEST = 6.0
 """No normal that is drawn lies so many standard deviations from zero."""
 
 
+class Scales(NamedTuple):
+    """Standard deviations of what is seen of robots ``(B, K, n)``, and of bodies ``(B, N, 2 d + 1)``."""
+
+    states: FloatArray
+    bodies: FloatArray
+
+
 @dataclass(frozen=True)
-class StateNoise(Disturbance[Memory]):
+class StateNoise(Disturbance[Scales]):
     """Gaussian noise on what is measured of the robots, independent over steps, robots and components.
 
     Bodies that are no robots are measured likewise. What the model of a robot has no state for is not measured but
@@ -64,23 +71,21 @@ class StateNoise(Disturbance[Memory]):
     def spare(self, problem: Problem) -> Spare:
         return Spare(*(_FARTHEST * std for std in (self.position_std, self.velocity_std, self.heading_std)))
 
-    def _scale(self, problem: Problem) -> FloatArray:
-        """``(K, n)`` standard deviations."""
-        scale: FloatArray = np.zeros((problem.num_robots, problem.state_size), np.float32)
-        scale[:, : problem.dimension] = self.position_std
-        for robot, model in enumerate(problem.team.robot_models):
-            scale[robot, list(model.speed_indices)] = self.velocity_std
+    def begin(self, scene: Scene, draws: Draws) -> Scales:
+        scales, d = Scales(np.zeros_like(scene.states), np.zeros_like(scene.bodies)), scene.problem.dimension
+        scales.states[..., :d] = scales.bodies[..., :d] = self.position_std
+        scales.bodies[..., d : 2 * d] = self.velocity_std
+        for robot, model in enumerate(scene.problem.team.robot_models):
+            scales.states[:, robot, list(model.speed_indices)] = self.velocity_std
             if model.heading_index is not None:
-                scale[robot, model.heading_index] = self.heading_std
-        return scale
+                scales.states[:, robot, model.heading_index] = self.heading_std
+        return scales
 
-    def see(self, seen: Seen, memory: Memory, scene: Scene, draws: Draws) -> Seen:
-        states = seen.states + self._scale(scene.problem) * draws.normal(*seen.states.shape[1:])
-        bodies, d = seen.bodies, scene.problem.dimension
+    def see(self, seen: Seen, memory: Scales, scene: Scene, draws: Draws) -> Seen:
+        states, bodies = seen.states + memory.states * draws.normal(*seen.states.shape[1:]), seen.bodies
         if bodies.shape[1]:
-            scale = np.array([self.position_std] * d + [self.velocity_std] * d + [0], np.float32)
-            bodies = bodies + scale * draws.normal(*bodies.shape[1:])
-        return seen._replace(states=states, bodies=bodies)
+            bodies = bodies + memory.bodies * draws.normal(*bodies.shape[1:])
+        return Seen(states, seen.controls, bodies)
 
 
 class Past(NamedTuple):

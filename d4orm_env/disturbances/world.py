@@ -65,19 +65,23 @@ class Push(Disturbance[Given]):
         hit = draws.uniform(states.shape[1]) < -math.expm1(-self.rate * scene.problem.dt)
         hit &= ~scene.standing
         memory.velocity[:] = 0
-        if not hit.any():
-            return states, controls
-        memory.velocity[:] = np.float32(self.speed) * draws.direction(*memory.velocity.shape[1:]) * hit[..., None]
-        return _pushed(scene.problem, states, memory.velocity), controls
+        worlds = np.flatnonzero(hit.any(axis=1))
+        if len(worlds):
+            directions = draws.of(worlds).direction(*memory.velocity.shape[1:])
+            memory.velocity[worlds] = given = np.float32(self.speed) * directions * hit[worlds, :, None]
+            states = states.copy()
+            states[worlds] = _pushed(scene.problem, states[worlds], given)
+        return states, controls
 
     def effect(self, memory: Given, scene: Scene) -> Effect:
         return Effect(pushed=memory.velocity)
 
 
 def _pushed(problem: Problem, states: FloatArray, velocity: FloatArray) -> FloatArray:
-    """``states`` ``(B, K, n)`` with velocities ``(B, K, d)`` given to the robots."""
-    states, slip, d = states.copy(), velocity.copy(), problem.dimension
-    for robot, model in enumerate(problem.team.robot_models):
+    """``states`` ``(B, K, n)``, changed in place, with velocities ``(B, K, d)`` given to the robots."""
+    slip, d = velocity.copy(), problem.dimension
+    for robot in np.flatnonzero(velocity.any(axis=(0, 2))):
+        model = problem.team.robot_models[robot]
         columns = list(model.speed_indices)
         if len(columns) == d:
             states[:, robot, columns] += velocity[:, robot]

@@ -37,7 +37,7 @@ class CpuEngine:
         collided, violated, rewards = np.empty_like(docked), np.empty_like(docked), np.empty(docked.shape, np.float32)
         arrays = _typed(arrays)
         _kernels(arrays).step_worlds(
-            arrays, *_single(arrays), state, control, docked, collided, violated, rewards, _ONE_WORLD
+            arrays, *_single(arrays), state, control, docked, collided, violated, rewards, _ONE_TILE
         )  # fmt: skip
         return StepResult(state[0], control[0], docked[0], collided[0], violated[0], rewards[0])
 
@@ -78,7 +78,10 @@ class CpuEngine:
         """See :meth:`d4orm_env.engine.base.WorldEngine.observe_worlds`."""
         arrays = _typed(arrays)
         kernel, shown = _kernels(arrays).observe_worlds, (layout.bounds, layout.num_neighbors, layout.num_obstacles)
-        self._threads.over(-(-len(out) // TILE), lambda part: kernel(arrays, *sight, *shown, part, out))
+        if len(out) <= TILE:
+            kernel(arrays, *sight, *shown, _ONE_TILE, out)
+        else:
+            self._threads.over(-(-len(out) // TILE), lambda part: kernel(arrays, *sight, *shown, part, out))
 
     def advance(
         self,
@@ -255,7 +258,7 @@ def _by_counter(weights: FloatArray) -> tuple[FloatArray, FloatArray]:
     return turns[0::2] - turns[1::2], turns[0::2] + turns[1::2]
 
 
-_ONE_WORLD = np.array([0, 1])
+_ONE_TILE = np.array([0, 1])
 
 
 def _kernels(arrays: ProblemArrays) -> WorldKernels:
