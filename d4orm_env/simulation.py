@@ -13,11 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, frozen_array, whole_number
+from d4orm_env.core.marks import Marks
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import inverse_initial_distance
 from d4orm_env.disturbances.disturbance import Effect, Scene, Seen
 from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
+from d4orm_env.disturbances.marks import marks_of
 from d4orm_env.disturbances.selection import total_spare
 from d4orm_env.engine.base import Sight, StepResult, WorldEngine
 from d4orm_env.env_inputs import checked_cycles, checked_states
@@ -219,12 +221,21 @@ class Simulation:
 
     def state(self) -> FloatArray:
         """The joint state vector; see :mod:`d4orm_env.joint_state`."""
+        return self._joined(self._seen)
+
+    def true_state(self) -> FloatArray:
+        """:meth:`state` as it truly is, whatever is seen."""
+        return self._joined(None)
+
+    def _joined(self, seen: Seen | None) -> FloatArray:
         self.require_reset()
-        seen = self._seen
-        if seen is None:
-            return join_state(JointState(self.states, self.arrays.goal, self.controls, self.arrived, self.steps))
-        states, controls, bodies = (part[0] for part in seen)
-        return join_state(JointState(states, self.arrays.goal, controls, self.arrived, self.steps, bodies))
+        states, controls, bodies = self.states, self.controls, None
+        if seen is not None:
+            states, controls, bodies = (part[0] for part in seen)
+        elif self._disturbed is not None:
+            bodies = self._disturbed.bodies[0]
+        joint = JointState(states, self.arrays.goal, controls, self.arrived, self.steps)
+        return join_state(joint if bodies is None else joint._replace(bodies=bodies))
 
     def metrics(self) -> dict[str, float]:
         """The episode so far in numbers; see :meth:`d4orm_env.episode_record.EpisodeRecord.metrics`."""
@@ -234,6 +245,7 @@ class Simulation:
 
     def effect(self) -> Effect:
         """What disturbances have done up to now, as of a batch of one world."""
+        self.require_reset()
         return Effect() if self._disturbed is None else self._disturbed.effect(self._scene())
 
     @property
@@ -242,6 +254,10 @@ class Simulation:
         if self.lifelong:
             return np.zeros_like(self.arrived)
         return self.arrived if self.problem.docks else self.arrived & self.arrived.all()
+
+    def marks(self) -> Marks | None:
+        """Where the present moment is disturbed, as far as it can be drawn; ``None`` without disturbances."""
+        return marks_of([self.effect()], self.problem) if self.disturbances else None
 
     def _disturb(self, seed: int) -> None:
         """Begin the disturbances of an episode."""

@@ -56,7 +56,9 @@ from d4orm_env.disturbances.registry import (
 )
 from d4orm_env.joint_env import JointNavigationEnv
 from d4orm_env.joint_state import split_state
+from d4orm_env.render import plot_trajectory, save_animation
 from d4orm_env.vector_env import NavigationVectorEnv
+from d4orm_planners import run_episode
 
 NAMES = pytest.mark.parametrize("name", CASES)
 EARLY = line_problem([0.3, 0.5, 0.8], "holonomic2d", goal_radius=0.25, horizon=40)
@@ -689,3 +691,46 @@ def test_disturbances_by_name_and_level() -> None:
 def test_names_that_mean_nothing(text: str, complaint: str) -> None:
     with pytest.raises(ValueError, match=complaint):
         disturbance_at(text, 0.1)
+
+
+# What pictures and records of an execution show
+
+
+def test_an_episode_records_the_truth_and_where_it_was_disturbed(tmp_path: Any) -> None:
+    quiet, noisy = (
+        run_episode(navigation_v0.parallel_env(problem=EARLY, disturbances=[*perception, Push(2.0, 0.2)]), "random")
+        for perception in ([], [StateNoise(0.3), StateDelay(2)])
+    )
+    # A policy that looks at nothing moves the same whatever is seen.
+    np.testing.assert_array_equal(quiet.trajectory.states, noisy.trajectory.states)
+    marks = noisy.marks
+    assert marks.pushed.shape == (len(marks.stalled), 3, 2)
+    assert len(marks.pushed) == len(noisy.trajectory.states)
+    assert marks.pushed.any()
+    assert not marks.pushed[0].any()
+    assert run_episode(navigation_v0.parallel_env(problem=EARLY), "random").marks is None
+
+
+@pytest.mark.parametrize("scenario", ["circle", "sphere"])
+def test_pictures_show_where_it_was_disturbed(scenario: str, tmp_path: Any) -> None:
+    disturbances = [Push(2.0, 0.3), Stall(1.0, robots=1), Intruder(2)]
+    episode = run_episode(navigation_v0.parallel_env(scenario, 3, disturbances=disturbances, max_cycles=30), "goal")
+    problem, trajectory, marks = episode.problem, episode.trajectory, episode.marks
+    figure = plot_trajectory(problem, trajectory, marks=marks)
+    told = {text.get_text() for text in figure.legends[0].get_texts()}
+    assert told >= {"push", "intruder"}
+    assert ("stalls" in told) == marks.stalled.any()
+    assert not {text.get_text() for text in plot_trajectory(problem, trajectory).legends[0].get_texts()} & {"push"}
+    save_animation(problem, trajectory, tmp_path / "plain.gif", max_frames=4)
+    save_animation(problem, trajectory, tmp_path / "marked.gif", max_frames=4, marks=marks)
+    assert (tmp_path / "plain.gif").read_bytes() != (tmp_path / "marked.gif").read_bytes()
+
+
+def test_frames_show_intruders() -> None:
+    frames = []
+    for disturbances in ([], [Intruder(5)]):
+        env = navigation_v0.parallel_env("circle", 2, render_mode="rgb_array", disturbances=disturbances)
+        env.reset(seed=0)
+        frames.append(env.render())
+        env.close()
+    assert (frames[0] != frames[1]).any()

@@ -6,6 +6,7 @@ to the bit. All arrays have a leading axis over the worlds.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
 
@@ -97,6 +98,10 @@ class Effect(NamedTuple):
     lost: BoolArray | None = None
     bodies: FloatArray | None = None
 
+    def copy(self) -> Effect:
+        """A copy, for the arrays go on with the episode."""
+        return copy.deepcopy(self)
+
 
 @dataclass(frozen=True)
 class Disturbance(Generic[M]):
@@ -111,6 +116,12 @@ class Disturbance(Generic[M]):
     def negligible(self) -> bool:
         """Whether it changes nothing, as at level zero; it is left out then."""
         return False
+
+    @property
+    def replayable(self) -> bool:
+        """Whether executed controls, driven again without it, make the same motion and can be judged alone."""
+        kind = type(self)
+        return kind.move is Disturbance.move and kind.limits is Disturbance.limits
 
     def check(self, problem: Problem) -> None:
         """Raise ``ValueError``, in one line, where the robots or the world cannot have this disturbance."""

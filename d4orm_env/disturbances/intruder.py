@@ -59,6 +59,10 @@ class Intruder(Disturbance[Courses]):
     def negligible(self) -> bool:
         return self.count == 0
 
+    @property
+    def replayable(self) -> bool:
+        return True  # it changes neither states nor controls
+
     def spare(self, problem: Problem) -> Spare:
         faster = max(0.0, self.speed - float(problem.team.max_speed.max()))
         return Spare(distance=2 * self._room(problem) + self.speed * problem.dt, speed=faster, radius=self.radius)

@@ -139,6 +139,10 @@ class Stall(Disturbance[Stops]):
     def negligible(self) -> bool:
         return not (self.probability and self.duration)
 
+    @property
+    def replayable(self) -> bool:
+        return True  # it changes controls only
+
     def begin(self, scene: Scene, draws: Draws) -> Stops:
         num_robots = scene.problem.num_robots
         happens = draws.uniform(num_robots) < self.probability

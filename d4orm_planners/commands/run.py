@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from d4orm_planners.commands.dataclass_options import takes
-from d4orm_planners.commands.inputs import refuse_options
+from d4orm_planners.commands.inputs import parse_levels, refuse_options
 from d4orm_planners.commands.options import PictureOptions, ProblemOptions
 from d4orm_planners.commands.outputs import episode_rows, print_table
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from d4orm_env.core.problem import Problem
+    from d4orm_env.disturbances import Disturbance
     from d4orm_planners.episode import Episode
     from d4orm_planners.policy import Policy
 
@@ -28,6 +31,25 @@ class RunOptions(PictureOptions, ProblemOptions):
     control_noise_std: Annotated[
         float, typer.Option("--control-noise-std", "--noise", help="Standard deviation of the execution noise.")
     ] = 0.0
+
+    disturb: Annotated[
+        list[str] | None,
+        typer.Option("--disturb", help="A disturbance at a level, as delay=2 or push.speed=0.3; repeatable."),
+    ] = None
+
+    def disturbances(self) -> tuple[Disturbance[Any], ...]:
+        """What goes wrong.
+
+        Raises:
+            ValueError: For an unknown name, or a level that makes no sense.
+        """
+        from d4orm_env.disturbances.registry import disturbances_at
+
+        levels = parse_levels(self.disturb) or {}
+        for name, values in levels.items():
+            if len(values) != 1:
+                raise ValueError(f"--disturb {name}: an episode has one level, not {len(values)}; use d4orm evaluate")
+        return disturbances_at({name: values[0] for name, values in levels.items()})
 
     def chosen(self) -> tuple[Problem, Policy]:
         """The problem, and what acts in it.
@@ -54,21 +76,28 @@ class RunOptions(PictureOptions, ProblemOptions):
 def run(options: RunOptions) -> None:
     """Run a plan or a policy in the environment, step by step, and judge what happened."""
     options.check_pictures()
+    disturbances = options.disturbances()
     problem, policy = options.chosen()
-    episode = execute(problem, policy, options.seed, options.control_noise_std)
-    options.draw(problem, episode.trajectory)
+    episode = execute(problem, policy, options.seed, options.control_noise_std, disturbances)
+    options.draw(problem, episode.trajectory, episode.marks)
     if not options.quiet:
         print_table("Execution", episode_rows(episode))
     if not episode.metrics["success"]:
         raise typer.Exit(1)
 
 
-def execute(problem: Problem, policy: Policy, seed: int, control_noise_std: float = 0.0) -> Episode:
+def execute(
+    problem: Problem,
+    policy: Policy,
+    seed: int,
+    control_noise_std: float = 0.0,
+    disturbances: Sequence[Disturbance[Any]] = (),
+) -> Episode:
     """An episode of a policy on a problem."""
     from d4orm_env import navigation_v0
     from d4orm_planners.episode import run_episode
 
-    env = navigation_v0.parallel_env(problem=problem, control_noise_std=control_noise_std)
+    env = navigation_v0.parallel_env(problem=problem, control_noise_std=control_noise_std, disturbances=disturbances)
     episode = run_episode(env, policy, seed=seed)
     env.close()
     return episode
