@@ -80,8 +80,9 @@ class CorrelatedNoise(_Spread, Disturbance[Drawn]):
     def command(self, controls: FloatArray, memory: Drawn, scene: Scene, draws: Draws) -> FloatArray:
         disturbed = controls + scaled(self.std, memory.values)
         kept = math.exp(-scene.problem.dt / self.time_constant)
-        memory.values[:] = np.float32(kept) * memory.values
-        memory.values[:] += np.float32(math.sqrt(1 - kept * kept)) * draws.normal(*controls.shape[1:])
+        fresh = draws.normal(*controls.shape[1:])
+        fresh *= np.float32(math.sqrt(1 - kept * kept))
+        np.add(np.float32(kept) * memory.values, fresh, out=memory.values)
         return disturbed
 
 

@@ -62,5 +62,6 @@ def check_components(value: float | tuple[float, ...], name: str, control_size: 
 
 def scaled(value: float | tuple[float, ...], numbers: FloatArray) -> FloatArray:
     """``numbers`` ``(..., m)`` times levels."""
-    product: FloatArray = np.asarray(value, np.float32) * numbers
+    level = np.array(value, np.float32) if isinstance(value, tuple) else np.float32(value)
+    product: FloatArray = level * numbers
     return product

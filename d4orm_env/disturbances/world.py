@@ -65,8 +65,8 @@ class Push(Disturbance[Given]):
         hit = draws.uniform(states.shape[1]) < -math.expm1(-self.rate * scene.problem.dt)
         hit &= ~scene.standing
         memory.velocity[:] = 0
-        worlds = np.flatnonzero(hit.any(axis=1))
-        if len(worlds):
+        if hit.any():
+            worlds = np.flatnonzero(hit.any(axis=1))
             directions = draws.of(worlds).direction(*memory.velocity.shape[1:])
             memory.velocity[worlds] = given = np.float32(self.speed) * directions * hit[worlds, :, None]
             states = states.copy()
