@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from d4orm_planners.evaluation.summary import Group, SuccessRate
 
 NoiseLevels = Annotated[
-    str,
+    str | None,
     typer.Option("--control-noise-std", "--noise", help="Standard deviations of the execution noise, as 0,0.1."),
 ]
 DisturbanceLevels = Annotated[
@@ -93,7 +93,9 @@ class StudyOptions:
             policies=_with_settings(_policies(self.policies or ["d4orm,goal"]), parse_settings(self.settings)),
             scenarios=names(self.scenario) or (),
             seeds=_seeds(self.seeds),
-            control_noise_std=decimals("--control-noise-std", self.control_noise_std),
+            control_noise_std=decimals(
+                "--control-noise-std", "0" if self.control_noise_std is None else self.control_noise_std
+            ),
             disturbances=parse_levels(self.disturb),
             num_robots=numbers("--num-robots", self.num_robots) or (None,),
             model=names(self.model),

@@ -29,7 +29,7 @@ STANDARD = (
 class RobustnessOptions(StudyOptions):
     """Those of ``d4orm evaluate``; without levels of noise or disturbances :data:`STANDARD`."""
 
-    control_noise_std: NoiseLevels = ""
+    control_noise_std: NoiseLevels = None
     out: Out = Path("robustness")
 
 
@@ -41,8 +41,8 @@ def robustness(options: RobustnessOptions) -> None:
     from d4orm_planners.evaluation.report import markdown, write_robustness
     from d4orm_planners.evaluation.summary import success_rates
 
-    if not options.control_noise_std:
-        options = replace(options, control_noise_std="0", disturb=options.disturb or list(STANDARD))
+    if options.control_noise_std is None and options.disturb is None:
+        options = replace(options, disturb=list(STANDARD))
     groups = options.run()
     rates = success_rates(groups)
     written = write_robustness(options.out, rates)
