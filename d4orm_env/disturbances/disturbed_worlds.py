@@ -90,11 +90,6 @@ class DisturbedWorlds:
         self._begun = False
 
     @property
-    def num_worlds(self) -> int:
-        """``B``."""
-        return len(self._keys)
-
-    @property
     def bodies(self) -> FloatArray:
         """``(B, N, 2 d + 1)`` what moves among the robots and is none, see :class:`Effect`."""
         return self._bodies
