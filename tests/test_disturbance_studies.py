@@ -24,7 +24,7 @@ from d4orm_planners.evaluation.leaderboard import leaderboard
 from d4orm_planners.evaluation.pairs import compare_pairs
 from d4orm_planners.evaluation.store import STORE, TrialStore
 from d4orm_planners.evaluation.study import Study
-from d4orm_planners.evaluation.summary import Group, success_rates
+from d4orm_planners.evaluation.summary import TrialGroup, success_rates
 from d4orm_planners.evaluation.tolerance import tolerances
 
 TINY: dict[str, Any] = {"num_robots": 2, "seeds": range(2), "workers": 1}
@@ -136,10 +136,10 @@ def test_a_stalled_robot_does_not_spoil_the_trial(tmp_path: Path) -> None:
     assert rate.late > 0
 
 
-def group(label: str, level: float | None, wins: str, disturbance: str = "delay", **changes: Any) -> Group:
+def group(label: str, level: float | None, wins: str, disturbance: str = "delay", **changes: Any) -> TrialGroup:
     """A group with a trial for every character, ``+`` for a success."""
     rows = [trial(seed, label=label, success=mark == "+", **changes) for seed, mark in enumerate(wins)]
-    return Group(label, rows, disturbance, level)
+    return TrialGroup(label, rows, disturbance, level)
 
 
 def test_the_level_at_which_success_falls_below_90_percent() -> None:

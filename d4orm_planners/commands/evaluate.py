@@ -21,7 +21,7 @@ from d4orm_planners.commands.inputs import (
 from d4orm_planners.commands.options import Quiet, ScenarioSettings, TimeLimit
 
 if TYPE_CHECKING:
-    from d4orm_planners.evaluation.summary import Group, SuccessRate
+    from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup
 
 NoiseLevels = Annotated[
     str | None,
@@ -79,7 +79,7 @@ class StudyOptions:
     out: Out = Path("evaluation")
     quiet: Quiet = False
 
-    def run(self) -> list[Group]:
+    def run(self) -> list[TrialGroup]:
         """Run the trials that are not stored yet, and give all that were asked for.
 
         Raises:

@@ -8,13 +8,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from d4orm_planners.evaluation.disturbance_figures import draw_disturbance, draw_map
-from d4orm_planners.evaluation.pairs import Paired, compare_pairs
+from d4orm_planners.evaluation.pairs import PairedPolicies, compare_pairs
 from d4orm_planners.evaluation.report import markdown, panels, table, target, write_csv
-from d4orm_planners.evaluation.summary import Group, SuccessRate, success_rates
+from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_rates
 from d4orm_planners.evaluation.tolerance import Tolerance, tolerances
 
 
-def write_disturbances(folder: str | os.PathLike[str], groups: Sequence[Group]) -> list[Path]:
+def write_disturbances(folder: str | os.PathLike[str], groups: Sequence[TrialGroup]) -> list[Path]:
     """Write ``disturbances.md``, ``tolerance.csv``, ``pairs.csv``, ``tolerance.png`` and a picture per disturbance.
 
     Args:
@@ -46,7 +46,7 @@ def write_disturbances(folder: str | os.PathLike[str], groups: Sequence[Group]) 
     return paths
 
 
-def _page(rates: Sequence[SuccessRate], stood: Sequence[Tolerance], pairs: Sequence[Paired]) -> str:
+def _page(rates: Sequence[SuccessRate], stood: Sequence[Tolerance], pairs: Sequence[PairedPolicies]) -> str:
     titles = {(rate.scenario, rate.num_robots, rate.model): title for title, group in panels(rates).items()
               for rate in group}  # fmt: skip
     blocks = [f"## Level at which success falls below {stood[0].threshold:.0%}"]
@@ -74,7 +74,7 @@ def _matrix(title: str, cells: Mapping[tuple[str, str], str]) -> str:
     return table(title, ("policy", *columns), rows)
 
 
-def _pair_tables(titles: Mapping[tuple[str, int, str], str], pairs: Sequence[Paired]) -> list[str]:
+def _pair_tables(titles: Mapping[tuple[str, int, str], str], pairs: Sequence[PairedPolicies]) -> list[str]:
     header = ("first", "second", "noise", "disturbance", "level", "trials", "only first", "only second", "p",
               "difference in success", "first slower by, s")  # fmt: skip
     blocks = []
@@ -85,7 +85,7 @@ def _pair_tables(titles: Mapping[tuple[str, int, str], str], pairs: Sequence[Pai
     return blocks
 
 
-def _pair_cells(pair: Paired) -> tuple[str, ...]:
+def _pair_cells(pair: PairedPolicies) -> tuple[str, ...]:
     slower = "-" if pair.slower is None else f"{pair.slower:.2f}"
     if pair.slower_lower is not None:
         slower += f" ({pair.slower_lower:.2f} to {pair.slower_upper:.2f})"

@@ -19,7 +19,7 @@ from d4orm_planners.evaluation.pool import Pool, ProcessPool, run_here, run_jobs
 from d4orm_planners.evaluation.report import PARQUET_HINT, write_results
 from d4orm_planners.evaluation.store import STORE, Trial, TrialKey, TrialStore
 from d4orm_planners.evaluation.study import Policies, Scenarios, Study
-from d4orm_planners.evaluation.summary import Group, SuccessRate, success_rates
+from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_rates
 from d4orm_planners.evaluation.trials import Job
 from d4orm_planners.references import check_sendable
 
@@ -112,7 +112,7 @@ def run_study(
     workers: int | None = None,
     ray: str | None = None,
     progress: Progress | None = None,
-) -> list[Group]:
+) -> list[TrialGroup]:
     """Run those trials of a study that are not stored in a folder yet. Nothing is written apart from the store.
 
     For the arguments and errors see :func:`evaluate`.
@@ -132,7 +132,9 @@ def run_study(
     _store(running, store, done, total, progress or (lambda what, done, total: None))
     stored = {trial.key: trial for trial in store.trials()}
     return [
-        Group(group[0].policy.label, [stored[job.key(condition)] for job in group], condition.name, condition.level)
+        TrialGroup(
+            group[0].policy.label, [stored[job.key(condition)] for job in group], condition.name, condition.level
+        )
         for group in groups
         for condition in group[0].conditions
     ]

@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 from d4orm_planners.evaluation.report import deadline_table, errors, panels, rate_table, share, table
 from d4orm_planners.evaluation.store import Trial
-from d4orm_planners.evaluation.summary import Group, SuccessRate, success_by, success_rates
+from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_by, success_rates
 
 INTRODUCTION = """\
 # Leaderboard
@@ -38,7 +38,7 @@ def leaderboard(trials: Sequence[Trial], deadlines: Sequence[float] = ()) -> str
     if not trials:
         raise ValueError("the store holds no trials yet; run `d4orm evaluate` first")
     groups = _groups(trials)
-    rates = success_rates(Group(key[0], group, key[-1]) for key, group in groups.items())
+    rates = success_rates(TrialGroup(key[0], group, key[-1]) for key, group in groups.items())
     blocks = [INTRODUCTION, "## Success", *_matrices(rates), "## Scenario by scenario"]
     for title, panel in panels(rates).items():
         # The best first, at every level of noise.

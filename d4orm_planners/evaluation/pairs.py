@@ -9,13 +9,13 @@ from itertools import combinations
 import numpy as np
 
 from d4orm_planners.evaluation.store import Trial
-from d4orm_planners.evaluation.summary import Group
+from d4orm_planners.evaluation.summary import TrialGroup
 
 _RESAMPLES = 2000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Paired:
+class PairedPolicies:
     """How two policies differ under one condition, by trials with the same problem and seed.
 
     Attributes:
@@ -59,9 +59,9 @@ class Paired:
     slower_upper: float | None
 
 
-def compare_pairs(groups: Iterable[Group]) -> list[Paired]:
+def compare_pairs(groups: Iterable[TrialGroup]) -> list[PairedPolicies]:
     """Every two policies that have trials under the same condition with the same problems and seeds."""
-    cells: dict[tuple[object, ...], list[Group]] = {}
+    cells: dict[tuple[object, ...], list[TrialGroup]] = {}
     for group in groups:
         one = group.trials[0]
         cell = (one.scenario, one.num_robots, one.model, one.control_noise_std, group.disturbance, group.level)
@@ -69,7 +69,7 @@ def compare_pairs(groups: Iterable[Group]) -> list[Paired]:
     return [pair for group in cells.values() for two in combinations(group, 2) if (pair := _compared(*two)) is not None]
 
 
-def _compared(first: Group, second: Group) -> Paired | None:
+def _compared(first: TrialGroup, second: TrialGroup) -> PairedPolicies | None:
     others = {(trial.problem, trial.seed): trial for trial in second.trials}
     met = [(one, others[key]) for one in first.trials if (key := (one.problem, one.seed)) in others]
     if not met:
@@ -83,7 +83,7 @@ def _compared(first: Group, second: Group) -> Paired | None:
     slower = [_time(one) - _time(other) for one, other in met if one.success and other.success]
     trial, lower, upper = first.trials[0], *_bootstrap(won[:, 0] - won[:, 1])
     slower_lower, slower_upper = _bootstrap(slower) if len(slower) > 1 else (None, None)
-    return Paired(
+    return PairedPolicies(
         scenario=trial.scenario,
         num_robots=trial.num_robots,
         model=trial.model,

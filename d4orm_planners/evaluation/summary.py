@@ -13,7 +13,7 @@ from d4orm_env.core.arrays import positive_number
 from d4orm_planners.evaluation.store import Trial
 
 
-class Group(NamedTuple):
+class TrialGroup(NamedTuple):
     """Trials of one policy, one per seed, that have all but their seeds in common.
 
     Attributes:
@@ -178,7 +178,7 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
-def success_rates(groups: Iterable[Group]) -> list[SuccessRate]:
+def success_rates(groups: Iterable[TrialGroup]) -> list[SuccessRate]:
     """Sum up groups of trials, see :func:`success_rate`."""
     return [
         replace(success_rate(group.trials, group.label), disturbance=group.disturbance, level=group.level)
