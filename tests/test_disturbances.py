@@ -734,3 +734,31 @@ def test_frames_show_intruders() -> None:
         frames.append(env.render())
         env.close()
     assert (frames[0] != frames[1]).any()
+
+
+WEIRD = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-3, 2000),
+    st.floats(),
+    st.text(max_size=3),
+    st.tuples(st.integers(), st.floats()),
+)
+
+
+@given(name=st.sampled_from(sorted(DISTURBANCES)), level=WEIRD)
+@settings(max_examples=60, deadline=None)
+def test_any_level_works_or_is_refused_in_one_line(name: str, level: Any) -> None:
+    complaint = ""
+    try:
+        env = navigation_v0.parallel_env(problem=EARLY, disturbances=[disturbance_at(name, level)])
+    except ValueError as error:
+        complaint = str(error)
+    assert "\n" not in complaint
+    if complaint:
+        return
+    env.reset(seed=0)
+    for _ in range(3):
+        seen, *_ = env.step(dict.fromkeys(env.agents, np.array([0.5, 0.0], np.float32)))
+        assert all(values in env.observation_space(agent) for agent, values in seen.items())
+        assert env.state() in env.state_space

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.arrays import LARGEST, FloatArray, positive_number, shown, whole_number
+from d4orm_env.core.arrays import LARGEST, SMALLEST, FloatArray, positive_number, shown, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.brakes import brake
 from d4orm_env.disturbances.disturbance import Disturbance, Memory, Scene
@@ -132,13 +132,14 @@ class Quantisation(Disturbance[Memory]):
     """Controls in steps: each component is rounded to the nearest multiple of ``step``, halves to even.
 
     Attributes:
-        step: [control units].
+        step: At least 1e-7, or zero [control units].
     """
 
     step: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "step", standard_deviation(self.step, "Quantisation step"))
+        step = positive_number(self.step, "Quantisation step", zero_allowed=True, least=SMALLEST, most=LARGEST)
+        object.__setattr__(self, "step", step)
 
     @property
     def negligible(self) -> bool:
