@@ -39,8 +39,8 @@ class DisturbedBatch:
 
     @property
     def alters_sight(self) -> bool:
-        """Whether what is seen is not simply what there is of the robots."""
-        return self._disturbed.alters_sight
+        """Whether what is seen is not simply what the kernel that steps the worlds knows of the robots."""
+        return self._disturbed.alters_sight or self._disturbed.alters_limits
 
     @property
     def lost(self) -> BoolArray | None:

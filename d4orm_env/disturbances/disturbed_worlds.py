@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import zlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from functools import reduce
+from functools import cache, reduce
 from typing import Any
 
 import numpy as np
@@ -97,7 +97,7 @@ class DisturbedWorlds:
     @property
     def alters_sight(self) -> bool:
         """Whether what is seen is not simply what there is of the robots."""
-        return bool(self._seeing or self._observing or self._bodies.shape[1] or self.alters_limits)
+        return bool(self._seeing or self._observing or self._bodies.shape[1])
 
     def true_limits(self, limits: FloatArray) -> FloatArray:
         """``(K, L)`` what limits truly are, read-only."""
@@ -190,12 +190,8 @@ class DisturbedWorlds:
         Returns:
             Two arrays ``(B, K)`` bool; near is within the margin.
         """
-        # Here, because importing the compiler takes longer than importing all the rest of the package.
-        from d4orm_env.engine.bodies import meet_bodies
-
         touched, near = np.empty((2, *states.shape[:2]), np.bool_)
-        margin = self.problem.arrays.margin
-        meet_bodies(states, self.problem.team.radius, self._bodies, margin, touched, near)
+        _judge()(states, self.problem.team.radius, self._bodies, self.problem.arrays.margin, touched, near)
         return touched, near
 
     def see(self, scene: Scene, worlds: Worlds | None = None) -> Seen:
@@ -231,6 +227,15 @@ class DisturbedWorlds:
 
     def _draws(self, one: _Running, scene: Scene, purpose: _Purpose) -> Draws:
         return Draws(self._keys, scene.steps, one.stream, purpose)
+
+
+@cache
+def _judge() -> Callable[..., None]:
+    # Here, because importing the compiler takes longer than importing all the rest of the package.
+    from d4orm_env.engine.bodies import meet_bodies
+
+    judge: Callable[..., None] = meet_bodies
+    return judge
 
 
 def _together(join: Any, parts: Sequence[Any]) -> Any:
