@@ -57,6 +57,10 @@ def test_conditions_are_one_disturbance_at_a_time() -> None:
         )
     ]
     assert found[0].text == "[]"
+    assert (
+        Condition(disturbances=(Stall(0.5),)).text
+        == '[["stall", {"duration": "inf", "probability": 0.5, "robots": null}]]'
+    )
     assert json.loads(found[2].text) == [["push", {"rate": 0.2, "speed": 0.3}]]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import MISSING, asdict, fields, is_dataclass
@@ -116,5 +117,5 @@ def name_of(disturbance: Disturbance[Any]) -> str:
 
 
 def attributes_of(disturbance: Disturbance[Any]) -> dict[str, object]:
-    """All attributes, as JSON has them."""
-    return asdict(disturbance)
+    """All attributes; what is infinite, which JSON does not have, as the text ``"inf"``."""
+    return {name: "inf" if value == math.inf else value for name, value in asdict(disturbance).items()}
