@@ -15,7 +15,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test portability lint docs bench format clean
+.PHONY: help demo test portability lint docs bench results format clean
 
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -40,6 +40,10 @@ docs: $(DEV_STAMP) ## Build the documentation into docs/_build/html
 
 bench: $(CORE_STAMP) ## Measure the engines on this machine, write bench/
 	$(BIN)/d4orm bench --out bench
+
+results: $(DEV_STAMP) ## Make the tables and figures in docs/tables from the trials in data/
+	$(BIN)/python examples/tune_rivals.py --trials data/tuning.parquet --out docs/tables
+	$(BIN)/python examples/credit_by_update.py --trials data/credit_by_update.parquet --out docs/tables
 
 format: $(DEV_STAMP) ## Format the code and mend what ruff can
 	$(BIN)/ruff check --fix .

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
+import subprocess
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -31,6 +32,26 @@ def versions(names: Iterable[str]) -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             continue
     return installed
+
+
+def commit() -> str:
+    """The commit of the checkout that this package is run from, with ``+`` behind it where files differ from it.
+
+    Empty for a package that is installed elsewhere, and without git.
+    """
+    package = Path(__file__).parent
+    if not (package.parent / ".git").exists():
+        return ""
+    try:
+        number, changes = (
+            subprocess.run(
+                ["git", "-C", str(package), *words], capture_output=True, text=True, check=True, timeout=10
+            ).stdout.strip()
+            for words in (("rev-parse", "--short=12", "HEAD"), ("status", "--porcelain", "--untracked-files=no"))
+        )
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return number + ("+" if changes else "")
 
 
 def _processor() -> str:

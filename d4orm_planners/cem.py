@@ -13,6 +13,7 @@ from d4orm_env.engine.base import SamplingRules
 from d4orm_planners.sampling.optimizer import SamplingPlanner
 from d4orm_planners.sampling.schedule import constant
 from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, SamplingConfig
+from d4orm_planners.sampling.tuned import TUNED
 from d4orm_planners.sampling.weights import Array, EliteWeights
 from d4orm_planners.search import Search
 from d4orm_planners.settings import Positive, Share
@@ -52,7 +53,7 @@ class CEM(SamplingPlanner):
 
     name: ClassVar[str] = "cem"
     config_class = CEMConfig
-    presets: ClassVar = {"paper": PAPER}
+    presets: ClassVar = {"paper": PAPER, "tuned": {**PAPER, **TUNED["cem"]}}
     config: CEMConfig
 
     def noise_scale(self) -> FloatArray:

@@ -11,14 +11,25 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.engine.base import SamplingTask
 from d4orm_planners.guidance.planner import Guide, compile_roadmap, first_ways, guided_iteration, leads_round
 from d4orm_planners.planner import Iteration, State
+from d4orm_planners.refinement.iteration import refined_iteration
 from d4orm_planners.sampling.optimizer import DenoisingPlanner, standard_normal
 from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, Credit, DenoisingConfig
+from d4orm_planners.sampling.tuned import TUNED
 from d4orm_planners.search import Search
 from d4orm_planners.settings import Samples, Share, ShareOrNone, Steps, one_of
 
 SPELL, PATIENT_SAMPLES = 8, 4
 """Iterations without a solution after which the default weights by the team's reward for as many, in turn; and how many
 times as many samples it draws meanwhile."""
+
+PAPER_DEFORMATION = {
+    **PAPER,
+    "credit": "team",
+    "late_samples": 1.0,
+    "shorten": False,
+    "start": "team",
+    "random_start": False,
+}
 Start = Annotated[str, one_of(("auto", "team", "guided"))]
 
 
@@ -35,6 +46,8 @@ class D4ormConfig(ContinuationSettings, DenoisingConfig):
             in the rollout only.
         late_steps: Share of the steps, the last ones, at which the noise is small enough for fewer samples.
         late_samples: Share of the samples that these steps draw.
+        shorten: Whether, once there is a solution, groups of robots look for faster ways around all others, rather than
+            the whole team being deformed again (:mod:`d4orm_planners.refinement`).
         start: What the first iteration does without initial controls. ``"team"`` deforms standing still, as in the
             paper; ``"guided"`` drives on ways found on a roadmap (:mod:`d4orm_planners.guidance`), which later
             iterations deform; ``"auto"`` does the second where obstacles lead somebody far round.
@@ -48,6 +61,7 @@ class D4ormConfig(ContinuationSettings, DenoisingConfig):
     clip_between_iterations: bool = True
     late_steps: ShareOrNone = 0.7
     late_samples: Share = 0.5
+    shorten: bool = True
     start: Start = "auto"
     random_start: bool = False
 
@@ -57,9 +71,7 @@ class D4orm(DenoisingPlanner):
 
     name: ClassVar[str] = "d4orm"
     config_class = D4ormConfig
-    presets: ClassVar = {
-        "paper": {**PAPER, "credit": "team", "late_samples": 1.0, "start": "team", "random_start": False}
-    }
+    presets: ClassVar = {"paper": PAPER_DEFORMATION, "tuned": {**PAPER_DEFORMATION, **TUNED["d4orm"]}}
     config: D4ormConfig
 
     def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
@@ -68,6 +80,8 @@ class D4orm(DenoisingPlanner):
             guide = first_ways(search)
             if isinstance(guide, Guide):
                 return state, guided_iteration(search, guide)
+        if self.config.shorten and search.best.solved:
+            return state, refined_iteration(search)
         return super().iterate(search, state)
 
     def task(self, search: Search, base: FloatArray) -> SamplingTask:

@@ -10,6 +10,7 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray
 from d4orm_planners.sampling.optimizer import DenoisingPlanner, standard_normal
 from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, DenoisingConfig
+from d4orm_planners.sampling.tuned import TUNED
 from d4orm_planners.search import Search
 from d4orm_planners.settings import Count, Steps
 
@@ -27,7 +28,7 @@ class MBD(DenoisingPlanner):
 
     name: ClassVar[str] = "mbd"
     config_class: ClassVar[type[DenoisingConfig]] = MBDConfig
-    presets: ClassVar = {"paper": {**PAPER, "num_steps": 10_000}}
+    presets: ClassVar = {"paper": {**PAPER, "num_steps": 10_000}, "tuned": {**PAPER, **TUNED["mbd"]}}
 
     def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
         """See :meth:`SamplingPlanner.initial`: the controls themselves are denoised, not a deformation."""
@@ -48,7 +49,7 @@ class IterativeMBD(MBD):
 
     name: ClassVar[str] = "i-mbd"
     config_class = IterativeMBDConfig
-    presets: ClassVar = {"paper": PAPER}
+    presets: ClassVar = {"paper": PAPER, "tuned": {**PAPER, **TUNED["i-mbd"]}}
     config: IterativeMBDConfig
 
     def noisy_controls(self, search: Search) -> FloatArray:

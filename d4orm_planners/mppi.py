@@ -12,6 +12,7 @@ from d4orm_env.engine.base import SamplingRules
 from d4orm_planners.sampling.optimizer import SamplingPlanner
 from d4orm_planners.sampling.schedule import constant
 from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, SamplingConfig, SoftmaxSettings
+from d4orm_planners.sampling.tuned import TUNED
 from d4orm_planners.search import Search
 from d4orm_planners.settings import Positive, ShareOrNone
 
@@ -39,7 +40,7 @@ class MPPI(SamplingPlanner):
 
     name: ClassVar[str] = "mppi"
     config_class = MPPIConfig
-    presets: ClassVar = {"paper": PAPER}
+    presets: ClassVar = {"paper": PAPER, "tuned": {**PAPER, **TUNED["mppi"]}}
     config: MPPIConfig
 
     def rules(self) -> SamplingRules:

@@ -77,6 +77,7 @@ for _name, _path in {
     "i-mbd": "mbd:IterativeMBD",
     "ipopt": "ipopt:Ipopt",
     "guided": "guidance.planner:Guided",
+    "amswarm": "amswarm.planner:AMSwarm",
 }.items():
     register_planner(_name, f"d4orm_planners.{_path}")
 

@@ -14,13 +14,12 @@ import numpy as np
 from pydantic import Field
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.joint_state import JointState
 from d4orm_planners.policy import StatePolicy
 from d4orm_planners.settings import CheckedSettings, NotNegative, Positive, Whole
-from d4orm_planners.steering import preferred_velocities, track_velocities
+from d4orm_planners.steering import preferred_velocities, present_velocities, track_velocities
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
@@ -99,7 +98,7 @@ class Orca(StatePolicy):
         radius, max_speed = np.asarray(problem.team.radius), np.asarray(problem.team.max_speed)
         stands = joint.arrived & problem.docks
         moving = np.flatnonzero(~stands)
-        velocities = _velocities(problem, joint)
+        velocities = present_velocities(problem, joint.states, joint.controls)
         for robot in moving:
             simulator.add_agent(
                 joint.states[robot, :2].tolist(),
@@ -130,17 +129,6 @@ def _load_pyrvo() -> ModuleType:
     except ImportError as error:
         raise ImportError("policy 'orca' needs pyrvo; install it with pip install \"d4orm-env[orca]\"") from error
     return pyrvo
-
-
-def _velocities(problem: Problem, joint: JointState) -> FloatArray:
-    """``(K, 2)`` present velocities [m/s]; that of a first-order robot is its last command."""
-    velocities = [
-        model.functions.velocity(state, control, limits, NUMPY_OPS)
-        for model, state, control, limits in zip(
-            problem.team.robot_models, joint.states, joint.controls, problem.team.limits, strict=True
-        )
-    ]
-    return np.array(velocities, np.float32)
 
 
 def _walls(problem: Problem) -> Iterator[FloatArray]:

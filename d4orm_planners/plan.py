@@ -23,6 +23,7 @@ from d4orm_env.rollout import rollout
 from d4orm_env.scenarios.schema import describe, parse
 from d4orm_env.verify import verify
 from d4orm_planners.grouping import conflicts
+from d4orm_planners.provenance import Provenance
 
 Status = Literal["solved", "iteration_limit", "time_limit", "stopped", "interrupted", "refuted"]
 """How a search ended; see :class:`Plan`."""
@@ -91,6 +92,7 @@ class Plan:
         metrics: See :func:`d4orm_env.core.metrics.trajectory_metrics`. ``d-d4orm`` adds ``"messages"`` and
             ``"message_bytes"`` that its nodes sent, each to all others, and ``"waiting_share"``, the share of their
             time that they waited for each other.
+        provenance: Preset, settings, version and machine; ``None`` for a plan of an older file.
 
     Raises:
         ValueError: If the status is none of these, or ``"solved"`` and the plan is not, or ``"refuted"`` and it is.
@@ -108,6 +110,7 @@ class Plan:
     history: tuple[IterationRecord, ...]
     trajectory: Trajectory
     metrics: dict[str, float]
+    provenance: Provenance | None = None
 
     def __post_init__(self) -> None:
         if self.status not in get_args(Status):
@@ -160,6 +163,7 @@ class Plan:
             "format": FORMAT,
             "problem": describe(self.problem),
             "history": [asdict(record) for record in self.history],
+            "provenance": None if self.provenance is None else asdict(self.provenance),
             **{name: getattr(self, name) for name in _SCALARS},
         }
         arrays = {field.name: getattr(self.trajectory, field.name) for field in fields(Trajectory)}
@@ -186,7 +190,9 @@ class Plan:
                 problem = parse(header.pop("problem"))
                 claimed = _checked_trajectory(problem, archive)
             history = tuple(IterationRecord(**record) for record in header.pop("history"))
-            return cls._judged(problem, history, claimed, _checked(header))
+            made = header.pop("provenance", None)
+            provenance = None if made is None else Provenance(**made)
+            return cls._judged(problem, history, claimed, _checked(header) | {"provenance": provenance})
         except FileNotFoundError:
             raise FileNotFoundError(f"there is no plan at {source}") from None
         except Exception as error:  # a damaged archive makes zipfile, zlib and NumPy raise errors of a dozen kinds

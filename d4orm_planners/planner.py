@@ -67,6 +67,7 @@ class Planner(ABC):
     Attributes:
         name: What its plans say they are by; that of the class unless it gives another.
         config: The settings.
+        preset: Which of its presets it was made with, if any.
         drives_straight: Whether it begins with straight drives, whose kernels the command line then compiles ahead.
         presets: By name, settings for :func:`~d4orm_planners.make_planner`, which leaves out those that do not apply.
     """
@@ -75,6 +76,7 @@ class Planner(ABC):
     config_class: ClassVar[type[PlannerConfig]] = PlannerConfig
     drives_straight: ClassVar[bool] = False
     presets: ClassVar[Mapping[str, Mapping[str, object]]] = {}
+    preset: str | None = None
 
     def __init_subclass__(cls) -> None:
         cls.name = cls.__dict__.get("name", cls.__name__)

@@ -48,7 +48,8 @@ def make_planner(name: str | type[Planner] = RECOMMENDED, *, preset: str | None 
     Args:
         name: One of :func:`list_planners`, ``"package.module:Name"`` (or ``"folder/file.py:Name"``) of a planner class,
             or the class.
-        preset: ``"paper"`` for the paper's algorithm and parameters; ``None`` for this project's defaults.
+        preset: ``"paper"`` for the paper's algorithm and parameters; ``"tuned"``, of D4orm and its rivals, for that
+            with parameters that were tuned; ``None`` for this project's defaults.
         **config: Settings that differ from the preset; see the planner's configuration class.
 
     Raises:
@@ -61,7 +62,9 @@ def make_planner(name: str | type[Planner] = RECOMMENDED, *, preset: str | None 
     settings = {} if preset is None else kind.presets[preset]
     known = kind.config_class.setting_names({**settings, **config})
     applying = {name: value for name, value in settings.items() if name in known}
-    return kind(kind.config_class.from_keywords({**applying, **config}, owner))
+    planner = kind(kind.config_class.from_keywords({**applying, **config}, owner))
+    planner.preset = preset
+    return planner
 
 
 def make_policy(name: PolicyLike, **config: Any) -> Policy:

@@ -18,6 +18,7 @@ from d4orm_env.engine.base import Engine, SamplingResult, SamplingRules, Samplin
 from d4orm_env.engine.choice import get_engine
 from d4orm_planners.candidate import Candidate, evaluate_controls
 from d4orm_planners.plan import IterationRecord, Plan, Status
+from d4orm_planners.provenance import Provenance
 from d4orm_planners.stopwatch import Stopwatch
 
 if TYPE_CHECKING:
@@ -169,4 +170,5 @@ class Search:
             history=tuple(self.history),
             trajectory=self.best.trajectory,
             metrics=trajectory_metrics(self.problem, self.best.trajectory) | self.metrics,
+            provenance=Provenance.here(self.planner.preset, self.planner.config.keywords()),
         )

@@ -66,6 +66,21 @@ def track_velocities(problem: Problem, states: FloatArray, velocities: FloatArra
     return np.clip(controls, -limit, limit)
 
 
+def present_velocities(problem: Problem, states: FloatArray, controls: FloatArray) -> FloatArray:
+    """``(K, d)`` velocities [m/s]; that of a first-order robot is its last command.
+
+    Args:
+        problem: Whose robots they are.
+        states: ``(K, n)``.
+        controls: ``(K, m)`` executed last.
+    """
+    velocities = np.zeros((problem.num_robots, problem.dimension), np.float32)
+    for model, robots in by_model(problem):
+        x, u, limits = (tuple(rows[robots].T) for rows in (states, controls, problem.team.limits))
+        velocities[robots] = np.stack(model.functions.velocity(x, u, limits, NUMPY_OPS), axis=1)
+    return velocities
+
+
 def by_model(problem: Problem) -> Iterator[tuple[Model, list[int]]]:
     """The models of the team, each with its robots."""
     models = problem.team.models

@@ -30,6 +30,7 @@ CHEAP = {
     "refine": "sync",
     "rounds": 2,
     "solver_iterations": 60,
+    "alternations": 10,
 }
 """Settings that plan in no time, badly, and the same every time."""
 

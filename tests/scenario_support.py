@@ -19,7 +19,7 @@ WALLED = {
 }
 """The scenarios with walls, which are tested with a model or two each."""
 
-OPEN_3D = ("sphere", "amswarm_1", "amswarm_2", "amswarm_3", "amswarm_4", "amswarm_5")
+OPEN_3D = ("sphere", "paper_sphere", "amswarm_1", "amswarm_2", "amswarm_3", "amswarm_4", "amswarm_5")
 MAP = Path(__file__).parents[1] / "examples" / "maps" / "office.map"
 
 
@@ -27,10 +27,12 @@ def scenario_models() -> list[tuple[str, str | None]]:
     """Every scenario with the models to test it with; ``None`` where it has models of its own."""
     cases: list[tuple[str, str | None]] = []
     for scenario in list_scenarios():
-        if scenario == "heterogeneous":
+        if scenario.endswith("heterogeneous"):
             cases.append((scenario, None))
         elif scenario in OPEN_3D:
             cases.append((scenario, "holonomic3d"))
+        elif scenario == "paper_random":
+            cases += [(scenario, model) for model in MODELS_2D]
         else:
             cases += [(scenario, model) for model in WALLED.get(scenario, (*MODELS_2D, "holonomic3d"))]
     return cases

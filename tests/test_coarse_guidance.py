@@ -9,7 +9,9 @@ import pytest
 from planner_support import hop_problem
 
 from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.core.world import World
 from d4orm_env.engine.choice import get_engine
+from d4orm_env.joint_state import JointState
 from d4orm_planners.d4orm_c2f.coarse import (
     Guidance,
     coarse_problem,
@@ -19,6 +21,8 @@ from d4orm_planners.d4orm_c2f.coarse import (
     rest_of,
     subgoal_indices,
 )
+from d4orm_planners.d4orm_c2f.following import STUCK_AFTER, Patience, follow_slowly, keep_time
+from d4orm_planners.d4orm_c2f.sight import LEAST, within_sight
 
 
 @pytest.mark.parametrize(
@@ -111,3 +115,65 @@ def test_the_rest_begins_at_the_next_coarse_step(index: int, step: int) -> None:
     # Executed from there, it is the rest of the plan.
     again = get_engine("cpu").rollout(left, rest)
     np.testing.assert_allclose(again.states, plan.states[step:], atol=1e-5)
+
+
+def right_angle(num_robots: int = 2) -> Any:
+    """``(41, K, 2)`` paths: every robot 1 m along x, and then 1 m along y."""
+    along = np.linspace(0, 1, 21)[:, None]
+    path = np.concatenate([along * [1, 0], [1, 0] + along[1:] * [0, 1]])
+    return np.stack([path + np.array([0, robot]) for robot in range(num_robots)], axis=1).astype(np.float32)
+
+
+@pytest.mark.parametrize("walls", [True, False])
+def test_a_subgoal_behind_a_corner_is_exchanged_for_one_in_sight(walls: bool) -> None:
+    problem = hop_problem(1, world=World(boxes=[[0.3, 0.3, 0.6, 2.0]]))
+    begin = np.zeros(1, int)
+    nearer = within_sight(
+        problem, np.zeros((1, 2), np.float32), right_angle(1), begin, begin + 40, np.array([False]), walls
+    )
+    # A body of 0.15 m passes the corner at (0.6, 0.3) to no more than (1, 0.3) or so.
+    assert 20 <= nearer[0] <= 26 if walls else nearer[0] == 40
+
+
+def test_who_stands_in_the_way_of_a_subgoal_hides_it() -> None:
+    problem = hop_problem(2)
+    path, places = right_angle(2), np.array([[0, 0], [0.5, 0.5]], np.float32)
+    indices, targets = np.zeros(2, int), np.full(2, 40)
+    for standing in (False, True):
+        nearer = within_sight(problem, places, path, indices, targets, np.array([False, standing]), walls=False)
+        assert (nearer[0] == 40) != standing
+        assert nearer[0] > LEAST
+        assert nearer[1] == 40
+
+
+def joint(problem: Any, states: Any, steps: int = 0) -> JointState:
+    nobody = np.zeros(problem.num_robots, bool)
+    return JointState(np.asarray(states, np.float32), problem.goal, np.zeros((problem.num_robots, 2)), nobody, steps)
+
+
+def test_who_should_have_moved_and_has_not_is_stuck() -> None:
+    problem = hop_problem(3)
+    patience, states = Patience(joint(problem, problem.start)), problem.start.copy()
+    due = problem.start[:, :2] + np.array([[1, 0], [0, 0], [1, 0]], np.float32)
+    for step in range(1, STUCK_AFTER + 2):
+        states[2, 0] += 0.05
+        late, careful = patience.observe(joint(problem, states, step), due)
+        assert late[0] == (step > STUCK_AFTER)
+        # The second one has to wait where it is, and the third one moves.
+        np.testing.assert_array_equal(late[1:], False)
+        np.testing.assert_array_equal(careful, late)
+    states[0, 0] += 1.0
+    late, careful = patience.observe(joint(problem, states, STUCK_AFTER + 2), due)
+    assert not late[0]
+    assert careful[0]
+
+
+@pytest.mark.parametrize(("follow", "most"), [(keep_time, 0.25), (follow_slowly, 0.05)])
+def test_a_path_is_followed(follow: Any, most: float) -> None:
+    problem, engine, path = hop_problem(1, horizon=100), get_engine("cpu"), right_angle(1)
+    present = problem.resumed_at(problem.start, path[-1])
+    controls = follow(problem, engine, joint(present, problem.start), path, np.zeros(1, int), 100)
+    places = engine.rollout(present, controls).positions[:, 0]
+    off = np.linalg.norm(places[:, None] - path[:, 0], axis=2).min(axis=1)
+    assert off.max() < most
+    assert np.linalg.norm(places[-1] - path[-1, 0]) < 0.1

@@ -315,10 +315,10 @@ def replanned(
     calls = []
     plan = Guide.plan
 
-    def coarse_plan(self: Guide, joint: JointState, initial: Any, iterations: int) -> Any:
+    def coarse_plan(self: Guide, joint: JointState, initial: Any, iterations: int, *more: Any) -> Any:
         if initial is not None:
             calls.append((joint, initial.copy(), iterations, self.guidance, self.index))
-        return plan(self, joint, initial, iterations)
+        return plan(self, joint, initial, iterations, *more)
 
     monkeypatch.setattr(Guide, "plan", coarse_plan)
     world = navigation_v0.parallel_env(**env)
@@ -332,6 +332,22 @@ def replanned(
 
 def straight(problem: Problem, joint: JointState, factor: int) -> Any:
     return straight_drives(coarse_problem(problem.resumed_at(joint.states, joint.goals), factor)).controls[:, :, 0]
+
+
+def test_robots_within_the_margin_of_each_other_part() -> None:
+    start = np.array([[0, 0, 0, 0], [0.33, 0, 0, 0]], np.float32)
+    problem = Problem(Team(("holonomic2d",) * 2), start, start[:, :2] + [[-1, 0], [1, 0]], horizon=60, margin=0.05)
+    executed = episode(controller(), problem)
+    assert executed.metrics["success"], executed.metrics
+
+
+def test_ways_through_rooms_are_kept_in_order() -> None:
+    problem = make_problem("rooms", num_robots=6, seed=1)
+    policy = controller()
+    executed = episode(policy, problem)
+    assert policy.guidance.ordered
+    assert executed.metrics["success"], executed.metrics
+    assert not executed.metrics["collided"]
 
 
 def test_who_lost_the_guidance_begins_anew_straight_to_the_goals(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -209,7 +209,7 @@ def test_given_controls_are_repaired_rather_than_thrown_away() -> None:
     drives = search_of(problem, iterations=1, start="straight").current
     assert drives.failed.any()
     assert not drives.failed.all()
-    planner = make_planner("d4orm-d", engine="cpu", start="team")
+    planner = make_planner("d4orm-d", engine="cpu", start="team", shorten=False)
     search = Search(planner, problem, 0, drives.controls)
     search.advance()
     assert (search.current.controls == drives.controls).all(axis=(0, 2))[~drives.failed].all()

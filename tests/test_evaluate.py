@@ -25,7 +25,7 @@ from d4orm_planners import IterationRecord, cli, evaluate
 from d4orm_planners.evaluation import report, trials
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.leaderboard import leaderboard
-from d4orm_planners.evaluation.report import markdown, write_csv, write_parquet, write_results
+from d4orm_planners.evaluation.report import markdown, read_parquet, write_csv, write_parquet, write_results
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import mean_interval, solved_after, success_by, success_rate, wilson_interval
@@ -401,12 +401,24 @@ def test_ten_thousand_rows_are_exported(tmp_path: Path) -> None:
     paths = write_results(tmp_path, [success_rate(stored)])
     assert [path.name for path in paths] == ["table.md", "table.csv", "trials.csv", "trials.parquet"]
     assert parquet.read_table(paths[3]).to_pylist() == [asdict(row) for row in stored]
+    assert read_parquet(paths[3]) == stored
     with paths[2].open(newline="") as file:
         written = list(csv.DictReader(file))
     assert [(int(row["seed"]), float(row["control_noise_std"]), row["verified"]) for row in written] == [
         (row.seed, row.control_noise_std, "" if row.verified is None else str(row.verified)) for row in stored
     ]
     assert {row["violation"] for row in written} == {'a "b",\nc'}
+
+
+def test_what_is_no_parquet_of_trials_is_refused_by_name(tmp_path: Path) -> None:
+    pandas = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    (tmp_path / "text.parquet").write_text("policy,seed")
+    pandas.DataFrame({"policy": ["d4orm"], "colour": ["blue"]}).to_parquet(tmp_path / "other.parquet")
+    for name in ("text", "other"):
+        with pytest.raises(ValueError, match=rf"{name}\.parquet is no Parquet file of trials") as error:
+            read_parquet(tmp_path / f"{name}.parquet")
+        assert "\n" not in str(error.value)
 
 
 def test_without_pyarrow_there_is_csv_and_a_word_about_it(

@@ -44,8 +44,8 @@ def table(path: Path) -> list[dict[str, str]]:
     return rows
 
 
-def completed(name: str, out: Path) -> None:
-    result = run(name, out)
+def completed(name: str, out: Path, *arguments: str) -> None:
+    result = run(name, out, *arguments)
     assert result.returncode == 0, result.stderr
     assert not [path for path in out.iterdir() if path.name.startswith(".")], "a temporary file was left behind"
 
@@ -139,11 +139,47 @@ def test_mixed_team_example_solves_a_scenario_and_draws_it(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_walled_worlds_are_drawn(tmp_path: Path) -> None:
-    completed("walled_worlds", tmp_path / "out")
+def test_scenarios_are_drawn(tmp_path: Path) -> None:
+    completed("scenario_pictures", tmp_path / "out")
     pictures = sorted((tmp_path / "out").iterdir())
-    assert [path.name for path in pictures] == ["scenario_maze.png", "scenario_rooms.png"]
+    assert [path.name for path in pictures] == ["scenario_paper_circle.png", "scenario_paper_sphere.png"]
     assert all(path.read_bytes().startswith(PNG) for path in pictures)
+
+
+@pytest.mark.slow
+def test_rivals_are_tuned_and_a_second_call_runs_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("tune_rivals", out, "--method", "cem")
+    rows = table(out / "tuning.csv")
+    # Two settings at first, on four teams; the better one goes on to four seeds.
+    assert [(row["method"], row["trials"]) for row in rows] == [("cem", "16"), ("cem", "4")]
+    assert sum(row["settings"].startswith("sigma=1.0, elite_fraction=0.05, adapt_variance=False") for row in rows) == 1
+    trials = (out / "trials.sqlite").read_bytes()
+    completed("tune_rivals", out, "--method", "cem")
+    assert (out / "trials.sqlite").read_bytes() == trials
+    completed("tune_rivals", tmp_path / "again", "--trials", str(out / "tuning.parquet"))
+    assert table(tmp_path / "again" / "tuning.csv") == rows
+
+
+@pytest.mark.slow
+def test_credit_and_update_are_crossed(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("credit_by_update", out)
+    rows = table(out / "credit_by_update.csv")
+    assert len({(row["update"], row["credit"]) for row in rows}) == len(rows) == 20
+    assert all(row["p (steps)"] == "1" for row in rows if row["update"] == "d4orm")
+    assert (out / "credit_by_update.png").read_bytes().startswith(PNG)
+    completed("credit_by_update", tmp_path / "again", "--trials", str(out / "credit_by_update.parquet"))
+    assert table(tmp_path / "again" / "credit_by_update.csv") == rows
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("program", "name"), [("tune_rivals", "tuning"), ("credit_by_update", "credit_by_update")])
+def test_the_tables_of_the_docs_are_those_of_the_data(tmp_path: Path, program: str, name: str) -> None:
+    completed(program, tmp_path / "out", "--trials", str(ROOT / "data" / f"{name}.parquet"))
+    for kind in ("csv", "md"):
+        committed = ROOT / "docs" / "tables" / f"{name}.{kind}"
+        assert (tmp_path / "out" / f"{name}.{kind}").read_bytes() == committed.read_bytes()
 
 
 def test_gradient_ascent_through_the_dynamics_raises_the_reward(tmp_path: Path) -> None:

@@ -287,3 +287,13 @@ def test_a_goal_without_a_way_is_named_at_once() -> None:
 @pytest.mark.parametrize(("scenario", "guided"), [("circle", False), ("four_obstacles", False), ("maze", True)])
 def test_teams_are_guided_where_obstacles_lead_far_round(scenario: str, guided: bool) -> None:
     assert leads_round(make_problem(scenario, num_robots=8, seed=0)) == guided
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_who_is_alone_drives_about_as_fast_as_it_can(seed: int) -> None:
+    """Along its shortest way at full speed, and as long again as it takes to get to that."""
+    problem = make_problem("rooms", num_robots=4, seed=seed).select([0])
+    plan = make_planner("guided").solve(problem, seed=0)
+    speed, acceleration = problem.team.limits[0, :2]
+    assert plan.solved
+    assert plan.metrics["travel_time"] < 1.3 * (problem.ways.length[0] / speed + 0.5 * speed / acceleration)

@@ -17,7 +17,7 @@ from d4orm_env import load_problem, navigation_v0, rollout, save_problem, verify
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.core.world_index import MAX_BYTES, build_index
+from d4orm_env.core.world_index import MAX_BYTES, build_index, nearest_distance
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.verify.geometry import polygon_approach
 from d4orm_planners import make_planner
@@ -72,6 +72,17 @@ def test_index_finds_the_nearest_obstacle(seed: int, dimension: int, count: int,
     world.index(radius)
     np.testing.assert_array_equal(world.clearance(points), all_clearances(world, points))
     np.testing.assert_array_equal(world.clearance(points[7]), world.clearance(points)[7])
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_crowded_cells_keep_only_who_can_be_nearest(dimension: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    shapes, points = random_world(5, dimension, 400).shapes, np.random.default_rng(5).uniform(-5, 5, (20000, dimension))
+    short = build_index(shapes, 0.25, 1.0)
+    monkeypatch.setattr("d4orm_env.core.world_index.CROWDED", 10**6)
+    long = build_index(shapes, 0.25, 1.0)
+    assert len(short.items) < 0.8 * len(long.items)
+    distances = [nearest_distance(shapes, index, points) for index in (short, long)]
+    np.testing.assert_array_equal(*distances)
 
 
 @worlds

@@ -17,9 +17,10 @@ import numpy as np
 import pytest
 from planner_support import cheap_planner, hop_problem
 
+import d4orm_env
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.scenarios import make_problem
-from d4orm_planners import Plan, load_plan
+from d4orm_planners import Plan, load_plan, make_planner
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +91,25 @@ def test_a_plan_without_iterations_does_too(tmp_path: Path) -> None:
     assert plan.history == ()
     plan.save(tmp_path / "plan.npz")
     assert_equal(plan, Plan.load(tmp_path / "plan.npz"))
+
+
+def test_a_plan_says_how_it_was_made(tmp_path: Path) -> None:
+    plan = cheap_planner("d4orm", preset="paper", temperature=0.25).solve(hop_problem(), seed=3)
+    plan.save(tmp_path / "plan.npz")
+    made = Plan.load(tmp_path / "plan.npz").provenance
+    assert made is not None
+    assert made == plan.provenance
+    assert (made.preset, made.settings["temperature"], made.version) == ("paper", 0.25, d4orm_env.__version__)
+    assert made.machine["cores"] == os.cpu_count()
+    again = make_planner(plan.planner, **made.settings)
+    assert again.config == cheap_planner("d4orm", preset="paper", temperature=0.25).config
+
+
+def test_a_plan_of_an_older_file_does_not_say(saved: Path) -> None:
+    header, arrays = contents(saved)
+    del header["provenance"]
+    rewrite(saved, header, arrays)
+    assert Plan.load(saved).provenance is None
 
 
 def test_saving_replaces_the_file_and_leaves_no_other(plan: Plan, saved: Path) -> None:
@@ -401,6 +421,9 @@ def test_another_version_is_refused(saved: Path) -> None:
         lambda header: header.update(history=[{"iteration": 1}]),
         lambda header: header.update(history=4),
         lambda header: header["history"][0].update(surprise=1),
+        lambda header: header.update(provenance=4),
+        lambda header: header["provenance"].update(settings="all"),
+        lambda header: header["provenance"].pop("version"),
     ],
 )
 def test_a_header_that_makes_no_sense_is_refused(saved: Path, change: Callable[[dict[str, Any]], Any]) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import itertools
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,7 +31,9 @@ from d4orm_planners import IterationRecord, Plan, list_planners, make_planner
 from d4orm_planners.registry import PLANNERS, describe_planner
 from d4orm_planners.sampling.optimizer import SamplingPlanner, standard_normal
 from d4orm_planners.sampling.schedule import alpha_bar, annealed
+from d4orm_planners.sampling.tuned import TUNED
 from d4orm_planners.search import Search
+from d4orm_planners.steering import straight_drives
 
 ALL = pytest.mark.parametrize("name", list_planners())
 SAMPLING = tuple(name for name in list_planners() if issubclass(PLANNERS[name], SamplingPlanner))
@@ -68,7 +72,7 @@ def test_solve_returns_a_plan(name: str) -> None:
     assert plan.status in ("solved", "iteration_limit")
     assert (plan.status == "solved") == plan.solved
     assert 1 <= plan.iterations == len(plan.history) <= 2
-    assert (plan.denoising_steps > 0) == (name not in ("ipopt", "guided"))
+    assert (plan.denoising_steps > 0) == (name not in ("ipopt", "guided", "amswarm"))
     assert plan.wall_time > 0
     assert trajectory_metrics(problem, plan.trajectory).items() <= plan.metrics.items()
 
@@ -488,6 +492,17 @@ def test_a_preset_says_nothing_of_what_no_planner_has(name: str) -> None:
     assert all(preset.keys() <= known for preset in PLANNERS[name].presets.values())
 
 
+def test_the_tuned_presets_are_the_best_of_the_tuning() -> None:
+    with (Path(__file__).parents[1] / "docs" / "tables" / "tuning.csv").open(newline="") as file:
+        best = {row["method"]: row["settings"] for row in reversed(list(csv.DictReader(file)))}
+    assert best.keys() == TUNED.keys()
+    for name, found in best.items():
+        config = make_planner(name, preset="tuned").config.keywords()
+        settings = dict(part.split("=") for part in found.split(", "))
+        assert {setting: str(config[setting]) for setting in settings} == settings
+        assert (config["num_samples"], config["credit"]) == (1024, "team")
+
+
 def test_the_paper_presets_of_the_methods_own_parameters() -> None:
     assert make_planner("d4orm", preset="paper").config.random_start is False
     assert make_planner("d4orm", preset="paper").config.late_samples == 1
@@ -724,6 +739,19 @@ def test_the_noise_of_the_reference_is_standard_normal() -> None:
     assert draws.mean() == pytest.approx(0, abs=1e-6)
     assert draws.std() == pytest.approx(1, abs=0.01)
     assert np.abs(draws).max() < 6
+
+
+@pytest.mark.parametrize("name", ["d4orm", "mppi", "cem"])
+def test_credit_by_groups_is_that_of_those_in_conflict(name: str) -> None:
+    problem = make_problem("circle", num_robots=4)
+    drives = straight_drives(problem).controls[:, :, 0]  # everybody meets in the middle
+    for start, same in ((None, "robot"), (drives, "team")):
+        controls = []
+        for credit in ("group", same):
+            search = Search(cheap_planner(name, credit=credit), problem, 0, start)
+            search.advance()
+            controls.append(search.current.controls)
+        np.testing.assert_allclose(*controls, atol=1e-3)
 
 
 def test_the_methods_sample_with_the_papers_deviation() -> None:

@@ -19,6 +19,7 @@ from d4orm_env.engine.beam_search import search_kernel
 from d4orm_env.engine.drives import drive_kernel
 from d4orm_env.engine.softmax import softmax_weights
 from d4orm_env.engine.tiles import OPTIONS
+from d4orm_planners.amswarm.alternation import alternate
 from d4orm_planners.commands.warmup import sample_once
 
 PORTABILITY = Path(__file__).parent / "portability"
@@ -46,6 +47,7 @@ def kernels() -> Iterator[tuple[str, Any]]:
     """Kernels of the CPU engine by name, each called at least once."""
     problem = make_problem("circle", num_robots=2, seed=0)
     plans.digest(plans.CASES["mppi"])
+    plans.digest(plans.CASES["amswarm"])
     rollout(problem, np.zeros((problem.horizon, 2, 2), np.float32), engine="cpu")
     softmax_weights(np.zeros((1, 4)), 1.0, 0.0)
     make_problem("four_obstacles").check_reachable()
@@ -59,6 +61,7 @@ def kernels() -> Iterator[tuple[str, Any]]:
     yield "drive", drive_kernel("differential_drive")
     yield "search", search_kernel("differential_drive")
     yield "meetings", path_index._count_met
+    yield "alternate", alternate
     yield "roll out", worlds.world_kernels(("holonomic2d",)).roll_out
 
 

@@ -322,7 +322,7 @@ def test_a_planner_that_is_not_there_is_named_before_anything_runs(tmp_path: Pat
 def test_a_part_of_a_figure() -> None:
     part = find_figure("big-teams").only(["2D Holo Random"], ["d4orm-d, defaults", "d4orm-c2f"])
     assert [(section.num_robots, list(section.policies)) for section in part.sections] == [
-        ((16, 32, 64, 100), ["d4orm-d, defaults", "d4orm-c2f"]),
+        ((16, 32, 64), ["d4orm-d, defaults", "d4orm-c2f"]),
     ]
     assert find_figure("big-teams").only() == FIGURES["big-teams"]
 

@@ -16,9 +16,9 @@ from d4orm_env.engine.threads import Threads
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import make_planner
-from d4orm_planners.d4orm_d import rerouting
 from d4orm_planners.d4orm_d.rerouting import reroute
-from d4orm_planners.d4orm_d.team import TeamPaths
+from d4orm_planners.refinement import beams
+from d4orm_planners.refinement.team import TeamPaths
 from d4orm_planners.search import Search
 from d4orm_planners.steering import straight_drives
 
@@ -27,7 +27,7 @@ def rerouted(problem: Problem, seed: int = 0) -> TeamPaths:
     """A team that sets off straight, after one call."""
     planner: Any = make_planner("d4orm-d", engine="cpu")
     search = Search(planner, problem, seed, straight_drives(problem).controls[:, :, 0])
-    team = TeamPaths(planner, search, search.current.trajectory)
+    team = TeamPaths(search, search.current.trajectory)
     reroute(team)
     return team
 
@@ -66,11 +66,18 @@ def test_who_cannot_pass_waits() -> None:
     assert team.faults([0, 1])[0].tolist() == [0, 0]
 
 
+def test_two_that_face_each_other_make_way_together() -> None:
+    """Robots 0 and 1 start 4 mm apart: nothing that one of them does helps while the other comes on at once."""
+    problem = make_problem("random", num_robots=16, model="differential_drive", seed=4)
+    plan = make_planner("d4orm-d", engine="cpu").solve(problem, seed=4, max_iterations=10)
+    assert plan.solved
+
+
 def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = make_problem("random", num_robots=40, size=7.0, seed=0)
     teams = []
     for threads in (1, 3):
-        for module in (path_index, rerouting):
+        for module in (path_index, beams):
             monkeypatch.setattr(module, "Threads", lambda _, threads=threads: Threads(threads))
         teams.append(rerouted(problem))
     np.testing.assert_array_equal(teams[0].controls, teams[1].controls)

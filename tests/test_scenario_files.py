@@ -24,7 +24,9 @@ EXAMPLE = Path(__file__).parents[1] / "examples" / "scenarios" / "mixed_team.yam
 CASES: list[tuple[str, str | None]] = [
     (name, model) for name in ("circle", "random", "four_obstacles", "swap") for model in MODELS
 ]
-CASES += [("sphere", None), ("heterogeneous", None), *((f"amswarm_{index}", None) for index in range(1, 6))]
+CASES += [("sphere", None), ("heterogeneous", None)]
+CASES += [(f"paper_{name}", None) for name in ("circle", "sphere", "random", "heterogeneous", "obstacles")]
+CASES += [*((f"amswarm_{index}", None) for index in range(1, 6))]
 CASES += [(name, model) for name, models in WALLED.items() for model in models]
 
 ROBOT = "{model: holonomic2d, start: [0, 0], goal: [1, 0]}"

@@ -19,6 +19,7 @@ from d4orm_env.scenarios.layout import default_horizon
 from d4orm_env.scenarios.registry import SCENARIOS
 
 OPEN = ("circle", "sphere", "random", "four_obstacles", "heterogeneous", "swap")
+PAPER = ("paper_circle", "paper_sphere", "paper_random", "paper_heterogeneous", "paper_obstacles")
 AMSWARM = tuple(f"amswarm_{index}" for index in range(1, 6))
 CASES = scenario_models()
 
@@ -45,7 +46,7 @@ def starts(problem: Problem) -> Any:
 
 def test_the_cases_cover_every_scenario() -> None:
     assert {name for name, _ in CASES} == set(list_scenarios())
-    assert list_scenarios() == (*OPEN, *AMSWARM, *WALLED)
+    assert list_scenarios() == (*OPEN, *AMSWARM, *PAPER, *WALLED)
 
 
 @pytest.mark.parametrize(("name", "model"), CASES)
@@ -65,7 +66,8 @@ def test_starts_and_goals_keep_the_margin(name: str, model: str | None, num_obst
 
 @pytest.mark.parametrize(("name", "model"), CASES)
 def test_the_same_arguments_give_the_same_problem(name: str, model: str | None) -> None:
-    arguments: dict[str, Any] = {"model": model, "num_obstacles": 2, **needed(name)}
+    # The paper's obstacles stand still up to four.
+    arguments: dict[str, Any] = {"model": model, "num_obstacles": 5 if name == "paper_obstacles" else 2, **needed(name)}
     first, again, other = (make_problem(name, seed=seed, **arguments) for seed in (3, 3, 4))
     assert first == again
     assert first != other
@@ -231,6 +233,74 @@ def test_amswarm_jitter_moves_the_starts_alone() -> None:
     assert moved != other
 
 
+class TestPaper:
+    """Known answers from the definitions of the authors' code of 2026."""
+
+    def test_circle(self) -> None:
+        problem = make_problem("paper_circle", 4, max_speed=0.1)
+        assert problem.horizon == 100
+        assert problem.replace(horizon=1) == make_problem("circle", 4, max_speed=0.1, horizon=1)
+
+    def test_sphere(self) -> None:
+        problem = make_problem("paper_sphere", 2)
+        np.testing.assert_allclose(problem.team.radius, 0.3)
+        assert problem.margin == 0.05
+        # Polar angles of 60 and 120 degrees; the second azimuth is pi (1 + sqrt 5), 222.4922 degrees.
+        expected = [[2.1650635, 0, 1.25], [-1.5964505, -1.4624794, -1.25]]
+        np.testing.assert_allclose(starts(problem), expected, atol=1e-6)
+        np.testing.assert_array_equal(problem.goal, -starts(problem))
+
+    @pytest.mark.parametrize("seed", range(5))
+    def test_random(self, seed: int) -> None:
+        problem = make_problem("paper_random", 16, seed)
+        third = 5 / 3
+        row = [-5, -third, third, 5]
+        np.testing.assert_allclose(problem.goal, [(x, y) for y in row for x in row], rtol=1e-6)
+        distance = np.linalg.norm(problem.goal - starts(problem), axis=1)
+        assert (distance.min(), distance.max()) == (pytest.approx(5.5, abs=0.5), pytest.approx(5.5, abs=0.5))
+        assert np.abs(starts(problem)).max() <= 5
+        assert min(math.dist(a, b) for a, b in combinations(starts(problem).tolist(), 2)) >= 0.9 - 1e-6
+
+    def test_random_takes_the_first_points_of_its_grid(self) -> None:
+        assert make_problem("paper_random", 3).goal.tolist() == [[-5, -5], [5, -5], [-5, 5]]
+        assert make_problem("paper_random", 64).goal[-1].tolist() == [5, 5]
+
+    def test_random_has_no_room_for_a_hundred(self) -> None:
+        with pytest.raises(ValueError, match=r"100 robots of radius 0\.15 m found no room.*use fewer robots"):
+            make_problem("paper_random", 100)
+
+    def test_heterogeneous(self) -> None:
+        problem = make_problem("paper_heterogeneous", num_robots=4)
+        assert problem.team.models == ("holonomic2d", "differential_drive") * 2
+        assert np.asarray(problem.team.max_acceleration).tolist() == [1, 2, 1, 2]
+        np.testing.assert_allclose(problem.team.max_turn_rate, np.pi / 2)
+        np.testing.assert_allclose(problem.start[:, 2:], [[0, 0], [-np.pi / 2, 0], [0, 0], [np.pi / 2, 0]], atol=1e-6)
+
+    @pytest.mark.parametrize(
+        ("count", "expected"),
+        [
+            (0, []),
+            (1, [[0, 0, 0.5]]),
+            (2, [[0, 1, 0.15], [0, -1, 0.15]]),
+            (3, [[0, 1, 0.15], [0.8660254, -0.5, 0.15], [-0.8660254, -0.5, 0.15]]),
+            (4, [[0, 1, 0.15], [1, 0, 0.15], [0, -1, 0.15], [-1, 0, 0.15]]),
+        ],
+    )
+    def test_obstacles(self, count: int, expected: list[list[float]]) -> None:
+        problem = make_problem("paper_obstacles", num_obstacles=count)
+        np.testing.assert_allclose(problem.world.circles, np.reshape(expected, (-1, 3)), atol=1e-7)
+        assert problem.replace(world=None) == make_problem("paper_circle")
+
+    def test_more_obstacles_fill_the_unit_disc(self) -> None:
+        circles = make_problem("paper_obstacles", num_obstacles=2000, obstacle_radius=0.1).world.circles
+        distance = np.linalg.norm(circles[:, :2], axis=1)
+        assert distance.max() <= 1
+        # Uniform in the disc: the mean distance is 2/3, with a standard deviation of sqrt(1/18 / 2000).
+        assert distance.mean() == pytest.approx(2 / 3, abs=0.02)
+        np.testing.assert_allclose(circles[:, 2], 0.1)
+        assert make_problem("paper_obstacles").world.num_obstacles == 4
+
+
 class TestObstacles:
     @pytest.mark.parametrize("name", ["circle", "random", "swap", "sphere", "amswarm_3"])
     def test_leave_a_passage_for_every_robot(self, name: str) -> None:
@@ -257,7 +327,7 @@ class TestObstacles:
 
 class TestHorizon:
     def test_stays_at_the_papers_where_that_suffices(self) -> None:
-        for name in {*OPEN, *AMSWARM} - {"random"}:
+        for name in {*OPEN, *AMSWARM, *PAPER} - {"random"}:
             assert make_problem(name).horizon == 100
 
     def test_grows_with_the_way(self) -> None:
@@ -348,6 +418,9 @@ BAD = [
     ("amswarm_1", {"jitter": 1e308}, "jitter is 1e"),
     ("amswarm_2", {"jitter": 0.3, "seed": 1}, "the start of robot_.* from an obstacle or the bounds"),
     ("heterogeneous", {"model": "holonomic2d"}, "takes no model"),
+    ("paper_heterogeneous", {"model": "holonomic2d"}, "'paper_heterogeneous' mixes holonomic2d and .* takes no model"),
+    ("paper_sphere", {"model": "holonomic2d"}, "three-dimensional and .*; use model='holonomic3d'"),
+    ("paper_random", {"model": "holonomic3d"}, "is planar"),
     ("random", {"size": 0}, "size is 0"),
     ("swap", {"spacing": math.inf}, "spacing is inf"),
     ("four_obstacles", {"obstacle_distance": 2.15}, "the start of robot_0 is 0.05.* the margin is 0.05"),

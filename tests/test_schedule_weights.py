@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from d4orm_planners.sampling.schedule import alpha_bar, annealed, constant
-from d4orm_planners.sampling.weights import EliteWeights, SoftmaxWeights
+from d4orm_planners.sampling.weights import EliteWeights, GroupWeights, SoftmaxWeights
 
 PAPER_BETAS = (1e-4, 2e-2)
 
@@ -187,3 +187,23 @@ def test_weights_are_a_distribution_and_both_libraries_agree(rule: Any, rewards:
     usable = np.isfinite(rewards).any(axis=1)
     np.testing.assert_allclose(ours.sum(axis=1), usable.astype(float), atol=1e-5)
     np.testing.assert_allclose(weigh(rule, rewards, jnp), ours, atol=1e-4)
+
+
+# By groups.
+
+
+@pytest.mark.parametrize("xp", [np, jnp])
+@pytest.mark.parametrize("rule", [SoftmaxWeights(0.3), EliteWeights(0.2)])
+def test_a_group_weights_by_the_sum_of_its_rewards(rule: Any, xp: Any) -> None:
+    rewards = np.random.default_rng(0).normal(size=(4, 50)).astype(np.float32)
+    rewards[1, 7] = -np.inf
+    weights = np.asarray(GroupWeights(rule, ((0, 2), (1, 3)))(xp.asarray(rewards), xp))
+    together, others = (np.asarray(rule(xp.asarray(rewards[[i]] + rewards[[i + 2]]), xp))[0] for i in (0, 1))
+    np.testing.assert_allclose(weights, [together, others, together, others], rtol=1e-5)
+    assert weights[1, 7] == weights[3, 7] == 0 < weights[0, 7] + weights[0].sum()
+    # Everybody alone is credit by robot; all in one group have the same weights, which are the team's.
+    alone = GroupWeights(rule, ((0,), (1,), (2,), (3,)))(xp.asarray(rewards), xp)
+    np.testing.assert_array_equal(alone, rule(xp.asarray(rewards), xp))
+    team = np.asarray(GroupWeights(rule, ((0, 1, 2, 3),))(xp.asarray(rewards), xp))
+    mean = xp.asarray(rewards.mean(axis=0, keepdims=True))
+    np.testing.assert_allclose(team, np.tile(rule(mean, xp), (4, 1)), rtol=1e-4)

@@ -599,3 +599,25 @@ def test_a_large_team_is_judged_pair_by_pair():
     assert {violation.robots for violation in report.violations} == {(lane, lane + 32) for lane in narrow}
     assert kinds(report) == ["robot contact"] * 2
     assert report.min_separation == pytest.approx(-0.01, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_looking_at_many_steps_at_once_misses_nothing(seed, monkeypatch):
+    random = np.random.default_rng(seed)
+    places = random.uniform(-4, 4, (120, 2))
+    world = World(
+        circles=np.column_stack([places[:60], np.full(60, 0.1)]),
+        boxes=np.hstack([places[60:] - 0.1, places[60:] + 0.1]),
+    )
+    start = [(x, y, 0, 0) for x, y in random.uniform(6, 30, (6, 2)) * random.choice([-1, 1], (6, 2))]
+    problem = make(["holonomic2d"] * 6, start, [(40, k) for k in range(6)], world=world, horizon=300)
+    controls = np.tile(-0.05 * np.array(start)[:, :2], (300, 1, 1)) * random.uniform(0.2, 1.0, (1, 6, 1))
+    at_once = verify(problem, controls)
+    monkeypatch.setattr(sys.modules["d4orm_env.verify.contact"], "BLOCKS", (1,))
+    one_by_one = verify(problem, controls)
+    assert at_once.violations
+    assert at_once.min_clearance == pytest.approx(one_by_one.min_clearance, abs=1e-8)
+    assert at_once.min_separation == pytest.approx(one_by_one.min_separation, abs=1e-8)
+    assert [(v.kind, v.robots, v.detail) for v in at_once.violations] == [
+        (v.kind, v.robots, v.detail) for v in one_by_one.violations
+    ]

@@ -33,6 +33,7 @@ class Stream(IntEnum):
     TRAINING = 16  # first weights (0), then exploration and minibatches by lesson (from 1)
     TAKEOVER = 17  # the seeds of the plans that a team makes on the way, by takeover
     GUIDANCE = 18  # ties of path finding, by try, and which robots are replanned, by iteration
+    NEIGHBOURHOODS = 19  # which robots look for faster ways, and how, by iteration
 
 
 def derived_seed(seed: int, stream: Stream, *key: int) -> int:

@@ -65,6 +65,18 @@ class Shapes:
         distance[angular] = _triangle_distance(points[angular], corners)
         return distance
 
+    def box_slope(self, points: Floats, items: NDArray[np.int64]) -> Floats:
+        """``(N, d)`` a gradient of the distance from each point to the rounded box of that number."""
+        boxes, d = self.boxes[items].astype(np.float64), self.dimension
+        below, above = boxes[:, :d] - points, points - boxes[:, d : 2 * d]
+        outside = np.maximum(below, above)
+        # Within a box its nearest face decides.
+        nearest_face = np.arange(d) == outside.argmax(axis=1)[:, None]
+        beyond = outside.max(axis=1, keepdims=True) > 0
+        away = np.where(beyond, np.maximum(outside, 0.0), nearest_face)
+        slope: Floats = np.where(above > below, away, -away) / np.linalg.norm(away, axis=1)[:, None]
+        return slope
+
 
 def _box_distance(points: Floats, boxes: Floats) -> Floats:
     d = points.shape[1]

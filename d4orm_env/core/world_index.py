@@ -31,6 +31,11 @@ FREE_CELLS, CELLS_PER_OBSTACLE = 2**15, 2**8
 WIDER = 4
 """How much wider each grid of an index is than the one before it."""
 
+CROWDED = 8
+"""Obstacles of a cell beyond which it is worthwhile to look closer at which of them count."""
+
+_CORNERS = {d: np.array(list(product((-0.5, 0.5), repeat=d))) for d in (2, 3)}
+
 _PAIRS_AT_ONCE = 2**18
 """Cells times obstacles whose distances are worked out in one go."""
 
@@ -218,12 +223,40 @@ def _refined(
         keep = distance <= (np.where(unasked, clearance, bar) + 2 * rounding)[cells.cell]
         cells = _Cells(cells.place, cells.cell[keep], cells.item[keep])
         if level == 0:
-            order = np.lexsort((distance[keep], cells.cell))
+            distance = distance[keep]
+            if nearest == 1:
+                keep = ~_hidden(shapes, centre, cells, distance, width, 2 * rounding)
+                cells, distance = _Cells(cells.place, cells.cell[keep], cells.item[keep]), distance[keep]
+            order = np.lexsort((distance, cells.cell))
             cells = _Cells(cells.place, cells.cell, cells.item[order])
             yield cells, clearance
             continue
         for part in _halved(cells):
             waiting.append((level - 1, _split(part, np.ceil(size / 2 ** (level - 1)))))
+
+
+def _hidden(
+    shapes: Shapes, centre: Floats, cells: _Cells, distance: Floats, width: float, rounding: float
+) -> NDArray[np.bool_]:
+    """Which pairs of a crowded cell and a box do not count, because the obstacle that is nearest to the cell's centre,
+    or to one of its corners, is nearer everywhere in the cell.
+
+    Distance from a convex shape is a convex function: no less than its tangent at the centre. Another one's, taken
+    from that tangent, leaves a concave function, whose least value over the cell is at a corner of it.
+    """
+    hidden = np.zeros(len(cells.cell), bool)
+    asked = np.flatnonzero(np.bincount(cells.cell, minlength=len(centre))[cells.cell] > CROWDED)
+    if not len(asked):
+        return hidden
+    cell, item, offsets = cells.cell[asked], cells.item[asked], width * _CORNERS[centre.shape[1]]
+    at_corners = np.stack([shapes.signed_distance(centre[cell] + offset, item) for offset in offsets], axis=1)
+    boxes = np.flatnonzero(item < len(shapes.boxes))
+    tangent = distance[asked[boxes], None] + shapes.box_slope(centre[cell[boxes]], item[boxes]) @ offsets.T
+    bounds, own = np.unique(cell, return_index=True, return_inverse=True)[1:]
+    for gap in (distance[asked], *at_corners.T):
+        nearest = at_corners[np.lexsort((gap, cell))[bounds]]
+        hidden[asked[boxes]] |= (tangent - nearest[own[boxes]]).min(axis=1) > rounding
+    return hidden
 
 
 class _Turn(NamedTuple):

@@ -71,11 +71,19 @@ class Seekers(NamedTuple):
         robots: ``(R,)`` their numbers in the team.
         blocks: ``(R,)`` the block at whose beginning their new ways begin,
         states: ``(R, n)`` and in which state.
+        limits: ``(R,)`` what their ways must cost less than [s]: the step at which one ends, and what contacts cost.
+        without: ``(R, N)`` numbers of robots that they do not mind, their own among them.
+        beside: ``(R, M, H+1, d)`` ways that they mind as well [m],
+        radius: ``(R, M)`` and the radii of who is on them [m].
     """
 
     robots: NDArray[np.int64]
     blocks: NDArray[np.int64]
     states: FloatArray
+    limits: NDArray[np.float64]
+    without: NDArray[np.int64]
+    beside: FloatArray
+    radius: NDArray[np.float64]
 
 
 class _Beam(NamedTuple):
@@ -178,6 +186,24 @@ def _keep(ways: Any, way: Any, kept: Any, number: Any) -> None:
     kept.before[number], kept.moves[number] = ways.before[way], ways.moves[way]
 
 
+@compiled
+def _count_beside(table: Any, robot: Any, seekers: Any, r: Any, path: Any, first: Any, last: Any) -> Any:
+    """How many of the further ways a path meets from one step to another; at its end it stands still."""
+    count, end = 0, path.shape[0] - 1
+    for other in range(seekers.beside.shape[1]):
+        reach = table.radius[robot] + seekers.radius[r, other] + table.margin
+        for t in range(first, last):
+            gap2 = 0.0
+            for axis in range(path.shape[1]):
+                place = np.float64(path[min(t - first, end), axis])
+                gap = place - np.float64(seekers.beside[r, other, t, axis])
+                gap2 += gap * gap
+            if gap2 <= reach * reach:
+                count += 1
+                break
+    return count
+
+
 @cache
 def search_kernel(name: str) -> Any:
     """The compiled search for robots of the model with this name.
@@ -229,7 +255,8 @@ def search_kernel(name: str) -> Any:
             for i in range(n):
                 beam.states[0, i] = seekers.states[r, i]
             beam.faults[0], numbers[0], size, num_kept = 0.0, -1, 1, 0
-            best, best_number, best_move = np.inf, -1, -1
+            best, best_number, best_move = seekers.limits[r], -1, -1
+            without = seekers.without[r]
             for block in range(begin, num_blocks):
                 first, last = steps_of(table, block)
                 count = 0
@@ -250,25 +277,32 @@ def search_kernel(name: str) -> Any:
                                 faults += 1.0
                             if closed and touches_static(arrays, reach, path[t - first]):
                                 faults += _TOUCH
-                        faults += count_near(table, robot, path, first, block)
+                        velocity, cost = velocity_of(state, control, limits, OPS), end * dt[0]
+                        if not at_goal:
+                            rest2 = 0.0
+                            for axis in range(d):
+                                gap = goal[axis] - (state[axis] + _AHEAD * velocity[axis])
+                                rest2 += gap * gap
+                            cost = end * dt[0] + max(np.sqrt(rest2) - goal_radius, ZERO) / limits[SPEED]
+                        if rules.contact * faults + cost >= best:
+                            continue
+                        faults += count_near(table, robot, without, path, first, block)
+                        faults += _count_beside(table, robot, seekers, r, path, first, last)
                         if at_goal:
                             # It stays there: whoever comes by later counts too.
                             for axis in range(d):
                                 path[:, axis] = state[axis]
                             for later in range(block + 1, last_busy + 1):
-                                faults += count_near(table, robot, path, steps_of(table, later)[0], later)
-                            if rules.contact * faults + end * dt[0] < best:
-                                best = rules.contact * faults + end * dt[0]
-                                best_number, best_move = numbers[way], number
+                                faults += count_near(table, robot, without, path, steps_of(table, later)[0], later)
+                            faults += _count_beside(table, robot, seekers, r, path, last, table.places.shape[0])
+                            if rules.contact * faults + cost < best:
+                                best, best_number, best_move = rules.contact * faults + cost, numbers[way], number
                             continue
-                        velocity, rest2 = velocity_of(state, control, limits, OPS), 0.0
                         for axis in range(d):
                             ways.velocities[count, axis] = velocity[axis]
-                            gap = goal[axis] - (state[axis] + _AHEAD * velocity[axis])
-                            rest2 += gap * gap
                         for i in range(n):
                             ways.states[count, i] = state[i]
-                        ways.bounds[count] = rules.contact * faults + last * dt[0] + np.sqrt(rest2) / limits[SPEED]
+                        ways.bounds[count] = rules.contact * faults + cost
                         ways.faults[count], ways.before[count], ways.moves[count] = faults, numbers[way], number
                         count += 1
                 size = 0
@@ -281,7 +315,7 @@ def search_kernel(name: str) -> Any:
                         size, num_kept = size + 1, num_kept + 1
                 if size == 0:
                     break
-            found[r] = best < np.inf
+            found[r] = best_move >= 0
             if not found[r]:
                 continue
             # What it did, from the last block to the first.

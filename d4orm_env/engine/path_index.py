@@ -272,9 +272,20 @@ def _cells_around(table: Any, middle: Any, spread: Any) -> Any:
     )  # fmt: skip
 
 
+@inlined
+def _is_among(robot: Any, robots: Any) -> Any:
+    found = False
+    for other in robots:
+        found |= other == robot
+    return found
+
+
 @compiled
-def count_near(table: Any, robot: Any, path: Any, begin: Any, block: Any) -> Any:
-    """How many others a robot meets in a block, on a path that begins with its place at step ``begin``."""
+def count_near(table: Any, robot: Any, without: Any, path: Any, begin: Any, block: Any) -> Any:
+    """How many a robot meets in a block, on a path that begins with its place at step ``begin``.
+
+    Those in ``without`` ``(N,)`` do not count; it has to be one of them.
+    """
     first, last = steps_of(table, block)
     middle, spread = _enclose(path, table.places.shape[2], first - begin, last - begin)
     low_i, high_i, low_j, high_j, low_k, high_k = _cells_around(table, middle, spread)
@@ -284,8 +295,8 @@ def count_near(table: Any, robot: Any, path: Any, begin: Any, block: Any) -> Any
             for k in range(low_k, high_k + 1):
                 other = table.first[block, _bucket(table, i, j, k)]
                 while other != _NOBODY:
-                    if other != robot and _first_near(table, robot, path, begin, middle, spread, block, other) > 0:
-                        count += 1
+                    if not _is_among(other, without):
+                        count += _first_near(table, robot, path, begin, middle, spread, block, other) > 0
                     other = table.following[block, other]
     return count
 

@@ -29,7 +29,7 @@ def circle(settings: Settings, *, diameter: float = 5.0) -> Problem:
         settings: The common arguments.
         diameter: Diameter of the circle [m].
     """
-    return build(settings, _antipodal_circle(settings, bounded(diameter, "diameter")))
+    return build(settings, antipodal_circle(settings, bounded(diameter, "diameter")))
 
 
 def sphere(settings: Settings, *, diameter: float = 5.0) -> Problem:
@@ -41,15 +41,7 @@ def sphere(settings: Settings, *, diameter: float = 5.0) -> Problem:
         settings: The common arguments.
         diameter: Diameter of the sphere [m].
     """
-    _require_space(settings)
-    diameter = bounded(diameter, "diameter")
-    points = fibonacci_sphere(settings.num_robots)
-    needed = 2 * settings.spacing / _smallest_distance(points)
-    if needed >= diameter:
-        raise _too_small(settings, "diameter", diameter, needed)
-    starts, goals = _antipodal(points * (diameter / 2))
-    area = Area(np.full(3, diameter / 2), is_round=True)
-    return build(settings, Layout(starts, goals, World(dimension=3), diameter, area))
+    return build(settings, antipodal_sphere(settings, bounded(diameter, "diameter")))
 
 
 def random(settings: Settings, *, size: float | None = None) -> Problem:
@@ -84,7 +76,7 @@ def four_obstacles(settings: Settings, *, diameter: float = 5.0, obstacle_distan
         diameter: Diameter of the circle of robots [m].
         obstacle_distance: Distance of each obstacle's centre from the origin [m].
     """
-    layout = _antipodal_circle(settings, bounded(diameter, "diameter"))
+    layout = antipodal_circle(settings, bounded(diameter, "diameter"))
     distance = bounded(obstacle_distance, "obstacle_distance")
     centres = distance * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
     obstacles = np.hstack([centres, np.full((4, 1), settings.obstacle_radius)])
@@ -103,15 +95,8 @@ def heterogeneous(settings: Settings, *, diameter: float = 5.0) -> Problem:
         settings: The common arguments, ``model`` left out.
         diameter: Diameter of the circle [m].
     """
-    if settings.model is not None:
-        raise ValueError(
-            f"scenario 'heterogeneous' mixes differential_drive and holonomic2d itself and takes no model, "
-            f"not {settings.model!r}; leave it out, or give one name per robot to scenario 'circle'"
-        )
-    second = np.arange(settings.num_robots) % 2 == 1
-    models = tuple("holonomic2d" if is_second else "differential_drive" for is_second in second)
-    limits = settings.max_acceleration if settings.max_acceleration is not None else np.where(second, 2.0, 1.0)
-    return circle(replace(settings, model=models, max_acceleration=limits), diameter=diameter)
+    mixed = mixed_team(settings, first=("differential_drive", 1.0), second=("holonomic2d", 2.0))
+    return circle(mixed, diameter=diameter)
 
 
 def swap(settings: Settings, *, distance: float = 5.0, spacing: float | None = None) -> Problem:
@@ -195,7 +180,44 @@ def fibonacci_sphere(count: int) -> Points:
     return np.column_stack([across * cos(index * GOLDEN_ANGLE), across * sin(index * GOLDEN_ANGLE), z])
 
 
-def _antipodal_circle(settings: Settings, diameter: float) -> Layout:
+def mixed_team(settings: Settings, first: tuple[str, float], second: tuple[str, float]) -> Settings:
+    """The settings with two models in turn, each with its limit of acceleration [m/s^2] unless one is given.
+
+    Raises:
+        ValueError: If a model is given.
+    """
+    if settings.model is not None:
+        raise ValueError(
+            f"scenario {settings.scenario!r} mixes {first[0]} and {second[0]} itself and takes no model, "
+            f"not {settings.model!r}; leave it out, or give one name per robot to scenario 'circle'"
+        )
+    models, limits = zip(*((first, second)[robot % 2] for robot in range(settings.num_robots)), strict=True)
+    given = settings.max_acceleration
+    return replace(settings, model=models, max_acceleration=np.array(limits) if given is None else given)
+
+
+def antipodal_sphere(settings: Settings, diameter: float) -> Layout:
+    """Robots on the Fibonacci points of a sphere, goals at the antipodes.
+
+    Raises:
+        ValueError: If the models are planar, or the robots do not fit.
+    """
+    _require_space(settings)
+    points = fibonacci_sphere(settings.num_robots)
+    needed = 2 * settings.spacing / _smallest_distance(points)
+    if needed >= diameter:
+        raise _too_small(settings, "diameter", diameter, needed)
+    starts, goals = _antipodal(points * (diameter / 2))
+    area = Area(np.full(3, diameter / 2), is_round=True)
+    return Layout(starts, goals, World(dimension=3), diameter, area)
+
+
+def antipodal_circle(settings: Settings, diameter: float) -> Layout:
+    """Robots evenly on a circle, goals at the antipodes.
+
+    Raises:
+        ValueError: If the robots do not fit.
+    """
     count, dimension = settings.num_robots, settings.team.dimension
     needed = settings.spacing / float(sin(math.pi / count)) if count > 1 else 0.0
     if needed >= diameter:
@@ -221,7 +243,7 @@ def _amswarm(settings: Settings, jitter: float, centres: Sequence[tuple[float, f
             f"num_robots out, or use scenario 'circle' with model='holonomic3d'"
         )
     jitter = bounded(jitter, "jitter", zero_allowed=True)
-    layout = _antipodal_circle(settings, 5.0)
+    layout = antipodal_circle(settings, 5.0)
     moved = layout.starts + settings.generator(JITTER).uniform(-jitter, jitter, layout.starts.shape)
     world = World(dimension=3, cylinders=[(x, y, 0.2) for x, y in centres], lower=[-3.0] * 3, upper=[3.0] * 3)
     return build(settings, replace(layout, starts=moved, world=world))

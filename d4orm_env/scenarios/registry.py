@@ -8,7 +8,7 @@ from functools import partial
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.registry import Registry
-from d4orm_env.scenarios import corridors, forest, generators, maps, maze, rooms, warehouse
+from d4orm_env.scenarios import corridors, forest, generators, maps, maze, paper, rooms, warehouse
 from d4orm_env.scenarios.scenario import BuiltIn, Scenario
 
 FILE_SUFFIXES = (".yaml", ".yml")
@@ -37,6 +37,7 @@ def register_scenario(name: str, generator: Callable[..., Problem]) -> None:
 
 
 _in_space = partial(BuiltIn, model="holonomic3d")
+_paper = partial(BuiltIn, horizon=100)
 _amswarm = partial(_in_space, num_robots=10, radius=0.29, margin=0.05)
 
 for _scenario in (
@@ -51,6 +52,11 @@ for _scenario in (
     _amswarm(generators.amswarm_3),
     _amswarm(generators.amswarm_4),
     _amswarm(generators.amswarm_5),
+    _paper(paper.paper_circle),
+    _paper(paper.paper_sphere, model="holonomic3d", radius=0.3),
+    _paper(paper.paper_random, draws=True),
+    _paper(paper.paper_heterogeneous, model=None, max_acceleration=None),
+    _paper(paper.paper_obstacles, num_obstacles=4),
     BuiltIn(rooms.rooms, draws=True),
     BuiltIn(maze.maze, draws=True),
     BuiltIn(warehouse.warehouse, draws=True),

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.verify.contact import MAX_NUMBERS, Pairs, Stretch, Watch, surroundings
+from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Pairs, Stretch, Watch, surroundings
 from d4orm_env.verify.docking import Docking, find_docking
 from d4orm_env.verify.geometry import Floats, norm
 from d4orm_env.verify.motion import TeamMotion
@@ -119,7 +119,7 @@ class _Course:
         horizon, dt, robot = len(self.ends) - 1, self._motion.dt, docking.robot
         stop = np.minimum(docking.steps, horizon)
         docked = self.ends[stop, robot]
-        for steps in self._parts(horizon, max(self._numbers, num_pairs)):
+        for steps in self._parts(horizon, max(self._numbers, num_pairs // BLOCKS[0])):
             way, place = self._way(steps), self.ends[:-1][steps]
             if len(robot) > way.shape[2]:  # copying is not free, and one reading each is the rule
                 way, place = way[:, :, robot], place[:, robot]

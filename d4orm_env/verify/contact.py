@@ -33,6 +33,9 @@ Indices = NDArray[np.intp]
 _ROUNDING = 1e-6
 """What boxes are widened by for it [m]."""
 
+BLOCKS = (128, 32, 8, 1)
+"""Steps that are judged at once, from many to one."""
+
 MAX_NUMBERS = 2**18
 """Numbers in the largest arrays that are worked on at once, but for those of a single step."""
 
@@ -79,8 +82,12 @@ class Watch(ABC):
         self._smallest, self._smallest_time, self._first = (np.full(size, np.inf) for _ in range(3))
 
     @abstractmethod
-    def begin(self, stretch: Stretch) -> tuple[Floats, Floats]:
-        """``(T, P)`` gaps at the beginning of each step, and by how much they may shrink during it."""
+    def gap(self, stretch: Stretch, steps: Indices, pairs: Indices) -> Floats:
+        """``(N,)`` gap of that pair at the beginning of that step [m]."""
+
+    @abstractmethod
+    def bodies(self, pairs: Indices) -> Sequence[Indices]:
+        """Whose motion changes the gaps of these pairs."""
 
     @abstractmethod
     def approach(self, stretch: Stretch, steps: Indices, pairs: Indices) -> tuple[Floats, Floats]:
@@ -96,17 +103,36 @@ class Watch(ABC):
     def observe(self, stretch: Stretch) -> None:
         """Judge a stretch. Only pairs that may touch, or come closer than any so far, are looked at closely."""
         self.select(stretch)
-        gap, shrinkage = self.begin(stretch)
-        self.minimum = min(self.minimum, float(gap.min(initial=np.inf)))
-        least = gap - shrinkage - 1e-9
-        steps, pairs = np.nonzero(least < max(self.minimum, 0.0))
-        least = least[steps, pairs]
+        least, steps, pairs = self._near(stretch)
         order = np.argsort(least, kind="stable")
         size = max(1, MAX_NUMBERS // (stretch.path.shape[1] * stretch.path.shape[3]))
         for some in (order[first : first + size] for first in range(0, len(order), size)):
             if least[some[0]] >= max(self.minimum, 0.0):
                 break
             self._look(stretch, steps[some], pairs[some])
+
+    def _near(self, stretch: Stretch) -> tuple[Floats, Indices, Indices]:
+        """``(N,)`` the least gap there may be, step and pair, where it may matter. Steps are taken many at a time
+        first, and fewer of those in which something may be near.
+        """
+        travelled = np.concatenate([np.zeros((1, stretch.reach.shape[1])), np.cumsum(stretch.reach, axis=0)])
+        num_steps, num_pairs = len(stretch.path), len(self.rows)
+        steps = np.repeat(np.arange(0, num_steps, BLOCKS[0]), num_pairs)
+        pairs = np.tile(np.arange(num_pairs), len(range(0, num_steps, BLOCKS[0])))
+        for block, parts in zip(BLOCKS, (*BLOCKS[1:], 1), strict=True):
+            gap = self.gap(stretch, steps, pairs)
+            self.minimum = min(self.minimum, float(gap.min(initial=np.inf)))
+            ends = np.minimum(steps + block, num_steps)
+            least = gap - sum(travelled[ends, body] - travelled[steps, body] for body in self.bodies(pairs)) - 1e-9
+            near = least < max(self.minimum, 0.0)
+            steps, pairs = steps[near], pairs[near]
+            if block == 1:
+                return least[near], steps, pairs
+            steps = (steps[:, None] + np.arange(0, block, parts)).ravel()
+            pairs = np.repeat(pairs, block // parts)
+            inside = steps < num_steps
+            steps, pairs = steps[inside], pairs[inside]
+        raise AssertionError("the last block is one step")
 
     def _look(self, stretch: Stretch, steps: Indices, pairs: Indices) -> None:
         gap, fraction = self.approach(stretch, steps, pairs)
@@ -166,10 +192,14 @@ class Pairs(Watch):
         self.rows, self.columns = np.divmod(key, len(order))
         self._size = self._radius[self.rows] + self._radius[self.columns]
 
-    def begin(self, stretch: Stretch) -> tuple[Floats, Floats]:
+    def gap(self, stretch: Stretch, steps: Indices, pairs: Indices) -> Floats:
         place = stretch.path[:, 0]
-        gap = norm(place[:, self.rows] - place[:, self.columns]) - self._size
-        return gap, stretch.reach[:, self.rows] + stretch.reach[:, self.columns]
+        distance = norm(place[steps, self.rows[pairs]] - place[steps, self.columns[pairs]])
+        gap: Floats = distance - self._size[pairs]
+        return gap
+
+    def bodies(self, pairs: Indices) -> Sequence[Indices]:
+        return self.rows[pairs], self.columns[pairs]
 
     def approach(self, stretch: Stretch, steps: Indices, pairs: Indices) -> tuple[Floats, Floats]:
         offset = stretch.of(steps, self.rows[pairs]) - stretch.of(steps, self.columns[pairs])
@@ -188,9 +218,13 @@ class Static(Watch):
         super().__init__(kind, robot, names, rows, columns)
         self._radius = radius[robot[rows]]
 
-    def begin(self, stretch: Stretch) -> tuple[Floats, Floats]:
-        gap = self.distance(stretch.path[:, 0][:, self.rows], self.columns) - self._radius
-        return gap, stretch.reach[:, self.rows]
+    def gap(self, stretch: Stretch, steps: Indices, pairs: Indices) -> Floats:
+        distance = self.distance(stretch.path[steps, 0, self.rows[pairs]], self.columns[pairs])
+        gap: Floats = distance - self._radius[pairs]
+        return gap
+
+    def bodies(self, pairs: Indices) -> Sequence[Indices]:
+        return (self.rows[pairs],)
 
     def approach(self, stretch: Stretch, steps: Indices, pairs: Indices) -> tuple[Floats, Floats]:
         path = stretch.of(steps, self.rows[pairs])

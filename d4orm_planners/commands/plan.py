@@ -26,7 +26,9 @@ class PlanOptions(PictureOptions, ProblemOptions):
     planner: Annotated[
         str, typer.Option("--planner", "-p", help="Planner (see `d4orm planners`), or package.module:Name.")
     ] = "d4orm-d"
-    preset: Annotated[str | None, typer.Option("--preset", help="`paper` for the paper's parameters.")] = None
+    preset: Annotated[
+        str | None, typer.Option("--preset", help="`paper` for the paper's parameters, `tuned` for tuned ones.")
+    ] = None
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="A planner setting, as num_samples=512; repeatable.")
     ] = None

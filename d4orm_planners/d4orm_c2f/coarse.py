@@ -20,12 +20,14 @@ class Guidance:
         controls: ``(H_c, K, m)`` of the coarse plan.
         states: ``(H_c+1, K, n)``.
         path: ``(H+1, K, d)`` waypoints, one per time step of the control loop [m].
+        ordered: Whether the ways were found on a roadmap, where who waits for whom decides.
     """
 
     problem: Problem
     controls: FloatArray
     states: FloatArray
     path: FloatArray
+    ordered: bool = False
 
 
 def coarse_problem(problem: Problem, factor: int) -> Problem:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
-from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.base import Engine
 from d4orm_env.joint_state import JointState
 from d4orm_planners.d4orm_c2f.background import Background
@@ -20,9 +21,12 @@ from d4orm_planners.d4orm_c2f.coarse import (
     rest_of,
     subgoal_indices,
 )
+from d4orm_planners.d4orm_c2f.following import STUCK_AFTER, Patience, follow_slowly, keep_time
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
+from d4orm_planners.d4orm_c2f.sight import within_sight
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
+from d4orm_planners.guidance.planner import Guide as Ways
 from d4orm_planners.search import Search
 from d4orm_planners.steering import straight_drives
 
@@ -47,31 +51,39 @@ class Guide:
         guidance: What is followed at present.
         index: Waypoint at which the team is.
         anew: ``(K,)`` robots that are sent another way than before, until :meth:`fresh_start` has reported it.
+        stuck: ``(K,)`` robots that do not get on, or did not until a short while ago.
     """
 
     guidance: Guidance
     index: int
     anew: BoolArray
+    stuck: BoolArray
 
     def __init__(
         self, problem: Problem, config: D4ormC2FConfig, seed: int, refiner: Engine, background: Background[Guidance]
     ) -> None:
         self._problem, self._config, self._seed = problem, config, seed
         self._refiner, self._background = refiner, background
-        self._planner = D4ormD(
-            D4ormDConfig(
-                engine=config.engine,
-                num_samples=config.coarse_samples,
-                num_steps=config.coarse_steps,
-                repair_steps=config.coarse_repair_steps,
-                improve=True,
-                # Ways that fit between others to the centimetre are no guidance: fine plans cannot keep to them.
-                reroute=False,
+        # Ways that fit between others to the centimetre are no guidance: fine plans cannot keep to them. But where
+        # the team does not get on there may be no other ways.
+        self._planner, self._thorough = (
+            D4ormD(
+                D4ormDConfig(
+                    engine=config.engine,
+                    num_samples=config.coarse_samples,
+                    num_steps=config.coarse_steps,
+                    repair_steps=config.coarse_repair_steps,
+                    improve=True,
+                    reroute=reroute,
+                    shorten=False,
+                )
             )
+            for reroute in (False, True)
         )
 
     def begin(self, joint: JointState) -> None:
         """Plan for the episode."""
+        self._patience = Patience(joint)
         guidance = self.plan(joint, None, self._config.coarse_iterations)
         self._follow(joint, guidance, np.ones(self._problem.num_robots, bool))
 
@@ -79,37 +91,50 @@ class Guide:
         """Begin at the beginning of a guidance, which sends the robots ``anew`` ``(K,)`` another way than before."""
         self.anew = anew
         self.guidance = guidance
-        self.index, self._indices = 0, np.zeros(len(joint.goals), int)
-        self._goals = joint.goals
+        self.index, self._due_index, self._indices = 0, 0, np.zeros(len(joint.goals), int)
+        self._goals, self._began = joint.goals, joint.steps
         self._nearest, self._nearest_at = float("inf"), joint.steps
 
-    def plan(self, joint: JointState, initial: FloatArray | None, iterations: int) -> Guidance:
+    def plan(self, joint: JointState, initial: FloatArray | None, iterations: int, thorough: bool = False) -> Guidance:
         """Plan for the whole team from where it is, until a plan passes the checks (Algorithm 4, lines 1 to 3)."""
+        planner = self._thorough if thorough else self._planner
         present = self._problem.resumed_at(joint.states, joint.goals)
         coarse = coarse_problem(present, self._config.coarse_factor)
-        search = Search(self._planner, coarse, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps), initial)
-        chosen = search.current
-        for _ in range(iterations):
+        search = Search(planner, coarse, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps), initial)
+        chosen, ordered = search.current, False
+        for number in range(iterations):
             if passes_checks(chosen.trajectory, self._config.check_interval):
                 break
             search.advance()
+            if number == 0:
+                ordered = isinstance(search.state, Ways)
             chosen = search.current if search.current.rank >= search.best.rank else search.best
             if passes_checks(search.current.trajectory, self._config.check_interval):
                 chosen = search.current
-        return self._guidance(coarse, chosen.trajectory)
-
-    def _guidance(self, coarse: Problem, trajectory: Trajectory) -> Guidance:
-        path = interpolate(trajectory.positions, self._config.coarse_factor)
-        return Guidance(coarse, trajectory.controls, trajectory.states, path)
+        plan = chosen.trajectory
+        path = interpolate(plan.positions, self._config.coarse_factor)
+        return Guidance(coarse, plan.controls, plan.states, path, ordered)
 
     def subgoals(self, joint: JointState, docked: BoolArray) -> IntArray:
         """``(K,)`` waypoints that the robots head for; finds out where on the path they are (Algorithm 4, line 6)."""
         path, offset = self.guidance.path, self._config.subgoal_offset
         positions = joint.states[:, : self._problem.dimension]
         self._indices = nearest_indices(path, positions, self._indices, offset)
-        if not docked.all():
-            self.index = round(float(self._indices[~docked].mean()))
-        return subgoal_indices(self._indices, self.index, offset, LAG, len(path) - 1)
+        going = ~docked & ~self.stuck
+        if going.any():
+            self.index = round(float(self._indices[going].mean()))
+        targets = subgoal_indices(self._indices, self.index, offset, LAG, len(path) - 1)
+        walls = self.guidance.ordered
+        return within_sight(self._problem, positions, path, self._indices, targets, docked, walls)
+
+    def followed(self, joint: JointState, engine: Engine, horizon: int) -> FloatArray:
+        """``(horizon, K, m)`` controls that take every robot slowly along its path."""
+        return follow_slowly(self._problem, engine, joint, self.guidance.path, self._indices, horizon)
+
+    def timed(self, joint: JointState, engine: Engine, horizon: int) -> FloatArray:
+        """``(horizon, K, m)`` controls that take every robot along its path in the team's time."""
+        clock = np.minimum(self.index, self._indices + LAG)
+        return keep_time(self._problem, engine, joint, self.guidance.path, clock, horizon)
 
     def fresh_start(self, base: FloatArray) -> None:
         """Have those that are sent another way begin ``base`` ``(H_predict, K, m)`` with the coarse plan's controls."""
@@ -121,14 +146,17 @@ class Guide:
             self.anew = np.zeros_like(self.anew)
 
     def replan_if_needed(self, joint: JointState, docked: BoolArray) -> bool:
-        """Plan anew for robots with new goals, for a team that lost the guidance or has come to its end."""
+        """Plan anew for robots with new goals or stuck, for a team that lost the guidance or has come to its end."""
         changed = (joint.goals != self._goals).any(axis=1)
         moving = ~docked
+        stuck, self.stuck = self._patience.observe(joint, self._due(joint))
         if not moving.any():
             return False
         lost = self._is_lost(joint, moving)
-        if not changed.any() and not lost:
+        held_up = moving & stuck & (joint.steps - self._began > STUCK_AFTER)
+        if not (changed | held_up).any() and not lost:
             return False
+        changed |= held_up
         present = coarse_problem(self._problem.resumed_at(joint.states, joint.goals), self._config.coarse_factor)
         initial = straight_drives(present).controls[:, :, 0]
         keep = moving & ~changed
@@ -136,9 +164,15 @@ class Guide:
             rest = self.guidance.controls[self.index // self._config.coarse_factor :]
             initial[:, keep] = 0
             initial[: len(rest), keep] = rest[:, keep]
-        iterations = self._config.coarse_iterations if lost else self._config.replan_iterations
-        self._follow(joint, self.plan(joint, initial, iterations), ~keep | lost)
+        thorough = lost or bool(held_up.any())
+        iterations = self._config.coarse_iterations if thorough else self._config.replan_iterations
+        self._follow(joint, self.plan(joint, initial, iterations, thorough), ~keep | lost)
         return True
+
+    def _due(self, joint: JointState) -> FloatArray:
+        """``(K, d)`` where the robots should be by now: as far as the others, and half as far as planned."""
+        self._due_index = max(self._due_index, self.index, (joint.steps - self._began) // 2)
+        return self.guidance.path[min(self._due_index, len(self.guidance.path) - 1)]
 
     def _is_lost(self, joint: JointState, moving: BoolArray) -> bool:
         """Whether the robots under way are far from their waypoints, at the end of the path, or get no nearer."""
@@ -183,4 +217,4 @@ class Guide:
         positions = np.concatenate([before[..., : left.dimension], after.positions[1:]])
         all_controls = np.concatenate([guidance.controls[:done], after.controls])
         path = interpolate(positions, self._config.coarse_factor)
-        return Guidance(guidance.problem, all_controls, states, path)
+        return replace(guidance, controls=all_controls, states=states, path=path)

@@ -112,14 +112,13 @@ class D4ormC2F(StatePolicy):
         refined = not replanned and guide.refine(joint.steps, due=len(self.loops) % self.config.refine_every == 0)
         targets = guide.subgoals(joint, docked)
         subgoals = guide.guidance.path[targets, np.arange(len(targets))]
-        left, base = self._plan[self._next :], self._window.no_controls()
-        ahead = self._plan[self._next : len(base)]
-        base[: len(ahead)] = ahead
-        guide.fresh_start(base)
+        left, base = self._plan[self._next :], self._base(joint)
         seed = derived_seed(self._seed, Stream.CONTROL_LOOP, joint.steps)
+        stuck = guide.stuck & ~docked
+        careful = guide.followed(joint, self._engine, len(base)) if stuck.any() else None
 
         def predict() -> Prediction:
-            return self._window.predict(joint, docked, subgoals, base, left, seed)
+            return self._window.predict(joint, docked, subgoals, base, left, careful, stuck, seed)
 
         result: Prediction | None
         if self.config.deadline is None:
@@ -132,6 +131,20 @@ class D4ormC2F(StatePolicy):
         used = time.perf_counter() - begin
         missed = result is None
         self.loops.append(LoopRecord(joint.steps, used, int(targets.max()), margin, missed, replanned, refined))
+
+    def _base(self, joint: JointState) -> FloatArray:
+        """``(H_predict, K, m)`` controls to deform: what is left of the last loop's.
+
+        Where who waits for whom decides, the coarse plan's own pace is kept instead.
+        """
+        horizon = self.config.predict_horizon
+        if self._guide.guidance.ordered:
+            return self._guide.timed(joint, self._engine, horizon)
+        base = self._window.no_controls()
+        ahead = self._plan[self._next : horizon]
+        base[: len(ahead)] = ahead
+        self._guide.fresh_start(base)
+        return base
 
     def _at_goal(self, joint: JointState) -> BoolArray:
         gap = joint.goals - joint.states[:, : self.problem.dimension]

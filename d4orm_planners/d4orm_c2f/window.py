@@ -8,6 +8,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.base import Engine, SamplingRules, SamplingTask
 from d4orm_env.joint_state import JointState
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
@@ -18,6 +19,10 @@ NOT_AT_SUBGOALS = 1e-6
 
 SHORTER = 3
 """How many times fewer fresh steps a robot takes before it stops if it would violate the margin otherwise."""
+
+
+ROUNDING = 1e-5
+"""Allowance for it [m]."""
 
 
 class Prediction(NamedTuple):
@@ -67,6 +72,8 @@ class Window:
         subgoals: FloatArray,
         base: FloatArray,
         before: FloatArray,
+        careful: FloatArray | None,
+        stuck: BoolArray,
         seed: int,
     ) -> Prediction:
         """Fine controls towards the subgoals.
@@ -77,6 +84,8 @@ class Window:
             subgoals: ``(K, d)`` [m].
             base: ``(H_predict, K, m)`` controls to deform.
             before: ``(T, K, m)`` controls that the robots had in mind, with the stop after them.
+            careful: ``(H_predict, K, m)`` controls for robots that are stuck, if any are.
+            stuck: ``(K,)`` who is; they may come as near as half of the margin.
             seed: Of the samples.
         """
         problem, config = self._problem, self._config
@@ -86,9 +95,11 @@ class Window:
         )
         limit = problem.team.control_limits
         controls = np.clip(base + result.mean, -limit, limit).astype(np.float32)
+        if careful is not None:
+            controls[:, stuck] = careful[:, stuck]
         radius = problem.goal_radius if self._docks else NOT_AT_SUBGOALS
         truth = problem.resumed_at(joint.states, joint.goals, horizon=config.predict_horizon, goal_radius=radius)
-        return self._safe_mix(truth, controls, before, docked)
+        return self._safe_mix(truth, controls, before, docked, stuck)
 
     def _task(self, joint: JointState, docked: BoolArray, subgoals: FloatArray, base: FloatArray) -> SamplingTask:
         """Deform ``base`` so that everybody heads for its subgoal, or its goal where that is near."""
@@ -122,7 +133,9 @@ class Window:
             states = self._engine.step(window.arrays, states, docked, stopping[t]).states
         return stopping
 
-    def _safe_mix(self, window: Problem, fresh: FloatArray, left: FloatArray, docked: BoolArray) -> Prediction:
+    def _safe_mix(
+        self, window: Problem, fresh: FloatArray, left: FloatArray, docked: BoolArray, stuck: BoolArray
+    ) -> Prediction:
         """Fresh controls where they keep everyone apart; where not, robots stop earlier, or do as they had in mind.
 
         What they had in mind was free of violations, and ends at rest. So without disturbances there always is a mix
@@ -135,23 +148,39 @@ class Window:
         window_to_rest = window.resumed_at(window.start, window.goal, horizon=len(controls))
         # After how many fresh steps each robot stops.
         steps = np.full(window.num_robots, horizon)
-        trajectory = self._engine.rollout(window_to_rest, controls)
-        while (violating := trajectory.margin_violated[1:].any(axis=0) & (steps > 0)).any():
+        trajectory, violated = self._violations(window_to_rest, controls, stuck)
+        while (violating := violated & (steps > 0)).any():
             steps[violating] //= SHORTER
             steps[steps < self._config.execute_horizon] = 0
             for number in np.unique(steps[violating]):
                 fewer = self._with_stop(window, fresh, int(number), docked) if number else before
                 chosen = violating & (steps == number)
                 controls[:, chosen] = fewer[:, chosen]
-            trajectory = self._engine.rollout(window_to_rest, controls)
-        return Prediction(controls, least_gap(window, trajectory.positions))
+            trajectory, violated = self._violations(window_to_rest, controls, stuck)
+        return Prediction(controls, least_gap(window, trajectory.positions[1:]))
+
+    def _violations(self, window: Problem, controls: FloatArray, stuck: BoolArray) -> tuple[Trajectory, BoolArray]:
+        """The rollout, and ``(K,)`` who comes too near to anything in it.
+
+        That is within the margin; of half of it for those that are stuck; nearer than now for who is within it already.
+        """
+        trajectory = self._engine.rollout(window, controls)
+        violated: BoolArray = np.any(trajectory.margin_violated[1:], axis=0)
+        lenient = trajectory.margin_violated[0] | stuck
+        if lenient.any():
+            places = trajectory.positions[0]
+            clearance = window.world.clearance(places) - np.asarray(window.team.radius)
+            gap = min(least_gap(window, places[None]), float(clearance.min())) - ROUNDING
+            nearer = window.resumed_at(window.start, window.goal, margin=max(min(gap, window.margin / 2), 0.0))
+            violated[lenient] = self._engine.rollout(nearer, controls).margin_violated[1:, lenient].any(axis=0)
+        return trajectory, violated
 
 
 def least_gap(problem: Problem, positions: FloatArray) -> float:
-    """Least gap between the surfaces of any two robots on ``(T, K, d)`` after the first time step [m]."""
+    """Least gap between the surfaces of any two robots on ``(T, K, d)`` [m]."""
     radius = np.asarray(problem.team.radius)
     first, second = np.triu_indices(problem.num_robots, 1)
     if not len(first):
         return float("inf")
-    gap2 = ((positions[1:, first] - positions[1:, second]) ** 2).sum(axis=2)
+    gap2 = ((positions[:, first] - positions[:, second]) ** 2).sum(axis=2)
     return float((np.sqrt(gap2.min(axis=0)) - radius[first] - radius[second]).min())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from d4orm_planners.d4orm_d.team import TeamPaths
+from d4orm_planners.d4orm_d.team import DeformedTeam
 from d4orm_planners.grouping import Graph, conflicts, failure_groups, reconnected
 
 
@@ -18,7 +18,7 @@ class Groups:
 
     graph: Graph | None = None
 
-    def replan(self, team: TeamPaths) -> Groups:
+    def replan(self, team: DeformedTeam) -> Groups:
         """Replan every group with a failed robot in turn, the robots outside it as moving obstacles."""
         planner, search, problem = team.planner, team.search, team.problem
         graph = conflicts(search.current.trajectory.positions, problem.team.radius, problem.margin)

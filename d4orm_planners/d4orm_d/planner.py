@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import ClassVar
 
+import numpy as np
+
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.base import SamplingTask
@@ -12,7 +14,7 @@ from d4orm_planners.d4orm import D4orm
 from d4orm_planners.d4orm_d.groups import Groups
 from d4orm_planners.d4orm_d.repairs import Repairs
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
-from d4orm_planners.d4orm_d.team import TeamPaths
+from d4orm_planners.d4orm_d.team import DeformedTeam
 from d4orm_planners.grouping import conflicts
 from d4orm_planners.guidance.planner import (
     Guide,
@@ -22,6 +24,8 @@ from d4orm_planners.guidance.planner import (
     guided_iteration,
 )
 from d4orm_planners.planner import Iteration
+from d4orm_planners.refinement.iteration import refined_iteration, shorten_first_ways
+from d4orm_planners.refinement.team import TeamPaths
 from d4orm_planners.search import Search
 from d4orm_planners.steering import prepare_drives, straight_drives
 
@@ -55,14 +59,14 @@ class D4ormD(D4orm):
     def init(self, search: Search) -> State:
         """See :meth:`Planner.init`."""
         # Here, because importing numba takes long.
-        from d4orm_planners.d4orm_d.rerouting import prepare_rerouting
+        from d4orm_planners.refinement.beams import prepare_beams
 
         with search.watch.paused():
             prepare_drives(search.problem)
             if self.config.decoupling == "groups":
                 return Groups()
-            if self.config.reroute:
-                prepare_rerouting(TeamPaths(self, search, search.current.trajectory))
+            if self.config.reroute or self.config.shorten:
+                prepare_beams(TeamPaths(search, search.current.trajectory))
         return Repairs.of(search.problem.num_robots)
 
     def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
@@ -77,10 +81,15 @@ class D4ormD(D4orm):
         if search.iteration == 0 and not search.current.controls.any():
             drives = self.straight_start(search.problem)
             return self.whole_team(search, state) if drives is None else (state, Iteration(drives))
+        if self.config.shorten and search.best.solved:
+            return state, refined_iteration(search)
         if not search.current.failed.any() or (isinstance(state, Groups) and search.best.solved):
             return self.whole_team(search, state)
-        team = TeamPaths(self, search, search.current.trajectory)
-        state = state.replan(team) if isinstance(state, Groups) else state.repair(team, self.config)
+        team = DeformedTeam(self, search, search.current.trajectory)
+        if isinstance(state, Groups):
+            return state.replan(team), team.iteration()
+        state = state.repair(team, self.config)
+        self.shorten_first(team)
         return state, team.iteration()
 
     def is_guided(self, search: Search) -> bool:
@@ -95,8 +104,15 @@ class D4ormD(D4orm):
         iteration = self.run(search)
         if not isinstance(state, Repairs):
             return state, iteration
-        team = TeamPaths(self, search, search.engine.rollout(search.problem, iteration.controls))
-        return state.shorten(team), replace(iteration, controls=team.controls)
+        team = DeformedTeam(self, search, search.engine.rollout(search.problem, iteration.controls))
+        state = state.shorten(team)
+        self.shorten_first(team)
+        return state, replace(iteration, controls=team.controls)
+
+    def shorten_first(self, team: DeformedTeam) -> None:
+        """Let the ways of a team in which nobody fails any more become shorter."""
+        if self.config.shorten and not team.faults(np.arange(team.problem.num_robots))[0].any():
+            shorten_first_ways(team)
 
     def is_patient(self, search: Search) -> bool:
         """See :meth:`D4orm.is_patient`: repairs are what helps here."""

@@ -7,12 +7,16 @@ import numpy as np
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import IntArray
 from d4orm_env.core.seeds import Stream
-from d4orm_env.engine.beam_search import BeamRules, Moves, Seekers, search_kernel
+from d4orm_env.engine.beam_search import BeamRules
 from d4orm_env.engine.path_index import BLOCK
-from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_planners.d4orm_d.settings import REROUTE_RULES
-from d4orm_planners.d4orm_d.team import TeamPaths
-from d4orm_planners.steering import Drives, by_model, drives, standing
+from d4orm_planners.grouping import components
+from d4orm_planners.refinement.beams import Company, Manner, find_ways
+from d4orm_planners.refinement.team import TeamPaths
+from d4orm_planners.steering import drives, standing
+
+AWAY = np.float32(1e6)
+"""Where a robot is that is in nobody's way [m]."""
 
 
 def reroute(team: TeamPaths) -> None:
@@ -27,7 +31,9 @@ def reroute(team: TeamPaths) -> None:
         faults, _ = team.faults(everybody)
         failed = np.lexsort((random.random(len(everybody)), -faults))[: np.count_nonzero(faults)]
         swing = (2 * random.random() - 1) * REROUTE_RULES.swing
+        manner = Manner(tuple(np.array(REROUTE_RULES.angles) + swing), REROUTE_RULES.paces)
         contact = REROUTE_RULES.contact * REROUTE_RULES.contact_growth**sweep
+        rules = BeamRules(REROUTE_RULES.width, contact, REROUTE_RULES.apart)
         for first in range(0, len(failed), REROUTE_RULES.batch):
             if team.search.should_stop():
                 return
@@ -37,45 +43,41 @@ def reroute(team: TeamPaths) -> None:
             least, most = REROUTE_RULES.earlier
             earlier = random.integers(least, most << sweep, len(robots), endpoint=True)
             blocks = np.maximum((begin - 1) // BLOCK - earlier, 0)
-            lost = _search(team, robots[faults > 0], blocks[faults > 0], swing, contact)
-            if len(lost):
-                _try_detours(team, lost, random)
+            robots, blocks = robots[faults > 0], blocks[faults > 0]
+            if len(robots):
+                ways = find_ways(team, robots, blocks, manner, rules)
+                team.take_best(robots, ways)
+                lost = robots[~ways.arrived[:, 0]]
+                if len(lost):
+                    _try_detours(team, lost, random)
+    for pair in components(team.conflicts()):
+        if len(pair) == 2 and not team.search.should_stop():
+            _reroute_pair(team, np.array(pair), manner, rules)
 
 
-def prepare_rerouting(team: TeamPaths) -> None:
-    """Compile what rerouting of this team needs, if it is not yet."""
-    firsts = {model.name: robots[0] for model, robots in by_model(team.problem)}
-    if not all(search_kernel(name).signatures for name in firsts):
-        robots = np.array(list(firsts.values()))
-        team.faults(robots)
-        _search(team, robots, np.zeros(len(robots), int), 0.0, REROUTE_RULES.contact)
-        team.index.move(robots, team.positions[:, robots])
+def _reroute_pair(team: TeamPaths, pair: IntArray, manner: Manner, rules: BeamRules) -> None:
+    """Let two that meet only each other look for ways from the start, one after the other, if that is better.
 
-
-def _search(team: TeamPaths, robots: IntArray, blocks: IntArray, swing: float, contact: float) -> IntArray:
-    """Let robots ``(R,)`` take the best ways that they find from these blocks ``(R,)`` on.
-
-    Returns:
-        Those who found none.
+    Where they face each other at once, nothing that one of them does helps while the other comes on.
     """
-    problem, table, arrived = team.problem, team.index.table, np.zeros(team.problem.num_robots, bool)
-    rules = BeamRules(REROUTE_RULES.width, contact, REROUTE_RULES.apart)
-    for model, members in by_model(problem):
-        mine = np.isin(robots, members)
-        own = robots[mine]
-        if len(own):
-            seekers = Seekers(own, blocks[mine], team.states[blocks[mine] * BLOCK, own])
-            u, x = (np.ascontiguousarray(rows[:, own].swapaxes(0, 1)) for rows in (team.controls, team.states))
-            moves = _moves(problem.dimension, swing, has_heading=model.heading_index is not None)
-            found, search = np.zeros(len(own), bool), search_kernel(model.name)
-            Threads(available_cores()).over(
-                len(own),
-                lambda part: search(problem.arrays, table, moves, rules, seekers, part, u, x, found),  # noqa: B023
-            )
-            u, x = (rows.swapaxes(0, 1)[:, :, None] for rows in (u, x))
-            team.take_best(own, Drives(u, x, found[:, None], problem.dimension))
-            arrived[own] = found
-    return robots[~arrived[robots]]
+    problem = team.problem
+    faults, radius = team.faults(pair)[0].sum(), np.asarray(problem.team.radius, np.float64)
+    present = team.controls[:, pair], team.states[:, pair], team.arrived[pair]
+    for first, second in (pair, pair[::-1]):
+        # Who goes second stays where it is as long as the first may need to get away.
+        beside = np.full((1, 1, problem.horizon + 1, problem.dimension), AWAY, np.float32)
+        beside[:, :, : REROUTE_RULES.standing * BLOCK + 1] = problem.start[second, : problem.dimension]
+        ways = []
+        for robot, other in ((first, second), (second, first)):
+            company = Company(pair[None], beside, radius[[[other]]])
+            ways.append(find_ways(team, np.array([robot]), 0, manner, rules, company=company))
+            beside = np.ascontiguousarray(np.moveaxis(ways[-1].positions, 0, 2))
+        controls = np.concatenate([way.controls[:, :, 0] for way in ways], axis=1)
+        states = np.concatenate([way.states[:, :, 0] for way in ways], axis=1)
+        team.move([first, second], controls, states, [way.arrived[0, 0] for way in ways])
+        if team.faults(pair)[0].sum() < faults:
+            return
+        team.move(pair, *present)
 
 
 def _try_detours(team: TeamPaths, robots: IntArray, random: np.random.Generator) -> None:
@@ -87,24 +89,3 @@ def _try_detours(team: TeamPaths, robots: IntArray, random: np.random.Generator)
     vias = start + random.random((*size, 1)) * (goal - start)
     vias = vias + spread * portable.standard_normal(random, (*size, part.dimension))
     team.take_best(robots, drives(part, *standing(part), np.zeros(size, int), vias[:, :, None]))
-
-
-def _moves(dimension: int, swing: float, *, has_heading: bool) -> Moves:
-    """What a robot may do, all angles changed by ``swing`` [degrees]."""
-    angle = np.radians(np.array(REROUTE_RULES.angles) + swing)
-    # To the left and to the right; in space upwards and downwards too.
-    across = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])[: 2 * (dimension - 1)]
-    sides = portable.sin(angle)[:, None, None] * across
-    ahead = np.broadcast_to(portable.cos(angle)[:, None, None], (*sides.shape[:2], 1))
-    turned = np.concatenate([ahead, sides], axis=2).reshape(-1, 3)
-    home = np.zeros((1, 3))
-    beside = np.column_stack([np.zeros(len(across)), REROUTE_RULES.beside * across])
-    parts = [(home, True, pace) for pace in REROUTE_RULES.paces] + [(beside, True, 1.0), (turned, False, 1.0)]
-    if has_heading:
-        parts += [(home, True, REROUTE_RULES.on_the_spot), (turned, False, REROUTE_RULES.on_the_spot)]
-    sizes = [len(turns) for turns, _, _ in parts]
-    return Moves(
-        np.concatenate([turns for turns, _, _ in parts]).astype(np.float32),
-        np.repeat([homewards for _, homewards, _ in parts], sizes),
-        np.repeat([pace for _, _, pace in parts], sizes).astype(np.float32),
-    )

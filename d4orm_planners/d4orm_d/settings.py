@@ -64,8 +64,8 @@ class RerouteRules:
         angles: By which a robot turns off from the way to its goal [degrees]; in space up and down as well.
         swing: From one sweep to the next all of them change by up to so much either way [degrees].
         paces: Shares of its speed with which a robot heads for its goal: waiting has no direction.
-        beside: Goal radii beside its goal to which it may head too: who docks there keeps clear of a neighbour.
-        on_the_spot: The share with which one that has a heading turns, to its goal or to one side, as if it stood.
+        standing: Blocks for which, of two robots that meet only each other, the second is taken to stay where it starts
+            while the first looks for a way.
         detours: Random points by which it tries to drive if it has found no way.
     """
 
@@ -79,8 +79,7 @@ class RerouteRules:
     angles: tuple[float, ...] = (30.0, 60.0, 90.0, 135.0, 180.0)
     swing: float = 14.0
     paces: tuple[float, ...] = (1.0, 0.5, 0.0)
-    beside: float = 0.8
-    on_the_spot: float = 0.001
+    standing: int = 4
     detours: int = 32
 
 
@@ -101,7 +100,6 @@ class RepairRules:
         shortenings: How many times in turn robots look for shorter ways home.
         earlier: Steps before a robot's arrival, or its nearest approach, at which it may turn straight to its goal.
         batch: Robots that look for ways home at the same time: all ways of a big team take room.
-        missing_cost: Robots that a robot may meet rather than never arrive, or touch an obstacle.
     """
 
     noise_factors: tuple[float, ...] = (1.0, 2.0)
@@ -115,7 +113,6 @@ class RepairRules:
     shortenings: int = 2
     earlier: tuple[int, ...] = (0, 8, 16, 32, 64)
     batch: int = 64
-    missing_cost: int = 5
 
 
 REROUTE_RULES, RULES = RerouteRules(), RepairRules()

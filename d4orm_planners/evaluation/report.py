@@ -108,6 +108,24 @@ def write_parquet(path: Path, trials: Sequence[Trial]) -> bool:
     return True
 
 
+def read_parquet(path: str | os.PathLike[str]) -> list[Trial]:
+    """The trials that :func:`write_parquet` wrote.
+
+    Raises:
+        ImportError: If pyarrow is not installed.
+        ValueError: If the file is no Parquet, or has other columns.
+        OSError: If it cannot be read.
+    """
+    import pyarrow
+    from pyarrow import parquet
+
+    try:
+        rows = parquet.read_table(path).to_pylist()
+        return [Trial(**row) for row in rows]
+    except (pyarrow.ArrowInvalid, TypeError) as error:
+        raise ValueError(f"{os.fspath(path)} is no Parquet file of trials: {str(error).splitlines()[0]}") from error
+
+
 @contextmanager
 def target(path: Path) -> Iterator[Path]:
     """A temporary file that takes the place of ``path``; what goes wrong with it names ``path``.

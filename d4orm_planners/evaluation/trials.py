@@ -17,7 +17,7 @@ from d4orm_env import navigation_v0, verify
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.errors import UnknownKeywordError, describe
 from d4orm_env.core.problem import Problem
-from d4orm_planners._machine import describe_machine, versions
+from d4orm_planners._machine import commit, describe_machine, versions
 from d4orm_planners.episode import Episode, run_episode
 from d4orm_planners.evaluation.conditions import Condition
 from d4orm_planners.evaluation.store import Trial, TrialKey
@@ -208,5 +208,6 @@ class _TimedPolicy(Policy):
 
 @cache
 def _origin() -> tuple[str, str]:
-    """Versions of the libraries, and the machine, as JSON."""
-    return json.dumps(versions(LIBRARIES), sort_keys=True), json.dumps(describe_machine(), sort_keys=True)
+    """Versions of the libraries with the commit of this package, and the machine, as JSON."""
+    source = {"commit": found} if (found := commit()) else {}
+    return json.dumps({**versions(LIBRARIES), **source}, sort_keys=True), json.dumps(describe_machine(), sort_keys=True)

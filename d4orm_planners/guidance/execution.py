@@ -292,13 +292,16 @@ def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[Floa
         steps += 1
 
 
-def paces_along(problem: Problem, robot: int, arcs: Any, bends: Any) -> Any:
-    """``(P,)`` how fast a robot may pass each point of its route [m/s], from their places along it and their bends."""
+def paces_along(problem: Problem, robot: int, arcs: Any, bends: Any, share: float = BRAKING) -> Any:
+    """``(P,)`` how fast a robot may pass each point of its route [m/s], from their places along it and their bends.
+
+    It counts on that share of its acceleration.
+    """
     model, limits = problem.team.robot_models[robot], np.asarray(problem.team.limits[robot], np.float64)
-    corner = np.sqrt(BRAKING * limits[ACCELERATION] * bends)
+    corner = np.sqrt(share * limits[ACCELERATION] * bends)
     if model.heading_index is not None:
-        corner = np.minimum(corner, BRAKING * limits[TURN_RATE] * bends)
-    braking = BRAKING * limits[ACCELERATION] if ACCELERATION in model.control_limits else LARGEST
+        corner = np.minimum(corner, share * limits[TURN_RATE] * bends)
+    braking = share * limits[ACCELERATION] if ACCELERATION in model.control_limits else LARGEST
     paces = np.empty(len(arcs))
     fill_paces(arcs, problem.dt, corner, limits[SPEED], braking, paces)
     return paces

@@ -21,7 +21,7 @@ from d4orm_planners.guidance.timed_drive import drive_by_clock, timed_kernel
 
 FIRST_CUT = 0.03
 """By how much corners are cut at most on first routes [m]."""
-MANNERS = ((0.9, 0.1), (0.75, 0.03), (0.6, 0.01))
+MANNERS = ((1.0, 0.25), (0.9, 0.1), (0.75, 0.03), (0.6, 0.01))
 """Shares of its speed that a robot is taken to drive at when its way is planned, and by how much it cuts corners [m];
 the next where it is late so, or comes too near to something."""
 LEISURE = 0.1
@@ -201,15 +201,23 @@ class Replanning:
             roadmap.nodes[nodes[:left]], np.array([0, left]), departs[:left].astype(float), arrives[:left].astype(float)
         )
         route = make_routes(self.problem, stops, [robot], cut)[0]
-        controls, places, arrival = drive_by_clock(self.problem, robot, route, stops.departs, stops.arrives, steps)
-        if arrival > latest or touches(Others(driven.places, np.minimum(apart + TOUCH, others.need)), robot, places):
+        # As soon as it can, or else by the clock of its way.
+        for hurrying in (True, False):
+            drive = drive_by_clock(self.problem, robot, route, stops, steps, hurrying=hurrying)
+            if self.fits(Others(driven.places, np.minimum(apart + TOUCH, others.need)), robot, drive, latest):
+                driven.controls[:, robot], driven.places[:, robot], driven.arrivals[robot] = drive
+                return True
+        return False
+
+    def fits(self, others: Others, robot: int, drive: tuple[FloatArray, Floats, int], latest: int) -> bool:
+        """Whether a drive of a robot ends in time, and comes near to nobody and nothing."""
+        _, places, arrival = drive
+        if arrival > latest or touches(others, robot, places):
             return False
-        if self.space is not None:
-            room = self.problem.world.clearance(places[1 : arrival + 1, : self.problem.dimension])
-            if room.min() <= min(bodies.reach[robot] + TOUCH, self.own_room[robot]):
-                return False
-        driven.controls[:, robot], driven.places[:, robot], driven.arrivals[robot] = controls, places, arrival
-        return True
+        if self.space is None:
+            return True
+        room = self.problem.world.clearance(places[1 : arrival + 1, : self.problem.dimension])
+        return bool(room.min() > min(self.bodies.reach[robot] + TOUCH, self.own_room[robot]))
 
 
 def is_compiled(problem: Problem) -> bool:

@@ -15,9 +15,12 @@ from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS, ZERO, make_stepper, models_key, to_fixed_tuple
 from d4orm_planners.guidance import execution
 from d4orm_planners.guidance.execution import BEYOND, LOOKAHEAD, REACHED, RESERVE, point_reached, square_to, steering
-from d4orm_planners.guidance.routes import Route
+from d4orm_planners.guidance.routes import Route, Stops
 
 SOURCES = execution.SOURCES + fingerprint((execution,))
+
+HURRYING = 0.85
+"""Share of its acceleration that a robot counts on that hurries: if it leaves its route so, it drives by the clock."""
 
 
 class Timed(NamedTuple):
@@ -132,7 +135,7 @@ def timed_kernel(name: str) -> Any:
 
 
 def drive_by_clock(
-    problem: Problem, robot: int, route: Route, departs: Any, arrives: Any, steps: int
+    problem: Problem, robot: int, route: Route, stops: Stops, steps: int, *, hurrying: bool = False
 ) -> tuple[FloatArray, Any, int]:
     """``(controls (T, m), places (T + 1, 3), arrival)`` of one robot along its route.
 
@@ -140,16 +143,21 @@ def drive_by_clock(
         problem: The team.
         robot: The robot.
         route: Its route.
-        departs: ``(C,)`` step at which it may set out for each corner.
-        arrives: ``(C,)`` step at which it should be there.
+        stops: Its corners, the steps at which it may set out for each, and at which it should be there.
         steps: ``T``.
+        hurrying: Whether it comes to each as soon as it can, and waits only where it would have waited.
     """
+    departs, arrives = stops.departs, stops.arrives
     arrays, model = problem.arrays, problem.team.models[robot]
     # Corners are rounded: the middle of those of its points that are passed at its time.
     at = (np.searchsorted(route.times, arrives) + np.searchsorted(route.times, arrives, side="right") - 1) // 2
+    if hurrying:
+        waits = np.append(False, departs[1:] > arrives[:-1] + 1)
+        departs, arrives = np.where(waits, departs, 0.0), np.zeros(len(arrives))
     moves = np.diff(route.points, axis=0)
     arcs = np.append(0.0, np.cumsum(np.sqrt(moves[:, 0] ** 2 + moves[:, 1] ** 2 + moves[:, 2] ** 2)))
-    paces = execution.paces_along(problem, robot, arcs, route.bends)
+    share = HURRYING if hurrying else execution.BRAKING
+    paces = execution.paces_along(problem, robot, arcs, route.bends, share)
     controls = np.zeros((steps, problem.control_size), np.float32)
     places = np.empty((steps + 1, 3))
     arrival = timed_kernel(model)(

@@ -16,9 +16,11 @@ from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.seeds import Stream
 from d4orm_env.engine.base import SamplingRules, SamplingTask
+from d4orm_planners.grouping import Groups, components, conflicts
 from d4orm_planners.planner import Iteration, Planner, State
 from d4orm_planners.sampling.schedule import alpha_bar
 from d4orm_planners.sampling.settings import DenoisingConfig, SamplingConfig
+from d4orm_planners.sampling.weights import GroupWeights
 from d4orm_planners.search import Search
 
 
@@ -44,6 +46,8 @@ class SamplingPlanner(Planner):
         credit = self.config.credit
         if credit == "alternate":
             credit = "team" if search.iteration % 2 else "robot"
+        elif credit == "group":  # the rules sum the robots' rewards
+            credit = "robot"
         return SamplingTask(search.problem, base, credit=credit)
 
     def num_samples(self, search: Search) -> int:
@@ -63,12 +67,21 @@ class SamplingPlanner(Planner):
         """One run of the sampling loop over the whole team."""
         base, mean = self.initial(search)
         task, rules = self.task(search, base), self.rules()
+        if self.config.credit == "group":
+            rules = rules._replace(weights=GroupWeights(rules.weights, conflict_groups(search)))
         num_steps = excluded = 0
         for stage, (noise_scale, num_samples) in enumerate(self.stages(search)):
             seed = search.iteration_seed(Stream.SAMPLES, stage)
             result = search.denoise(task, rules, mean, noise_scale, num_samples, seed)
             mean, num_steps, excluded = result.mean, num_steps + len(result.rewards), excluded + result.excluded
         return Iteration(base + mean, num_steps, excluded)
+
+
+def conflict_groups(search: Search) -> Groups:
+    """The robots that are in conflict with each other in the present candidate, directly or by others."""
+    problem = search.problem
+    positions = search.current.trajectory.positions
+    return components(conflicts(positions, problem.team.radius, problem.margin))
 
 
 class DenoisingPlanner(SamplingPlanner):

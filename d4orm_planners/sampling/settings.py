@@ -14,7 +14,7 @@ from d4orm_planners.sampling.schedule import annealed
 from d4orm_planners.sampling.weights import SoftmaxWeights
 from d4orm_planners.settings import CheckedSettings, NotNegative, Positive, Samples, Steps, Variance, one_of
 
-Credit = Annotated[str, one_of(("team", "robot", "alternate"))]
+Credit = Annotated[str, one_of(("team", "robot", "alternate", "group"))]
 Cutoff = Annotated[NotNegative, Field(lt=1)]
 
 PAPER = {"num_samples": 1024, "num_steps": 100, "weight_cutoff": 0.0, "clip_between_iterations": False}
@@ -30,7 +30,8 @@ class SamplingConfig(PlannerConfig):
         num_steps: ``N``, steps per iteration.
         credit: ``"team"`` weights samples by the team's mean reward, as in the paper; ``"robot"`` weights each robot's
             part of a sample by the robot's own reward, which keeps the signal from diluting with the number of robots;
-            ``"alternate"`` does the second in the first iteration, the first in the next, and so on.
+            ``"alternate"`` does the second in the first iteration, the first in the next, and so on; ``"group"``
+            weights by the reward of those that a robot was in conflict with, directly or by others, in the last plan.
     """
 
     num_samples: Samples = 1024

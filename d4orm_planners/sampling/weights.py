@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, TypeAlias
@@ -52,6 +53,30 @@ class SoftmaxWeights:
         if self.cutoff > 0:
             weight = xp.where(weight >= self.cutoff, weight, 0)
         return weight * (1 / xp.maximum(weight.sum(-1, keepdims=True), 1e-30))
+
+
+@dataclass(frozen=True)
+class GroupWeights:
+    """Weights of each robot's part of a sample by what the robot's group gained by it.
+
+    Attributes:
+        rule: What makes weights of rewards.
+        groups: Disjoint groups of robots, all robots together.
+    """
+
+    rule: Callable[..., Array]
+    groups: tuple[tuple[int, ...], ...]
+
+    def __call__(self, rewards: Array, xp: ModuleType, log_ratio: Array | None = None) -> Array:
+        """Weights ``(K, M)`` of the robots' own ``rewards`` ``(K, M)``; see :class:`SoftmaxWeights`."""
+        shared = self._summed(rewards, xp)
+        return self.rule(shared, xp) if log_ratio is None else self.rule(shared, xp, self._summed(log_ratio, xp))
+
+    def _summed(self, rows: Array, xp: ModuleType) -> Array:
+        """``(K, M)`` the sum over each robot's group."""
+        group_of = {robot: group for group in self.groups for robot in group}
+        sums = {group: rows[np.array(group)].sum(axis=0) for group in self.groups}
+        return xp.stack([sums[group_of[robot]] for robot in range(len(rows))])
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
-"""Draw the scenarios with walls, and a map from a file: the pictures of docs/scenarios.md.
+"""Draw the paper's scenarios, those with walls, and a map from a file: the pictures of docs/scenarios.md.
 
-python examples/walled_worlds.py
+python examples/scenario_pictures.py
 """
 
 from __future__ import annotations
@@ -16,6 +16,11 @@ from d4orm_env import make_problem, rollout
 from d4orm_env.render import save_picture
 
 SCENARIOS: dict[str, dict[str, Any]] = {
+    "paper_circle": {},
+    "paper_sphere": {},
+    "paper_random": {},
+    "paper_heterogeneous": {},
+    "paper_obstacles": {},
     "rooms": {},
     "maze": {},
     "warehouse": {},

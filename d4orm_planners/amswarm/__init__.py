@@ -1,0 +1,1 @@
+"""AMSwarm: receding-horizon planning by alternating minimisation, every robot for itself."""

@@ -1,0 +1,105 @@
+"""Following the coarse path itself: in its own time, or slowly where sampling leaves robots stuck."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.engine.base import Engine
+from d4orm_env.joint_state import JointState
+from d4orm_planners.steering import preferred_velocities, track_velocities
+
+STUCK_WITHIN, STUCK_AFTER = 0.3, 25
+"""How far a robot has to get [m] in so many time steps not to be stuck."""
+
+CAREFUL_FOR = 30
+"""Steps for which a robot that was stuck follows its path."""
+
+SPEED, REACHED = 0.3, 0.05
+"""How fast it does [m/s], and how near to a waypoint it turns to the next one [m]."""
+
+CATCHING_UP = 2.0
+"""What of its lag a robot makes good in a second [1/s]."""
+
+
+class Patience:
+    """Watches an episode for robots that hardly move although they are not at their goals.
+
+    Args:
+        joint: Where they begin.
+    """
+
+    def __init__(self, joint: JointState) -> None:
+        self._places = joint.states[:, : joint.goals.shape[1]].copy()
+        self._since = np.full(len(joint.goals), joint.steps)
+        self._careful_until = np.full(len(joint.goals), joint.steps)
+
+    def observe(self, joint: JointState, due: FloatArray) -> tuple[BoolArray, BoolArray]:
+        """``(K,)`` who is stuck now, and who is or was not long ago, so that it follows its path slowly.
+
+        Args:
+            joint: Where the robots are.
+            due: ``(K, d)`` where they should be by now: some have to wait.
+        """
+        places = joint.states[:, : joint.goals.shape[1]]
+        moved = np.linalg.norm(places - self._places, axis=1) > STUCK_WITHIN
+        moved |= np.linalg.norm(places - due, axis=1) < STUCK_WITHIN
+        self._places[moved], self._since[moved] = places[moved], joint.steps
+        late = joint.steps - self._since > STUCK_AFTER
+        self._careful_until[late] = joint.steps + CAREFUL_FOR
+        return late, self._careful_until > joint.steps
+
+
+def follow_slowly(
+    problem: Problem, engine: Engine, joint: JointState, path: FloatArray, indices: IntArray, horizon: int
+) -> FloatArray:
+    """``(horizon, K, m)`` controls that take every robot along its path, slowly.
+
+    Args:
+        problem: The robots.
+        engine: What moves them.
+        joint: Where they are.
+        path: ``(H+1, K, d)`` waypoints [m].
+        indices: ``(K,)`` where on it they are.
+        horizon: Steps.
+    """
+    states, arrays = joint.states, problem.resumed_at(joint.states, joint.goals).arrays
+    nobody, every = np.zeros(len(indices), bool), np.arange(len(indices))
+    controls = np.empty((horizon, len(indices), problem.control_size), np.float32)
+    at = indices.copy()
+    for t in range(horizon):
+        for _ in range(2):
+            gap = np.linalg.norm(path[at, every] - states[:, : path.shape[2]], axis=1)
+            at = np.minimum(at + (gap < REACHED), len(path) - 1)
+        ahead = np.where((at == len(path) - 1)[:, None], joint.goals, path[at, every])
+        velocities = preferred_velocities(problem, states, ahead)
+        speed = np.linalg.norm(velocities, axis=1, keepdims=True)
+        controls[t] = track_velocities(problem, states, velocities * np.minimum(1, SPEED / np.maximum(speed, SPEED)))
+        states = engine.step(arrays, states, nobody, controls[t]).states
+    return controls
+
+
+def keep_time(
+    problem: Problem, engine: Engine, joint: JointState, path: FloatArray, indices: IntArray, horizon: int
+) -> FloatArray:
+    """``(horizon, K, m)`` controls that take every robot along its path in the path's own time.
+
+    Args:
+        problem: The robots.
+        engine: What moves them.
+        joint: Where they are.
+        path: ``(H+1, K, d)`` waypoints, one per time step [m].
+        indices: ``(K,)`` where on it each should be now.
+        horizon: Steps.
+    """
+    states, arrays = joint.states, problem.resumed_at(joint.states, joint.goals).arrays
+    nobody, every = np.zeros(len(indices), bool), np.arange(len(indices))
+    controls = np.empty((horizon, len(indices), problem.control_size), np.float32)
+    for t in range(horizon):
+        at, after = np.minimum(indices + t, len(path) - 1), np.minimum(indices + t + 1, len(path) - 1)
+        now = path[at, every]
+        velocities = (path[after, every] - now) / problem.dt + CATCHING_UP * (now - states[:, : path.shape[2]])
+        controls[t] = track_velocities(problem, states, velocities.astype(np.float32))
+        states = engine.step(arrays, states, nobody, controls[t]).states
+    return controls

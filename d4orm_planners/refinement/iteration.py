@@ -1,0 +1,32 @@
+"""An iteration that makes the best plan so far better."""
+
+from __future__ import annotations
+
+from d4orm_env.core.seeds import Stream
+from d4orm_planners.planner import Iteration
+from d4orm_planners.refinement.team import TeamPaths
+from d4orm_planners.search import Search
+
+ROUNDS = 96
+"""Rounds of the search in an iteration: one annealing."""
+FIRST_ROUNDS = 4
+"""Rounds for a plan that has just been found."""
+
+
+def refined_iteration(search: Search) -> Iteration:
+    """The best plan so far, whose robots have looked for faster ways around all others."""
+    # Here, because importing numba takes long.
+    from d4orm_planners.refinement.beams import prepare_beams
+    from d4orm_planners.refinement.neighbourhoods import shorten_ways
+
+    team = TeamPaths(search, search.best.trajectory)
+    with search.watch.paused():
+        prepare_beams(team)
+    return Iteration(shorten_ways(team, search.iteration_seed(Stream.NEIGHBOURHOODS), ROUNDS))
+
+
+def shorten_first_ways(team: TeamPaths) -> None:
+    """Take what faster ways there are at once for a team in which nobody fails."""
+    from d4orm_planners.refinement.neighbourhoods import shorten_ways
+
+    shorten_ways(team, team.search.iteration_seed(Stream.NEIGHBOURHOODS), FIRST_ROUNDS, temperature=0.0)

@@ -1,0 +1,140 @@
+"""Which matters more, who gets the credit or how samples become an update: a factorial of both, on four teams.
+
+    python examples/credit_by_update.py --seeds 50 --out factorial
+
+Credit: samples are weighted by the reward of the team, of the group that a robot was in conflict with, of the robot, or
+of robot and team in turn. Update: MPPI, CEM with adaptive variance, MBD, i-MBD or D4orm, everything else being the
+paper's. Every trial has the same budget of denoising steps of 1024 samples, which MBD spends in one iteration (so that
+its credit by groups, or in turn, is credit by robot). The table has success with its 95% interval (Wilson), the mean
+number of steps to the first solution, a trial without one counting twice the budget (PAR-2), and how likely it is that
+the cell and D4orm with the same credit are equally good (McNemar on successes, Wilcoxon on steps, paired by seed).
+Trials are stored in the folder, and a call that was broken off goes on from there. `--trials FILE` makes the table and
+the curves of trials that are in a Parquet file, such as those in `data/`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from outputs import argument_parser, count, plt, save_figure, save_table
+
+from d4orm_planners.evaluation.comparison import paired, penalised_steps, steps_to_solution, survival
+from d4orm_planners.evaluation.evaluate import run_study
+from d4orm_planners.evaluation.report import read_parquet, write_parquet
+from d4orm_planners.evaluation.store import Trial
+from d4orm_planners.evaluation.study import Study
+from d4orm_planners.evaluation.summary import wilson_interval
+
+TEAMS = (("paper_circle", 8), ("paper_circle", 16), ("paper_random", 16), ("paper_heterogeneous", 8))
+CREDITS = {"team": "team", "group": "group", "robot": "robot", "in turn": "alternate"}
+UPDATES: dict[str, dict[str, Any]] = {
+    "mppi": {},
+    "cem": {"adapt_variance": True},
+    "mbd": {"max_iterations": 1},
+    "i-mbd": {},
+    "d4orm": {},
+}
+REFERENCE = "d4orm"
+BUDGET, TINY, ITERATION = 1000, 20, 100
+"""Denoising steps of a trial, of the small version's, and of an iteration."""
+
+Cells = dict[tuple[str, str], list[Trial]]
+
+
+def policies(budget: int) -> dict[str, dict[str, Any]]:
+    """Every credit with every update, each with so many steps."""
+    steps = min(ITERATION, budget)
+    return {
+        f"{update}, {credit}": {
+            "policy": update, "preset": "paper", "engine": "cpu", "credit": value,
+            "num_steps": budget if update == "mbd" else steps, "max_iterations": budget // steps, **settings,
+        }
+        for update, settings in UPDATES.items()
+        for credit, value in CREDITS.items()
+    }  # fmt: skip
+
+
+def run(teams: Iterable[tuple[str, int]], seeds: int, budget: int, out: Path) -> list[Trial]:
+    """Trials of every cell on every team."""
+    chosen = policies(budget)
+    studies = (
+        Study(policies=chosen, scenarios=(scenario,), num_robots=num_robots, seeds=range(seeds))
+        for scenario, num_robots in teams
+    )
+    return [trial for study in studies for group in run_study(study, out, workers=1) for trial in group.trials]
+
+
+def by_team(trials: Iterable[Trial]) -> dict[str, Cells]:
+    """Trials by team, update and credit."""
+    teams: dict[str, Cells] = {}
+    for trial in trials:
+        update, _, credit = trial.label.partition(", ")
+        teams.setdefault(f"{trial.scenario}, {trial.num_robots}", {}).setdefault((update, credit), []).append(trial)
+    return teams
+
+
+def rows_of(team: str, cells: Cells) -> list[dict[str, Any]]:
+    """A row per cell."""
+    rows = []
+    for update, credit in ((update, credit) for update in UPDATES for credit in CREDITS):
+        trials = cells[update, credit]
+        solved = sum(steps_to_solution(trial) is not None for trial in trials)
+        lower, upper = wilson_interval(solved, len(trials))
+        test = paired(trials, cells[REFERENCE, credit], penalised_steps)
+        rows.append(
+            {"team": team, "update": update, "credit": credit, "solved": f"{solved} of {len(trials)}",
+             "interval": f"{lower:.0%} to {upper:.0%}", "steps": round(float(np.mean([*map(penalised_steps, trials)]))),
+             "p (solved)": f"{test.success_p:.2g}", "p (steps)": f"{test.cost_p:.2g}"}
+        )  # fmt: skip
+    return rows
+
+
+def draw(teams: dict[str, Cells], path: Path) -> None:
+    """The share of seeds without a solution against the steps spent: a row per team, a column per credit."""
+    figure, axes = plt.subplots(
+        len(teams), len(CREDITS), figsize=(11, 2.4 * len(teams)), sharex=True, sharey=True, squeeze=False
+    )
+    for row, (team, cells) in zip(axes, teams.items(), strict=True):
+        budget = max(penalised_steps(trial) for trials in cells.values() for trial in trials) / 2
+        for axis, credit in zip(row, CREDITS, strict=True):
+            for number, update in enumerate(UPDATES):
+                curve = survival([steps_to_solution(trial) for trial in cells[update, credit]])
+                steps = np.concatenate([[0], curve.costs, [budget]])
+                left = np.concatenate([[1.0], curve.unsolved])
+                axis.stairs(left, steps, baseline=None, label=update, color=f"C{number}")
+            axis.set(title=f"{team}, credit: {credit}", ylim=(-0.02, 1.02))
+    for axis in axes[-1]:
+        axis.set_xlabel("denoising steps")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("unsolved")
+    axes[0, 0].legend()
+    figure.tight_layout()
+    save_figure(figure, path)
+
+
+def main() -> int:
+    """Run every cell on every team, write the table and draw the curves."""
+    parser = argument_parser(__doc__)
+    parser.add_argument("--seeds", type=count, default=50)
+    parser.add_argument("--trials", type=Path, help="run nothing; a Parquet file of trials")
+    arguments = parser.parse_args()
+    if arguments.trials is None:
+        teams, seeds, budget = (TEAMS[:1], 1, TINY) if arguments.quick else (TEAMS, arguments.seeds, BUDGET)
+        trials = run(teams, seeds, budget, arguments.out)
+        write_parquet(arguments.out / "credit_by_update.parquet", trials)
+    else:
+        trials = read_parquet(arguments.trials)
+    found = by_team(trials)
+    save_table(
+        [row for team, cells in found.items() for row in rows_of(team, cells)], arguments.out / "credit_by_update.csv"
+    )
+    draw(found, arguments.out / "credit_by_update.png")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
