@@ -22,6 +22,7 @@ from d4orm_planners.commands.node import node
 from d4orm_planners.commands.options import Quiet
 from d4orm_planners.commands.outputs import print_table
 from d4orm_planners.commands.plan import plan
+from d4orm_planners.commands.play import play
 from d4orm_planners.commands.reproduce import reproduce
 from d4orm_planners.commands.robustness import robustness
 from d4orm_planners.commands.run import run
@@ -37,7 +38,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-for command in (demo, plan, run, evaluate, robustness, reproduce, leaderboard, train, bench, node):
+for command in (demo, plan, run, play, evaluate, robustness, reproduce, leaderboard, train, bench, node):
     app.command()(command)
 
 

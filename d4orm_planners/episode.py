@@ -12,18 +12,20 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, whole_number
 from d4orm_env.core.marks import Marks
 from d4orm_env.core.metrics import mean_squared_jerk, mean_stretch
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.summary import Row, count, outcome_rows
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.disturbances.marks import marks_of
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_env.team_step import AgentInfos
 from d4orm_planners.registry import PolicyLike, make_policy
+from d4orm_planners.shown import Shown
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
 
 
-@dataclass(frozen=True, eq=False)
-class Episode:
+@dataclass(frozen=True, eq=False, repr=False)
+class Episode(Shown):
     """What happened.
 
     Attributes:
@@ -33,6 +35,7 @@ class Episode:
             ``mean_squared_jerk``, see :func:`d4orm_env.core.metrics.mean_squared_jerk`.
         observations: Observations of all agents at the reset and after every step.
         infos: Infos likewise.
+        goals: ``(T+1, K, d)`` where the robots were to go; it changes in lifelong mode.
         marks: Where it was disturbed, for pictures; ``None`` without disturbances.
     """
 
@@ -41,7 +44,19 @@ class Episode:
     metrics: dict[str, float]
     observations: tuple[dict[str, FloatArray], ...]
     infos: tuple[AgentInfos, ...]
+    goals: FloatArray
     marks: Marks | None = None
+
+    @property
+    def title(self) -> str:
+        """What happened where."""
+        seconds = len(self.trajectory.controls) * self.problem.dt
+        return f"{self.problem.name}, {count(self.problem.num_robots, 'robot')}, {seconds:.1f} s"
+
+    @property
+    def key_figures(self) -> list[Row]:
+        """How the team did."""
+        return outcome_rows(self.metrics, self.problem.num_robots)
 
     @cached_property
     def stretch(self) -> float:
@@ -87,7 +102,8 @@ def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0) -> Episode:
     jerk = mean_squared_jerk(trajectory.controls, trajectory.arrived, problem.dt)
     metrics = {**env.unwrapped.metrics(), "mean_squared_jerk": jerk}
     marks = None if all(part is None for part in effects[0]) else marks_of(effects, problem)
-    return Episode(problem, trajectory, metrics, tuple(all_observations), tuple(all_infos), marks)
+    goals = np.stack([joint.goals for joint in joints])
+    return Episode(problem, trajectory, metrics, tuple(all_observations), tuple(all_infos), goals, marks)
 
 
 class _Outcome(NamedTuple):

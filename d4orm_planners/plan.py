@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from math import prod
 from pathlib import Path
@@ -18,12 +18,14 @@ from d4orm_env.core.errors import first_line
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.metrics import mean_stretch, trajectory_metrics
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.summary import Row, count, outcome_rows
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.rollout import rollout
 from d4orm_env.scenarios.schema import describe, parse
 from d4orm_env.verify import verify
 from d4orm_planners.grouping import conflicts
 from d4orm_planners.provenance import Provenance
+from d4orm_planners.shown import Shown
 
 Status = Literal["solved", "iteration_limit", "time_limit", "stopped", "interrupted", "refuted"]
 """How a search ended; see :class:`Plan`."""
@@ -55,6 +57,8 @@ class IterationRecord:
         excluded: Samples of this iteration that were left out because their reward was not finite.
         note: What the method itself says of how the iteration ended; ``ipopt`` has IPOPT's return status here,
             ``d-d4orm`` the nodes that were lost and the messages that were dropped.
+        controls: ``(H, K, m)`` of this iteration's candidate, for callbacks; ``None`` in a plan's history.
+        trajectory: Where they lead, likewise.
     """
 
     iteration: int
@@ -69,10 +73,12 @@ class IterationRecord:
     best_solved: bool
     excluded: int = 0
     note: str = ""
+    controls: FloatArray | None = field(default=None, repr=False, compare=False)
+    trajectory: Trajectory | None = field(default=None, repr=False, compare=False)
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
+@dataclass(frozen=True, eq=False, repr=False)
+class Plan(Shown):
     """Controls for a whole team, how they were found and what they lead to.
 
     Attributes:
@@ -151,6 +157,18 @@ class Plan:
                 reasons[f"robot_{robot}"] = "; ".join(faults)
         return reasons
 
+    @property
+    def title(self) -> str:
+        """What was planned by what, and how that ended."""
+        spent = f"{count(self.iterations, 'iteration')}, {self.wall_time:.2f} s"
+        team = f"{self.problem.name}, {count(self.problem.num_robots, 'robot')}"
+        return f"{team} by {self.planner}: {self.status.replace('_', ' ')} after {spent}"
+
+    @property
+    def key_figures(self) -> list[Row]:
+        """What the plan leads to."""
+        return outcome_rows(self.metrics, self.problem.num_robots)
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the plan, its problem and its trajectory to an ``.npz`` file.
 
@@ -162,7 +180,7 @@ class Plan:
         header = {
             "format": FORMAT,
             "problem": describe(self.problem),
-            "history": [asdict(record) for record in self.history],
+            "history": [{name: getattr(record, name) for name in _RECORDED} for record in self.history],
             "provenance": None if self.provenance is None else asdict(self.provenance),
             **{name: getattr(self, name) for name in _SCALARS},
         }
@@ -189,7 +207,7 @@ class Plan:
                     raise ValueError("written by another version")
                 problem = parse(header.pop("problem"))
                 claimed = _checked_trajectory(problem, archive)
-            history = tuple(IterationRecord(**record) for record in header.pop("history"))
+            history = tuple(_read_record(record) for record in header.pop("history"))
             made = header.pop("provenance", None)
             provenance = None if made is None else Provenance(**made)
             return cls._judged(problem, history, claimed, _checked(header) | {"provenance": provenance})
@@ -228,6 +246,7 @@ def failed_robots(trajectory: Trajectory) -> BoolArray:
     return failed
 
 
+_RECORDED = tuple(field.name for field in fields(IterationRecord) if field.compare)
 _ARRAYS = tuple(field.name for field in fields(Trajectory))
 _NUMBERS = ("states", "positions", "controls", "rewards")
 _SCALARS = ("planner", "seed", "solved", "status", "iterations", "denoising_steps", "wall_time", "metrics")
@@ -238,6 +257,12 @@ def _npz_path(path: str | os.PathLike[str]) -> Path:
     if target.suffix != ".npz":
         raise ValueError(f"plan file {str(target)!r} must end in .npz")
     return target
+
+
+def _read_record(record: dict[str, Any]) -> IterationRecord:
+    if not record.keys() <= set(_RECORDED):
+        raise ValueError(f"its history has {', '.join(sorted(record.keys() - set(_RECORDED)))}")
+    return IterationRecord(**record)
 
 
 def _checked(header: dict[str, Any]) -> dict[str, object]:

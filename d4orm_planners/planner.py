@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray, duration, whole_number
 from d4orm_env.core.problem import Problem
+from d4orm_env.engine.base import StepWatcher
 from d4orm_planners.candidate import Candidate
 from d4orm_planners.plan import IterationRecord, Plan, Status
 from d4orm_planners.search import Search
@@ -103,6 +104,7 @@ class Planner(ABC):
         max_iterations: int | None = None,
         callback: Callback | None = None,
         initial_controls: ArrayLike | None = None,
+        watcher: StepWatcher | None = None,
     ) -> Plan:
         """Plan until a solution is found (or on, with ``improve``), the budget is used up, or Ctrl-C is pressed.
 
@@ -113,14 +115,17 @@ class Planner(ABC):
                 denoising steps, repairs or IPOPT's iterations. An iteration that it cuts short ends with what it has
                 by then, a candidate like any other. A limit that is not reached changes nothing.
             max_iterations: Iterations; the configured number by default.
-            callback: Called with an :class:`IterationRecord` after every iteration; returning ``True`` stops.
+            callback: Called with an :class:`IterationRecord` after every iteration, with the candidate that came of it;
+                returning ``True`` stops.
             initial_controls: ``(H, K, m)`` to start from, zeros by default.
+            watcher: Called with a :class:`~d4orm_env.engine.base.DenoisingStep` after every denoising step, by the CPU
+                engine only. It changes nothing, and its time is not counted.
 
         Returns:
             The best plan found: a solved one with the most reward, else the one with the fewest robots failing.
 
         Raises:
-            ValueError: If an argument makes no sense; the message names it.
+            ValueError: If an argument makes no sense, or there is a watcher and another engine; the message names it.
         """
         limit = None if time_limit is None else duration(time_limit, "time_limit")
         most = (
@@ -128,6 +133,7 @@ class Planner(ABC):
         )
         search = Search(self, problem, seed, initial_controls)
         search.time_limit = limit
+        search.watcher = watcher
         try:
             status = _run(search, most, callback)
         except KeyboardInterrupt:

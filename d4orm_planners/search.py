@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,15 @@ from d4orm_env.core.arrays import FloatArray, whole_number
 from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
-from d4orm_env.engine.base import Engine, SamplingResult, SamplingRules, SamplingTask, checked_controls
+from d4orm_env.engine.base import (
+    DenoisingStep,
+    Engine,
+    SamplingResult,
+    SamplingRules,
+    SamplingTask,
+    StepWatcher,
+    checked_controls,
+)
 from d4orm_env.engine.choice import get_engine
 from d4orm_planners.candidate import Candidate, evaluate_controls
 from d4orm_planners.plan import IterationRecord, Plan, Status
@@ -47,6 +56,7 @@ class Search:
         state: What the planner keeps between its own iterations, of a type of its own; ``None`` before the first one.
         metrics: Numbers of the method's own that the plan's metrics will have.
         time_limit: Seconds that the solve may take, or ``None``.
+        watcher: What is told of every denoising step, or ``None``.
         cancelled: Once set, by whatever thread, the iteration under way is left as if its time were over.
     """
 
@@ -84,6 +94,7 @@ class Search:
         self._began = False
         self.metrics: dict[str, float] = {}
         self.time_limit: float | None = None
+        self.watcher: StepWatcher | None = None
         self.cancelled = threading.Event()
 
     @property
@@ -112,14 +123,21 @@ class Search:
         """See :meth:`d4orm_env.engine.base.Engine.denoise`; compiling is not counted, and time may end it."""
         with self.watch.paused():
             self.engine.prepare(task, rules, noise_scale, num_samples)
-        return self.engine.denoise(task, rules, mean, noise_scale, num_samples, seed, self.should_stop)
+        # Engines of others need not know of watchers.
+        watched = {} if self.watcher is None else {"watcher": self._tell}
+        return self.engine.denoise(task, rules, mean, noise_scale, num_samples, seed, self.should_stop, **watched)
+
+    def _tell(self, step: DenoisingStep) -> None:
+        with self.watch.paused():
+            assert self.watcher is not None
+            self.watcher(step)
 
     def iteration_seed(self, stream: Stream = Stream.SAMPLES, number: int = 0) -> int:
         """A seed for the present iteration's use of a stream with this number."""
         return derived_seed(self.seed, stream, self.iteration, number)
 
     def advance(self) -> IterationRecord:
-        """Run one iteration, judge it and remember the best."""
+        """Run one iteration, judge it and remember the best; the record that is kept has no arrays."""
         if not self._began:
             self.state, self._began = self.planner.init(self), True
         self.state, iteration = self.planner.iterate(self, self.state)
@@ -144,7 +162,7 @@ class Search:
             note=iteration.note,
         )
         self.history.append(record)
-        return record
+        return replace(record, controls=self.current.controls, trajectory=trajectory)
 
     def close(self) -> None:
         """Let the planner finish what it has begun."""

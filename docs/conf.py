@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from importlib.metadata import version as installed_version
+from pathlib import Path
 from typing import Any
+
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE))  # for replays.py
 
 project = "d4orm-env"
 author = "d4orm-env contributors"
@@ -13,7 +18,7 @@ version = release
 
 extensions = ["myst_parser", "sphinx.ext.apidoc", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
-exclude_patterns = ["_build", "tables"]
+exclude_patterns = ["_build", "_extra", "tables"]
 
 myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
@@ -36,13 +41,16 @@ autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
 # Optional extras that a build of the documentation does without.
-autodoc_mock_imports = ["casadi", "msgpack", "pyarrow", "pyrvo", "ray", "zenoh"]
+autodoc_mock_imports = ["casadi", "msgpack", "pyarrow", "pyrvo", "ray", "trimesh", "viser", "zenoh"]
 # As fields of the class and not as entries of their own: autodoc lists the documented attributes itself.
 napoleon_use_ivar = True
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 
 html_theme = "furo"
+html_static_path = ["_static"]
+html_css_files = ["replays.css"]
+html_extra_path = ["_extra"]  # what is in it lies beside the pages
 html_title = "d4orm-env"
 
 
@@ -52,6 +60,14 @@ def _skip_described_field(app: Any, what: str, name: str, member: Any, skip: boo
     return True if is_alias else None
 
 
+def _write_replays(app: Any, config: Any) -> None:
+    """Make the replays that the pages show."""
+    from replays import write_replays
+
+    write_replays(HERE / "_extra" / "replays")
+
+
 def setup(app: Any) -> None:
     """Connect what the extensions leave to the project."""
+    app.connect("config-inited", _write_replays)
     app.connect("autodoc-skip-member", _skip_described_field)

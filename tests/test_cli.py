@@ -53,6 +53,36 @@ def test_plan_writes_the_plan_and_its_pictures(d4orm, tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"plan.npz", "plan.png", "plan.gif"}
 
 
+def test_plan_writes_a_replay(d4orm, tmp_path: Path) -> None:
+    outcome = d4orm("plan", "--num-robots", "2", "--out", "plan.html")
+    assert outcome.status == 0, outcome.err
+    assert "wrote plan.html" in outcome.out
+    assert "circle, 2 robots by d4orm-d" in (tmp_path / "plan.html").read_text(encoding="utf-8")
+
+
+def test_run_compares_policies_side_by_side(d4orm, tmp_path: Path) -> None:
+    outcome = d4orm("run", "--num-robots", "2", "--compare", "goal, random", "--out", "compare.html")
+    assert outcome.status == 0, outcome.err
+    page = (tmp_path / "compare.html").read_text(encoding="utf-8")
+    assert page.index('"title": "goal"') < page.index('"title": "random"')
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (("--compare", "goal,random"), "--compare needs --out"),
+        (("--compare", "goal", "--policy", "d4orm", "--out", "a.html"), "--policy does not go with --compare goal"),
+        (("--compare", "goal,nobody", "--out", "a.html"), "nobody"),
+        (("--out", "a.htm"), "must end in .html"),
+    ],
+)
+def test_what_cannot_be_compared_is_said(d4orm, tmp_path: Path, options: Sequence[str], complaint: str) -> None:
+    outcome = d4orm("run", "--num-robots", "2", *options)
+    assert outcome.status == 2
+    assert complaint in outcome.err
+    assert not list(tmp_path.iterdir())
+
+
 def test_run_executes_a_plan_file(d4orm) -> None:
     assert d4orm("plan", "--num-robots", "2", "--out", "plan.npz", "--quiet").status == 0
     outcome = d4orm("run", "plan.npz")
@@ -85,10 +115,17 @@ def test_demo_plans_executes_verifies_and_says_where(d4orm, tmp_path: Path) -> N
     outcome = d4orm("demo", "--num-robots", "3", "--out", "pictures")
     assert outcome.status == 0, outcome.err
     written = {path.name for path in (tmp_path / "pictures").iterdir()}
-    assert written == {"plan.npz", "plan.png", "execution.gif"}
+    assert written == {"plan.npz", "plan.png", "execution.gif", "execution.html"}
     assert "verified" in outcome.out
     for name in written:
         assert name in outcome.out
+
+
+def test_demo_shows_the_denoising(d4orm, tmp_path: Path) -> None:
+    outcome = d4orm("demo", "--denoising", "--num-robots", "3", "--out", "pictures")
+    assert outcome.status == 0, outcome.err
+    assert {path.name for path in (tmp_path / "pictures").iterdir()} == {"denoising.png", "denoising.html"}
+    assert "denoising step 100 of" in (tmp_path / "pictures" / "denoising.html").read_text(encoding="utf-8")
 
 
 def test_scenario_file(d4orm, tmp_path: Path) -> None:

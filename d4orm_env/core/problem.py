@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,10 +24,13 @@ from d4orm_env.core.arrays import (
 from d4orm_env.core.dynamics import MODEL_CODES, NUM_BUILT_IN, model_digest
 from d4orm_env.core.problem_arrays import ProblemArrays, inverse_initial_distance
 from d4orm_env.core.problem_checks import check_places, check_resolution, check_states, check_turning
+from d4orm_env.core.summary import Row, count, joined, team_text
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from d4orm_env.ways import Ways
 
 Arrival = Literal["dock", "stay"]
@@ -49,7 +52,7 @@ def check_arrival(value: object) -> None:
         raise ValueError(f"arrival is {shown(value)}; choose one of {', '.join(get_args(Arrival))}")
 
 
-@dataclass(frozen=True, eq=False, init=False)
+@dataclass(frozen=True, eq=False, init=False, repr=False)
 class Problem(Frozen):
     """A multi-robot trajectory planning problem (paper, section III-A), checked on construction.
 
@@ -255,6 +258,45 @@ class Problem(Frozen):
 
     def __hash__(self) -> int:
         return hash(self.digest)
+
+    @property
+    def key_figures(self) -> list[Row]:
+        """What it is, in a few words."""
+        world = self.world
+        bounds = (
+            "open" if world.lower is None else " x ".join(f"{side:g}" for side in np.ptp(world.bounds, axis=0)) + " m"
+        )
+        return [
+            ("robots", team_text(self.team.models)),
+            ("world", f"{bounds}, {count(world.num_obstacles, 'obstacle')}"),
+            ("time", f"{count(self.horizon, 'step')} of {self.dt:g} s"),
+            ("margin", f"{self.margin:g} m"),
+            ("arrival", self.arrival),
+        ]
+
+    def __repr__(self) -> str:
+        return f"Problem: {self.name}\n  {joined(self.key_figures)}"
+
+    def _repr_html_(self) -> str:
+        from d4orm_env.render.notebook import problem_html
+
+        return problem_html(self, f"Problem: {self.name}", self.key_figures)
+
+    def plot(self, axes: Axes | None = None) -> Any:
+        """Draw starts, goals and world with matplotlib; see :func:`d4orm_env.render.pictures.plot`.
+
+        Args:
+            axes: Where to draw; by default axes of a new figure of ``matplotlib.pyplot``.
+
+        Returns:
+            The axes, spatial for a spatial problem.
+
+        Raises:
+            ValueError: If the axes are spatial and the problem is not.
+        """
+        from d4orm_env.render.pictures import plot
+
+        return plot(self, None, axes)
 
     def replace(self, **changes: object) -> Problem:
         """A copy with some attributes changed, checked again."""

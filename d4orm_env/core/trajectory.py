@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.summary import Row, count, joined
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Trajectory:
     """The motion of a team. Index 0 along time is the start, index ``t`` the state after ``t`` steps.
 
@@ -28,3 +29,27 @@ class Trajectory:
     arrived: BoolArray
     collided: BoolArray
     margin_violated: BoolArray
+
+    @property
+    def key_figures(self) -> list[Row]:
+        """Robots at their goals at the end, and those that were ever too near anything."""
+        robots = self.arrived.shape[1]
+        return [
+            ("arrived", f"{self.arrived[-1].sum()} of {robots}"),
+            ("in contact", f"{self.collided.any(axis=0).sum()}"),
+            ("within the margin", f"{self.margin_violated.any(axis=0).sum()}"),
+        ]
+
+    @property
+    def title(self) -> str:
+        """How many robots, and for how long."""
+        steps, robots = self.controls.shape[:2]
+        return f"{count(robots, 'robot')}, {count(steps, 'step')}"
+
+    def __repr__(self) -> str:
+        return f"Trajectory: {self.title}\n  {joined(self.key_figures)}"
+
+    def _repr_html_(self) -> str:
+        from d4orm_env.render.notebook import paths_html
+
+        return paths_html(self, f"Trajectory: {self.title}", self.key_figures)

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from d4orm_env.engine.worlds import WorldBatch
 
 __all__ = [
-    "Engine", "MovingObstacles", "SamplingResult", "SamplingRules", "SamplingTask", "StepResult", "WorldEngine",
-    "checked_controls",
+    "DenoisingStep", "Engine", "MovingObstacles", "SamplingResult", "SamplingRules", "SamplingTask", "StepResult",
+    "StepWatcher", "WorldEngine", "checked_controls",
 ]  # fmt: skip
 
 
@@ -127,6 +127,31 @@ class SamplingResult(NamedTuple):
     excluded: int
 
 
+class DenoisingStep(NamedTuple):
+    """One step of a denoising run, for whoever watches it.
+
+    Attributes:
+        task: What is sampled around, and how it is scored.
+        noise_scale: Standard deviation of the samples.
+        mean: ``(H, K, m)`` the weighted mean of the deformations, which the next step samples around.
+        samples: ``(S, H, K, m)`` the first deformations that it is the mean of, at most :data:`WATCHED_SAMPLES`.
+        weights: ``(S,)`` what they count for with team credit, ``(K, S)`` with robot credit; those of all ``M`` samples
+            add up to one.
+    """
+
+    task: SamplingTask
+    noise_scale: float
+    mean: FloatArray
+    samples: FloatArray
+    weights: FloatArray
+
+
+WATCHED_SAMPLES = 8
+"""Samples of a :class:`DenoisingStep`, where as many are drawn."""
+
+StepWatcher = Callable[[DenoisingStep], object]
+
+
 class Engine(Protocol):
     """The operations that the environment and the planners need from the physics."""
 
@@ -156,13 +181,17 @@ class Engine(Protocol):
         num_samples: int,
         seed: int,
         should_stop: Callable[[], bool] | None = None,
+        watcher: StepWatcher | None = None,
     ) -> SamplingResult:
         """Run ``len(noise_scale)`` sample-score-update steps (paper, Algorithm 1, lines 2 to 7).
 
         Each step draws ``num_samples`` deformations around ``mean`` ``(H, K, m)`` with the step's standard deviation,
         rolls them out on top of ``task.base``, and replaces the mean by the weighted mean of the deformations.
         The noise is a function of ``seed`` and the step alone. Between steps ``should_stop`` is asked whether to leave
-        the rest out; the result is then that of the steps done.
+        the rest out; the result is then that of the steps done. After every step ``watcher`` is told of it.
+
+        Raises:
+            ValueError: If there is a watcher and the engine cannot look into its run.
         """
         ...
 

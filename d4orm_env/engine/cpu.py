@@ -14,7 +14,17 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine import noise, sampling
-from d4orm_env.engine.base import SamplingResult, SamplingRules, SamplingTask, Sight, StepResult, checked_controls
+from d4orm_env.engine.base import (
+    WATCHED_SAMPLES,
+    DenoisingStep,
+    SamplingResult,
+    SamplingRules,
+    SamplingTask,
+    Sight,
+    StepResult,
+    StepWatcher,
+    checked_controls,
+)
 from d4orm_env.engine.lanes import TILE
 from d4orm_env.engine.noise import DRAWS, TURNS
 from d4orm_env.engine.proximity import body_boxes, bound_boxes, make_scratch
@@ -145,6 +155,7 @@ class CpuEngine:
         num_samples: int,
         seed: int,
         should_stop: Callable[[], bool] | None = None,
+        watcher: StepWatcher | None = None,
     ) -> SamplingResult:
         """See :meth:`d4orm_env.engine.base.Engine.denoise`."""
         run = Sampling(task, rules, num_samples, seed, self._threads)
@@ -166,7 +177,11 @@ class CpuEngine:
             extra = (rules.importance * run.log_ratio(mean, scale),) if rules.importance else ()
             weights = rules.weights(rewards, np, *extra)
             first, second = run.moments(weights, rules.adapt is not None)
+            samples = None if watcher is None else mean + scale * run.first_noise(WATCHED_SAMPLES)
             mean = mean + scale * first
+            if watcher is not None and samples is not None:
+                kept = np.squeeze(np.array(weights[:, : len(samples)], np.float32), 0 if len(weights) == 1 else ())
+                watcher(DenoisingStep(task, float(sigma), mean, samples, kept))
             if rules.adapt is not None:
                 # The square deviation of the samples from their new mean.
                 factor = rules.adapt(scale**2 * (second - first**2), np).astype(np.float32)
@@ -231,6 +246,13 @@ class Sampling:
         turns = np.stack([along, -along, across, -across], axis=2)
         samples = turns.reshape(num_robots, -1)[:, : self.rewards.shape[1]]
         return -(samples.sum(axis=0, keepdims=True) if self.task.credit == "team" else samples)
+
+    def first_noise(self, count: int) -> FloatArray:
+        """``(S, H, K, m)`` noise of the first samples of the last step, ``count`` at most: those not turned."""
+        count = min(count, self.rewards.shape[1], DRAWS)
+        draws = np.moveaxis(self.kept[0, ..., :count], -1, 0)
+        pairs = draws.reshape(count, *draws.shape[1:3], -1)[..., : self.base.shape[2]]
+        return np.ascontiguousarray(pairs.swapaxes(1, 2))
 
     def moments(self, weights: Any, with_second: bool) -> tuple[FloatArray, FloatArray]:
         """``(H, K, m)`` weighted mean of the noise and, if asked for, of its square."""

@@ -30,6 +30,7 @@ from d4orm_env.engine.base import (
     SamplingRules,
     SamplingTask,
     StepResult,
+    StepWatcher,
     checked_controls,
 )
 
@@ -402,8 +403,15 @@ class JaxEngine:
         num_samples: int,
         seed: int,
         should_stop: Callable[[], bool] | None = None,
+        watcher: StepWatcher | None = None,
     ) -> SamplingResult:
-        """See :meth:`d4orm_env.engine.base.Engine.denoise`."""
+        """See :meth:`d4orm_env.engine.base.Engine.denoise`.
+
+        Raises:
+            ValueError: If there is a watcher: the steps are compiled into one program.
+        """
+        if watcher is not None:
+            raise ValueError("engine 'jax' runs all denoising steps as one program; to watch them, use engine='cpu'")
         compiled, (inputs, scale, run, *_) = self._lower(task, rules, mean, noise_scale, num_samples, seed)
         done, total = 0, len(noise_scale)
         part = total if should_stop is None else 1

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from d4orm_env.core.marks import Marks
 from d4orm_env.core.problem import Problem
 from d4orm_env.render.marks import MarkLayer
-from d4orm_env.render.panels import INK, Array, Panel, TeamLayer, view_limits
+from d4orm_env.render.panels import INK, Array, Panel, TeamLayer, make_axes, view_limits
 
 __all__ = ["FrameRenderer", "WindowRenderer"]
 
@@ -75,7 +75,7 @@ class FrameRenderer:
             places = [("space", (0.01, 0.04, 0.86, 0.86))]
         panels = []
         for view, rectangle in places:
-            panel = Panel(figure, 111, self.problem, limits, view)
+            panel = Panel(make_axes(figure, 111, view), self.problem, limits)
             panel.axes.set_position(rectangle)
             panels.append(panel)
         return panels

@@ -16,7 +16,6 @@ import numpy as np
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.gridspec import SubplotSpec
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import ArrayLike
 
@@ -96,8 +95,18 @@ def view_limits(problem: Problem, points: ArrayLike = ()) -> Array:
     return limits
 
 
+def make_axes(figure: Figure, place: int, view: str) -> Any:
+    """Axes of a figure for a view: ``"space"``, or flat for ``"plane"`` and ``"above"``."""
+    return figure.add_subplot(place, projection="3d" if view == "space" else None)
+
+
 class Panel:
     """One view of the world on one axes: the plane, space, or space seen from above.
+
+    Args:
+        axes: Where to draw: flat, or ``projection="3d"`` for a view of space.
+        problem: Whose world it is.
+        limits: ``(2, d)`` corners of what is shown, see :func:`view_limits`.
 
     Attributes:
         axes: Where it draws.
@@ -105,10 +114,9 @@ class Panel:
         right, up: ``(2,)`` or ``(3,)`` unit vectors that span the plane of the picture.
     """
 
-    def __init__(self, figure: Figure, place: SubplotSpec | int, problem: Problem, limits: Array, view: str) -> None:
-        self.spatial = view == "space"
+    def __init__(self, axes: Any, problem: Problem, limits: Array) -> None:
+        self.axes, self.spatial = axes, axes.name == "3d"
         self.limits = limits if self.spatial else limits[:, :2]
-        self.axes: Any = figure.add_subplot(place, projection="3d" if self.spatial else None)
         if self.spatial:
             self._look_at_space()
         else:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -14,11 +15,23 @@ from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.marks import Marks
 from d4orm_env.core.metrics import arrival_times
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.summary import count
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.render.marks import MarkLayer, mark_legend
-from d4orm_env.render.panels import CONTACT, INK, MARGIN, OBSTACLE, OBSTACLE_EDGE, Array, Panel, TeamLayer, view_limits
+from d4orm_env.render.panels import (
+    CONTACT,
+    INK,
+    MARGIN,
+    OBSTACLE,
+    OBSTACLE_EDGE,
+    Array,
+    Panel,
+    TeamLayer,
+    make_axes,
+    view_limits,
+)
 
-__all__ = ["plot_trajectory", "save_picture"]
+__all__ = ["plot", "plot_trajectory", "save_picture"]
 
 PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
 
@@ -83,7 +96,7 @@ def plot_trajectory(
     figure = Figure(figsize=(11.0 if spatial else 5.8, height + 0.9), layout="constrained")
     layer = None
     for place, view in ((121, "space"), (122, "above")) if spatial else ((111, "plane"),):
-        panel = Panel(figure, place, problem, limits, view)
+        panel = Panel(make_axes(figure, place, view), problem, limits)
         layer = TeamLayer(panel, problem)
         _draw_history(layer, trajectory)
         if marks is not None:
@@ -107,16 +120,67 @@ def _draw_history(layer: TeamLayer, trajectory: Trajectory) -> None:
     size = 0.5 * layer.mark_size
     panel.polygons(panel.outlines(margin_only, size), facecolors=MARGIN, edgecolors="none", zorder=2)
     panel.polygons(panel.outlines(further, size), facecolors=CONTACT, edgecolors="none", zorder=3.5)
-    start = problem.start
+    _draw_starts(layer)
+    contacts = contact_points(trajectory)[-1]
+    layer.update(trajectory.states[-1], trajectory.arrived[-1], problem.goal, positions, contacts)
+
+
+def _draw_starts(layer: TeamLayer) -> None:
+    panel, start = layer.panel, layer.problem.start
     panel.polygons(
-        panel.outlines(start[:, : problem.dimension], layer.radius),
+        panel.outlines(start[:, : layer.problem.dimension], layer.radius),
         **layer.hollow,
         linewidths=layer.goals.get_linewidth(),
         zorder=2.5,
     )
     panel.segments(layer.heading_lines(start), colors=layer.colors[layer.drives], linewidths=1.2, zorder=2.5)
-    contacts = contact_points(trajectory)[-1]
-    layer.update(trajectory.states[-1], trajectory.arrived[-1], problem.goal, positions, contacts)
+
+
+def plot(problem: Problem, trajectory: Trajectory | None = None, axes: Axes | None = None) -> Axes:
+    """Draw a problem, and a motion in it if there is one, on axes, as :func:`plot_trajectory` does without its legend.
+
+    Args:
+        problem: What to draw.
+        trajectory: A motion that belongs to it; without one the team stands at its starts.
+        axes: Where to draw; for a spatial problem ``projection="3d"``, or flat for a view from above. By default axes
+            of a new figure of ``matplotlib.pyplot``, so that notebooks and ``pyplot.show()`` show it.
+
+    Returns:
+        The axes.
+
+    Raises:
+        ValueError: If the trajectory does not fit the problem, or the axes are spatial and the problem is not.
+    """
+    if trajectory is not None:
+        checked_trajectory(problem, trajectory)
+    if axes is None:
+        from matplotlib import pyplot
+
+        figure = pyplot.figure(layout="constrained")
+        axes = make_axes(figure, 111, "space" if problem.dimension == 3 else "plane")
+    elif axes.name == "3d" and problem.dimension == 2:
+        raise ValueError("the axes are spatial and the problem is planar; give axes without projection='3d'")
+    return _plot_on(axes, problem, trajectory)
+
+
+def plot_problem(problem: Problem) -> Figure:
+    """A problem alone, as :func:`plot` draws it, in a figure that belongs to no window."""
+    figure = Figure(figsize=(4.6, 4.6), layout="constrained")
+    _plot_on(make_axes(figure, 111, "space" if problem.dimension == 3 else "plane"), problem, None)
+    return figure
+
+
+def _plot_on(axes: Axes, problem: Problem, trajectory: Trajectory | None) -> Axes:
+    positions = () if trajectory is None else trajectory.positions
+    layer = TeamLayer(Panel(axes, problem, view_limits(problem, positions)), problem)
+    if trajectory is None:
+        nowhere = np.empty((0, problem.num_robots, problem.dimension))
+        layer.update(problem.start, np.zeros(problem.num_robots, bool), problem.goal, nowhere, nowhere[:, 0])
+        axes.set_title(f"{problem.name}, {count(problem.num_robots, 'robot')}", fontsize=10)
+    else:
+        _draw_history(layer, trajectory)
+        axes.set_title(_outcome(problem, trajectory), fontsize=10)
+    return axes
 
 
 def _number_robots(layer: TeamLayer, trajectory: Trajectory, points_per_metre: float) -> None:
@@ -132,9 +196,8 @@ def _outcome(problem: Problem, trajectory: Trajectory) -> str:
     robots, contacts = problem.num_robots, int(np.asarray(trajectory.collided).any(axis=0).sum())
     times = arrival_times(trajectory.arrived, problem.dt)
     arrived = int(np.isfinite(times).sum())
-    noun = "robot" if robots == 1 else "robots"
     result = f"all arrived after {times.max():.1f} s" if arrived == robots else f"{arrived} of {robots} arrived"
-    return f"{problem.name}, {robots} {noun}: {result}" + (f", {contacts} in contact" if contacts else "")
+    return f"{problem.name}, {count(robots, 'robot')}: {result}" + (f", {contacts} in contact" if contacts else "")
 
 
 def _legend(problem: Problem, trajectory: Trajectory) -> list[Line2D]:

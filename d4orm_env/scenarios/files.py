@@ -46,17 +46,17 @@ def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:
     target = Path(path)
     try:
         with replaced_when_done(target) as temporary:
-            temporary.write_text(_format(describe(problem)), encoding="utf-8")
+            temporary.write_text(scenario_text(problem), encoding="utf-8")
     except OSError as error:
         raise ValueError(
             f"{target}: cannot be written ({error.strerror or error}); choose a file in a folder you own"
         ) from error
 
 
-def _format(content: dict[str, object]) -> str:
-    """One line for each robot and obstacle."""
+def scenario_text(problem: Problem) -> str:
+    """What :func:`save_problem` writes: one line for each robot and obstacle."""
     lines = []
-    for key, value in content.items():
+    for key, value in describe(problem).items():
         if isinstance(value, list):
             lines += [f"{key}:", *(f"  - {_flow(entry)}" for entry in value)]
         elif isinstance(value, dict):

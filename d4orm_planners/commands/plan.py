@@ -35,7 +35,7 @@ class PlanOptions(PictureOptions, ProblemOptions):
     engine: Engine = "auto"
     time_limit: TimeLimit = None
     max_iterations: Annotated[int | None, typer.Option("--max-iterations", help="Iterations for planning.")] = None
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Plan file to write, .npz.")] = None
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Plan file (.npz) or replay (.html) to write.")] = None
 
 
 @takes(PlanOptions)
@@ -43,7 +43,7 @@ def plan(options: PlanOptions) -> None:
     """Plan for a team; write the plan, a picture or an animation."""
     from d4orm_planners.registry import make_planner
 
-    check_target(options.out, (".npz",))
+    check_target(options.out, (".npz", ".html"))
     options.check_pictures()
     chosen = parse_settings(options.settings)
     for name in {"engine", "preset", "max_iterations"}.intersection(chosen):
@@ -55,7 +55,7 @@ def plan(options: PlanOptions) -> None:
     if not options.quiet:
         print_plan(found)
     if options.out is not None:
-        found.save(options.out)
+        (found.to_html if options.out.suffix == ".html" else found.save)(options.out)
     options.draw(problem, found.trajectory)
     for path in (options.out, options.picture, options.animation):
         if path is not None and not options.quiet:

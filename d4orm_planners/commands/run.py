@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from d4orm_env.core.summary import count
 from d4orm_planners.commands.dataclass_options import takes
-from d4orm_planners.commands.inputs import parse_levels, refuse_options
+from d4orm_planners.commands.inputs import check_target, names, parse_levels, refuse_options
 from d4orm_planners.commands.options import PictureOptions, ProblemOptions
 from d4orm_planners.commands.outputs import episode_rows, print_table
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from d4orm_env.core.problem import Problem
     from d4orm_env.disturbances import Disturbance
     from d4orm_planners.episode import Episode
@@ -31,6 +31,11 @@ class RunOptions(PictureOptions, ProblemOptions):
     control_noise_std: Annotated[
         float, typer.Option("--control-noise-std", "--noise", help="Standard deviation of the execution noise.")
     ] = 0.0
+    compare: Annotated[
+        str | None,
+        typer.Option("--compare", help="Several policies, separated by commas, on the same problem and seed."),
+    ] = None
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Replay to write, .html.")] = None
 
     disturb: Annotated[
         list[str] | None,
@@ -65,7 +70,7 @@ class RunOptions(PictureOptions, ProblemOptions):
             return self.problem(), make_policy(self.policy)
         refuse_options(
             self.context,
-            {"policy", *(field.name for field in fields(ProblemOptions) if field.name != "seed")},
+            {"policy", "compare", *(field.name for field in fields(ProblemOptions) if field.name != "seed")},
             f"does not go with a plan file; {self.plan_file} has a problem and controls of its own",
         )
         plan = Plan.load(self.plan_file)
@@ -76,14 +81,47 @@ class RunOptions(PictureOptions, ProblemOptions):
 def run(options: RunOptions) -> None:
     """Run a plan or a policy in the environment, step by step, and judge what happened."""
     options.check_pictures()
+    check_target(options.out, (".html",))
+    if options.compare is not None:
+        compare(options, names(options.compare) or ())
+        return
     disturbances = options.disturbances()
     problem, policy = options.chosen()
     episode = execute(problem, policy, options.seed, options.control_noise_std, disturbances)
     options.draw(problem, episode.trajectory, episode.marks)
+    if options.out is not None:
+        episode.to_html(options.out)
     if not options.quiet:
         print_table("Execution", episode_rows(episode))
+        if options.out is not None:
+            typer.echo(f"wrote {options.out}")
     if not episode.metrics["success"]:
         raise typer.Exit(1)
+
+
+def compare(options: RunOptions, policies: Sequence[str]) -> None:
+    """Run several policies on the same problem with the same seed, and write them side by side.
+
+    Raises:
+        ValueError: Without a file to write, or for an option that makes no sense or does not go with it.
+    """
+    from d4orm_env.render.replay import Replay
+    from d4orm_planners.registry import make_policy
+
+    if options.out is None:
+        raise ValueError("--compare needs --out, the replay to write, as --out compare.html")
+    alone = {"policy", "picture", "animation", "plan_file"}
+    refuse_options(options.context, alone, f"does not go with --compare {','.join(policies)}; run that policy alone")
+    problem, makers = options.problem(), {name: make_policy(name) for name in policies}
+    episodes = {}
+    for name, policy in makers.items():
+        episodes[name] = execute(problem, policy, options.seed, options.control_noise_std, options.disturbances())
+        if not options.quiet:
+            print_table(name, episode_rows(episodes[name]))
+    title = f"{problem.name}, {count(problem.num_robots, 'robot')}"
+    Replay(title, tuple(episode.motion(name) for name, episode in episodes.items())).save(options.out)
+    if not options.quiet:
+        typer.echo(f"wrote {options.out}")
 
 
 def execute(

@@ -55,6 +55,7 @@ class D4ormC2F(StatePolicy):
         config: The settings.
         loops: A :class:`LoopRecord` per control loop of the present episode.
         coarse_time: Time that the first coarse plan took [s].
+        subgoals: ``(K, d)`` where the last control loop headed for [m]; the start before the first.
     """
 
     name = "d4orm-c2f"
@@ -88,6 +89,7 @@ class D4ormC2F(StatePolicy):
         self._window = Window(self.problem, self.config, self._engine, docks=not env.unwrapped.lifelong)
         self._window.prepare(joint)
         self._plan, self._next = self._window.no_controls(), 0
+        self.subgoals: FloatArray = joint.states[:, : self.problem.dimension]
         begin = time.perf_counter()
         self._guide = Guide(self.problem, self.config, seed, self._refiner, self._refinement)
         self._guide.begin(joint)
@@ -111,7 +113,7 @@ class D4ormC2F(StatePolicy):
         replanned = guide.replan_if_needed(joint, docked)
         refined = not replanned and guide.refine(joint.steps, due=len(self.loops) % self.config.refine_every == 0)
         targets = guide.subgoals(joint, docked)
-        subgoals = guide.guidance.path[targets, np.arange(len(targets))]
+        self.subgoals = subgoals = guide.guidance.path[targets, np.arange(len(targets))]
         left, base = self._plan[self._next :], self._base(joint)
         seed = derived_seed(self._seed, Stream.CONTROL_LOOP, joint.steps)
         stuck = guide.stuck & ~docked

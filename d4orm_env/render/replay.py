@@ -1,0 +1,221 @@
+"""Replays: motions to play, pause and scrub in a browser, in one HTML file that loads nothing from a network."""
+
+from __future__ import annotations
+
+import base64
+import json
+from dataclasses import dataclass
+from html import escape
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.colors import to_hex
+from numpy.typing import ArrayLike, NDArray
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.metrics import arrival_times
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.render.denoising import Denoising
+from d4orm_env.render.panels import robot_colors, view_limits
+from d4orm_env.render.pictures import checked_trajectory
+
+__all__ = ["REPLAY_SUFFIXES", "Replay", "ReplayMotion", "motion"]
+
+REPLAY_SUFFIXES = (".html",)
+
+_NOTEBOOK_HEIGHT = 640
+_AFTERMATH = 1.0
+"""How long a replay goes on when everybody has arrived [s]."""
+_NO_CLEARANCE = 1e9
+"""What stands for an infinite distance [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayMotion:
+    """One team's motion, ready for a page.
+
+    Attributes:
+        content: What the page reads: lists, numbers and texts only.
+    """
+
+    content: dict[str, Any]
+
+
+def motion(
+    problem: Problem,
+    trajectory: Trajectory,
+    title: str,
+    figures: str = "",
+    *,
+    goals: ArrayLike | None = None,
+    denoising: Denoising | None = None,
+) -> ReplayMotion:
+    """Take what a replay shows of a motion: up to a second after the last robot has arrived, or to its end.
+
+    Args:
+        problem: The problem that the trajectory belongs to.
+        trajectory: What to show, ``T`` steps.
+        title: What to call it.
+        figures: Key figures in a line.
+        goals: ``(T+1, K, d)`` where they change on the way; the problem's by default.
+        denoising: How a plan came about, shown before the motion.
+
+    Raises:
+        ValueError: If the trajectory or the goals do not fit the problem, or are not finite.
+    """
+    checked_trajectory(problem, trajectory)
+    places = problem.goal[None] if goals is None else np.asarray(goals, np.float32)
+    shape = (len(trajectory.states), *problem.goal.shape)
+    if goals is not None and (places.shape != shape or not np.isfinite(places).all()):
+        raise ValueError(f"goals have shape {places.shape}; they must be finite and of shape (T+1, K, d) = {shape}")
+    if (places == places[0]).all():
+        places = places[:1]
+    end = _end(problem, trajectory)
+    flags = trajectory.arrived * 1 + trajectory.collided * 2 + trajectory.margin_violated * 4
+    content = {
+        "title": title,
+        "figures": figures,
+        "limits": _in_space(view_limits(problem, np.concatenate([trajectory.positions, places])).tolist()),
+        **_setting(problem),
+        "states": rounded(trajectory.states[:end]),
+        "goals": rounded(places[:end]),
+        "world_clearance": _clearance(problem, trajectory.positions[:end]),
+        "flags": _text(flags[:end].astype(np.uint8)),
+    }
+    return ReplayMotion(content if denoising is None else content | {"denoising": _denoising(denoising)})
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """Motions side by side on one page, with one clock; notebooks show it where it is the last value of a cell.
+
+    Attributes:
+        title: What the page is called.
+        motions: What it shows, one or more.
+        autoplay: Whether it plays when it is opened.
+
+    Raises:
+        ValueError: If there is none.
+    """
+
+    title: str
+    motions: tuple[ReplayMotion, ...]
+    autoplay: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.motions:
+            raise ValueError(f"the replay {self.title!r} has no motion; give one or more")
+
+    @property
+    def html(self) -> str:
+        """The page."""
+        page = {"autoplay": self.autoplay, "scenes": [motion.content for motion in self.motions]}
+        # No text of a problem may end the script that the data is in; JSON reads the escapes back.
+        data = json.dumps(page, allow_nan=False).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+        parts = {
+            "title": escape(self.title),
+            "style": _file("style.css"),
+            "view": _file("view.js"),
+            "draw": _file("draw.js"),
+            "player": _file("player.js"),
+            "data": data,
+        }
+        pieces = _file("page.html").split("{{")
+        filled = [parts[name] + rest for name, _, rest in (piece.partition("}}") for piece in pieces[1:])]
+        return "".join([pieces[0], *filled])
+
+    def save(self, path: str | Path) -> Path:
+        """Write the page to an ``.html`` file.
+
+        Raises:
+            ValueError: For another suffix.
+            OSError: If it cannot be written; nothing is left behind then.
+        """
+        with replaced_when_done(path := Path(path), REPLAY_SUFFIXES) as temporary:
+            temporary.write_text(self.html, encoding="utf-8")
+        return path
+
+    def __repr__(self) -> str:
+        return f"Replay({self.title!r}, {len(self.motions)} side by side)"
+
+    def _repr_html_(self) -> str:
+        """The page in a frame of its own, which may run its script and nothing else."""
+        style = f"width:100%;height:{_NOTEBOOK_HEIGHT}px;border:0"
+        return f'<iframe sandbox="allow-scripts" style="{style}" srcdoc="{escape(self.html)}"></iframe>'
+
+
+def rounded(array: ArrayLike) -> dict[str, Any]:
+    """Numbers ``(..., c)`` as 16-bit ones between the least and the most of each of the ``c`` components."""
+    values = np.asarray(array, np.float64)
+    flat = values.reshape(-1, values.shape[-1])
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    step = np.where(high > low, (high - low) / 65535, 1.0)
+    data = np.round((flat - low) / step).astype("<u2")
+    return {"low": low.tolist(), "step": step.tolist(), "data": _text(data)}
+
+
+def _setting(problem: Problem) -> dict[str, Any]:
+    """Team and world, which do not change."""
+    models = problem.team.robot_models
+    return {
+        "dimension": problem.dimension,
+        "dt": problem.dt,
+        "bounds": None if problem.world.lower is None else problem.world.bounds.tolist(),
+        "world": _obstacles(problem),
+        "radius": np.asarray(problem.team.radius).tolist(),
+        "models": [model.name for model in models],
+        "names": [list(model.state_names) for model in models],
+        "heading": [model.heading_index for model in models],
+        "colors": [to_hex(color) for color in robot_colors(problem.num_robots)],
+    }
+
+
+def _denoising(denoising: Denoising) -> dict[str, Any]:
+    samples, kept = denoising.samples, denoising.samples.shape[1]
+    return {
+        "labels": list(denoising.labels),
+        "seconds": denoising.seconds_per_step,
+        "points": denoising.paths.shape[1],
+        "kept": kept,
+        "paths": rounded(denoising.paths),
+        "samples": rounded(samples) if kept else {"low": [0.0], "step": [1.0], "data": ""},
+        "alpha": np.round(denoising.alpha, 2).tolist(),
+    }
+
+
+def _end(problem: Problem, trajectory: Trajectory) -> int:
+    """How many moments there is something to see at."""
+    everyone = arrival_times(trajectory.arrived, problem.dt).max()
+    last = len(trajectory.states) - 1
+    return last + 1 if np.isinf(everyone) else min(last, round((everyone + _AFTERMATH) / problem.dt)) + 1
+
+
+def _clearance(problem: Problem, positions: FloatArray) -> dict[str, Any]:
+    clearance = problem.world.clearance(positions)
+    return rounded(np.where(np.isfinite(clearance), clearance, _NO_CLEARANCE)[..., None])
+
+
+def _obstacles(problem: Problem) -> dict[str, Any]:
+    world = problem.world
+    return {
+        "balls": world.balls.tolist(),
+        "cylinders": world.cylinders.tolist(),
+        "boxes": world.boxes.tolist(),
+        "polygons": [corners.tolist() for corners in world.polygons],
+    }
+
+
+def _in_space(limits: list[list[float]]) -> list[list[float]]:
+    return [[*corner, 0.0][:3] for corner in limits]
+
+
+def _text(array: NDArray[Any]) -> str:
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
+
+
+def _file(name: str) -> str:
+    return (resources.files(__package__) / "replay_page" / name).read_text(encoding="utf-8")

@@ -1,0 +1,157 @@
+"""What one may do to a scene: functions from a problem, whose start is where the robots are now, to another.
+
+All raise a ``ValueError`` of one line where the scene would make no sense; it then stays as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_checks import check_resolution
+from d4orm_env.core.world import World
+from d4orm_env.lifelong import goal_region
+
+Edit = Callable[[Problem], Problem]
+
+MOST_ROBOTS, MOST_OBSTACLES = 200, 500
+"""A slip of the finger must not fill the page."""
+
+_ATTEMPTS = 500
+_KINDS = ("circles", "spheres", "cylinders", "boxes", "polygons")
+
+
+def move_goal(problem: Problem, robot: int, place: ArrayLike) -> Problem:
+    """Send a robot elsewhere: ``place`` ``(d,)`` [m]."""
+    goal = np.array(problem.goal)
+    goal[robot] = place
+    _check_place(problem, "the goal", robot, goal)
+    return problem.resumed_at(problem.start, goal)
+
+
+def move_robot(problem: Problem, robot: int, place: ArrayLike) -> Problem:
+    """Put a robot elsewhere, at rest: ``place`` ``(d,)`` [m]."""
+    start, model = np.array(problem.start), problem.team.robot_models[robot]
+    start[robot, : problem.dimension] = place
+    own = tuple(float(value) for value in start[robot, : model.state_size])
+    start[robot, : model.state_size] = model.functions.rest(own, 0.0)
+    _check_place(problem, "the robot", robot, start[:, : problem.dimension])
+    return problem.resumed_at(start, problem.goal)
+
+
+def push(problem: Problem, robot: int, shove: ArrayLike) -> Problem:
+    """Push a robot off its way by ``shove`` ``(d,)`` [m]; it comes to rest there."""
+    return move_robot(problem, robot, problem.start[robot, : problem.dimension] + np.asarray(shove, np.float32))
+
+
+def add_robot(problem: Problem, random: np.random.Generator) -> Problem:
+    """One more robot, like the first, with a random start and goal."""
+    count = problem.num_robots
+    if count >= MOST_ROBOTS:
+        raise ValueError(f"there are {count} robots, which is the most here; remove one first")
+    positions = np.vstack([problem.start[:, : problem.dimension], _free_place(problem, problem.start, random)])
+    goals = np.vstack([problem.goal, _free_place(problem, problem.goal, random)])
+    start = np.zeros((count + 1, problem.start.shape[1]), np.float32)
+    start[:count] = problem.start
+    start[count, : problem.dimension] = positions[count]
+    changed = problem.select([*range(count), 0])
+    return changed.resumed_at(start, goals)
+
+
+def remove_robot(problem: Problem) -> Problem:
+    """One robot fewer: the last one leaves."""
+    if problem.num_robots == 1:
+        raise ValueError("the last robot stays; load another scene to begin anew")
+    return problem.select(range(problem.num_robots - 1))
+
+
+def add_obstacle(problem: Problem, kind: str, random: np.random.Generator) -> Problem:
+    """One more obstacle, a ``"disc"`` or a ``"box"`` of 0.4 m, where there is room."""
+    world, reach = problem.world, 0.3
+    if world.num_obstacles >= MOST_OBSTACLES:
+        raise ValueError(f"there are {world.num_obstacles} obstacles, which is the most here; remove one first")
+    taken = np.vstack([problem.start[:, : problem.dimension], problem.goal])
+    place = _free_place(problem, taken, random, reach + float(np.max(problem.team.radius)))
+    if kind == "box":
+        return _with_world(problem, boxes=[*world.boxes, [*(place - 0.2), *(place + 0.2)]])
+    name = "circles" if problem.dimension == 2 else "spheres"
+    return _with_world(problem, **{name: [*getattr(world, name), [*place, 0.2]]})
+
+
+def remove_obstacle(problem: Problem) -> Problem:
+    """One obstacle fewer: the last one of its kind."""
+    for kind in reversed(_KINDS):
+        shapes = getattr(problem.world, kind)
+        if len(shapes):
+            return _with_world(problem, **{kind: shapes[:-1]})
+    raise ValueError("there is no obstacle to remove")
+
+
+def move_obstacle(problem: Problem, kind: str, index: int, shift: ArrayLike) -> Problem:
+    """Move an obstacle by ``shift`` ``(d,)`` [m].
+
+    Args:
+        problem: The scene.
+        kind: ``"circles"``, ``"spheres"``, ``"cylinders"``, ``"boxes"`` or ``"polygons"``.
+        index: Which one of them.
+        shift: By how much.
+    """
+    by, d = np.asarray(shift, np.float32), problem.dimension
+    shapes = [np.array(shape) for shape in getattr(problem.world, kind)]
+    if kind == "boxes":
+        shapes[index] = shapes[index] + np.tile(by, 2)
+    elif kind == "polygons":
+        shapes[index] = shapes[index] + by
+    else:
+        axes = 2 if kind == "cylinders" else d
+        shapes[index][:axes] += by[:axes]
+    return _with_world(problem, **{kind: shapes})
+
+
+def _with_world(problem: Problem, **changes: Any) -> Problem:
+    world = problem.world
+    parts: dict[str, Any] = {name: getattr(world, name) for name in ("dimension", *_KINDS, "lower", "upper")}
+    changed = World(**parts | changes)
+    radius = np.asarray(problem.team.radius, np.float64)
+    for what, places in (("robot", problem.start[:, : problem.dimension]), ("goal of robot", problem.goal)):
+        touched = np.flatnonzero(changed.clearance(places) <= radius)
+        if len(touched):
+            raise ValueError(f"the obstacle would touch the {what}_{touched[0]}; put it elsewhere")
+    return problem.resumed_at(problem.start, problem.goal, world=changed)
+
+
+def _check_place(problem: Problem, what: str, robot: int, places: FloatArray) -> None:
+    """Refuse the place of a robot among ``places`` ``(K, d)`` if it is none, or touches something."""
+    radius = np.asarray(problem.team.radius, np.float64)
+    if not np.isfinite(places[robot]).all():
+        raise ValueError(f"{what} of robot_{robot} is not at a place; drag it again")
+    check_resolution(problem.team, places, problem.dt, problem.goal_radius)
+    if problem.world.clearance(places[robot]) <= radius[robot]:
+        raise ValueError(f"{what} of robot_{robot} would touch an obstacle or the bounds; it stays where it was")
+    gaps = np.linalg.norm(places - places[robot], axis=1) - radius - radius[robot]
+    gaps[robot] = np.inf
+    if gaps.min() <= 0:
+        raise ValueError(
+            f"{what} of robot_{robot} would touch that of robot_{int(gaps.argmin())}; it stays where it was"
+        )
+
+
+def _free_place(
+    problem: Problem, taken: ArrayLike, random: np.random.Generator, reach: float | None = None
+) -> FloatArray:
+    """``(d,)`` a random place with room for a robot of the first one's size among ``taken`` ``(N, d or more)``."""
+    others = np.asarray(taken, np.float32)[:, : problem.dimension]
+    reach = float(problem.team.radius[0]) + problem.margin if reach is None else reach
+    room = reach + float(np.max(problem.team.radius))
+    low, high = goal_region(problem)
+    for _ in range(_ATTEMPTS):
+        place = random.uniform(low, high).astype(np.float32)
+        clear = problem.world.clearance(place) > reach
+        if clear and (np.linalg.norm(others - place, axis=1) > room).all():
+            return place
+    raise ValueError("there is no room for one more; remove something first")

@@ -1,0 +1,216 @@
+"""The controls of the page: everything that it can ask for."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import viser
+
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.yaml_text import parse_yaml
+from d4orm_env.scenarios import list_scenarios, make_problem
+from d4orm_env.scenarios.files import scenario_text
+from d4orm_env.scenarios.schema import parse
+from d4orm_planners.play import edits
+from d4orm_planners.play.frame import Frame
+from d4orm_planners.play.session import Session
+from d4orm_planners.play.view import View
+
+POLICIES = ("d4orm-c2f", "orca", "ppo", "sac", "goal", "d4orm-d", "guided")
+COMPARED = ("d4orm-c2f", "d4orm-d", "goal")
+"""Policies that need no extra, and no model of their own."""
+MODELS = ("scenario's own", "holonomic2d", "velocity2d", "differential_drive", "unicycle", "car", "holonomic3d")
+OWN_MODEL = MODELS[0]
+STATUS_EVERY = 0.2
+LARGEST_UPLOAD = 2_000_000
+SHOVE = 0.25
+"""How far a push moves a robot [m]."""
+
+
+class Panel:
+    """Buttons, sliders and menus of a page.
+
+    Args:
+        server: The page.
+        session: What they control.
+        view: What is shown of it.
+    """
+
+    def __init__(self, server: viser.ViserServer, session: Session, view: View) -> None:
+        self._gui, self._session, self._view = server.gui, session, view
+        self._random = np.random.default_rng(0)
+        self._status_at = 0.0
+        self._text = ""
+        self._status = self._gui.add_markdown("")
+        with self._gui.add_folder("Clock"):
+            self._add_clock()
+        with self._gui.add_folder("Change the scene"):
+            self._add_edits()
+        with self._gui.add_folder("Another scene", expand_by_default=False):
+            self._add_scenes()
+        with self._gui.add_folder("Show", expand_by_default=False):
+            self._add_views(server)
+        with self._gui.add_folder("Files", expand_by_default=False):
+            self._add_files()
+
+    def update(self, frame: Frame) -> None:
+        """Say how the team is doing."""
+        now = time.perf_counter()
+        if now - self._status_at < STATUS_EVERY:
+            return
+        self._status_at = now
+        text = status_text(frame, self._session.policy)
+        if text != self._text:
+            self._text = self._status.content = text
+
+    def _add_clock(self) -> None:
+        paused: Any = self._gui.add_checkbox("Paused", False)
+        paused.on_update(lambda _: self._session.pause(paused.value))
+        step, reset = self._gui.add_button("Step"), self._gui.add_button("Reset")
+
+        def one_step(_: Any) -> None:
+            paused.value = True
+            self._session.step()
+
+        step.on_click(one_step)
+        reset.on_click(lambda _: self._session.reset())
+        speed = self._gui.add_slider("Speed", 0.1, 8.0, 0.1, 1.0)
+        speed.on_update(lambda _: self._session.set_speed(speed.value))
+        policy = self._gui.add_dropdown("Policy", tuple(dict.fromkeys((self._session.policy, *POLICIES))))
+        policy.on_update(lambda _: self._session.choose(policy.value))
+        horizon = self._gui.add_slider("Look ahead", 5, 50, 1, 20, hint="Steps that D4orm-C2F predicts.")
+        horizon.on_update(lambda _: self._session.set_horizon(int(horizon.value)))
+        lifelong = self._gui.add_checkbox("Lifelong goals", False)
+        lifelong.on_update(lambda _: self._session.set_lifelong(lifelong.value))
+
+    def _add_edits(self) -> None:
+        self._gui.add_markdown("Drag robots, goals and obstacles.")
+        changes: dict[str, edits.Edit] = {
+            "Add robot": self._drawn(edits.add_robot),
+            "Remove robot": edits.remove_robot,
+            "Add disc": self._drawn(lambda scene, random: edits.add_obstacle(scene, "disc", random)),
+            "Add box": self._drawn(lambda scene, random: edits.add_obstacle(scene, "box", random)),
+            "Remove obstacle": edits.remove_obstacle,
+            "Push a robot": self._drawn(_push_somebody),
+        }
+        for name, change in changes.items():
+            self._add_edit(name, change)
+
+    def _add_edit(self, name: str, change: edits.Edit) -> None:
+        self._gui.add_button(name).on_click(lambda _: self._session.edit(change))
+
+    def _drawn(self, change: Callable[[Problem, np.random.Generator], Problem]) -> edits.Edit:
+        """A change that draws at random."""
+        return lambda scene: change(scene, self._random)
+
+    def _add_scenes(self) -> None:
+        names = tuple(name for name in list_scenarios() if name != "map")
+        scenario = self._gui.add_dropdown("Scenario", names, initial_value="circle")
+        robots = self._gui.add_slider("Robots", 1, 64, 1, 16)
+        model = self._gui.add_dropdown("Model", MODELS)
+        seed = self._gui.add_number("Seed", 0, min=0, max=2**31 - 1, step=1)
+
+        def load(_: Any) -> None:
+            chosen = None if model.value == OWN_MODEL else model.value
+            make = partial(make_problem, scenario.value, int(robots.value), int(seed.value), model=chosen)
+            self._session.load(make, int(seed.value))
+
+        self._gui.add_button("Begin").on_click(load)
+
+    def _add_views(self, server: viser.ViserServer) -> None:
+        for name in self._view.shown:
+            self._add_choice(name)
+        dark = self._gui.add_checkbox("Dark", False)
+        dark.on_update(lambda _: server.gui.configure_theme(dark_mode=dark.value, **THEME))
+
+    def _add_choice(self, name: str) -> None:
+        box = self._gui.add_checkbox(name.capitalize(), self._view.shown[name])
+        box.on_update(lambda _: self._view.shown.update({name: box.value}))
+
+    def _add_files(self) -> None:
+        scene, replay = self._gui.add_button("Save scene"), self._gui.add_button("Save replay")
+        compare = self._gui.add_button("Compare policies", hint="From the beginning, with the same seed, as a replay.")
+        load = self._gui.add_upload_button("Load scene", mime_type=".yaml,.yml")
+
+        def save_scene(event: Any) -> None:
+            _send(event.client, "scene.yaml", scenario_text(at_rest(self._session.scene)))
+
+        def save_replay(event: Any) -> None:
+            _send(event.client, "replay.html", self._session.recording.replay(self._session.policy).html)
+
+        def save_comparison(event: Any) -> None:
+            client = event.client
+            self._session.compare(COMPARED, lambda replay: _send(client, "compare.html", replay.html))
+
+        compare.on_click(save_comparison)
+        scene.on_click(save_scene)
+        replay.on_click(save_replay)
+        load.on_upload(lambda _: self._session.load(partial(read_scene, load.value.content)))
+
+
+THEME: dict[str, Any] = {"show_logo": False, "show_share_button": False, "control_width": "medium"}
+
+
+def _send(client: viser.ClientHandle, name: str, text: str) -> None:
+    """Let a browser save a file."""
+    client.send_file_download(name, text.encode(), save_immediately=True)
+
+
+def status_text(frame: Frame, policy: str) -> str:
+    """What the page says of a moment."""
+    team = frame.problem.num_robots
+    contacts = int(frame.collided.sum())
+    lines = [
+        f"**{frame.problem.name}, {team} robots, {policy}: {frame.state}**",
+        f"time {frame.time:.1f} s, arrived {int(frame.arrived.sum())} of {team}",
+        f"closest approach {100 * frame.closest:.1f} cm" + (f", **{contacts} in contact**" if contacts else ""),
+        f"control loop {1e3 * frame.loop:.0f} ms, last replanning {frame.replanned:.2f} s",
+    ]
+    if frame.message:
+        lines.append(f"**{plain(frame.message)}**")
+    return "  \n".join(lines)
+
+
+def plain(text: str) -> str:
+    """Text that Markdown reads as itself."""
+    return "".join(f"\\{letter}" if letter in "\\`*_{}[]()<>#+!|~" else letter for letter in text)
+
+
+def read_scene(content: bytes) -> Problem:
+    """A scenario file that a page sent.
+
+    Raises:
+        ValueError: If it is too large, not text, or no scenario.
+    """
+    if len(content) > LARGEST_UPLOAD:
+        raise ValueError(f"the file has {len(content)} bytes; a scene has at most {LARGEST_UPLOAD}")
+    try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError:
+        raise ValueError("the file is not UTF-8 text; load a scenario's YAML file") from None
+    problem = parse(parse_yaml(text))
+    if problem.num_robots > edits.MOST_ROBOTS:
+        raise ValueError(f"the scene has {problem.num_robots} robots; at most {edits.MOST_ROBOTS} can be played with")
+    return problem
+
+
+def at_rest(scene: Problem) -> Problem:
+    """A scene with all robots at rest, as files have it."""
+    start = np.array(scene.start)
+    for robot, model in enumerate(scene.team.robot_models):
+        own = tuple(float(value) for value in start[robot, : model.state_size])
+        start[robot, : model.state_size] = model.functions.rest(own, 0.0)
+    return scene.resumed_at(start, scene.goal)
+
+
+def _push_somebody(scene: Problem, random: np.random.Generator) -> Problem:
+    """Push a robot that is under way, or any."""
+    d = scene.dimension
+    away = np.linalg.norm(scene.goal - scene.start[:, :d], axis=1) > scene.goal_radius
+    robot = int(random.choice(np.flatnonzero(away) if away.any() else scene.num_robots))
+    shove = random.normal(size=d)
+    return edits.push(scene, robot, SHOVE * shove / np.linalg.norm(shove))

@@ -1,0 +1,127 @@
+"""A session and its page, from the first browser to the last."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import socket
+import threading
+import time
+
+import viser
+
+from d4orm_env.core.problem import Problem
+from d4orm_planners.play.gate import Gate
+from d4orm_planners.play.panel import THEME, Panel
+from d4orm_planners.play.session import Session
+from d4orm_planners.play.view import View, look_at
+
+FRAMES_PER_SECOND = 33
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+
+
+class _Server(viser.ViserServer):
+    """A page that cannot be asked to open a tunnel to the internet."""
+
+    def request_share_url(self, verbose: bool = True) -> None:
+        del verbose
+
+
+class Playground:
+    """A page that shows a session, and lets whoever looks at it change it.
+
+    Args:
+        problem: The scene to begin with.
+        policy: Name of what drives.
+        seed: Of the policy.
+        host: Where to be found; by default on this machine only. Elsewhere the address has a token.
+        port: Where to be found; 0 for any free port.
+
+    Attributes:
+        address: What to open in a browser.
+        session: What it shows.
+
+    Raises:
+        ValueError: If it cannot be found there, or there is no such policy.
+    """
+
+    def __init__(
+        self, problem: Problem, policy: str = "d4orm-c2f", seed: int = 0, host: str = LOOPBACK[0], port: int = 0
+    ) -> None:
+        local = host in LOOPBACK
+        chosen = _free_port(host, port)
+        self.session = Session(problem, policy, seed)
+        with contextlib.redirect_stdout(io.StringIO()):  # its own words on where it is
+            self._server = _Server(
+                host="127.0.0.1", port=chosen if local else _free_port("127.0.0.1", 0), verbose=False
+            )
+        self._gate = None if local else Gate(host, chosen, self._server.get_port())
+        if self._gate is None:
+            self.address = f"http://127.0.0.1:{self._server.get_port()}/"
+        else:
+            named = socket.gethostname() if host in ("0.0.0.0", "::") else host
+            self.address = f"http://{named}:{self._gate.port}/?token={self._gate.token}"
+        self._server.scene.configure_default_lights(enabled=False)
+        self._server.scene.add_light_ambient("/light", intensity=1.1)
+        self._server.scene.add_light_directional("/sun", intensity=0.5, position=(-1.0, -0.5, 2.0))
+        self._server.gui.configure_theme(**THEME)
+        self._server.gui.set_panel_label("d4orm play")
+        self._view = View(self._server, self.session)
+        self._panel = Panel(self._server, self.session, self._view)
+        self._looked_at: object = None
+        self._stopping = threading.Event()
+
+    def run(self, seconds: float | None = None) -> None:
+        """Show the session until Ctrl-C or :meth:`stop`, or for so long.
+
+        Raises:
+            BaseException: What ended the session, if anything did.
+        """
+        end = None if seconds is None else time.perf_counter() + seconds
+        self.session.start()
+        due = time.perf_counter()
+        while not self._stopping.is_set() and (end is None or time.perf_counter() < end):
+            if self.session.failure is not None:
+                raise self.session.failure
+            self.show()
+            due = max(due + 1 / FRAMES_PER_SECOND, time.perf_counter())
+            time.sleep(max(due - time.perf_counter(), 0.001))
+
+    def stop(self) -> None:
+        """Let :meth:`run` come to its end."""
+        self._stopping.set()
+
+    @property
+    def clients(self) -> dict[int, viser.ClientHandle]:
+        """Who looks at the page, by number."""
+        return self._server.get_clients()
+
+    def show(self) -> None:
+        """Bring the page up to date."""
+        frame = self.session.frame
+        scene = (frame.problem.name, frame.problem.num_robots, frame.problem.dimension)
+        if scene != self._looked_at:
+            self._looked_at = scene
+            look_at(self._server, frame.problem)
+        self._view.update(frame)
+        self._panel.update(frame)
+
+    def close(self) -> None:
+        """Leave no thread and no port."""
+        self.session.close()
+        if self._gate is not None:
+            self._gate.close()
+        self._server.stop()
+
+
+def _free_port(host: str, port: int) -> int:
+    """That port, or any that is free for 0.
+
+    Raises:
+        ValueError: If it is taken, or the host is not one of this machine's.
+    """
+    try:
+        with socket.create_server((host, port)) as listening:
+            return int(listening.getsockname()[1])
+    except (OSError, OverflowError) as error:
+        raise ValueError(f"cannot listen at {host} port {port} ({error}); choose another --host or --port") from None

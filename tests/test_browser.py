@@ -1,0 +1,241 @@
+"""Pages in a real browser, headless Chromium: they load without complaint and do what is asked of them."""
+
+from __future__ import annotations
+
+import gc
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser_support import PATIENCE, Page, browser, missing
+
+from d4orm_env import Problem, World, load_problem, make_problem
+from d4orm_planners import make_planner
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(missing()), reason=missing())]
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with browser(tmp_path_factory.mktemp("profile")) as page:
+        yield page
+
+
+@pytest.fixture(scope="module")
+def replay(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    problem = make_problem("circle", num_robots=4, seed=0).replace(name="<b>circle</b> & friends")
+    return make_planner().solve(problem, seed=0).to_html(tmp_path_factory.mktemp("replay") / "plan.html")
+
+
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+@pytest.mark.parametrize("width", [400, 1300])
+def test_a_replay_plays_without_a_network(page: Page, replay: Path, width: int, dark: bool) -> None:
+    page.offline()
+    page.look(width, 800, dark)
+    page.requests.clear()
+    page.open(replay.as_uri())
+    assert page.evaluate("document.documentElement.dataset.theme") == ("dark" if dark else "light")
+    assert "<b>circle</b> & friends" in page.evaluate("document.querySelector('h1').textContent")
+    page.evaluate("document.getElementById('play').click()")
+    page.until("player.time > 0.3")
+    page.evaluate("document.getElementById('play').click()")
+    time, frames = page.evaluate("[player.time, player.frames]")
+    assert frames > 3
+    page.evaluate("new Promise((done) => setTimeout(done, 200))")
+    assert page.evaluate("player.time") == time, "pause pauses"
+    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), "nothing sticks out"
+    assert page.complaints == []
+    assert [address for address in page.requests if not address.startswith(("file:", "data:"))] == []
+
+
+def test_keys_and_the_slider_go_through_a_replay(page: Page, replay: Path) -> None:
+    page.look()
+    page.open(replay.as_uri())
+    duration, dt = page.evaluate("[player.duration, player.dt]")
+    page.press("End")
+    assert page.evaluate("player.time") == pytest.approx(duration)
+    page.press("Home")
+    page.press("ArrowRight")
+    assert page.evaluate("player.time") == pytest.approx(dt)
+    page.press("+")
+    assert page.evaluate("player.speed") == 2
+    page.press(" ")
+    page.until("player.playing && player.time > 1")
+    page.press(" ")
+    assert not page.evaluate("player.playing")
+    page.evaluate("const s = document.getElementById('scrub'); s.value = 500; s.dispatchEvent(new Event('input'))")
+    assert page.evaluate("player.time") == pytest.approx(duration / 2)
+    page.press("]")
+    page.until("document.querySelector('.robot').textContent.startsWith('robot_0 (holonomic2d): speed')")
+    assert page.complaints == []
+
+
+def test_a_robot_under_the_pointer_tells_about_itself(page: Page, replay: Path) -> None:
+    page.look()
+    page.open(replay.as_uri())
+    x, y = page.evaluate(
+        "(() => { const { painter, scene } = shows[0], box = painter.canvas.getBoundingClientRect();"
+        "const place = scene.place(scene.moment(player.time), 2);"
+        "return [box.left + painter.view.x(place), box.top + painter.view.y(place)]; })()"
+    )
+    page.mouse("Moved", x, y)
+    text = page.until("document.querySelector('.robot').textContent")
+    assert text.startswith("robot_2 (holonomic2d): speed 0.0")
+    assert "clearance" in text
+
+
+def test_a_hundred_robots_play_smoothly(page: Page, tmp_path: Path) -> None:
+    from d4orm_env.render.replay import Replay, motion
+    from d4orm_env.rollout import rollout
+
+    problem = make_problem("circle", num_robots=100, diameter=24)
+    trajectory = rollout(problem, np.full((problem.horizon, 100, 2), 0.05, np.float32))
+    page.look()
+    page.open(Replay("many", (motion(problem, trajectory, "many"),)).save(tmp_path / "many.html").as_uri())
+    page.evaluate("play(true)")
+    page.until("player.frames > 60 || player.time > 8")
+    assert page.evaluate("player.frames > 60"), "more than seven frames a second, on however loaded a machine"
+    assert page.complaints == []
+
+
+@contextmanager
+def running(problem: Problem, *arguments: str, **options: str) -> Iterator[Any]:
+    """A playground with its page."""
+    pytest.importorskip("viser")
+    from d4orm_planners.play.playground import Playground
+
+    playground = Playground(problem, *arguments, **options)
+    thread = threading.Thread(target=playground.run, daemon=True)
+    thread.start()
+    try:
+        yield playground
+    finally:
+        playground.stop()
+        thread.join()
+        playground.close()
+        del playground
+        gc.collect()  # viser leaves an event loop open, of which this test may warn and no other
+
+
+viser_leaves_loops = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+
+def pixel(playground: Any, place: Sequence[float]) -> tuple[float, float]:
+    """Where on the page a place of the plane is."""
+    from viser import transforms
+
+    camera = next(iter(playground.clients.values())).camera
+    x, y, z = transforms.SO3(np.asarray(camera.wxyz)).inverse() @ (np.array([*place, 0.0]) - camera.position)
+    scale = 0.5 * camera.image_height / np.tan(camera.fov / 2)
+    return camera.image_width / 2 + scale * x / z, camera.image_height / 2 + scale * y / z
+
+
+def tick(page: Page, label: str) -> None:
+    """Click on the check box with a label, as a mouse does."""
+    place = f"""(() => {{
+      let row = [...document.querySelectorAll('label')].find((part) => part.textContent === {label!r});
+      while (!row.querySelector('input[type=checkbox]')) row = row.parentElement;
+      const box = row.querySelector('input[type=checkbox]').getBoundingClientRect();
+      return [box.x + box.width / 2, box.y + box.height / 2];
+    }})()"""
+    before, (x, y) = None, page.evaluate(place)
+    while before != (x, y):  # the page is still making itself up
+        time.sleep(1.0)
+        before, (x, y) = (x, y), page.evaluate(place)
+    for kind in ("Moved", "Pressed", "Released"):
+        page.mouse(kind, x, y)
+
+
+def click(page: Page, text: str) -> None:
+    """Click on a button, or open a folder, as soon as it is there."""
+    find = f"[...document.querySelectorAll('button, div')].findLast((part) => part.textContent.trim() === {text!r})"
+    page.until(f"!!{find}")
+    time.sleep(0.5)
+    page.evaluate(f"{find}.click()")
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+@viser_leaves_loops
+def test_the_playground_pauses_and_a_dragged_goal_replans(page: Page, tmp_path: Path) -> None:
+    with running(make_problem("circle", num_robots=4, seed=0)) as playground:
+        pause_and_drag(page, playground, tmp_path)
+
+
+def pause_and_drag(page: Page, playground: Any, tmp_path: Path) -> None:
+    session = playground.session
+    page.look()
+    page.offline(False)
+    page.complaints.clear()
+    page.open(playground.address)
+    page.until("document.body.textContent.includes('circle, 4 robots, d4orm-c2f')")
+    tick(page, "Paused")
+    wait_for(lambda: session.frame.state == "paused")
+    page.until("document.body.textContent.includes('d4orm-c2f: paused')")
+    number = session.frame.number
+    page.evaluate("new Promise((done) => setTimeout(done, 500))")
+    assert session.frame.number == number, "pause pauses"
+
+    wait_for(lambda: len(playground.clients) == 1)
+    goal = session.frame.goals[0]
+    # By the corner of the diamond: a robot may stand on its middle.
+    page.drag(pixel(playground, goal + np.array([0.0, 0.19])), pixel(playground, (0.4, 0.6)))
+    wait_for(lambda: not np.array_equal(session.frame.goals[0], goal))
+    assert np.abs(session.frame.goals[0] - [0.4, 0.6]).max() < 0.25
+    assert session.frame.state == "paused"
+    tick(page, "Paused")
+    wait_for(lambda: session.frame.arrived[0])
+    assert np.linalg.norm(session.frame.states[0, :2] - session.frame.goals[0]) < 0.1
+    assert session.failure is None
+    page.screenshot(tmp_path / "play.png")
+    assert (tmp_path / "play.png").stat().st_size > 10_000
+    assert [line for line in page.complaints if "passive event listener" not in line] == [], "but for viser's own"
+
+
+@viser_leaves_loops
+def test_obstacles_are_dragged_and_scenes_and_replays_saved(page: Page, tmp_path: Path) -> None:
+    world = World(boxes=[[-0.2, -0.2, 0.2, 0.2]])
+    problem = make_problem("circle", num_robots=2, seed=0)
+    with running(problem.resumed_at(problem.start, problem.goal, world=world), "goal") as playground:
+        session = playground.session
+        page.look()
+        page.offline(False)
+        page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+        page.open(playground.address)
+        page.until("document.body.textContent.includes('circle, 2 robots, goal')")
+        tick(page, "Paused")
+        wait_for(lambda: session.frame.state == "paused" and len(playground.clients) == 1)
+        page.drag(pixel(playground, (0, 0)), pixel(playground, (0.9, 0.9)))
+        wait_for(lambda: session.frame.problem.world.boxes[0, 0] > 0)
+        assert np.abs(session.frame.problem.world.boxes[0] - [0.7, 0.7, 1.1, 1.1]).max() < 0.3
+
+        click(page, "Files")
+        for button, name in (("Save scene", "scene.yaml"), ("Save replay", "replay.html")):
+            click(page, button)
+            wait_for((tmp_path / name).exists)
+        saved = load_problem(tmp_path / "scene.yaml")
+        np.testing.assert_array_equal(saved.world.boxes, session.frame.problem.world.boxes)
+        assert "circle, 2 robots by goal" in (tmp_path / "replay.html").read_text(encoding="utf-8")
+
+
+@viser_leaves_loops
+def test_elsewhere_the_playground_asks_for_its_token(page: Page) -> None:
+    with running(make_problem("circle", num_robots=2), "goal", host="127.0.0.2") as playground:
+        page.offline(False)
+        page.open(playground.address.partition("?")[0])
+        assert page.evaluate("document.body.textContent").startswith("open the address with the token")
+        assert not playground.clients
+        page.open("about:blank")
+        page.open(playground.address)
+        page.until("document.body.textContent.includes('circle, 2 robots, goal')")
+        assert "token" not in page.evaluate("location.href"), "nor in the browser's history"
