@@ -56,6 +56,7 @@ class Viewer:
             simulation.collided,
             goals=simulation.arrays.goal,
             trail=simulation.trail,
+            marks=simulation.marks(),
         )
         return frame if self._mode == "rgb_array" else None
 

@@ -1,4 +1,4 @@
-"""What the worlds of a batch draw: instances and execution noise, each world as a single environment does."""
+"""What the worlds of a batch draw: instances and disturbances, each world as a single environment does."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, whole_number
+from d4orm_env.core.arrays import whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.simulation import Simulation
 
@@ -16,20 +16,19 @@ OWN_ARRAYS = ("start", "goal", "inverse_initial_distance")
 """What differs from world to world in one kernel call."""
 WORLD_ARRAYS = ("boxes", "triangles", "bounds")
 """What may differ too, at the price of a call for each world; all the rest of a problem is shared."""
-_NOISE_STEPS = 32
-"""Steps of execution noise that a world draws at a time: drawing costs more per call than per number."""
 
 
 class WorldDraws:
     """The random numbers of a batch.
 
     Args:
-        template: The simulation whose problem, scenario and noise the worlds share.
+        template: The simulation whose problem, scenario and disturbances the worlds share.
         num_worlds: ``B``.
         num_instances: Choose among so many instances, drawn at first; ``None`` draws a new one each time.
 
     Attributes:
         needed: Whether anything is random.
+        seeds: ``(B,)`` what each world has drawn for its present episode; all that is random in it follows from it.
 
     Raises:
         ValueError: If ``num_instances`` makes no sense, or instances differ in more than places and obstacles.
@@ -44,12 +43,9 @@ class WorldDraws:
         self._template, self._first = template, template.problem
         self._num_instances = None if num_instances is None else whole_number(num_instances, "num_instances", 1)
         self._pool: list[Problem] = []
-        self._noise_std = template.noise_std
-        self.needed = self._noise_std is not None or template.redraws
+        self.needed = bool(template.disturbances) or template.redraws
         self._generators: list[np.random.Generator | None] = [None] * num_worlds
-        self._episodes = [np.random.default_rng(0)] * num_worlds
-        block = min(_NOISE_STEPS, template.max_cycles) if self._noise_std is not None else 0
-        self._noise = np.zeros((num_worlds, block, self._first.num_robots, self._first.control_size), np.float32)
+        self.seeds: NDArray[np.int64] = np.zeros(num_worlds, np.int64)
         if template.redraws and not template.vouched:
             self._drawn(np.random.default_rng(0))
 
@@ -63,29 +59,15 @@ class WorldDraws:
         generator = self._generators[world]
         if generator is None:
             generator = self._generators[world] = seeding.np_random()[0]
-        episode = self._episodes[world] = np.random.default_rng(int(generator.integers(2**63)))
+        self.seeds[world] = seed = int(generator.integers(2**63))
         if not self._template.redraws:
             return None
+        episode = np.random.default_rng(seed)
         if self._num_instances is None:
             return self._drawn(episode)
         if not self._pool:
             self._pool = [self._drawn(episode) for _ in range(self._num_instances)]
         return self._pool[int(episode.integers(self._num_instances))]
-
-    def noise(self, steps: NDArray[np.int64], moving: BoolArray) -> FloatArray | None:
-        """``(B, K, m)`` noise of the step ahead, where there is any; worlds draw some steps at a time.
-
-        Args:
-            steps: ``(B,)`` steps taken.
-            moving: ``(B,)`` bool, worlds that are about to be stepped.
-        """
-        if self._noise_std is None:
-            return None
-        row = steps % self._noise.shape[1]
-        for world in np.flatnonzero(moving & (row == 0)):
-            self._noise[world] = self._episodes[world].standard_normal(self._noise.shape[1:], dtype=np.float32)
-        noise: FloatArray = self._noise_std * self._noise[np.arange(len(steps)), row]
-        return noise
 
     def _drawn(self, random: np.random.Generator) -> Problem:
         """A new instance that differs from the first in places and obstacles only."""

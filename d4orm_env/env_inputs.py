@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, as_float32, frozen_array, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_states
+from d4orm_env.disturbances.levels import check_components, per_component
 
 MAX_ACTION = 1e15
 """Largest magnitude of an action. float32 still holds the square of more, but no control of a robot is near it: an
@@ -86,19 +87,9 @@ def noise_std(value: ArrayLike, control_size: int) -> FloatArray | None:
     Raises:
         ValueError: If it has another shape, or a value is negative, not finite or above 1e6.
     """
-    try:
-        std = as_float32(value)
-    except ValueError:
-        raise ValueError(f"control_noise_std must be a number or one per control component, not {value!r}") from None
-    if std.shape not in ((), (control_size,)):
-        raise ValueError(
-            f"control_noise_std has shape {std.shape}; give one number, or {control_size}, one per control component"
-        )
-    if not np.isfinite(std).all() or (std < 0).any():
-        raise ValueError(f"control_noise_std is {std.tolist()}; it must be zero or more and finite")
-    if (std > LARGEST).any():
-        raise ValueError(f"control_noise_std is {std.tolist()}; it must be at most {LARGEST:g}")
-    return np.broadcast_to(std, (control_size,)).copy() if std.any() else None
+    std = per_component(value, "control_noise_std")
+    check_components(std, "control_noise_std", control_size)
+    return np.full(control_size, std, np.float32) if np.any(std) else None
 
 
 def joint_controls(actions: ArrayLike, shape: tuple[int, ...], num_robots: int) -> FloatArray:

@@ -47,8 +47,12 @@ class EpisodeRecord:
             self._arrival_step = np.where(arrived, np.minimum(self._arrival_step, self._steps), np.inf)
             self._goals_reached = arrived.astype(np.int64)
 
-    def metrics(self) -> dict[str, float]:
-        """The episode so far, as plain numbers; see :func:`episode_metrics`."""
+    def metrics(self, lost: BoolArray | None = None) -> dict[str, float]:
+        """The episode so far, as plain numbers; see :func:`episode_metrics`.
+
+        Args:
+            lost: ``(K,)`` bool: robots that a disturbance keeps from ever arriving.
+        """
         counts = EpisodeCounts(
             self._steps,
             self._reward,
@@ -56,6 +60,7 @@ class EpisodeRecord:
             self._collisions,
             self._margin_violations,
             None if self._lifelong else self._arrival_step,
+            lost,
         )
         metrics = episode_metrics(counts, self._dt)
         return {name: float(value) for name, value in metrics.items()}
@@ -72,6 +77,7 @@ class EpisodeCounts(NamedTuple):
         violations: ``(..., K)`` steps within the margin.
         arrival_step: ``(..., K)`` step since which a robot is at its goal, infinite where it is not; ``None`` in
             lifelong mode.
+        lost: ``(..., K)`` robots that a disturbance keeps from ever arriving, if there can be any.
     """
 
     steps: int | Counts
@@ -80,6 +86,7 @@ class EpisodeCounts(NamedTuple):
     contacts: Counts
     violations: Counts
     arrival_step: Floats | None
+    lost: BoolArray | None = None
 
 
 def episode_metrics(counts: EpisodeCounts, dt: float) -> dict[str, Floats]:
@@ -89,8 +96,9 @@ def episode_metrics(counts: EpisodeCounts, dt: float) -> dict[str, Floats]:
         ``steps``; ``reward``: mean over steps and robots; ``goals_reached``; ``goals_per_robot_minute``;
         ``collisions`` and ``margin_violations``: robot-steps in contact, or within the margin; ``collided`` and
         ``margin_violated``: robots that ever were. Unless lifelong also ``arrived``: robots docked; ``success``:
-        1.0 when all have docked and none was ever in contact; ``travel_time`` and ``makespan``: mean and latest
-        arrival [s], with the time so far for a robot that has not docked. Each ``(...)`` float64.
+        1.0 when all have docked, but for those that are lost, and none was ever in contact; ``travel_time`` and
+        ``makespan``: mean and latest arrival [s], with the time so far for a robot that has not docked. Each ``(...)``
+        float64.
     """
     team_size, steps = counts.contacts.shape[-1], np.asarray(counts.steps, np.float64)
     robot_steps = team_size * np.maximum(steps, 1)
@@ -109,6 +117,7 @@ def episode_metrics(counts: EpisodeCounts, dt: float) -> dict[str, Floats]:
     if counts.arrival_step is None:
         return metrics
     times = np.minimum(counts.arrival_step * dt, (steps * dt)[..., None])
-    success = ((reached == team_size) & (np.asarray(collided) == 0)).astype(np.float64)
+    there = counts.goals > 0 if counts.lost is None else (counts.goals > 0) | counts.lost
+    success = (there.all(axis=-1) & (np.asarray(collided) == 0)).astype(np.float64)
     arrivals = {"travel_time": times.mean(axis=-1), "makespan": times.max(axis=-1)}
     return metrics | {"arrived": reached.copy(), "success": success} | arrivals

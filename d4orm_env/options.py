@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import Any
@@ -12,6 +12,10 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.core.problem import Problem
+from d4orm_env.disturbances.controls import ControlNoise
+from d4orm_env.disturbances.disturbance import Disturbance
+from d4orm_env.disturbances.selection import Disturbances, at_work, checked_disturbances
+from d4orm_env.env_inputs import noise_std
 from d4orm_env.rewards import RewardFunction
 from d4orm_env.scenarios.problems import ScenarioLike, find_scenario, make_problem, unknown_argument
 
@@ -30,6 +34,9 @@ class EnvOptions:
         render_mode: ``"rgb_array"``, ``"human"`` or ``None``.
         control_noise_std: Standard deviation of Gaussian execution noise, in the controls' units, for all components
             or one per component. It is added before the control is clipped.
+            It is short for ``ControlNoise(std)`` as the first of the disturbances.
+        disturbances: What goes wrong, in the order in which it acts: instances of :mod:`d4orm_env.disturbances`, or of
+            subclasses of your own. Those at level zero leave the environment as it is.
         lifelong: A robot that arrives gets a fresh random goal, keeps moving and is not terminated; its info says
             ``arrived`` at that step, and ``distance_to_goal`` is to the new goal.
         max_cycles: Steps until truncation; the problem's horizon unless given.
@@ -52,6 +59,7 @@ class EnvOptions:
     problem: Problem | None = None
     render_mode: str | None = None
     control_noise_std: ArrayLike = 0.0
+    disturbances: Sequence[Disturbance[Any]] = ()
     lifelong: bool = False
     max_cycles: int | None = None
     randomize_instance: bool | None = None
@@ -79,6 +87,19 @@ class EnvOptions:
                 raise UnknownKeywordError(complaint)
         options._check()
         return options
+
+    def disturbances_of(self, problem: Problem) -> Disturbances:
+        """All disturbances that change anything in a problem, noise on the controls included.
+
+        Raises:
+            ValueError: If one of them makes no sense, or the robots or the world cannot have it.
+        """
+        std = noise_std(self.control_noise_std, problem.control_size)
+        noise = () if std is None else (ControlNoise(tuple(std.tolist())),)
+        return at_work((*noise, *self.disturbances), problem)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "disturbances", checked_disturbances(self.disturbances))
 
     def _check(self) -> None:
         if not isinstance(self.randomize_instance, bool | None):

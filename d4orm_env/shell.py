@@ -5,6 +5,7 @@ from __future__ import annotations
 from d4orm_env._viewer import Frame, Viewer
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
+from d4orm_env.disturbances.disturbance import Effect
 from d4orm_env.options import EnvOptions
 from d4orm_env.simulation import Simulation
 
@@ -38,6 +39,22 @@ class EnvironmentShell:
             RuntimeError: Before the first reset.
         """
         return self._simulation.state()
+
+    def true_state(self) -> FloatArray:
+        """:meth:`state` as it truly is, where a disturbance of what is seen has it told otherwise.
+
+        Raises:
+            RuntimeError: Before the first reset.
+        """
+        return self._simulation.true_state()
+
+    def effect(self) -> Effect:
+        """What disturbances have done up to now, as arrays with one world as their first axis.
+
+        Raises:
+            RuntimeError: Before the first reset.
+        """
+        return self._simulation.effect()
 
     def metrics(self) -> dict[str, float]:
         """The episode so far in numbers; see :meth:`d4orm_env.episode_record.EpisodeRecord.metrics`.

@@ -13,11 +13,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, frozen_array, whole_number
+from d4orm_env.core.marks import Marks
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import inverse_initial_distance
-from d4orm_env.engine.base import StepResult, WorldEngine
-from d4orm_env.env_inputs import checked_cycles, checked_states, noise_std
+from d4orm_env.disturbances.disturbance import Effect, Scene, Seen
+from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
+from d4orm_env.disturbances.marks import marks_of
+from d4orm_env.disturbances.selection import total_spare
+from d4orm_env.engine.base import Sight, StepResult, WorldEngine
+from d4orm_env.env_inputs import checked_cycles, checked_states
 from d4orm_env.episode_record import EpisodeRecord
 from d4orm_env.joint_state import JointState, join_state, state_bounds
 from d4orm_env.lifelong import fresh_goal, goal_region, reached_goals
@@ -46,7 +51,8 @@ class Simulation:
         self.vouched = options.vouched
         self.problem = problem
         self.max_cycles = checked_cycles(problem.horizon if options.max_cycles is None else options.max_cycles)
-        self.noise_std = noise_std(options.control_noise_std, problem.control_size)
+        self.disturbances = options.disturbances_of(problem)
+        self._spare = total_spare(self.disturbances, problem)
         self.lifelong = options.lifelong
         self.reward = find_reward(options.reward)
         self.layout = ObservationLayout.for_problem(
@@ -54,7 +60,9 @@ class Simulation:
             num_neighbors=whole_number(options.observed_robots, "observed_robots", 0, _MAX_OBSERVED),
             num_obstacles=whole_number(options.observed_obstacles, "observed_obstacles", 0, _MAX_OBSERVED),
             observed_way=options.observed_way,
+            spare=self._spare,
         )
+        self._disturb(0)  # to know what bodies there are
         # In an open world the two are the same.
         self.along_ways = options.progress == "way" and problem.world.num_obstacles > 0
         if self.along_ways:
@@ -78,12 +86,17 @@ class Simulation:
         low, high = (frozen_array(bound, "bounds", (None,)) for bound in (self.layout.low, self.layout.high))
         self.layout = replace(self.layout, low=low, high=high)
         if self._running:
-            self._set_goals(self.arrays.goal, self.arrays.inverse_initial_distance)
+            for array in (*self.arrays, *self.arrays.grid):
+                if isinstance(array, np.ndarray):
+                    array.setflags(write=False)
+            if self._disturbed is not None:
+                self._true_limits.setflags(write=False)
 
     @property
     def state_bounds(self) -> tuple[FloatArray, FloatArray]:
         """Finite bounds of :meth:`state`, for the present ``max_cycles``."""
-        return state_bounds(self.problem, self._places, self.max_cycles)
+        num_bodies = 0 if self._disturbed is None else self._disturbed.bodies.shape[1]
+        return state_bounds(self.problem, self._places, self.max_cycles, self._spare, num_bodies)
 
     @property
     def out_of_time(self) -> bool:
@@ -136,8 +149,9 @@ class Simulation:
         Raises:
             ValueError: If the instance drawn does not fit the spaces fixed by the first one.
         """
-        # One draw per episode, so that an episode's noise does not depend on how long those before it were.
-        self._random = np.random.default_rng(int(random.integers(2**63)))
+        # One draw per episode, so that an episode does not depend on how long those before it were.
+        seed = int(random.integers(2**63))
+        self._random = np.random.default_rng(seed)
         if self.redraws:
             self.problem = self.draw_instance(self._random)
         problem = self.problem
@@ -146,7 +160,8 @@ class Simulation:
         self.arrived = np.zeros(problem.num_robots, np.bool_)
         self.controls = np.zeros((problem.num_robots, problem.control_size), np.float32)
         self.steps = 0
-        self.collided, margin_violated = self._engine.contacts(self.arrays, self.states)
+        self._disturb(seed)
+        self.collided, margin_violated = self._contacts()
         self.record = EpisodeRecord(problem.num_robots, problem.dt, self.lifelong)
         self._trail: deque[FloatArray] = deque([self.states[:, : self._dimension]], _TRAIL_LENGTH)
         self._running = True
@@ -159,14 +174,16 @@ class Simulation:
             RuntimeError: Before the first reset, or if lifelong mode finds no room for a goal.
         """
         self.require_reset()
-        if self.noise_std is not None:
-            noise = self._random.standard_normal(controls.shape, dtype=np.float32)
-            controls = controls + self.noise_std * noise
-        arrays = self.arrays
+        arrays, states = self.arrays, self.states
+        if self._disturbed is not None:
+            acted = self._disturbed.act(self._scene(), controls[None])
+            states, controls = acted[0][0], acted[1][0]
+            if self._disturbed.alters_limits:
+                arrays = arrays._replace(limits=self._true_limits)
         if self.lifelong:
             # A goal radius that nothing is within: a robot under way to its next goal neither docks nor stops.
             arrays = arrays._replace(squared_goal_radius=np.float32(-1))
-        result = self._engine.step(arrays, self.states, self.arrived, controls)
+        result = self._met(self._engine.step(arrays, states, self.arrived, controls))
         if self.lifelong:
             arrived = reached_goals(self.problem, self.arrays.goal, result.states, result.controls)
         else:
@@ -198,19 +215,38 @@ class Simulation:
         self.require_reset()
         shape = self.problem.start.shape
         self.states = checked_states(self.problem, states, self.arrived & self.problem.docks, self.state_bounds, shape)
-        self.collided, margin_violated = self._engine.contacts(self.arrays, self.states)
+        self.collided, margin_violated = self._contacts()
         self._trail.append(self.states[:, : self._dimension])
         return self._report(np.zeros(len(self.states), np.float32), self.arrived.copy(), margin_violated)
 
     def state(self) -> FloatArray:
         """The joint state vector; see :mod:`d4orm_env.joint_state`."""
+        return self._joined(self._seen)
+
+    def true_state(self) -> FloatArray:
+        """:meth:`state` as it truly is, whatever is seen."""
+        return self._joined(None)
+
+    def _joined(self, seen: Seen | None) -> FloatArray:
         self.require_reset()
-        return join_state(JointState(self.states, self.arrays.goal, self.controls, self.arrived, self.steps))
+        states, controls, bodies = self.states, self.controls, None
+        if seen is not None:
+            states, controls, bodies = (part[0] for part in seen)
+        elif self._disturbed is not None:
+            bodies = self._disturbed.bodies[0]
+        joint = JointState(states, self.arrays.goal, controls, self.arrived, self.steps)
+        return join_state(joint if bodies is None else joint._replace(bodies=bodies))
 
     def metrics(self) -> dict[str, float]:
         """The episode so far in numbers; see :meth:`d4orm_env.episode_record.EpisodeRecord.metrics`."""
         self.require_reset()
-        return self.record.metrics()
+        lost = self.effect().lost
+        return self.record.metrics(None if lost is None else lost[0])
+
+    def effect(self) -> Effect:
+        """What disturbances have done up to now, as of a batch of one world."""
+        self.require_reset()
+        return Effect() if self._disturbed is None else self._disturbed.effect(self._scene())
 
     @property
     def finished(self) -> BoolArray:
@@ -218,6 +254,44 @@ class Simulation:
         if self.lifelong:
             return np.zeros_like(self.arrived)
         return self.arrived if self.problem.docks else self.arrived & self.arrived.all()
+
+    def marks(self) -> Marks | None:
+        """Where the present moment is disturbed, as far as it can be drawn; ``None`` without disturbances."""
+        return marks_of([self.effect()], self.problem) if self.disturbances else None
+
+    def _disturb(self, seed: int) -> None:
+        """Begin the disturbances of an episode."""
+        self._disturbed: DisturbedWorlds | None = None
+        self._seen: Seen | None = None
+        if self.disturbances:
+            problem = self.problem
+            self._disturbed = DisturbedWorlds(self.disturbances, problem, 1, self.max_cycles)
+            self._disturbed.begin(np.arange(1), [seed], problem.start[None], problem.goal[None])
+            self._true_limits = self._disturbed.true_limits(problem.arrays.limits)
+
+    def _scene(self) -> Scene:
+        assert self._disturbed is not None
+        start, goal, steps = self.problem.start[None], self.arrays.goal[None], np.array([self.steps])
+        return self._disturbed.scene(start, goal, self.states[None], self.controls[None], self.arrived[None], steps)
+
+    def _contacts(self) -> tuple[BoolArray, BoolArray]:
+        """``(K,)`` who is in contact, and who within the margin, where all stand now."""
+        collided, violated = self._engine.contacts(self.arrays, self.states)
+        if self._disturbed is None or not self._disturbed.bodies.shape[1]:
+            return collided, violated
+        touched, near = self._disturbed.touched(np.array(self.states)[None])
+        return collided | touched[0], violated | near[0]
+
+    def _met(self, result: StepResult) -> StepResult:
+        """The result of a step with what robots met that is none."""
+        if self._disturbed is None or not self._disturbed.bodies.shape[1]:
+            return result
+        touched, near = self._disturbed.touched(result.states[None])
+        return result._replace(
+            collided=result.collided | touched[0],
+            margin_violated=result.margin_violated | near[0],
+            rewards=result.rewards - near[0],
+        )
 
     def _rewards(self, reward: RewardFunction, result: StepResult, arrived: BoolArray) -> FloatArray:
         """``(K,)`` of the step from the present states to ``result``."""
@@ -246,15 +320,27 @@ class Simulation:
         return distances
 
     def _report(self, rewards: FloatArray, arrived: BoolArray, margin_violated: BoolArray) -> TeamStep:
-        time_left = max(0.0, 1.0 - self.steps / self.max_cycles)
-        observations = self._engine.observe(
-            self.arrays, self.layout, self.states, self.controls, self.arrived, time_left
-        )
-        if self.layout.observed_way:
-            observe_ways(observations, self.layout, self.problem.ways, self.states[:, : self._dimension])
-        distances = self._distances(self.states)
+        observations, distances = self._observe(), self._distances(self.states)
         self.last = TeamStep(observations, rewards, arrived, self.collided, margin_violated, distances)
         return self.last
+
+    def _observe(self) -> FloatArray:
+        """``(K, D)`` what the robots see, or believe to see."""
+        layout, states = self.layout, self.states
+        time_left = max(0.0, 1.0 - self.steps / self.max_cycles)
+        if self._disturbed is None or not self._disturbed.alters_sight:
+            observations = self._engine.observe(self.arrays, layout, states, self.controls, self.arrived, time_left)
+        else:
+            self._seen = seen = self._disturbed.see(self._scene())
+            states = seen.states[0]
+            goal, left = self.arrays.goal[None].copy(), np.array([time_left], np.float32)
+            parts = (np.array(seen.states), np.array(seen.controls), self.arrived[None].copy(), np.array(seen.bodies))
+            sight = Sight(goal, *parts, left)
+            observations = np.empty((len(states), layout.size), np.float32)
+            self._engine.observe_worlds(self.arrays, layout, sight, observations[None])
+        if layout.observed_way:
+            observe_ways(observations, layout, self.problem.ways, states[:, : self._dimension])
+        return observations if self._disturbed is None else self._disturbed.observe(observations[None], layout)[0]
 
     def _assign_goals(self, robots: NDArray[np.intp]) -> None:
         if not len(robots):

@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
+from d4orm_env._vector_disturbances import DisturbedBatch
 from d4orm_env._vector_infos import final_infos, masked
 from d4orm_env._vector_inputs import checked_autoreset_mode, reset_mask, world_seeds
 from d4orm_env._world_draws import OWN_ARRAYS, WorldDraws
@@ -120,6 +121,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         self._engine: WorldEngine = CpuEngine(threads)
         start, goal, inverse = (np.repeat(getattr(problem.arrays, name)[None], count, axis=0) for name in OWN_ARRAYS)
         self._worlds = WorldBatch.of(start, goal, inverse, problem.control_size)
+        self._disturbances = DisturbedBatch(self._template, self._worlds)
         self._arrays: list[ProblemArrays] = [problem.arrays_to_observe(self._template.layout.num_obstacles)] * count
         self._problems = [problem] * count
         self._apart = False
@@ -189,13 +191,10 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         self._require_episodes()
         controls = joint_controls(actions, self._action_shape, self.problem.num_robots)
         ended = self._ended
-        noise = self._draws.noise(self._worlds.steps, ~ended)
-        if noise is not None:
-            controls += noise
+        before, worlds = self._before(), self._worlds
+        np.copyto(worlds.control, self._disturbances.act(controls))
         if ended.any():
             self._begin(np.flatnonzero(ended))
-        before, worlds = self._before(), self._worlds
-        np.copyto(worlds.control, controls)
         observations = self._advance(np.where(ended, RESET, STEP))
         self._reward(before, ~ended)
         ended = self._ended
@@ -240,7 +239,8 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         """
         self._require_reset()
         worlds = self._worlds
-        parts = (worlds.state, worlds.goal, worlds.control, worlds.docked, worlds.steps)
+        states, controls, bodies = self._disturbances.seen
+        parts = (states, worlds.goal, controls, worlds.docked, worlds.steps, bodies)
         return np.concatenate([part.reshape(self.num_envs, -1).astype(np.float32) for part in parts], axis=1)
 
     def metrics(self) -> dict[str, NDArray[np.float64]]:
@@ -252,7 +252,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         self._require_reset()
         worlds = self._worlds
         arrival = np.where(worlds.arrival > 0, worlds.arrival, np.inf)
-        counts = (worlds.docked, worlds.contacts, worlds.violations, arrival)
+        counts = (worlds.docked, worlds.contacts, worlds.violations, arrival, self._disturbances.lost)
         return episode_metrics(EpisodeCounts(worlds.steps, worlds.total_reward, *counts), self.problem.dt)
 
     @property
@@ -274,25 +274,51 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
 
     def _advance(self, orders: NDArray[np.int64], observations: FloatArray | None = None) -> FloatArray:
         """Carry out ``orders`` ``(B,)``, and return what is seen ``(B, K * D)``, in ``observations`` if given."""
-        template = self._template
+        from d4orm_env.engine.worlds import SKIP, STEP
+
         if observations is None:
             observations = np.empty_like(self._observations) if self._copy else self._observations
         out = observations.reshape(self._observations.shape)
-        advance, layout, cycles = self._engine.advance, template.layout, self.max_cycles
+        advance, layout, cycles = self._engine.advance, self.layout, self.max_cycles
+        made, true = out[:0] if self._disturbances.alters_sight else out, self._disturbances.true
         if not self._apart:
-            advance(self._arrays[0], layout, cycles, orders, self._worlds, out)
+            advance(true(self._arrays[0]), layout, cycles, orders, self._worlds, made)
         else:
             for world, arrays in enumerate(self._arrays):
                 one = slice(world, world + 1)
                 part = type(self._worlds)(*(values[one] for values in self._worlds))
-                advance(arrays, layout, cycles, orders[one], part, out[one])
-        if layout.observed_way:
-            places = self._worlds.state[..., : self.problem.dimension]
-            if not template.redraws:
-                observe_ways(out, layout, self.problem.ways, places)
-            for world, problem in enumerate(self._problems if template.redraws else ()):
-                observe_ways(out[world], layout, problem.ways, places[world])
+                advance(true(arrays), layout, cycles, orders[one], part, made[one])
+        self._disturbances.meet(orders == STEP)
+        if self._disturbances.alters_sight:
+            self._look(np.flatnonzero(orders != SKIP), out)
+        elif layout.observed_way:
+            self._observe_ways(np.arange(self.num_envs), self._worlds.state, out)
         return out.reshape(self.num_envs, -1)
+
+    def _look(self, worlds: NDArray[np.intp], out: FloatArray) -> None:
+        """Fill ``out`` ``(B, K, D)`` with what robots of these worlds see where something alters that."""
+        sight, layout = self._disturbances.look(worlds), self.layout
+        every = len(worlds) == len(out)
+        seen: FloatArray = out if every else np.empty((len(worlds), *out.shape[1:]), np.float32)
+        if not self._apart:
+            self._engine.observe_worlds(self._arrays[0], layout, sight, seen)
+        for row, world in enumerate(worlds if self._apart else ()):
+            one = slice(row, row + 1)
+            self._engine.observe_worlds(self._arrays[world], layout, sight.of(one), seen[one])
+        if layout.observed_way:
+            self._observe_ways(worlds, sight.states, seen)
+        seen = self._disturbances.observe(seen, layout)
+        if seen is not out:
+            out[worlds] = seen
+
+    def _observe_ways(self, worlds: NDArray[np.intp], states: FloatArray, out: FloatArray) -> None:
+        """Add the ways of some worlds, from ``states`` ``(b, K, n)``, to what is seen there, ``(b, K, D)``."""
+        places = states[..., : self.problem.dimension]
+        if not self._template.redraws:
+            observe_ways(out, self.layout, self.problem.ways, places)
+            return
+        for row, world in enumerate(worlds):
+            observe_ways(out[row], self.layout, self._problems[world].ways, places[row])
 
     def _before(self) -> WorldBatch | None:
         """The worlds before a step, as far as a reward is computed from them; ``None`` for the paper's."""
@@ -343,15 +369,17 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
                 self._worlds.inverse[world] = problem.arrays.inverse_initial_distance
                 self._arrays[world] = problem.arrays_to_observe(self._template.layout.num_obstacles)
                 self._apart |= bool(self._draws.differing(problem))
+        self._disturbances.begin(indices, self._draws.seeds)
 
     def _infos(self, mask: BoolArray | None = None) -> Info:
         """Fresh infos, present for the worlds in ``mask``, or for all."""
-        worlds = self._worlds
+        worlds, lost = self._worlds, self._disturbances.lost
+        there = worlds.docked if lost is None else worlds.docked | lost
         values = {
             "arrived": worlds.docked,
             "collided": worlds.collided,
             "margin_violated": worlds.violated,
             "distance_to_goal": worlds.distance,
-            "is_success": worlds.docked.all(axis=1) & ~worlds.contacts.any(axis=1),
+            "is_success": there.all(axis=1) & ~worlds.contacts.any(axis=1),
         }
         return masked(values, np.ones(self.num_envs, np.bool_) if mask is None else mask)

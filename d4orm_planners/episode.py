@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, whole_number
+from d4orm_env.core.marks import Marks
 from d4orm_env.core.metrics import mean_squared_jerk, mean_stretch
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary import Row, count, outcome_rows
 from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.disturbances.marks import marks_of
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_env.team_step import AgentInfos
 from d4orm_planners.registry import PolicyLike, make_policy
@@ -34,6 +36,7 @@ class Episode(Shown):
         observations: Observations of all agents at the reset and after every step.
         infos: Infos likewise.
         goals: ``(T+1, K, d)`` where the robots were to go; it changes in lifelong mode.
+        marks: Where it was disturbed, for pictures; ``None`` without disturbances.
     """
 
     problem: Problem
@@ -42,6 +45,7 @@ class Episode(Shown):
     observations: tuple[dict[str, FloatArray], ...]
     infos: tuple[AgentInfos, ...]
     goals: FloatArray
+    marks: Marks | None = None
 
     @property
     def title(self) -> str:
@@ -82,21 +86,24 @@ def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0) -> Episode:
     observations, infos = env.reset(seed=seed)
     problem = env.unwrapped.problem
     actor.reset(env, seed=seed)
-    joints = [split_state(problem, env.state())]
+    # What is recorded is the truth, whatever the policy sees.
+    joints, effects = [split_state(problem, env.unwrapped.true_state())], [env.unwrapped.effect().copy()]
     all_observations, all_infos = [observations], [infos]
     outcomes = [_outcome(env, {})]
     while env.agents:
         acting = {agent: observations[agent] for agent in env.agents}
         observations, rewards, _, _, infos = env.step(actor.act(acting, env.state()))
-        joints.append(split_state(problem, env.state()))
+        joints.append(split_state(problem, env.unwrapped.true_state()))
+        effects.append(env.unwrapped.effect().copy())
         all_observations.append(observations)
         all_infos.append(infos)
         outcomes.append(_outcome(env, rewards))
     trajectory = _trajectory(problem, joints, outcomes)
     jerk = mean_squared_jerk(trajectory.controls, trajectory.arrived, problem.dt)
     metrics = {**env.unwrapped.metrics(), "mean_squared_jerk": jerk}
+    marks = None if all(part is None for part in effects[0]) else marks_of(effects, problem)
     goals = np.stack([joint.goals for joint in joints])
-    return Episode(problem, trajectory, metrics, tuple(all_observations), tuple(all_infos), goals)
+    return Episode(problem, trajectory, metrics, tuple(all_observations), tuple(all_infos), goals, marks)
 
 
 class _Outcome(NamedTuple):

@@ -65,7 +65,7 @@ def run(teams: Iterable[tuple[str, int]], seeds: int, budget: int, out: Path) ->
         Study(policies=chosen, scenarios=(scenario,), num_robots=num_robots, seeds=range(seeds))
         for scenario, num_robots in teams
     )
-    return [trial for study in studies for _, trials in run_study(study, out, workers=1) for trial in trials]
+    return [trial for study in studies for group in run_study(study, out, workers=1) for trial in group.trials]
 
 
 def by_team(trials: Iterable[Trial]) -> dict[str, Cells]:

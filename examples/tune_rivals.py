@@ -94,7 +94,7 @@ def scores(method: str, chosen: Sequence[Settings], seeds: int, budget: int, out
         study = Study(
             policies=policies, scenarios=(scenario,), num_robots=num_robots, seeds=range(FIRST_SEED, FIRST_SEED + seeds)
         )
-        for label, trials in run_study(study, out, workers=1):
+        for label, trials, *_ in run_study(study, out, workers=1):
             needed[label] += map(penalised_steps, trials)
     return [float(np.mean(values)) for values in needed.values()]
 

@@ -98,7 +98,9 @@ def test_the_numbers_hang_together(results: dict[str, list[Any]]) -> None:
         assert row["steps_per_second"] == pytest.approx(1 / row["seconds_per_step"].median)
     for row in results["obstacles"]:
         assert row["ratio"].count == row["iteration"].count >= 1
-    assert [row["obstacles"] for row in results["environments"]] == [0, 0, 5, 5]
+    assert [(row["obstacles"], row["disturbances"]) for row in results["environments"]] == [
+        (0, 0), (0, 0), (5, 0), (5, 0), (0, 3), (0, 3)
+    ]  # fmt: skip
     assert [(row["obstacles"], row["where"]) for row in results["obstacles"]] == [(3, "near"), (5, "far")]
     (index,) = results["index"]
     assert 0 < index["bytes"] < 2**20

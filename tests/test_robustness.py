@@ -31,6 +31,7 @@ from d4orm_planners.evaluation.report import HEADER, markdown, write_robustness
 from d4orm_planners.evaluation.store import APPLICATION_ID, STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import SuccessRate, success_rate, success_rates, wilson_interval
+from d4orm_planners.evaluation.trials import Job
 from d4orm_planners.policy import DriveToGoal
 
 TINY: dict[str, Any] = {"num_robots": [2], "control_noise_std": [0.0, 0.3], "seeds": range(2), "workers": 1}
@@ -146,14 +147,15 @@ def test_the_table_is_that_of_the_files_that_are_out_there(tmp_path: Path) -> No
         (made,) = connection.execute("SELECT sql FROM sqlite_schema WHERE name = 'trials'").fetchone()
     for former, name in (("noise", "control_noise_std"), ("robots", "num_robots")):
         made = made.replace(name, former)
-    # Files that lack this column get it.
-    assert made.replace(" stretch REAL,", "").split() == FIRST_SCHEMA.split()
+    # Files that lack these columns get them.
+    made = made.replace(" stretch REAL,", "").replace(" disturbances TEXT NOT NULL,", "")
+    assert made.replace("seed, disturbances)", "seed)").split() == FIRST_SCHEMA.split()
 
 
 def test_a_store_of_the_version_before_is_read_as_it_is_and_goes_on(tmp_path: Path) -> None:
     TrialStore(tmp_path / "now.sqlite").add(trial(), trial(1))
     with closing(sqlite3.connect(tmp_path / "now.sqlite")) as connection:
-        columns = [row[1] for row in connection.execute("PRAGMA table_info(trials)") if row[1] != "stretch"]
+        columns = [row[1] for row in connection.execute("PRAGMA table_info(trials)") if row[1] not in LATER]
         rows = connection.execute(f"SELECT {', '.join(columns)} FROM trials").fetchall()
     path = tmp_path / "before.sqlite"
     with closing(sqlite3.connect(path)) as connection, connection:
@@ -170,6 +172,9 @@ def test_a_store_of_the_version_before_is_read_as_it_is_and_goes_on(tmp_path: Pa
     assert store.add(trial(2))
     assert TrialStore.existing(path).trials() == [trial(), trial(1), trial(2)]
 
+
+LATER = ("stretch", "disturbances")
+"""Columns that version 4 had not."""
 
 FIRST_SCHEMA = """
 CREATE TABLE trials (policy TEXT NOT NULL, config TEXT NOT NULL, problem TEXT NOT NULL, noise REAL NOT NULL,
@@ -379,10 +384,12 @@ def test_a_plan_is_made_once_for_all_levels_of_noise(tmp_path: Path, monkeypatch
 def test_resuming_runs_only_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rates_of(["goal"], tmp_path, **TINY)
     ran: list[tuple[int, tuple[float, ...]]] = []
+
+    def levels(job: Job) -> tuple[float, ...]:
+        return tuple(condition.control_noise_std for condition in job.conditions)
+
     run_job = pool_module.run_job
-    monkeypatch.setattr(
-        pool_module, "run_job", lambda job: (ran.append((job.seed, job.control_noise_std)), run_job(job))[1]
-    )
+    monkeypatch.setattr(pool_module, "run_job", lambda job: (ran.append((job.seed, levels(job))), run_job(job))[1])
     before = rates_of(["goal"], tmp_path, **TINY)
     assert ran == []
     counts: list[tuple[int, int]] = []

@@ -18,9 +18,12 @@ from d4orm_env.core.world_index import WIDER, WorldIndex
 class Sensed(NamedTuple):
     """What there is to see of the robots, and scratch for what one of them sees.
 
+    Behind the ``K`` robots come ``N`` bodies that move among them and are none.
+
     Attributes:
-        position: ``(K, d)``.
-        velocity: ``(K, d)``.
+        position: ``(K + N, d)``.
+        velocity: ``(K + N, d)``.
+        radius: ``(K + N,)``.
         heading: ``(K, 2)`` cosine and sine, zeros for models without a heading.
         arrived: ``(K,)`` 0 or 1.
         nearest_robots: ``(num_neighbors, 2)`` scratch: squared distance, robot.
@@ -29,6 +32,7 @@ class Sensed(NamedTuple):
 
     position: FloatArray
     velocity: FloatArray
+    radius: FloatArray
     heading: FloatArray
     arrived: FloatArray
     nearest_robots: FloatArray
@@ -54,7 +58,7 @@ def observe_robot(
     _see_itself(k, arrays, goal, sensed, out)
     out[2 * d + 3] = time_left
     _find_nearest_robots(k, sensed.position, sensed.nearest_robots)
-    _see_robots(k, arrays.radius, sensed, neighbors, out)
+    _see_robots(k, sensed, neighbors, out)
     _find_nearest_obstacles(sensed.position[k], arrays, sensed.nearest_obstacles)
     _see_obstacles(sensed.position[k], arrays, arrays.radius[k], sensed.nearest_obstacles, obstacles, out)
 
@@ -76,7 +80,7 @@ def _see_itself(k: int, arrays: ProblemArrays, goal: FloatArray, sensed: Sensed,
     out[2 * d + 7] = arrays.limits[k, 1]
 
 
-def _see_robots(k: int, radius: FloatArray, sensed: Sensed, i: int, out: FloatArray) -> None:
+def _see_robots(k: int, sensed: Sensed, i: int, out: FloatArray) -> None:
     """Fill the rows of neighbours, from component ``i`` on."""
     d = sensed.position.shape[1]
     for row in range(sensed.nearest_robots.shape[0]):
@@ -86,7 +90,7 @@ def _see_robots(k: int, radius: FloatArray, sensed: Sensed, i: int, out: FloatAr
         for axis in range(d):
             out[i + 1 + axis] = sensed.position[other, axis] - sensed.position[k, axis]
             out[i + 1 + d + axis] = sensed.velocity[other, axis] - sensed.velocity[k, axis]
-        out[i + 1 + 2 * d] = radius[other] if present else 0
+        out[i + 1 + 2 * d] = sensed.radius[other] if present else 0
         i += 2 + 2 * d
 
 

@@ -17,6 +17,29 @@ WINDING = 10
 """The longest way that an observation tells, over the farthest that anything may be from a robot."""
 
 
+class Spare(NamedTuple):
+    """Room beyond what robots and their observations keep to by themselves.
+
+    Attributes:
+        distance: Between where a robot is and where it is seen [m].
+        speed: Beyond the speed limit, in what is seen [m/s].
+        heading: Between true and seen [rad].
+        drift: How fast a robot may be moved beside what it does itself [m/s].
+        radius: Of what is seen and is no robot [m].
+    """
+
+    distance: float = 0.0
+    speed: float = 0.0
+    heading: float = 0.0
+    drift: float = 0.0
+    radius: float = 0.0
+
+    def joined(self, other: Spare) -> Spare:
+        """Room for both."""
+        sums = Spare(*(a + b for a, b in zip(self, other)))
+        return sums._replace(radius=max(self.radius, other.radius))
+
+
 class OwnParts(NamedTuple):
     """Where a robot sees itself; ``d`` position dimensions, lengths in m and speeds in m/s."""
 
@@ -155,22 +178,35 @@ class ObservationLayout(ObservationSlices):
 
     @classmethod
     def for_problem(
-        cls, problem: Problem, num_neighbors: int = 4, num_obstacles: int = 4, observed_way: bool = False
+        cls,
+        problem: Problem,
+        num_neighbors: int = 4,
+        num_obstacles: int = 4,
+        observed_way: bool = False,
+        spare: Spare = Spare(),  # noqa: B008 - it is immutable
     ) -> ObservationLayout:
         """The layout for a problem, with bounds that no motion of its robots can leave.
+
+        Args:
+            problem: The problem.
+            num_neighbors: Neighbours listed.
+            num_obstacles: Obstacles listed.
+            observed_way: Whether the way is there.
+            spare: Room beyond that, for what disturbs the motion or what is seen of it.
 
         Raises:
             ValueError: If a number of neighbours or obstacles is negative or not whole.
         """
         slices = ObservationSlices(problem.dimension, num_neighbors, num_obstacles, observed_way=observed_way)
-        team, reach = problem.team, _reach(problem)
+        team, reach = problem.team, _reach(problem, spare)
         radius, speed, acceleration = (
             float(values.max()) for values in (team.radius, team.max_speed, team.max_acceleration)
         )
         high = np.empty(slices.size, np.float32)
-        own = {"velocity": speed, "heading": 1, "speed": speed, "goal": reach, "time_left": 1, "arrived": 1}
+        seen_speed, widest = speed + spare.speed, max(radius, spare.radius)
+        own = {"velocity": seen_speed, "heading": 1, "speed": seen_speed, "goal": reach, "time_left": 1, "arrived": 1}
         own |= {"radius": radius, "max_speed": speed, "max_acceleration": acceleration}
-        neighbor = {"present": 1, "position": reach, "velocity": 2 * speed, "radius": radius}
+        neighbor = {"present": 1, "position": reach, "velocity": 2 * seen_speed, "radius": widest}
         _fill(high, slices.own, own)
         _fill(slices.neighbors(high), slices.neighbor, neighbor)
         _fill(slices.obstacles(high), slices.obstacle, {"present": 1, "position": reach, "gap": reach})
@@ -212,7 +248,7 @@ def _fill(values: FloatArray, parts: NamedTuple, bounds: Mapping[str, float]) ->
         values[..., getattr(parts, name)] = bound
 
 
-def _reach(problem: Problem) -> float:
+def _reach(problem: Problem, spare: Spare) -> float:
     """Farthest that anything may be from a robot [m]."""
     team, places = (
         problem.team,
@@ -221,7 +257,7 @@ def _reach(problem: Problem) -> float:
     speed, acceleration = float(team.max_speed.max()), float(team.max_acceleration.max())
     # Nobody gets further than the widest distance between places, plus a full-speed drive from either end. Within a
     # step a robot may exceed the speed limit, which is applied at its end.
-    drive = (speed + acceleration * problem.dt / 2) * problem.duration
+    drive = (speed + acceleration * problem.dt / 2 + spare.drift) * problem.duration + spare.distance
     return float(np.sqrt(np.square(np.ptp(places, axis=0)).sum())) + 2 * drive + 2 * float(team.radius.max())
 
 

@@ -196,6 +196,33 @@ class Engine(Protocol):
         ...
 
 
+class Sight(NamedTuple):
+    """What there is to see of ``B`` worlds.
+
+    Attributes:
+        goal: ``(B, K, d)`` [m].
+        states: ``(B, K, n)``.
+        controls: ``(B, K, m)`` executed last.
+        arrived: ``(B, K)`` bool.
+        bodies: ``(B, N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves among the robots and is
+            none; a radius of zero stands for one that is not seen.
+        time_left: ``(B,)`` share of the time left, 1 to 0.
+    """
+
+    goal: FloatArray
+    states: FloatArray
+    controls: FloatArray
+    arrived: BoolArray
+    bodies: FloatArray
+    time_left: FloatArray
+
+    def of(self, worlds: slice) -> Sight:
+        """The same of some of the worlds."""
+        floats = (self.goal, self.states, self.controls, self.bodies, self.time_left)
+        goal, states, controls, bodies, time_left = (part[worlds] for part in floats)
+        return Sight(goal, states, controls, self.arrived[worlds], bodies, time_left)
+
+
 class WorldEngine(Engine, Protocol):
     """An engine with what environments need as well."""
 
@@ -227,6 +254,10 @@ class WorldEngine(Engine, Protocol):
         """
         ...
 
+    def observe_worlds(self, arrays: ProblemArrays, layout: ObservationLayout, sight: Sight, out: FloatArray) -> None:
+        """Fill ``out`` ``(B, K, D)`` with what every robot of every world sees, inside the layout's bounds."""
+        ...
+
     def advance(
         self,
         arrays: ProblemArrays,
@@ -244,7 +275,7 @@ class WorldEngine(Engine, Protocol):
             max_cycles: Steps in an episode.
             orders: ``(B,)`` one of :data:`~d4orm_env.engine.worlds.STEP` and its like for every world.
             batch: The worlds; ``batch.control`` holds what to do.
-            out: ``(B, K, D)`` observations, output; those of skipped worlds are not written.
+            out: ``(B, K, D)`` observations, output; those of skipped worlds are not written. ``(0, K, D)`` makes none.
         """
         ...
 

@@ -20,6 +20,7 @@ from d4orm_env.engine.base import (
     SamplingResult,
     SamplingRules,
     SamplingTask,
+    Sight,
     StepResult,
     StepWatcher,
     checked_controls,
@@ -46,7 +47,7 @@ class CpuEngine:
         collided, violated, rewards = np.empty_like(docked), np.empty_like(docked), np.empty(docked.shape, np.float32)
         arrays = _typed(arrays)
         _kernels(arrays).step_worlds(
-            arrays, *_single(arrays), state, control, docked, collided, violated, rewards, _ONE_WORLD
+            arrays, *_single(arrays), state, control, docked, collided, violated, rewards, _ONE_TILE
         )  # fmt: skip
         return StepResult(state[0], control[0], docked[0], collided[0], violated[0], rewards[0])
 
@@ -70,22 +71,27 @@ class CpuEngine:
         time_left: float,
     ) -> FloatArray:
         """See :meth:`d4orm_env.engine.base.WorldEngine.observe`."""
-        out: FloatArray = np.empty((1, len(states), layout.size), np.float32)
-        arrays = _typed(arrays)
-        _kernels(arrays).observe_world(
-            arrays,
-            _single(arrays)[0],
+        sight = Sight(
+            np.array(arrays.goal, np.float32)[None],
             np.array(states, np.float32)[None],
             np.array(controls, np.float32)[None],
             np.array(arrived, bool)[None],
-            time_left,
-            layout.bounds,
-            layout.num_neighbors,
-            layout.num_obstacles,
-            out,
+            np.empty((1, 0, 2 * layout.dimension + 1), np.float32),
+            np.array([time_left], np.float32),
         )
+        out: FloatArray = np.empty((1, len(states), layout.size), np.float32)
+        self.observe_worlds(arrays, layout, sight, out)
         seen: FloatArray = out[0]
         return seen
+
+    def observe_worlds(self, arrays: ProblemArrays, layout: ObservationLayout, sight: Sight, out: FloatArray) -> None:
+        """See :meth:`d4orm_env.engine.base.WorldEngine.observe_worlds`."""
+        arrays = _typed(arrays)
+        kernel, shown = _kernels(arrays).observe_worlds, (layout.bounds, layout.num_neighbors, layout.num_obstacles)
+        if len(out) <= TILE:
+            kernel(arrays, *sight, *shown, _ONE_TILE, out)
+        else:
+            self._threads.over(-(-len(out) // TILE), lambda part: kernel(arrays, *sight, *shown, part, out))
 
     def advance(
         self,
@@ -274,7 +280,7 @@ def _by_counter(weights: FloatArray) -> tuple[FloatArray, FloatArray]:
     return turns[0::2] - turns[1::2], turns[0::2] + turns[1::2]
 
 
-_ONE_WORLD = np.array([0, 1])
+_ONE_TILE = np.array([0, 1])
 
 
 def _kernels(arrays: ProblemArrays) -> WorldKernels:

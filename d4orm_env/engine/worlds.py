@@ -232,20 +232,24 @@ def judge_worlds(
 
 
 @numba.njit(nogil=True, **OPTIONS)
-def _allocate_sensed(num_robots: Any, dimension: Any, num_neighbors: Any, num_obstacles: Any) -> Any:
+def _allocate_sensed(num_robots: Any, num_bodies: Any, dimension: Any, num_neighbors: Any, num_obstacles: Any) -> Any:
+    everybody = num_robots + num_bodies
     return observation.Sensed(
-        np.empty((num_robots, dimension), np.float32), np.empty((num_robots, dimension), np.float32),
-        np.empty((num_robots, 2), np.float32), np.empty(num_robots, np.float32),
+        np.empty((everybody, dimension), np.float32), np.empty((everybody, dimension), np.float32),
+        np.empty(everybody, np.float32), np.empty((num_robots, 2), np.float32), np.empty(num_robots, np.float32),
         np.empty((num_neighbors, 2), np.float32), np.empty((num_obstacles, 2), np.float32),
     )  # fmt: skip
 
 
 @inlined
 def _observe(
-    read_motion: Any, arrays: Any, goal: Any, docked: Any, time_left: Any, s: Any, w: Any, bounds: Any, sensed: Any,
-    out: Any,
+    read_motion: Any, arrays: Any, goal: Any, docked: Any, bodies: Any, time_left: Any, s: Any, w: Any, bounds: Any,
+    sensed: Any, out: Any,
 ) -> None:  # fmt: skip
-    """Fill ``out`` ``(K, D)`` with what the robots of the world in lane ``s`` see, inside ``bounds`` ``(2, D)``."""
+    """Fill ``out`` ``(K, D)`` with what the robots of the world in lane ``s`` see, inside ``bounds`` ``(2, D)``.
+
+    Beside robots they see ``bodies`` ``(N, 2 d + 1)``: position, velocity and radius, which is zero for an unseen one.
+    """
     num_robots, dimension = goal.shape
     for k in range(num_robots):
         for axis in range(dimension):
@@ -255,6 +259,13 @@ def _observe(
         for axis in range(dimension):
             if transition.stands(docked[k], arrays.docks):
                 sensed.velocity[k, axis] = ZERO
+        sensed.radius[k] = arrays.radius[k]
+    for body in range(bodies.shape[0]):
+        sensed.radius[num_robots + body] = bodies[body, 2 * dimension]
+        for axis in range(dimension):
+            unseen = bodies[body, 2 * dimension] <= ZERO
+            sensed.position[num_robots + body, axis] = np.float32(np.inf) if unseen else bodies[body, axis]
+            sensed.velocity[num_robots + body, axis] = bodies[body, dimension + axis]
     for k in range(num_robots):
         row = out[k]
         observation.observe_robot(k, arrays, goal, sensed, time_left, row)
@@ -265,22 +276,41 @@ def _observe(
 
 
 @cache
-def observe_world_kernel(names: tuple[str, ...]) -> Any:
-    """A kernel that fills ``out`` ``(1, K, D)`` with what every robot of a single world sees."""
+def observe_worlds_kernel(names: tuple[str, ...]) -> Any:
+    """A kernel that fills ``out`` ``(B, K, D)`` with what every robot of every world sees.
+
+    Args:
+        names: Models that the kernel is for.
+        arrays: The problem that the worlds share; its starts and goals are not looked at.
+        goal: ``(B, K, d)``.
+        state: ``(B, K, n)``.
+        control: ``(B, K, m)`` executed last.
+        docked: ``(B, K)`` bool.
+        bodies: ``(B, N, 2 d + 1)`` position, velocity and radius of what is no robot.
+        time_left: ``(B,)`` share of the time left, 1 to 0.
+        bounds: ``(2, D)`` lowest and highest observation.
+        num_neighbors: Robots in an observation.
+        num_obstacles: Obstacles in an observation.
+        tile_range: First tile of worlds and the one after the last.
+    """
     read_motion = motion_reader(names)
 
     @cached_kernel(models_key(SOURCES, names), variant="_".join(names), **OPTIONS)
-    def observe_world(
-        arrays: Any, goal: Any, state: Any, control: Any, docked: Any, time_left: Any, bounds: Any, num_neighbors: Any,
-        num_obstacles: Any, out: Any,
+    def observe_worlds(
+        arrays: Any, goal: Any, state: Any, control: Any, docked: Any, bodies: Any, time_left: Any, bounds: Any,
+        num_neighbors: Any, num_obstacles: Any, tile_range: Any, out: Any,
     ) -> None:  # fmt: skip
         num_robots, dimension = arrays.goal.shape
         w = tiles.aligned_zeros(num_robots * STRIDE)
-        _load_world(goal, state, control, docked, 0, 0, w)
-        sensed = _allocate_sensed(num_robots, dimension, num_neighbors, num_obstacles)
-        _observe(read_motion, arrays, goal[0], docked[0], np.float32(time_left), 0, w, bounds, sensed, out[0])
+        sensed = _allocate_sensed(num_robots, bodies.shape[1], dimension, num_neighbors, num_obstacles)
+        for index in range(tile_range[0], tile_range[1]):
+            first = index * TILE
+            _load(goal, state, control, docked, first, w)
+            for s in range(min(TILE, state.shape[0] - first)):
+                b = first + s
+                _observe(read_motion, arrays, goal[b], docked[b], bodies[b], time_left[b], s, w, bounds, sensed, out[b])
 
-    return observe_world
+    return observe_worlds
 
 
 STEP, RESET, LOOK, SKIP = (np.uint8(order) for order in range(4))
@@ -424,7 +454,8 @@ def advance_worlds_kernel(names: tuple[str, ...]) -> Any:
         orders: ``(B,)`` uint8, one of ``STEP``, ``RESET``, ``LOOK`` and ``SKIP`` for every world.
         batch: The worlds, a :class:`WorldBatch`.
         tile_range: First tile of worlds and the one after the last.
-        out: ``(B, K, D)`` observations; those of skipped worlds are not written.
+        out: ``(B, K, D)`` observations; those of skipped worlds are not written. ``(0, K, D)`` leaves them to
+            :func:`observe_worlds_kernel`.
     """
     move_robot = robot_mover(names)
     read_motion = motion_reader(names)
@@ -438,7 +469,8 @@ def advance_worlds_kernel(names: tuple[str, ...]) -> Any:
         num_robots, dimension = arrays.goal.shape
         w = tiles.aligned_zeros(num_robots * STRIDE)
         near = np.empty((num_robots, 2), np.uint64)
-        sensed = _allocate_sensed(num_robots, dimension, num_neighbors, num_obstacles)
+        sensed = _allocate_sensed(num_robots, 0, dimension, num_neighbors, num_obstacles)
+        bodies = np.empty((0, 2 * dimension + 1), np.float32)
         for index in range(tile_range[0], tile_range[1]):
             first = index * TILE
             count = min(TILE, orders.shape[0] - first)
@@ -463,10 +495,13 @@ def advance_worlds_kernel(names: tuple[str, ...]) -> Any:
                 if orders[b] != SKIP:
                     for k in range(num_robots):
                         batch.distance[b, k] = np.sqrt(w[k * STRIDE + DISTANCE2 * TILE + s])
+                    if out.shape[0] == 0:
+                        continue
                     time_left = np.float32(max(0.0, 1.0 - batch.steps[b] / max_cycles))
                     _observe(
-                        read_motion, arrays, batch.goal[b], batch.docked[b], time_left, s, w, bounds, sensed, out[b]
-                    )
+                        read_motion, arrays, batch.goal[b], batch.docked[b], bodies, time_left, s, w, bounds, sensed,
+                        out[b],
+                    )  # fmt: skip
 
     return advance_worlds
 
@@ -476,7 +511,7 @@ class WorldKernels(NamedTuple):
 
     step_worlds: Any
     roll_out: Any
-    observe_world: Any
+    observe_worlds: Any
     advance_worlds: Any
 
 
@@ -487,7 +522,7 @@ def world_kernels(models: tuple[str, ...]) -> WorldKernels:
     own = models_of_kernel(models)
     names = COMMON if set(own) <= set(COMMON) else own
     return WorldKernels(
-        step_worlds_kernel(names), roll_out_kernel(own), observe_world_kernel(names), advance_worlds_kernel(names)
+        step_worlds_kernel(names), roll_out_kernel(own), observe_worlds_kernel(names), advance_worlds_kernel(names)
     )
 
 

@@ -14,6 +14,7 @@ from PIL import Image
 
 from d4orm_env.core.arrays import positive_number, whole_number
 from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.marks import Marks
 from d4orm_env.core.metrics import arrival_times
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
@@ -39,6 +40,7 @@ def save_animation(
     fps: float | None = None,
     speed: float = 1.0,
     max_frames: int = 400,
+    marks: Marks | None = None,
 ) -> Path:
     """Write a trajectory as a moving picture, up to half a second after the last robot has arrived, or to its end.
 
@@ -49,6 +51,7 @@ def save_animation(
         fps: Frames per second; by default one frame per time step, at most 20.
         speed: How many times faster than real time it plays.
         max_frames: A longer animation gets fewer frames per second, at the same speed.
+        marks: Where it was disturbed, as for :func:`~d4orm_env.render.plot_trajectory`.
 
     Returns:
         The path.
@@ -67,7 +70,7 @@ def save_animation(
         renderer = FrameRenderer(problem, frame_size(problem, trajectory), trajectory.positions)
         try:
             write = _write_gif if kind == ".gif" else _write_mp4
-            write(temporary, _Frames(renderer, trajectory, steps), rate)
+            write(temporary, _Frames(renderer, trajectory, steps, marks), rate)
         finally:
             renderer.close()
     return path
@@ -109,8 +112,10 @@ def frame_size(problem: Problem, trajectory: Trajectory) -> tuple[int, int]:
 class _Frames:
     """The images of an animation, drawn when asked for."""
 
-    def __init__(self, renderer: FrameRenderer, trajectory: Trajectory, steps: NDArray[np.int64]) -> None:
-        self.renderer, self.trajectory, self.steps = renderer, trajectory, steps
+    def __init__(
+        self, renderer: FrameRenderer, trajectory: Trajectory, steps: NDArray[np.int64], marks: Marks | None = None
+    ) -> None:
+        self.renderer, self.trajectory, self.steps, self.marks = renderer, trajectory, steps, marks
         self.contacts = contact_points(trajectory)
 
     def __len__(self) -> int:
@@ -128,6 +133,7 @@ class _Frames:
             trajectory.collided[step],
             trail=trajectory.positions[: step + 1],
             contacts=self.contacts[step],
+            marks=None if self.marks is None else self.marks.until(step),
             caption=f"{problem.name}    {step * problem.dt:.1f} s    arrived {arrived.sum()} of {len(arrived)}",
         )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import matplotlib as mpl
@@ -14,7 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import ArrayLike, NDArray
 
+from d4orm_env.core.marks import Marks
 from d4orm_env.core.problem import Problem
+from d4orm_env.render.marks import MarkLayer
 from d4orm_env.render.panels import INK, Array, Panel, TeamLayer, make_axes, view_limits
 
 __all__ = ["FrameRenderer", "WindowRenderer"]
@@ -49,13 +52,19 @@ class FrameRenderer:
         self._canvas = FigureCanvasAgg(figure)
         panels = self._panels(figure, limits)
         self._layers = [TeamLayer(panel, self.problem) for panel in panels]
+        self._mark_layers = [MarkLayer(panel, self.problem) for panel in panels]
         self._caption = figure.text(0.5, 0.965, "", ha="center", va="center", fontsize=10, color=INK, animated=True)
-        for layer in self._layers:
-            for artist in layer.artists:
-                artist.set_animated(True)
+        for artist, _ in self._artists:
+            artist.set_animated(True)
         self._limits = limits
         self._canvas.draw()
         self._background = self._canvas.copy_from_bbox(figure.bbox)
+
+    @property
+    def _artists(self) -> Iterator[tuple[Any, Panel]]:
+        """All that moves, in drawing order, with its panel."""
+        for layer, mark_layer in zip(self._layers, self._mark_layers):
+            yield from ((artist, layer.panel) for artist in (*layer.artists, *mark_layer.artists))
 
     def _panels(self, figure: Figure, limits: Array) -> list[Panel]:
         if self.problem.dimension == 2:
@@ -81,6 +90,7 @@ class FrameRenderer:
         *,
         contacts: ArrayLike = (),
         caption: str | None = None,
+        marks: Marks | None = None,
     ) -> NDArray[np.uint8]:
         """Draw one state.
 
@@ -92,6 +102,7 @@ class FrameRenderer:
             trail: ``(T, K, d)`` positions up to now, oldest first.
             contacts: ``(N, d)`` further points to mark with a star, such as earlier contacts.
             caption: Text above the picture; by default how many robots have arrived.
+            marks: Where the execution was disturbed up to now; its moments are the last ones of ``trail``.
 
         Returns:
             ``(height, width, 3)`` image, the caller's own.
@@ -108,6 +119,9 @@ class FrameRenderer:
         self._keep_in_view(np.concatenate([team[:, :d], places]))
         for layer in self._layers:
             layer.update(team, docked, places, way, stars)
+        if marks is not None:
+            for mark_layer in self._mark_layers:
+                mark_layer.show_last(marks, way[-len(marks.pushed) :])
         self._caption.set_text(f"arrived {docked.sum()} of {len(docked)}" if caption is None else caption)
         return self._paint()
 
@@ -135,11 +149,10 @@ class FrameRenderer:
 
     def _paint(self) -> NDArray[np.uint8]:
         self._canvas.restore_region(self._background)
-        for layer in self._layers:
-            for artist in layer.artists:
-                if layer.panel.spatial:
-                    artist.do_3d_projection()
-                layer.panel.axes.draw_artist(artist)
+        for artist, panel in self._artists:
+            if panel.spatial:
+                artist.do_3d_projection()
+            panel.axes.draw_artist(artist)
         self._canvas.figure.draw_artist(self._caption)
         return np.array(self._canvas.buffer_rgba())[..., :3].copy()
 
@@ -147,7 +160,7 @@ class FrameRenderer:
         """Let go of the figure. Closing twice is fine."""
         if not self._closed:
             self._closed = True
-            del self._canvas, self._layers, self._caption, self._background
+            del self._canvas, self._layers, self._mark_layers, self._caption, self._background
 
 
 class WindowRenderer:

@@ -23,6 +23,7 @@ from d4orm_env.core.problem import Problem
 
 OKABE_ITO = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#000000", "#F0E442")
 OBSTACLE, OBSTACLE_EDGE, BOUND, SHADOW, INK = "#C9CDD2", "#6B7280", "#374151", "#D9DCE1", "#1F2937"
+PUSH, BODY = "#7C3AED", "#4B5563"
 CONTACT, MARGIN, CLEAR = "#D0021B", "#F7B6BD", (1.0, 1.0, 1.0, 0.0)
 
 _ANGLES = np.linspace(0, 2 * np.pi, 36, endpoint=False)
@@ -46,7 +47,9 @@ def robot_colors(num_robots: int) -> Array:
 def picture_palette(num_robots: int, size: int) -> Array:
     """``(size, 3)`` uint8 colours that a picture of the team is made of: every solid one, then blends with white."""
     shades = np.array([1.0, 0.85, 0.65, ARRIVED_SHADE, 0.2])[:, None, None]
-    flat = np.array([to_rgb(color) for color in (CONTACT, MARGIN, OBSTACLE, OBSTACLE_EDGE, BOUND, INK, SHADOW)])
+    flat = np.array(
+        [to_rgb(color) for color in (CONTACT, MARGIN, OBSTACLE, OBSTACLE_EDGE, BOUND, INK, SHADOW, PUSH, BODY)]
+    )
     grays = np.repeat(np.linspace(0, 1, 12), 3).reshape(-1, 3)
     robots = robot_colors(num_robots)
     most = (size - len(flat) - len(grays)) // len(shades)

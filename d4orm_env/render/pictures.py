@@ -12,10 +12,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.marks import Marks
 from d4orm_env.core.metrics import arrival_times
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary import count
 from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.render.marks import MarkLayer, mark_legend
 from d4orm_env.render.panels import (
     CONTACT,
     INK,
@@ -63,7 +65,9 @@ def checked_trajectory(problem: Problem, trajectory: Trajectory) -> None:
         raise ValueError(f"state of robot_{robot} at step {t} is not finite; roll out finite controls to draw them")
 
 
-def plot_trajectory(problem: Problem, trajectory: Trajectory, *, title: str | None = None) -> Figure:
+def plot_trajectory(
+    problem: Problem, trajectory: Trajectory, *, title: str | None = None, marks: Marks | None = None
+) -> Figure:
     """Draw a whole trajectory, to scale: what the world is, where every robot went, and what went wrong.
 
     A circle in a robot's colour is its start, a diamond its goal, the filled disc where it ends (paler when it has
@@ -75,6 +79,8 @@ def plot_trajectory(problem: Problem, trajectory: Trajectory, *, title: str | No
         problem: The problem that the trajectory belongs to.
         trajectory: What to draw.
         title: Title of the figure; by default the problem's name and the outcome, ``""`` for none.
+        marks: Where it was disturbed, ``episode.marks``: arrows are pushes, as long as the way in a second at their
+            speed, crosses are where a robot stops obeying, and grey discs with dotted ways are intruders.
 
     Returns:
         A figure that belongs to no window; save it with ``figure.savefig`` or display it in a notebook.
@@ -93,13 +99,16 @@ def plot_trajectory(problem: Problem, trajectory: Trajectory, *, title: str | No
         panel = Panel(make_axes(figure, place, view), problem, limits)
         layer = TeamLayer(panel, problem)
         _draw_history(layer, trajectory)
+        if marks is not None:
+            MarkLayer(panel, problem).show_all(marks, np.asarray(trajectory.positions))
         if not panel.spatial:
             _number_robots(layer, trajectory, points_per_metre=72 * 4.6 / float(np.max(size[:2])))
     title = _outcome(problem, trajectory) if title is None else title
     if title:
         figure.suptitle(title, fontsize=11)
     spacing = {"columnspacing": 1.4, "handletextpad": 0.1, "fontsize": 8.5, "frameon": False}
-    figure.legend(handles=_legend(problem, trajectory), loc="outside lower center", ncols=6, **spacing)
+    handles = _legend(problem, trajectory) + ([] if marks is None else mark_legend(marks))
+    figure.legend(handles=handles, loc="outside lower center", ncols=6, **spacing)
     return figure
 
 
@@ -206,7 +215,14 @@ def _legend(problem: Problem, trajectory: Trajectory) -> list[Line2D]:
     return [line for shown, line in entries if shown]
 
 
-def save_picture(problem: Problem, trajectory: Trajectory, path: str | Path, *, title: str | None = None) -> Path:
+def save_picture(
+    problem: Problem,
+    trajectory: Trajectory,
+    path: str | Path,
+    *,
+    title: str | None = None,
+    marks: Marks | None = None,
+) -> Path:
     """Write :func:`plot_trajectory` to a PNG, SVG or PDF file, by its suffix. The same input gives the same bytes.
 
     Returns:
@@ -220,7 +236,7 @@ def save_picture(problem: Problem, trajectory: Trajectory, path: str | Path, *, 
     kind = path.suffix.lower()[1:]
     undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
     with replaced_when_done(path, PICTURE_SUFFIXES) as temporary:
-        figure = plot_trajectory(problem, trajectory, title=title)
+        figure = plot_trajectory(problem, trajectory, title=title, marks=marks)
         with mpl.rc_context({"svg.hashsalt": "d4orm", "pdf.fonttype": 42}):
             figure.savefig(temporary, format=kind, dpi=160, metadata=undated.get(kind))
     return path

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from pydantic import Field
@@ -13,6 +13,7 @@ from pydantic import Field
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.dynamics import COMMON, get_model
 from d4orm_env.core.problem import Problem
+from d4orm_env.disturbances import Delay, Disturbance, Dropout, StateNoise
 from d4orm_env.engine.base import SamplingTask
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.scenarios import make_problem
@@ -111,6 +112,9 @@ QUICK: Mapping[str, object] = {
 FIRST_STEPS = 5
 """Steps at the largest noise that are run together to time one."""
 
+DISTURBANCES: tuple[Disturbance[Any], ...] = (Delay(2), Dropout(0.3), StateNoise(0.02, 0.05))
+"""With what environments are stepped beside those that nothing disturbs."""
+
 Run: TypeAlias = Callable[[FloatArray, bool], object]
 """``(noise_scale, collisions)`` to what is timed."""
 
@@ -143,6 +147,9 @@ def parts(settings: BenchmarkSettings) -> Iterator[Part]:
         among = f" among {num_boxes} boxes" if num_boxes else ""
         yield "environments", f"one environment{among}", partial(_measure_env, settings, num_boxes)
         yield "environments", f"{settings.num_worlds} worlds{among}", partial(_measure_worlds, settings, num_boxes)
+    for what, measurement in (("one environment", _measure_env), (f"{settings.num_worlds} worlds", _measure_worlds)):
+        disturbed = partial(measurement, settings, 0, DISTURBANCES)
+        yield "environments", f"{what} with {len(DISTURBANCES)} disturbances", disturbed
     surroundings: dict[Where, tuple[int, ...]] = {"near": settings.obstacles, "far": settings.far_obstacles}
     for where, counts in surroundings.items():
         for count in counts:
@@ -237,11 +244,11 @@ def _measure_obstacles(settings: BenchmarkSettings, num_boxes: int, where: Where
     return measure_obstacles(iterate, num_boxes, where, settings.repetitions, settings.time_limit)
 
 
-def _measure_env(settings: BenchmarkSettings, num_boxes: int) -> Row:
+def _measure_env(settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[Disturbance[Any]] = ()) -> Row:
     """One PettingZoo environment of 8 robots under random controls, resets included."""
     from d4orm_env import navigation_v0
 
-    env = navigation_v0.parallel_env(problem=boxed_problem(num_boxes, "near"))
+    env = navigation_v0.parallel_env(problem=boxed_problem(num_boxes, "near"), disturbances=disturbances)
     env.reset(seed=0)
     space = env.action_space(env.possible_agents[0])
     random = np.random.default_rng(0)
@@ -258,11 +265,12 @@ def _measure_env(settings: BenchmarkSettings, num_boxes: int) -> Row:
 
     spread = measure(steps, settings.repetitions, settings.time_limit)
     env.close()
-    row = {"environment": "parallel_env", "num_worlds": 1, "num_robots": 8, "obstacles": num_boxes}
+    row: Row = {"environment": "parallel_env", "num_worlds": 1, "num_robots": 8, "obstacles": num_boxes}
+    row["disturbances"] = len(disturbances)
     return {**row, **_rate(spread, settings.env_steps)}
 
 
-def _measure_worlds(settings: BenchmarkSettings, num_boxes: int) -> Row:
+def _measure_worlds(settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[Disturbance[Any]] = ()) -> Row:
     """The batched environment of 8 robots per world under random controls, auto-reset included."""
     import gymnasium
 
@@ -272,6 +280,7 @@ def _measure_worlds(settings: BenchmarkSettings, num_boxes: int) -> Row:
         num_envs=size,
         vectorization_mode="vector_entry_point",
         problem=boxed_problem(num_boxes, "near"),
+        disturbances=disturbances,
     )
     env.reset(seed=0)
     space = env.single_action_space
@@ -287,7 +296,8 @@ def _measure_worlds(settings: BenchmarkSettings, num_boxes: int) -> Row:
 
     spread = measure(steps, settings.repetitions, settings.time_limit)
     env.close()
-    row = {"environment": "make_vec", "num_worlds": size, "num_robots": 8, "obstacles": num_boxes}
+    row: Row = {"environment": "make_vec", "num_worlds": size, "num_robots": 8, "obstacles": num_boxes}
+    row["disturbances"] = len(disturbances)
     return {**row, **_rate(spread, calls * size)}
 
 

@@ -108,11 +108,13 @@ def _environments(rows: list[Row]) -> str:
             str(row["num_worlds"]),
             str(row["num_robots"]),
             str(row["obstacles"]),
+            str(row["disturbances"]),
             f"{row['steps_per_second']:,.0f}",
         )
         for row in rows
     ]
-    return table("Environment steps", ("environment", "worlds", "robots", "boxes", "env-steps per second"), lines)
+    header = ("environment", "worlds", "robots", "boxes", "disturbances", "env-steps per second")
+    return table("Environment steps", header, lines)
 
 
 def _obstacles(rows: list[Row]) -> str:

@@ -9,15 +9,27 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from d4orm_planners.commands.dataclass_options import takes
-from d4orm_planners.commands.inputs import MOST_SEEDS, decimals, make_folder, names, numbers, parse_settings
+from d4orm_planners.commands.inputs import (
+    MOST_SEEDS,
+    decimals,
+    make_folder,
+    names,
+    numbers,
+    parse_levels,
+    parse_settings,
+)
 from d4orm_planners.commands.options import Quiet, ScenarioSettings, TimeLimit
 
 if TYPE_CHECKING:
-    from d4orm_planners.evaluation.summary import SuccessRate
+    from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup
 
 NoiseLevels = Annotated[
-    str,
+    str | None,
     typer.Option("--control-noise-std", "--noise", help="Standard deviations of the execution noise, as 0,0.1."),
+]
+DisturbanceLevels = Annotated[
+    list[str] | None,
+    typer.Option("--disturb", help="Levels of a disturbance, as delay=0,1,2 or push.speed=0.2,0.5; repeatable."),
 ]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to, and to go on from.")]
 
@@ -51,6 +63,7 @@ class StudyOptions:
         str, typer.Option("--seeds", "--trials", "-n", help="How many, or which: 50 for 0 to 49, 10-19, or 3,5,8.")
     ] = "50"
     control_noise_std: NoiseLevels = "0"
+    disturb: DisturbanceLevels = None
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="A setting of all policies that have it, or of one, as orca.time_horizon=2."),
@@ -66,8 +79,8 @@ class StudyOptions:
     out: Out = Path("evaluation")
     quiet: Quiet = False
 
-    def run(self) -> list[SuccessRate]:
-        """Run the trials that are not stored yet, and sum all up.
+    def run(self) -> list[TrialGroup]:
+        """Run the trials that are not stored yet, and give all that were asked for.
 
         Raises:
             ValueError: For an option that makes no sense. Nothing has run then.
@@ -75,13 +88,15 @@ class StudyOptions:
         from d4orm_planners.commands.progress import resumable
         from d4orm_planners.evaluation.evaluate import run_study
         from d4orm_planners.evaluation.study import Study
-        from d4orm_planners.evaluation.summary import success_rates
 
         study = Study(
             policies=_with_settings(_policies(self.policies or ["d4orm,goal"]), parse_settings(self.settings)),
             scenarios=names(self.scenario) or (),
             seeds=_seeds(self.seeds),
-            control_noise_std=decimals("--control-noise-std", self.control_noise_std),
+            control_noise_std=decimals(
+                "--control-noise-std", "0" if self.control_noise_std is None else self.control_noise_std
+            ),
+            disturbances=parse_levels(self.disturb),
             num_robots=numbers("--num-robots", self.num_robots) or (None,),
             model=names(self.model),
             scenario_settings=parse_settings(self.scenario_settings, "--scenario-set"),
@@ -89,20 +104,24 @@ class StudyOptions:
         )
         make_folder(self.out)
         with resumable(f"the finished trials are kept in {self.out}", enabled=not self.quiet) as progress:
-            trials = run_study(
+            return run_study(
                 study, self.out, trial_timeout=self.trial_timeout, workers=self.workers, ray=self.ray, progress=progress
             )
-        return success_rates(trials)
 
 
 @takes(StudyOptions)
 def evaluate(options: StudyOptions) -> None:
-    """Compare policies on scenarios, team sizes, seeds and levels of noise; goes on where it was stopped."""
+    """Compare policies on scenarios, team sizes, seeds, noise and disturbances; goes on where it was stopped."""
     from d4orm_planners.commands.progress import tell_results
+    from d4orm_planners.evaluation.disturbance_report import write_disturbances
     from d4orm_planners.evaluation.report import PARQUET_HINT, markdown, write_results
+    from d4orm_planners.evaluation.summary import success_rates
 
-    rates = options.run()
+    groups = options.run()
+    rates = success_rates(groups)
     written = write_results(options.out, rates)
+    if options.disturb is not None:
+        written += write_disturbances(options.out, groups)
     if not options.quiet:
         tell_results(markdown(rates), written)
     if options.out / "trials.parquet" not in written:

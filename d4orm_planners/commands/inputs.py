@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -33,6 +34,31 @@ def parse_settings(settings: list[str] | None, option: str = "--set") -> dict[st
         except ValueError as error:
             raise ValueError(f"{option} {setting!r}: the value {error}") from None
     return values
+
+
+def parse_levels(texts: list[str] | None) -> dict[str, list[Any]] | None:
+    """``name=level,level`` texts of ``--disturb`` as levels by name, read as YAML 1.2; ``None`` stays.
+
+    Raises:
+        ValueError: If a text has another form, or gives a name again.
+    """
+    from d4orm_env.core.yaml_text import parse_yaml
+
+    if texts is None:
+        return None
+    levels: dict[str, list[Any]] = {}
+    for text in texts:
+        name, separator, listed = (part.strip() for part in text.partition("="))
+        if not separator or not name or not listed:
+            raise ValueError(f"--disturb {text!r} is not of the form name=levels, as delay=0,1,2 or push.speed=0.2,0.5")
+        if name in levels:
+            raise ValueError(f"--disturb gives {name!r} twice; give it once")
+        try:
+            values: Any = parse_yaml(f"[{listed}]")
+        except ValueError as error:
+            raise ValueError(f"--disturb {text!r}: the levels {error}") from None
+        levels[name] = [math.inf if value == "inf" else value for value in values]
+    return levels
 
 
 def refuse_options(context: typer.Context, options: Iterable[str], reason: str) -> None:

@@ -11,6 +11,7 @@ import typer
 from d4orm_planners.commands.inputs import check_target, parse_settings, refuse_options
 
 if TYPE_CHECKING:
+    from d4orm_env.core.marks import Marks
     from d4orm_env.core.problem import Problem
     from d4orm_env.core.trajectory import Trajectory
 
@@ -83,11 +84,11 @@ class PictureOptions:
         check_target(self.picture, (".png", ".svg", ".pdf"))
         check_target(self.animation, (".gif", ".mp4"))
 
-    def draw(self, problem: Problem, trajectory: Trajectory) -> None:
+    def draw(self, problem: Problem, trajectory: Trajectory, marks: Marks | None = None) -> None:
         """Write the pictures that were asked for."""
         from d4orm_env.render import save_animation, save_picture
 
         if self.picture is not None:
-            save_picture(problem, trajectory, self.picture)
+            save_picture(problem, trajectory, self.picture, marks=marks)
         if self.animation is not None:
-            save_animation(problem, trajectory, self.animation)
+            save_animation(problem, trajectory, self.animation, marks=marks)

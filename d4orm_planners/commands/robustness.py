@@ -1,30 +1,53 @@
-"""``d4orm robustness``: ``d4orm evaluate`` at several levels of noise, with a picture of success against noise."""
+"""``d4orm robustness``: ``d4orm evaluate`` at several levels of every disturbance, or of those that are named."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from d4orm_planners.commands.dataclass_options import takes
 from d4orm_planners.commands.evaluate import NoiseLevels, Out, StudyOptions, require_trials
 
+STANDARD = (
+    "control_noise=0,0.1,0.2,0.3",
+    "correlated_noise=0,0.1,0.2,0.3",
+    "bias=0,0.05,0.1,0.2",
+    "delay=0,1,2,4",
+    "dropout=0,0.1,0.3,0.5",
+    "gain=0,0.1,0.2,0.4",
+    "state_noise=0,0.01,0.02,0.05",
+    "state_delay=0,1,2,4",
+    "push.speed=0,0.2,0.3,0.5",
+    "stall=0,0.1,0.3",
+    "intruder=0,1,2",
+    "limit_mismatch=1,0.9,0.8,0.7",
+)
+"""Levels that are run where none are named, from harmless to bad; all robot models have these disturbances."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RobustnessOptions(StudyOptions):
-    """Those of ``d4orm evaluate``, with several levels of noise."""
+    """Those of ``d4orm evaluate``; without levels of noise or disturbances :data:`STANDARD`."""
 
-    control_noise_std: NoiseLevels = "0,0.05,0.1,0.2"
+    control_noise_std: NoiseLevels = None
     out: Out = Path("robustness")
 
 
 @takes(RobustnessOptions)
 def robustness(options: RobustnessOptions) -> None:
-    """Measure how often policies succeed when their controls are executed with noise."""
+    """Measure how often policies succeed when something goes wrong: noise, delays, pushes and others."""
     from d4orm_planners.commands.progress import tell_results
+    from d4orm_planners.evaluation.disturbance_report import write_disturbances
     from d4orm_planners.evaluation.report import markdown, write_robustness
+    from d4orm_planners.evaluation.summary import success_rates
 
-    rates = options.run()
+    if options.control_noise_std is None and options.disturb is None:
+        options = replace(options, disturb=list(STANDARD))
+    groups = options.run()
+    rates = success_rates(groups)
     written = write_robustness(options.out, rates)
+    if options.disturb is not None:
+        written += write_disturbances(options.out, groups)
     if not options.quiet:
         tell_results(markdown(rates), written)
     require_trials(rates)

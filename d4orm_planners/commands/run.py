@@ -5,18 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from d4orm_env.core.summary import count
 from d4orm_planners.commands.dataclass_options import takes
-from d4orm_planners.commands.inputs import check_target, names, refuse_options
+from d4orm_planners.commands.inputs import check_target, names, parse_levels, refuse_options
 from d4orm_planners.commands.options import PictureOptions, ProblemOptions
 from d4orm_planners.commands.outputs import episode_rows, print_table
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
+    from d4orm_env.disturbances import Disturbance
     from d4orm_planners.episode import Episode
     from d4orm_planners.policy import Policy
 
@@ -35,6 +36,25 @@ class RunOptions(PictureOptions, ProblemOptions):
         typer.Option("--compare", help="Several policies, separated by commas, on the same problem and seed."),
     ] = None
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Replay to write, .html.")] = None
+
+    disturb: Annotated[
+        list[str] | None,
+        typer.Option("--disturb", help="A disturbance at a level, as delay=2 or push.speed=0.3; repeatable."),
+    ] = None
+
+    def disturbances(self) -> tuple[Disturbance[Any], ...]:
+        """What goes wrong.
+
+        Raises:
+            ValueError: For an unknown name, or a level that makes no sense.
+        """
+        from d4orm_env.disturbances.registry import disturbances_at
+
+        levels = parse_levels(self.disturb) or {}
+        for name, values in levels.items():
+            if len(values) != 1:
+                raise ValueError(f"--disturb {name}: an episode has one level, not {len(values)}; use d4orm evaluate")
+        return disturbances_at({name: values[0] for name, values in levels.items()})
 
     def chosen(self) -> tuple[Problem, Policy]:
         """The problem, and what acts in it.
@@ -65,9 +85,10 @@ def run(options: RunOptions) -> None:
     if options.compare is not None:
         compare(options, names(options.compare) or ())
         return
+    disturbances = options.disturbances()
     problem, policy = options.chosen()
-    episode = execute(problem, policy, options.seed, options.control_noise_std)
-    options.draw(problem, episode.trajectory)
+    episode = execute(problem, policy, options.seed, options.control_noise_std, disturbances)
+    options.draw(problem, episode.trajectory, episode.marks)
     if options.out is not None:
         episode.to_html(options.out)
     if not options.quiet:
@@ -94,7 +115,7 @@ def compare(options: RunOptions, policies: Sequence[str]) -> None:
     problem, makers = options.problem(), {name: make_policy(name) for name in policies}
     episodes = {}
     for name, policy in makers.items():
-        episodes[name] = execute(problem, policy, options.seed, options.control_noise_std)
+        episodes[name] = execute(problem, policy, options.seed, options.control_noise_std, options.disturbances())
         if not options.quiet:
             print_table(name, episode_rows(episodes[name]))
     title = f"{problem.name}, {count(problem.num_robots, 'robot')}"
@@ -103,12 +124,18 @@ def compare(options: RunOptions, policies: Sequence[str]) -> None:
         typer.echo(f"wrote {options.out}")
 
 
-def execute(problem: Problem, policy: Policy, seed: int, control_noise_std: float = 0.0) -> Episode:
+def execute(
+    problem: Problem,
+    policy: Policy,
+    seed: int,
+    control_noise_std: float = 0.0,
+    disturbances: Sequence[Disturbance[Any]] = (),
+) -> Episode:
     """An episode of a policy on a problem."""
     from d4orm_env import navigation_v0
     from d4orm_planners.episode import run_episode
 
-    env = navigation_v0.parallel_env(problem=problem, control_noise_std=control_noise_std)
+    env = navigation_v0.parallel_env(problem=problem, control_noise_std=control_noise_std, disturbances=disturbances)
     episode = run_episode(env, policy, seed=seed)
     env.close()
     return episode

@@ -167,8 +167,10 @@ def _plan() -> None:
 
 def _step_environments() -> None:
     from d4orm_env import navigation_v0
+    from d4orm_env.disturbances import Dropout, Intruder, StateNoise
 
-    for arguments in ({}, {"lifelong": True}, {"control_noise_std": 0.1}):
+    disturbances = [Dropout(0.5), StateNoise(0.1), Intruder()]
+    for arguments in ({}, {"lifelong": True}, {"disturbances": disturbances}):
         env = navigation_v0.parallel_env(problem=_smallest_problem(TEAMS[0]), **arguments)
         env.reset(seed=0)
         zero = np.zeros(env.action_space(env.possible_agents[0]).shape, np.float32)

@@ -69,8 +69,8 @@ def paired(first: Sequence[Trial], second: Sequence[Trial], cost: Callable[[Tria
     )
 
 
-def _circumstances(trial: Trial) -> tuple[str, float, int]:
-    return trial.problem, trial.control_noise_std, trial.seed
+def _circumstances(trial: Trial) -> tuple[str, float, int, str]:
+    return trial.problem, trial.control_noise_std, trial.seed, trial.disturbances
 
 
 def steps_to_solution(trial: Trial) -> int | None:

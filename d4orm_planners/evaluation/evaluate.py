@@ -13,11 +13,13 @@ from pathlib import Path
 from d4orm_env.core.arrays import duration, whole_number
 from d4orm_env.engine.threads import available_cores
 from d4orm_planners.evaluation.cluster import RayPool
+from d4orm_planners.evaluation.conditions import DisturbanceLevels
+from d4orm_planners.evaluation.disturbance_report import write_disturbances
 from d4orm_planners.evaluation.pool import Pool, ProcessPool, run_here, run_jobs
 from d4orm_planners.evaluation.report import PARQUET_HINT, write_results
 from d4orm_planners.evaluation.store import STORE, Trial, TrialKey, TrialStore
 from d4orm_planners.evaluation.study import Policies, Scenarios, Study
-from d4orm_planners.evaluation.summary import SuccessRate, success_rates
+from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_rates
 from d4orm_planners.evaluation.trials import Job
 from d4orm_planners.references import check_sendable
 
@@ -31,6 +33,7 @@ def evaluate(
     out: str | os.PathLike[str],
     seeds: Iterable[int] = range(50),
     control_noise_std: float | Iterable[float] = 0.0,
+    disturbances: DisturbanceLevels | None = None,
     num_robots: int | Iterable[int | None] | None = None,
     model: str | Iterable[str | None] | None = None,
     scenario_settings: Mapping[str, object] | None = None,
@@ -57,6 +60,10 @@ def evaluate(
         out: Folder to write to; made if it does not exist.
         seeds: Each seeds the scenario, the policy and the noise of a trial.
         control_noise_std: Standard deviations of the Gaussian noise added to the controls, in their units.
+        disturbances: Levels of disturbances by name, as ``{"delay": [0, 1, 2], "push.speed": [0.2, 0.5]}``, from
+            harmless to bad; without an attribute behind the name it is the kind's first. Or by any label instances of
+            them, your own included, or lists of instances. One at a time, each with every level of noise. With them
+            come the files of :func:`~d4orm_planners.evaluation.disturbance_report.write_disturbances` too.
         num_robots: Team sizes for scenarios by name; ``None`` is the scenario's own.
         model: Robot models for scenarios by name; ``None`` is the scenario's own.
         scenario_settings: Further arguments of the scenarios by name, as ``{"corridor_width": 0.8}``; every one of them
@@ -69,7 +76,7 @@ def evaluate(
         progress: Called as ``progress(what, trials done, trials in all)``.
 
     Returns:
-        One row per scenario, model, team size, policy and level of noise, in that order.
+        One row per scenario, model, team size, policy, level of noise and level of disturbance, in that order.
 
     Raises:
         ValueError: For an unknown name, a number that makes no sense, a policy of your own that worker processes cannot
@@ -82,6 +89,7 @@ def evaluate(
         scenarios=scenarios,
         seeds=seeds,
         control_noise_std=control_noise_std,
+        disturbances=disturbances,
         num_robots=num_robots,
         model=model,
         scenario_settings=scenario_settings or {},
@@ -91,6 +99,8 @@ def evaluate(
     rates = success_rates(trials)
     if Path(out) / "trials.parquet" not in write_results(out, rates):
         warnings.warn(PARQUET_HINT, stacklevel=2)
+    if disturbances is not None:
+        write_disturbances(out, trials)
     return rates
 
 
@@ -102,14 +112,13 @@ def run_study(
     workers: int | None = None,
     ray: str | None = None,
     progress: Progress | None = None,
-) -> list[tuple[str, list[Trial]]]:
+) -> list[TrialGroup]:
     """Run those trials of a study that are not stored in a folder yet. Nothing is written apart from the store.
 
     For the arguments and errors see :func:`evaluate`.
 
     Returns:
-        Trials, one per seed, behind the policy's label, for every scenario, model, team size, policy and level of
-        noise, in that order.
+        Trials, one per seed, for every scenario, model, team size, policy and condition, in that order.
     """
     if trial_timeout is not None:
         trial_timeout = duration(trial_timeout, "trial_timeout")
@@ -123,9 +132,11 @@ def run_study(
     _store(running, store, done, total, progress or (lambda what, done, total: None))
     stored = {trial.key: trial for trial in store.trials()}
     return [
-        (group[0].policy.label, [stored[job.key(level)] for job in group])
+        TrialGroup(
+            group[0].policy.label, [stored[job.key(condition)] for job in group], condition.name, condition.level
+        )
         for group in groups
-        for level in group[0].control_noise_std
+        for condition in group[0].conditions
     ]
 
 
@@ -135,13 +146,18 @@ def _missing(jobs: Sequence[Job], store: TrialStore) -> tuple[list[Job], int, in
     wanted: set[TrialKey] = set()
     missing = []
     for job in jobs:
-        keys = {level: job.key(level) for level in job.control_noise_std}
-        # The same problem may be asked for under two names.
-        left = tuple(level for level, key in keys.items() if key not in finished and key not in wanted)
+        keys = {condition: job.key(condition) for condition in job.conditions}
+        # The same problem may be asked for under two names, and all disturbances at level zero are one condition.
+        first = {key: condition for condition, key in reversed(keys.items())}
+        left = tuple(
+            condition
+            for condition, key in keys.items()
+            if key not in finished and key not in wanted and first[key] is condition
+        )
         wanted.update(keys.values())
         if left:
-            missing.append(replace(job, control_noise_std=left))
-    return missing, len(wanted) - sum(len(job.control_noise_std) for job in missing), len(wanted)
+            missing.append(replace(job, conditions=left))
+    return missing, len(wanted) - sum(len(job.conditions) for job in missing), len(wanted)
 
 
 def _run(
@@ -153,6 +169,8 @@ def _run(
         return run_here(jobs)
     for policy in {id(job.policy): job.policy for job in jobs}.values():
         check_sendable(policy.source, f"policy {policy.label!r}")
+    for condition in jobs[0].conditions if jobs else ():
+        check_sendable(condition.disturbances, f"disturbance {condition.name!r}")
     pool: Pool = ProcessPool(size, threads=cores if size == 1 else 1) if ray is None else RayPool(ray, workers)
     return run_jobs(jobs, pool, trial_timeout)
 

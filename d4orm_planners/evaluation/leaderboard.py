@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from typing import TypeAlias
 
-from d4orm_planners.evaluation.report import HEADER, cells, deadline_table, errors, panels, share, table
+from d4orm_planners.evaluation.report import deadline_table, errors, panels, rate_table, share, table
 from d4orm_planners.evaluation.store import Trial
-from d4orm_planners.evaluation.summary import SuccessRate, success_by, success_rates
+from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_by, success_rates
 
 INTRODUCTION = """\
 # Leaderboard
@@ -37,26 +38,41 @@ def leaderboard(trials: Sequence[Trial], deadlines: Sequence[float] = ()) -> str
     if not trials:
         raise ValueError("the store holds no trials yet; run `d4orm evaluate` first")
     groups = _groups(trials)
-    rates = success_rates((label, group) for (label, *_), group in groups.items())
+    rates = success_rates(TrialGroup(key[0], group, key[-1]) for key, group in groups.items())
     blocks = [INTRODUCTION, "## Success", *_matrices(rates), "## Scenario by scenario"]
     for title, panel in panels(rates).items():
         # The best first, at every level of noise.
-        ranked = sorted(panel, key=lambda rate: (rate.control_noise_std, -rate.rate, rate.travel_time or float("inf")))
-        blocks.append(table(title, HEADER, [cells(rate) for rate in ranked]))
+        ranked = sorted(panel, key=lambda rate: (*_condition(rate), -rate.rate, rate.travel_time or float("inf")))
+        blocks.append(rate_table(title, ranked))
     if deadlines:
         blocks += ["## Success within a deadline for planning", WITHIN, *_deadlines(groups, deadlines)]
     return "\n\n".join([*blocks, *errors((rate.label, rate.error) for rate in rates), origin(trials)]) + "\n"
 
 
-def _groups(trials: Sequence[Trial]) -> dict[tuple[str, str, int, str, float], list[Trial]]:
-    """Trials by label, scenario, team size, models and noise, in the order of the last four and the label."""
+Key: TypeAlias = tuple[str, str, int, str, float, str]
+
+
+def _groups(trials: Sequence[Trial]) -> dict[Key, list[Trial]]:
+    """Trials by label, scenario, team size, models, noise and disturbances, in the order of all but the label."""
     labels = _labels(trials)
-    groups: dict[tuple[str, str, int, str, float], list[Trial]] = {}
+    groups: dict[Key, list[Trial]] = {}
     for trial in trials:
         label = labels[trial.label, trial.config]
-        key = (label, trial.scenario, trial.num_robots, trial.model, trial.control_noise_std)
+        key = (label, trial.scenario, trial.num_robots, trial.model, trial.control_noise_std, told(trial.disturbances))
         groups.setdefault(key, []).append(trial)
     return {key: groups[key] for key in sorted(groups, key=lambda key: (*key[1:], key[0]))}
+
+
+def told(disturbances: str) -> str:
+    """Disturbances as they are stored, in words: ``"push rate=0.2, speed=0.5; delay steps=2"``."""
+    listed = json.loads(disturbances)
+    return "; ".join(
+        f"{name} " + ", ".join(f"{key}={value}" for key, value in values.items()) for name, values in listed
+    )
+
+
+def _condition(rate: SuccessRate) -> tuple[float, str]:
+    return rate.control_noise_std, rate.disturbance
 
 
 def _labels(trials: Iterable[Trial]) -> dict[tuple[str, str], str]:
@@ -75,31 +91,32 @@ def _labels(trials: Iterable[Trial]) -> dict[tuple[str, str], str]:
 
 
 def _matrices(rates: Sequence[SuccessRate]) -> list[str]:
-    """Policies against scenarios, one table per robot model and level of noise."""
+    """Policies against scenarios, one table per robot model, level of noise and disturbance."""
     blocks = []
-    for model, noise in sorted({(rate.model, rate.control_noise_std) for rate in rates}):
+    for model, *condition in sorted({(rate.model, *_condition(rate)) for rate in rates}):
+        noise, disturbance = condition
         columns = panels(rate for rate in rates if rate.model == model)
         found = {
             (rate.label, title): share(rate)
             for title, panel in columns.items()
             for rate in panel
-            if rate.control_noise_std == noise
+            if _condition(rate) == (noise, disturbance)
         }
         rows = [
             (label, *(found.get((label, title), "-") for title in columns))
             for label in sorted({label for label, _ in found})
         ]
         title = f"{model}, noise {noise:g}" if noise else f"{model}, no noise"
+        title += f", {disturbance}" if disturbance else ""
         blocks.append(table(title, ("policy", *columns), rows))
     return blocks
 
 
-def _deadlines(
-    groups: Mapping[tuple[str, str, int, str, float], Sequence[Trial]], deadlines: Sequence[float]
-) -> list[str]:
+def _deadlines(groups: Mapping[Key, Sequence[Trial]], deadlines: Sequence[float]) -> list[str]:
     blocks: dict[str, list[tuple[str, Sequence[Trial]]]] = {}
-    for (label, scenario, robots, model, noise), group in groups.items():
-        blocks.setdefault(f"{scenario}, {robots} robots, {model}, noise {noise:g}", []).append((label, group))
+    for (label, scenario, robots, model, noise, disturbance), group in groups.items():
+        title = f"{scenario}, {robots} robots, {model}, noise {noise:g}{disturbance and ', '}{disturbance}"
+        blocks.setdefault(title, []).append((label, group))
     return [
         deadline_table(title, [(label, [success_by(group, limit) for limit in deadlines]) for label, group in lines])
         for title, lines in blocks.items()

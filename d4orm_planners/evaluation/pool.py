@@ -113,15 +113,15 @@ class _Schedule:
     def _give_up(self, ticket: int, reason: str) -> list[Trial]:
         """The trials that a job fails in without its process; the others of the job are put back."""
         run = self.running.pop(ticket)
-        left = run.job.control_noise_std[run.done :]
-        # Without a plan there is nothing to execute, at any level of noise.
+        left = run.job.conditions[run.done :]
+        # Without a plan there is nothing to execute, under any condition.
         lost = len(left) if run.done == 0 and run.job.policy.planned else 1
         if left[lost:]:
-            self.waiting.appendleft(replace(run.job, control_noise_std=left[lost:]))
-        return [run.job.failed(noise, reason) for noise in left[:lost]]
+            self.waiting.appendleft(replace(run.job, conditions=left[lost:]))
+        return [run.job.failed(condition, reason) for condition in left[:lost]]
 
     def _left(self, run: _Running) -> float:
-        if self.trial_timeout is None or run.since is None or run.done == len(run.job.control_noise_std):
+        if self.trial_timeout is None or run.since is None or run.done == len(run.job.conditions):
             return float("inf")
         return run.since + self.trial_timeout - time.monotonic()
 

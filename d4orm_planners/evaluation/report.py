@@ -41,14 +41,15 @@ def write_results(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) 
 
 
 def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) -> list[Path]:
-    """Write ``robustness.csv``, ``robustness.md`` and ``robustness.png``, success against noise.
+    """Write ``robustness.csv``, ``robustness.md`` and, where nothing but noise went wrong, ``robustness.png``, success
+    against it.
 
     Args:
         folder: Where to.
         rates: What :func:`~d4orm_planners.evaluation.evaluate.evaluate` returned.
 
     Returns:
-        The three paths.
+        The paths.
 
     Raises:
         OSError: If the folder does not exist or cannot be written to.
@@ -57,6 +58,8 @@ def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate
     _write_rates(paths[0], rates)
     with target(paths[1]) as path:
         path.write_text(markdown(rates), encoding="utf-8")
+    if any(rate.disturbance for rate in rates):
+        return paths[:2]
     with target(paths[2]) as path:
         _draw(path, rates)
     return paths
@@ -140,15 +143,23 @@ def target(path: Path) -> Iterator[Path]:
 
 def markdown(rates: Sequence[SuccessRate]) -> str:
     """One table per scenario and team, with errors below. Intervals of means stand in brackets."""
-    blocks = [table(title, HEADER, [cells(rate) for rate in group]) for title, group in panels(rates).items()]
+    blocks = [rate_table(title, group) for title, group in panels(rates).items()]
     return "\n\n".join([*blocks, *errors((rate.label, rate.error) for rate in rates)]) + "\n"
 
 
-def cells(rate: SuccessRate) -> tuple[str, ...]:
-    """A row under :data:`HEADER`."""
+def rate_table(title: str, rates: Sequence[SuccessRate]) -> str:
+    """A table of rates, with a column more where something but noise went wrong."""
+    disturbed = any(rate.disturbance for rate in rates)
+    header = (*HEADER[:2], "disturbance", *HEADER[2:]) if disturbed else HEADER
+    return table(title, header, [_cells(rate, disturbed) for rate in rates])
+
+
+def _cells(rate: SuccessRate, disturbed: bool) -> tuple[str, ...]:
+    level = "" if rate.level is None else f" {rate.level:g}"
     return (
         rate.label,
         f"{rate.control_noise_std:g}",
+        *[f"{rate.disturbance}{level}" or "-"] * disturbed,
         f"{rate.successes} of {rate.trials} ({rate.rate:.0%})",
         f"{rate.lower:.0%} to {rate.upper:.0%}",
         *(str(count) for count in (rate.verified, rate.contacts, rate.late, rate.errors)),

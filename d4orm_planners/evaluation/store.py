@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 
 APPLICATION_ID = 0x64346F72
 """Marks the file as one of ours, in its header ("d4or")."""
-VERSION = 5
-READABLE = (4, VERSION)
-"""Of version 4 some columns have other names, and one is missing."""
+VERSION = 6
+READABLE = (4, 5, VERSION)
+"""Of versions before some columns have other names, and some are missing."""
 STORE = "trials.sqlite"
 """Name of the file in a folder of results."""
 LARGEST_NUMBER = 2**63 - 1
@@ -35,6 +35,7 @@ class TrialKey(NamedTuple):
         problem: :attr:`d4orm_env.core.problem.Problem.digest`.
         control_noise_std: Standard deviation of the execution noise, in the controls' units.
         seed: Seed of the episode: of the policy and of the noise.
+        disturbances: What else goes wrong, as JSON: a list of ``[name, attributes]``.
     """
 
     policy: str
@@ -42,13 +43,14 @@ class TrialKey(NamedTuple):
     problem: str
     control_noise_std: float
     seed: int
+    disturbances: str = "[]"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
     """One episode of one policy and how it ended: a row of the store, with a column per field, in this order.
 
-    The first five fields are its :class:`TrialKey`.
+    The first six fields are its :class:`TrialKey`.
 
     Attributes:
         label: What the policy with these settings was called.
@@ -90,6 +92,7 @@ class Trial:
     problem: str
     control_noise_std: float
     seed: int
+    disturbances: str = "[]"
     label: str
     scenario: str
     num_robots: int
@@ -122,15 +125,19 @@ class Trial:
 
     @property
     def key(self) -> TrialKey:
-        return TrialKey(self.policy, self.config, self.problem, self.control_noise_std, self.seed)
+        key = (self.policy, self.config, self.problem, self.control_noise_std, self.seed, self.disturbances)
+        return TrialKey(*key)
 
 
 _NAMES = tuple(field.name for field in fields(Trial))
 _KEY = ", ".join(TrialKey._fields)
 _FORMER = {"num_robots": "robots", "control_noise_std": "noise"}
 """Columns that had other names in version 4."""
+_FORMERLY = {"disturbances": "'[]'"}
+"""What columns that were missing stand for; others are empty."""
 _TRUTHS = ("success", "verified")
-_JSON = {"config": dict, "versions": dict, "machine": dict, "history": list}
+_JSON: Mapping[str, type | int] = {"config": dict, "versions": dict, "machine": dict, "history": 3, "disturbances": 2}
+"""What must be JSON: an object, or a list of lists of so many."""
 _SQL = {"str": "TEXT", "int": "INTEGER", "float": "REAL", "bool": "INTEGER"}
 _PYTHON: Mapping[str, tuple[type, ...]] = {
     "str": (str,),
@@ -143,7 +150,7 @@ _TYPES = {field.name: str(field.type).split(" | ") for field in fields(Trial)}
 _KINDS = {name: tuple(chain(*(_PYTHON[kind] for kind in kinds))) for name, kinds in _TYPES.items()}
 """What may be in a row, by column."""
 _COLUMNS = {name: f"{name} {_SQL[kinds[0]]}{'' if 'None' in kinds else ' NOT NULL'}" for name, kinds in _TYPES.items()}
-_CREATE = f"CREATE TABLE trials ({', '.join(_COLUMNS.values())}, PRIMARY KEY ({_KEY})) WITHOUT ROWID"
+_TABLE = f"({', '.join(_COLUMNS.values())}, PRIMARY KEY ({_KEY})) WITHOUT ROWID"
 # What has run to its end stays as it is; only a trial that failed may be tried again.
 _ADD = (
     f"INSERT INTO trials ({', '.join(_NAMES)}) VALUES ({', '.join('?' * len(_NAMES))}) ON CONFLICT ({_KEY}) "
@@ -211,10 +218,7 @@ class TrialStore:
     def trials(self) -> list[Trial]:
         """All trials, in order of key."""
         with self._connection() as connection:
-            there = _columns(connection)
-            former = {name: name if name in there else _FORMER.get(name, "NULL") for name in _NAMES}
-            columns = ", ".join(f"{column} AS {name}" for name, column in former.items())
-            rows = connection.execute(f"SELECT {columns} FROM trials ORDER BY {_KEY}").fetchall()
+            rows = connection.execute(f"SELECT {_as_now(connection)} FROM trials ORDER BY {_KEY}").fetchall()
         return [self._trial(number, dict(zip(_NAMES, row))) for number, row in enumerate(rows)]
 
     def _trial(self, number: int, values: dict[str, Any]) -> Trial:
@@ -267,17 +271,21 @@ class TrialStore:
             # One transaction, so that of two processes that find no file one makes the table.
             connection.execute("BEGIN IMMEDIATE")
             if _pragma(connection, "application_id") == 0 and _pragma(connection, "schema_version") == 0:
-                connection.execute(_CREATE)
+                connection.execute(f"CREATE TABLE trials {_TABLE}")
                 connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
                 connection.execute(f"PRAGMA user_version = {VERSION}")
             connection.execute("COMMIT")
         elif _pragma(connection, "user_version") in READABLE and set(_NAMES) - _columns(connection):
             connection.execute("BEGIN IMMEDIATE")
-            for name in set(_NAMES) - _columns(connection):
-                former = _FORMER.get(name)
-                change = f"RENAME COLUMN {former} TO {name}" if former else f"ADD COLUMN {_COLUMNS[name]}"
-                connection.execute(f"ALTER TABLE trials {change}")
-            connection.execute(f"PRAGMA user_version = {VERSION}")
+            # Another process may have been quicker.
+            if set(_NAMES) - _columns(connection):
+                # Columns of the key cannot be added.
+                connection.execute(f"CREATE TABLE anew {_TABLE}")
+                columns = f"({', '.join(_NAMES)})"
+                connection.execute(f"INSERT INTO anew {columns} SELECT {_as_now(connection)} FROM trials")
+                connection.execute("DROP TABLE trials")
+                connection.execute("ALTER TABLE anew RENAME TO trials")
+                connection.execute(f"PRAGMA user_version = {VERSION}")
             connection.execute("COMMIT")
 
     def _check(self, connection: sqlite3.Connection) -> None:
@@ -300,6 +308,15 @@ def _columns(connection: sqlite3.Connection) -> set[str]:
     return {row[1] for row in connection.execute("PRAGMA table_info(trials)")}
 
 
+def _as_now(connection: sqlite3.Connection) -> str:
+    """The columns of now, taken from those that a file has."""
+    there = _columns(connection)
+    former = {name: name if name in there else _FORMER.get(name, _FORMERLY.get(name, "NULL")) for name in _NAMES}
+    # A column may have been missing in a file that has the names of now.
+    found = {name: column if column in there or name not in _FORMER else "NULL" for name, column in former.items()}
+    return ", ".join(f"{column} AS {name}" for name, column in found.items())
+
+
 def _use_wal(connection: sqlite3.Connection) -> None:
     """Let readers and a writer not wait for each other; the file remembers it."""
     deadline = time.monotonic() + PATIENCE
@@ -314,14 +331,15 @@ def _use_wal(connection: sqlite3.Connection) -> None:
             time.sleep(0.01)
 
 
-def _is_json(text: str, kind: type) -> bool:
-    """Whether a text is JSON of this kind; a list must be one of lists of three, as a history is."""
+def _is_json(text: str, kind: type | int) -> bool:
+    """Whether a text is JSON of this kind: an object, or a list of lists of so many."""
     try:
         content = json.loads(text)
     except ValueError:
         return False
-    if kind is list and isinstance(content, list):
-        return all(isinstance(entry, list) and len(entry) == 3 for entry in content)
+    if isinstance(kind, int):
+        lists = content if isinstance(content, list) else [None]
+        return all(isinstance(entry, list) and len(entry) == kind for entry in lists)
     return isinstance(content, kind)
 
 

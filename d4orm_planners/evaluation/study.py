@@ -1,4 +1,4 @@
-"""What to compare: policies with their settings, on problems by scenario, team size and seed, at levels of noise."""
+"""What to compare: policies with their settings, on problems by scenario, team size and seed, under conditions."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
-from d4orm_env.core.arrays import duration, positive_number, shown, whole_number
+from d4orm_env.core.arrays import duration, shown, whole_number
 from d4orm_env.core.problem import Problem
+from d4orm_env.disturbances.selection import at_work
 from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_env.scenarios.problems import is_scenario_file
+from d4orm_planners.evaluation.conditions import DisturbanceLevels, conditions
 from d4orm_planners.evaluation.store import LARGEST_NUMBER
 from d4orm_planners.evaluation.trials import Configuration, Job
 from d4orm_planners.registry import PolicyLike, is_brought, list_policies, make_policy, origin
@@ -26,7 +28,7 @@ Scenarios: TypeAlias = Scenario | Iterable[Scenario]
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """Every policy on every scenario and team size, with every seed at every level of noise.
+    """Every policy on every scenario and team size, with every seed under every condition.
 
     The attributes are the arguments of the same names of :func:`~d4orm_planners.evaluation.evaluate.evaluate`. Scenario
     files and problems have a team of their own, and are the same for all seeds.
@@ -36,6 +38,7 @@ class Study:
     scenarios: Scenarios = ("circle",)
     seeds: Iterable[int] = range(50)
     control_noise_std: float | Iterable[float] = 0.0
+    disturbances: DisturbanceLevels | None = None
     num_robots: int | Iterable[int | None] | None = None
     model: str | Iterable[str | None] | None = None
     scenario_settings: Mapping[str, object] = field(default_factory=dict)
@@ -48,16 +51,15 @@ class Study:
             ValueError: For an unknown name or setting, a number that makes no sense, or nothing to do.
             ImportError: If a policy needs a library that is not installed.
         """
-        noise = (
-            positive_number(std, "control_noise_std", zero_allowed=True) for std in _several(self.control_noise_std)
-        )
-        levels = tuple(dict.fromkeys(noise))
-        if not levels:
-            raise ValueError("control_noise_std is empty; give at least one level")
+        under = conditions(self.control_noise_std, self.disturbances)
         policies, seeds = self.configurations(), _checked_seeds(self.seeds)
+        cells = self._problems(seeds)
+        for problem in (problems[0] for _, problems in cells):
+            for condition in under:
+                at_work(condition.disturbances, problem)
         return [
-            [Job(policy, problem, scenario, seed, levels) for seed, problem in zip(seeds, problems)]
-            for scenario, problems in self._problems(seeds)
+            [Job(policy, problem, scenario, seed, under) for seed, problem in zip(seeds, problems)]
+            for scenario, problems in cells
             for policy in policies
         ]
 

@@ -4,12 +4,29 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from d4orm_env.core.arrays import positive_number
 from d4orm_planners.evaluation.store import Trial
+
+
+class TrialGroup(NamedTuple):
+    """Trials of one policy, one per seed, that have all but their seeds in common.
+
+    Attributes:
+        label: What the policy with its settings is called.
+        trials: At least one.
+        disturbance: What else goes wrong, such as ``"push.speed"``; empty for nothing.
+        level: How much of it.
+    """
+
+    label: str
+    trials: Sequence[Trial]
+    disturbance: str = ""
+    level: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +40,8 @@ class Compared:
         num_robots: Team size.
         model: Models of the team.
         control_noise_std: Standard deviation of the execution noise, in the controls' units.
+        disturbance: What else went wrong, such as ``"push.speed"``; empty for nothing.
+        level: How much of it.
         trials: Trials, those with an error included.
         successes: Those that succeeded.
         lower: Lower end of the 95% confidence interval of the success rate (Wilson).
@@ -37,6 +56,8 @@ class Compared:
     num_robots: int
     model: str
     control_noise_std: float
+    disturbance: str = ""
+    level: float | None = None
     trials: int
     successes: int
     lower: float
@@ -157,9 +178,12 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
-def success_rates(groups: Iterable[tuple[str, Sequence[Trial]]]) -> list[SuccessRate]:
-    """Sum up groups of trials behind their labels, see :func:`success_rate`."""
-    return [success_rate(trials, label) for label, trials in groups]
+def success_rates(groups: Iterable[TrialGroup]) -> list[SuccessRate]:
+    """Sum up groups of trials, see :func:`success_rate`."""
+    return [
+        replace(success_rate(group.trials, group.label), disturbance=group.disturbance, level=group.level)
+        for group in groups
+    ]
 
 
 def success_rate(trials: Sequence[Trial], label: str | None = None) -> SuccessRate:

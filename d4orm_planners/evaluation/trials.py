@@ -18,7 +18,8 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.errors import UnknownKeywordError, describe
 from d4orm_env.core.problem import Problem
 from d4orm_planners._machine import commit, describe_machine, versions
-from d4orm_planners.episode import run_episode
+from d4orm_planners.episode import Episode, run_episode
+from d4orm_planners.evaluation.conditions import Condition
 from d4orm_planners.evaluation.store import Trial, TrialKey
 from d4orm_planners.plan import IterationRecord, Plan
 from d4orm_planners.policy import Actions, Observations, OpenLoop, Policy
@@ -76,30 +77,31 @@ class Configuration:
 
 @dataclass(frozen=True)
 class Job:
-    """A policy on a problem with one seed, at several levels of noise.
+    """A policy on a problem with one seed, under several conditions.
 
     Attributes:
         policy: The policy with its settings.
         problem: The problem.
         scenario: What it is called in the results.
         seed: Of the policy and of the noise.
-        control_noise_std: Standard deviations of the execution noise, in the controls' units.
+        conditions: What goes wrong.
     """
 
     policy: Configuration
     problem: Problem
     scenario: str
     seed: int
-    control_noise_std: tuple[float, ...]
+    conditions: tuple[Condition, ...]
 
-    def key(self, noise: float) -> TrialKey:
-        """Of the trial at one level of noise."""
-        return TrialKey(self.policy.policy, self.policy.config, self.problem.digest, noise, self.seed)
+    def key(self, condition: Condition) -> TrialKey:
+        """Of the trial under one condition."""
+        policy, noise = self.policy, condition.control_noise_std
+        return TrialKey(policy.policy, policy.config, self.problem.digest, noise, self.seed, condition.text)
 
-    def failed(self, noise: float, error: str) -> Trial:
-        """The trial at one level of noise, which has no outcome."""
+    def failed(self, condition: Condition, error: str) -> Trial:
+        """The trial under one condition, which has no outcome."""
         return Trial(
-            **self.key(noise)._asdict(),
+            **self.key(condition)._asdict(),
             label=self.policy.label,
             scenario=self.scenario,
             num_robots=self.problem.num_robots,
@@ -111,7 +113,7 @@ class Job:
 
 
 def run_job(job: Job) -> Iterator[Trial]:
-    """Run the trials of a job one after another; a plan is made once and executed at every level of noise.
+    """Run the trials of a job one after another; a plan is made once and executed under all conditions.
 
     Whatever a policy raises is the result of its trial.
 
@@ -119,36 +121,32 @@ def run_job(job: Job) -> Iterator[Trial]:
         KeyboardInterrupt: If Ctrl-C was pressed meanwhile.
     """
     timed: _TimedPolicy | None = None
-    for noise in job.control_noise_std:
+    for condition in job.conditions:
         begin = time.perf_counter()
         error, outcome = "", {}
         try:
             timed = timed or _TimedPolicy(make_policy(job.policy.source, **job.policy.settings))
-            outcome = _outcome(timed, job, noise)
+            outcome = _outcome(timed, job, condition)
         except Exception as problem:
             error = describe(problem)
         libraries, machine = _origin()
-        trial = replace(job.failed(noise, error), versions=libraries, machine=machine, **outcome)
+        trial = replace(job.failed(condition, error), versions=libraries, machine=machine, **outcome)
         yield replace(trial, elapsed=time.perf_counter() - begin)
 
 
-def _outcome(policy: _TimedPolicy, job: Job, noise: float) -> dict[str, Any]:
+def _outcome(policy: _TimedPolicy, job: Job, condition: Condition) -> dict[str, Any]:
     """Columns of a trial that runs to its end."""
     problem = job.problem
-    env = navigation_v0.parallel_env(problem=problem, control_noise_std=noise)
+    noise, disturbances = condition.control_noise_std, condition.disturbances
+    env = navigation_v0.parallel_env(problem=problem, control_noise_std=noise, disturbances=disturbances)
     episode = run_episode(env, policy, seed=job.seed)
     env.close()
-    # The judge looks at the whole horizon; an episode ends earlier when everyone has docked.
-    executed = episode.trajectory.controls
-    rest = np.zeros((problem.horizon - len(executed), *executed.shape[1:]), executed.dtype)
-    report = verify(problem, np.concatenate([executed, rest]))
     metrics, plan = episode.metrics, policy.plan
     sent = {} if plan is None else plan.metrics
     stretch = episode.stretch if metrics["arrived"] else np.inf
     return {
         "success": bool(metrics["success"]),
-        "verified": report.ok,
-        "violation": "" if report.ok else str(report.violations[0]),
+        **(_verdict(problem, episode) if condition.replayable else {}),
         **{name: int(metrics[name]) for name in ("collided", "arrived", "steps")},
         **{name: float(metrics[name]) for name in ("travel_time", "makespan", "reward", "mean_squared_jerk")},
         "stretch": stretch if np.isfinite(stretch) else None,
@@ -159,6 +157,15 @@ def _outcome(policy: _TimedPolicy, job: Job, noise: float) -> dict[str, Any]:
         "wall_time": policy.wall_time,
         "preparation": policy.preparation,
     }
+
+
+def _verdict(problem: Problem, episode: Episode) -> dict[str, Any]:
+    """What the judge says of the executed controls."""
+    # It looks at the whole horizon; an episode ends earlier when everyone has docked.
+    executed = episode.trajectory.controls
+    rest = np.zeros((problem.horizon - len(executed), *executed.shape[1:]), executed.dtype)
+    report = verify(problem, np.concatenate([executed, rest]))
+    return {"verified": report.ok, "violation": "" if report.ok else str(report.violations[0])}
 
 
 def compact_history(history: tuple[IterationRecord, ...]) -> str:

@@ -185,5 +185,5 @@ def reproduce(
     return [
         Group(title, label, trials)
         for title, study in studies
-        for label, trials in run_study(study, out, workers=workers, progress=progress)
+        for label, trials, *_ in run_study(study, out, workers=workers, progress=progress)
     ]

@@ -1,0 +1,37 @@
+"""What goes wrong in an execution: on the way of the controls, in what is seen, and in the world.
+
+``parallel_env(..., disturbances=[Delay(2), Push(0.1, 0.3)])``, and the same in the joint and the batched environment.
+Disturbances act in the order given. Everything random in them follows from the environment's seed: the same in all
+environments to the bit, and one disturbance draws the same whatever stands beside it. Your own is a subclass of
+:class:`Disturbance`.
+"""
+
+from d4orm_env.disturbances.controls import Bias, ControlNoise, CorrelatedNoise, Delay, Dropout, Gain, Quantisation
+from d4orm_env.disturbances.disturbance import Disturbance, Effect, Scene, Seen
+from d4orm_env.disturbances.draws import Draws
+from d4orm_env.disturbances.intruder import Intruder
+from d4orm_env.disturbances.perception import Occlusion, StateDelay, StateNoise
+from d4orm_env.disturbances.world import Drag, LimitMismatch, Push, Stall
+
+__all__ = [
+    "Bias",
+    "ControlNoise",
+    "CorrelatedNoise",
+    "Delay",
+    "Disturbance",
+    "Drag",
+    "Draws",
+    "Dropout",
+    "Effect",
+    "Gain",
+    "Intruder",
+    "LimitMismatch",
+    "Occlusion",
+    "Push",
+    "Quantisation",
+    "Scene",
+    "Seen",
+    "Stall",
+    "StateDelay",
+    "StateNoise",
+]

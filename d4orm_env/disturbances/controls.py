@@ -1,0 +1,229 @@
+"""Disturbances of controls: what the motors do is not what was commanded.
+
+Levels are in the controls' units: m/s^2 for double integrators, m/s for ``velocity2d``, and so on.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from d4orm_env.core.arrays import LARGEST, SMALLEST, FloatArray, positive_number, shown, whole_number
+from d4orm_env.core.problem import Problem
+from d4orm_env.disturbances.brakes import brake
+from d4orm_env.disturbances.disturbance import Disturbance, Memory, Scene
+from d4orm_env.disturbances.draws import Draws
+from d4orm_env.disturbances.levels import MAX_DELAY, check_components, per_component, scaled, share, standard_deviation
+
+
+class Drawn(NamedTuple):
+    """What was drawn when the episode began, or is drawn on: ``values`` ``(B, K, .)``."""
+
+    values: FloatArray
+
+
+@dataclass(frozen=True)
+class _Spread:
+    """What ``std`` has to be, one number or one per component."""
+
+    std: float | tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "std", per_component(self.std, f"{type(self).__name__} std"))
+
+    @property
+    def negligible(self) -> bool:
+        return not np.any(self.std)
+
+    def check(self, problem: Problem) -> None:
+        check_components(self.std, f"{type(self).__name__} std", problem.control_size)
+
+
+@dataclass(frozen=True)
+class ControlNoise(_Spread, Disturbance[Memory]):
+    """Gaussian noise on the controls, independent over steps, robots and components; the paper's (section V-D).
+
+    Attributes:
+        std: Standard deviation, one number or one per component [control units].
+    """
+
+    def command(self, controls: FloatArray, memory: Memory, scene: Scene, draws: Draws) -> FloatArray:
+        return controls + scaled(self.std, draws.normal(*controls.shape[1:]))
+
+
+@dataclass(frozen=True)
+class CorrelatedNoise(_Spread, Disturbance[Drawn]):
+    """Gaussian noise on the controls that is correlated over time: an Ornstein-Uhlenbeck process per component.
+
+    It is stationary from the beginning, with autocorrelation ``exp(-t / time_constant)`` (G. E. Uhlenbeck and L. S.
+    Ornstein, Physical Review 36, 1930), and is drawn exactly: ``x <- r x + std sqrt(1 - r^2) n`` with
+    ``r = exp(-dt / time_constant)``.
+
+    Attributes:
+        std: Standard deviation, one number or one per component [control units].
+        time_constant: [s].
+    """
+
+    time_constant: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        constant = positive_number(self.time_constant, "CorrelatedNoise time_constant", most=LARGEST)
+        object.__setattr__(self, "time_constant", constant)
+
+    def begin(self, scene: Scene, draws: Draws) -> Drawn:
+        return Drawn(draws.normal(*scene.controls.shape[1:]))
+
+    def command(self, controls: FloatArray, memory: Drawn, scene: Scene, draws: Draws) -> FloatArray:
+        disturbed = controls + scaled(self.std, memory.values)
+        kept = math.exp(-scene.problem.dt / self.time_constant)
+        fresh = draws.normal(*controls.shape[1:])
+        fresh *= np.float32(math.sqrt(1 - kept * kept))
+        np.add(np.float32(kept) * memory.values, fresh, out=memory.values)
+        return disturbed
+
+
+@dataclass(frozen=True)
+class Bias(_Spread, Disturbance[Drawn]):
+    """A constant added to the controls of a robot, Gaussian, drawn per robot, component and episode.
+
+    Attributes:
+        std: Standard deviation, one number or one per component [control units].
+    """
+
+    def begin(self, scene: Scene, draws: Draws) -> Drawn:
+        return Drawn(scaled(self.std, draws.normal(*scene.controls.shape[1:])))
+
+    def command(self, controls: FloatArray, memory: Drawn, scene: Scene, draws: Draws) -> FloatArray:
+        return controls + memory.values
+
+
+@dataclass(frozen=True)
+class Gain(Disturbance[Drawn]):
+    """Weaker or stronger motors: the controls of a robot times ``1 + std n``, at least zero, drawn per robot and
+    episode. They are clipped to the limits afterwards.
+
+    Attributes:
+        std: Standard deviation of the factor.
+    """
+
+    std: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "std", standard_deviation(self.std, "Gain std"))
+
+    @property
+    def negligible(self) -> bool:
+        return self.std == 0
+
+    def begin(self, scene: Scene, draws: Draws) -> Drawn:
+        factors = 1 + np.float32(self.std) * draws.normal(scene.problem.num_robots, 1)
+        return Drawn(np.maximum(factors, np.float32(0)))
+
+    def command(self, controls: FloatArray, memory: Drawn, scene: Scene, draws: Draws) -> FloatArray:
+        return controls * memory.values
+
+
+@dataclass(frozen=True)
+class Quantisation(Disturbance[Memory]):
+    """Controls in steps: each component is rounded to the nearest multiple of ``step``, halves to even.
+
+    Attributes:
+        step: At least 1e-7, or zero [control units].
+    """
+
+    step: float
+
+    def __post_init__(self) -> None:
+        step = positive_number(self.step, "Quantisation step", zero_allowed=True, least=SMALLEST, most=LARGEST)
+        object.__setattr__(self, "step", step)
+
+    @property
+    def negligible(self) -> bool:
+        return self.step == 0
+
+    def command(self, controls: FloatArray, memory: Memory, scene: Scene, draws: Draws) -> FloatArray:
+        step = np.float32(self.step)
+        rounded: FloatArray = np.rint(controls / step) * step
+        return rounded
+
+
+class Queue(NamedTuple):
+    """The last commands, the newest first: ``values`` ``(B, L, K, m)``."""
+
+    values: FloatArray
+
+
+@dataclass(frozen=True)
+class Delay(Disturbance[Queue]):
+    """Commands are executed some time steps late; until the first one arrives, the control is zero.
+
+    Attributes:
+        steps: Time steps, at most 1000. ``(1, 3)`` draws from 1, 2 and 3 anew for every robot and step.
+    """
+
+    steps: int | tuple[int, int]
+
+    def __post_init__(self) -> None:
+        ends = self.steps if isinstance(self.steps, tuple | list) else (self.steps, self.steps)
+        if len(ends) != 2:
+            raise ValueError(f"Delay steps is {shown(self.steps)}; give a number of steps, or a range as (1, 3)")
+        least = whole_number(ends[0], "Delay steps", 0, MAX_DELAY)
+        most = whole_number(ends[1], "Delay steps", least, MAX_DELAY)
+        object.__setattr__(self, "steps", least if least == most else (least, most))
+
+    @property
+    def _range(self) -> tuple[int, int]:
+        return self.steps if isinstance(self.steps, tuple) else (self.steps, self.steps)
+
+    @property
+    def negligible(self) -> bool:
+        return self.steps == 0
+
+    def begin(self, scene: Scene, draws: Draws) -> Queue:
+        worlds, *shape = scene.controls.shape
+        return Queue(np.zeros((worlds, self._range[1] + 1, *shape), np.float32))
+
+    def command(self, controls: FloatArray, memory: Queue, scene: Scene, draws: Draws) -> FloatArray:
+        least, most = self._range
+        memory.values[:, 1:] = memory.values[:, :-1]
+        memory.values[:, 0] = controls
+        if least == most:
+            return memory.values[:, most].copy()
+        worlds, robots = np.arange(len(controls))[:, None], np.arange(controls.shape[1])
+        return memory.values[worlds, draws.whole(least, most, len(robots)), robots]
+
+
+@dataclass(frozen=True)
+class Dropout(Disturbance[Drawn]):
+    """Commands get lost on their way, independently for every robot and step.
+
+    Attributes:
+        probability: That one is lost, from 0 to 1.
+        hold: Whether the robot goes on with the command that it got last, zero before the first; otherwise it brakes.
+    """
+
+    probability: float
+    hold: bool = True
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "probability", share(self.probability, "Dropout probability"))
+        if not isinstance(self.hold, bool):
+            raise ValueError(f"Dropout hold is {shown(self.hold)}; it must be True or False")
+
+    @property
+    def negligible(self) -> bool:
+        return self.probability == 0
+
+    def begin(self, scene: Scene, draws: Draws) -> Drawn:
+        return Drawn(np.zeros_like(scene.controls))
+
+    def command(self, controls: FloatArray, memory: Drawn, scene: Scene, draws: Draws) -> FloatArray:
+        lost = draws.uniform(controls.shape[1]) < self.probability
+        instead = memory.values if self.hold else brake(scene, scene.states, lost)
+        received: FloatArray = np.where(lost[..., None], instead, controls)
+        memory.values[:] = received
+        return received

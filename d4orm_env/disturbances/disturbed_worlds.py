@@ -1,0 +1,253 @@
+"""The disturbances of a batch of worlds, of which a single environment is one, in the middle of their episodes."""
+
+from __future__ import annotations
+
+import zlib
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from functools import cache, reduce
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32
+from d4orm_env.core.observation_layout import ObservationLayout
+from d4orm_env.core.problem import Problem
+from d4orm_env.disturbances.disturbance import Disturbance, Effect, Memory, Scene, Seen
+from d4orm_env.disturbances.draws import Draws, Keys, Steps, episode_keys
+
+Worlds = NDArray[np.intp]
+
+
+class _Purpose(IntEnum):
+    """What a disturbance draws for; the numbers are part of what a seed means, so append."""
+
+    BEGIN = 0
+    COMMAND = 1
+    MOVE = 2
+    SEE = 3
+
+
+@dataclass(eq=False)
+class _Running:
+    """A disturbance at work: its stream of random numbers, and what it remembers."""
+
+    disturbance: Disturbance[Any]
+    stream: int
+    memory: Memory = field(default=())
+
+    def remember(self, memory: Memory, worlds: Worlds, first: bool = False) -> None:
+        """Keep what is remembered of some worlds; the first time of all."""
+        if first:
+            self.memory = memory
+        else:
+            for past, new in zip(self.memory, memory, strict=True):
+                past[worlds] = new
+
+    def memory_of(self, worlds: Worlds) -> Memory:
+        """A copy of what is remembered of some worlds."""
+        parts = [values[worlds] for values in self.memory]
+        make = getattr(type(self.memory), "_make", tuple)
+        memory: Memory = make(parts)
+        return memory
+
+    def has(self, method: str) -> bool:
+        """Whether it does anything there."""
+        return getattr(type(self.disturbance), method) is not getattr(Disturbance, method)
+
+
+class DisturbedWorlds:
+    """Disturbances with the memory of ``B`` worlds.
+
+    Args:
+        disturbances: In the order in which they act; none of them negligible.
+        problem: What the worlds share.
+        num_worlds: ``B``.
+        max_cycles: Steps in an episode.
+    """
+
+    def __init__(
+        self, disturbances: Sequence[Disturbance[Any]], problem: Problem, num_worlds: int, max_cycles: int
+    ) -> None:
+        self.problem, self.max_cycles = problem, max_cycles
+        occurrences: Counter[str] = Counter()
+        self._all: list[_Running] = []
+        for disturbance in disturbances:
+            name = type(disturbance).__name__
+            # By name and not by place, so that each draws the same whatever stands beside it.
+            self._all.append(_Running(disturbance, zlib.crc32(f"{name}/{occurrences[name]}".encode())))
+            occurrences[name] += 1
+        self._commanding, self._moving, self._seeing, self._observing, self._effective = (
+            [one for one in self._all if one.has(method)] for method in ("command", "move", "see", "observe", "effect")
+        )
+        self.alters_limits = any(one.has("limits") for one in self._all)
+        self._keys: Keys = np.zeros((num_worlds, 2), np.uint32)
+        self._bodies: FloatArray = np.zeros((num_worlds, 0, 2 * problem.dimension + 1), np.float32)
+        self._bringing: list[_Running] = []
+        self._begun = False
+
+    @property
+    def bodies(self) -> FloatArray:
+        """``(B, N, 2 d + 1)`` what moves among the robots and is none, see :class:`Effect`."""
+        return self._bodies
+
+    @property
+    def alters_sight(self) -> bool:
+        """Whether what is seen is not simply what there is of the robots."""
+        return bool(self._seeing or self._observing or self._bodies.shape[1])
+
+    def true_limits(self, limits: FloatArray) -> FloatArray:
+        """``(K, L)`` what limits truly are, read-only."""
+        for one in self._all:
+            limits = one.disturbance.limits(limits)
+        limits = np.array(limits, np.float32)
+        limits.setflags(write=False)
+        return limits
+
+    def scene(
+        self,
+        start: FloatArray,
+        goal: FloatArray,
+        states: FloatArray,
+        controls: FloatArray,
+        arrived: BoolArray,
+        steps: Steps,
+    ) -> Scene:
+        """The worlds as they stand; arguments as the attributes of :class:`Scene`."""
+        return Scene(self.problem, self.max_cycles, start, goal, states, controls, arrived, steps, self._bodies)
+
+    def begin(self, worlds: Worlds, seeds: Sequence[int], start: FloatArray, goal: FloatArray) -> None:
+        """Begin the episodes of some worlds, the first time of all.
+
+        Args:
+            worlds: Their numbers, ``(b,)``.
+            seeds: What each has drawn from its environment's generator, from 0 to ``2**63 - 1``.
+            start: ``(b, K, n)``.
+            goal: ``(b, K, d)`` [m].
+        """
+        self._keys[worlds] = keys = episode_keys(seeds)
+        count, robots = start.shape[:2]
+        still = np.zeros((count, robots, self.problem.control_size), np.float32)
+        none, new = np.zeros((count, 0, 2 * self.problem.dimension + 1), np.float32), np.zeros(count, np.int64)
+        scene = self.scene(start, goal, start, still, np.zeros((count, robots), np.bool_), new)._replace(bodies=none)
+        # Those that bring bodies come first, for others see them.
+        for one in sorted(self._all, key=lambda one: one not in self._effective):
+            memory = one.disturbance.begin(scene, Draws(keys, scene.steps, one.stream, _Purpose.BEGIN))
+            one.remember(memory, worlds, first=not self._begun)
+            bodies = one.disturbance.effect(memory, scene).bodies
+            if bodies is not None:
+                if not self._begun:
+                    self._bringing.append(one)
+                scene = scene._replace(bodies=np.concatenate([scene.bodies, bodies], axis=1))
+        if not self._begun:
+            self._bodies = scene.bodies
+        else:
+            self._bodies[worlds] = scene.bodies
+        self._begun = True
+
+    def act(self, scene: Scene, controls: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """States ``(B, K, n)`` and controls ``(B, K, m)`` that a step truly begins from.
+
+        Args:
+            scene: The worlds.
+            controls: ``(B, K, m)`` as commanded.
+
+        Raises:
+            ValueError: If a disturbance returns another shape.
+        """
+        for one in self._commanding:
+            wanted = one.disturbance.command(controls, one.memory, scene, self._draws(one, scene, _Purpose.COMMAND))
+            controls = _checked(wanted, controls.shape, one, "command")
+        states = scene.states
+        for one in self._moving:
+            moved = one.disturbance.move(states, controls, one.memory, scene, self._draws(one, scene, _Purpose.MOVE))
+            states = _checked(moved[0], states.shape, one, "move")
+            controls = _checked(moved[1], controls.shape, one, "move")
+        if states is not scene.states and scene.standing.any():
+            states = np.where(scene.standing[..., None], scene.states, states)
+        if self._bodies.shape[1]:
+            effects = (one.disturbance.effect(one.memory, scene).bodies for one in self._bringing)
+            there = [bodies for bodies in effects if bodies is not None]
+            self._bodies = there[0] if len(there) == 1 else np.concatenate(there, axis=1)
+        return states, controls
+
+    def effect(self, scene: Scene) -> Effect:
+        """What all have done together up to now."""
+        effects = [one.disturbance.effect(one.memory, scene) for one in self._effective]
+        return Effect(
+            pushed=_together(np.add, [effect.pushed for effect in effects]),
+            stalled=_together(np.logical_or, [effect.stalled for effect in effects]),
+            lost=_together(np.logical_or, [effect.lost for effect in effects]),
+            bodies=self._bodies,
+        )
+
+    def touched(self, states: FloatArray) -> tuple[BoolArray, BoolArray]:
+        """Which robots in ``states`` ``(B, K, n)`` touch a body that is none, and which are near one.
+
+        Returns:
+            Two arrays ``(B, K)`` bool; near is within the margin.
+        """
+        touched, near = np.empty((2, *states.shape[:2]), np.bool_)
+        _judge()(states, self.problem.team.radius, self._bodies, self.problem.arrays.margin, touched, near)
+        return touched, near
+
+    def see(self, scene: Scene, worlds: Worlds | None = None) -> Seen:
+        """What is seen of all worlds, or of some, as they stand in ``scene``, which is always of all.
+
+        Raises:
+            ValueError: If a disturbance returns another shape.
+        """
+        part = scene if worlds is None else scene.of(worlds)
+        seen = Seen(part.states, part.controls, part.bodies)
+        for one in self._seeing:
+            memory = one.memory if worlds is None else one.memory_of(worlds)
+            draws = Draws(self._keys if worlds is None else self._keys[worlds], part.steps, one.stream, _Purpose.SEE)
+            changed = one.disturbance.see(seen, memory, part, draws)
+            states, controls, bodies = changed
+            seen = Seen(
+                _checked(states, seen.states.shape, one, "see"),
+                _checked(controls, seen.controls.shape, one, "see"),
+                _checked(bodies, seen.bodies.shape, one, "see"),
+            )
+            if worlds is not None:
+                one.remember(memory, worlds)
+        return seen
+
+    def observe(self, observations: FloatArray, layout: ObservationLayout) -> FloatArray:
+        """``(B, K, D)`` observations of what is seen, as robots make them."""
+        for one in self._observing:
+            made = one.disturbance.observe(observations, layout)
+            observations = _checked(made, observations.shape, one, "observe")
+        if self._observing:
+            observations = np.clip(observations, layout.low, layout.high)
+        return observations
+
+    def _draws(self, one: _Running, scene: Scene, purpose: _Purpose) -> Draws:
+        return Draws(self._keys, scene.steps, one.stream, purpose)
+
+
+@cache
+def _judge() -> Callable[..., None]:
+    # Here, because importing the compiler takes longer than importing all the rest of the package.
+    from d4orm_env.engine.bodies import meet_bodies
+
+    judge: Callable[..., None] = meet_bodies
+    return judge
+
+
+def _together(join: Any, parts: Sequence[Any]) -> Any:
+    """What several disturbances have done; ``None`` if none did."""
+    done = [part for part in parts if part is not None]
+    return reduce(join, done) if done else None
+
+
+def _checked(values: ArrayLike, shape: tuple[int, ...], one: _Running, method: str) -> FloatArray:
+    """What a disturbance returned, as float32."""
+    array = values if isinstance(values, np.ndarray) and values.dtype == np.float32 else as_float32(values)
+    if array.shape != shape:
+        name = type(one.disturbance).__name__
+        raise ValueError(f"disturbance {name}: {method} returned shape {array.shape}; expected {shape}")
+    return array

@@ -1,0 +1,81 @@
+"""What disturbances draw from: every disturbance of every world has random numbers of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.core.arrays import FloatArray
+
+Keys = NDArray[np.uint32]
+Steps = NDArray[np.int64]
+Kernel = Callable[..., Any]
+
+
+def episode_keys(seeds: Sequence[int]) -> Keys:
+    """``(B, 2)`` keys of episodes, of the 63 bits that each draws from its environment's generator."""
+    words = np.array(seeds, np.uint64)
+    return np.stack([words & np.uint64(0xFFFFFFFF), words >> np.uint64(32)], axis=1).astype(np.uint32)
+
+
+@cache
+def _kernels() -> tuple[Kernel, Kernel]:
+    # Here, because importing the compiler takes longer than importing all the rest of the package.
+    from d4orm_env.engine.draws import draw_normals, draw_uniforms
+
+    return draw_normals, draw_uniforms
+
+
+class Draws:
+    """Random numbers of one disturbance at one moment of ``B`` worlds.
+
+    They are a function of the world's episode, its step, the disturbance and the number of the call, and of nothing
+    else: a world draws the same alone and in any batch, and a disturbance the same whatever stands beside it.
+
+    Args:
+        keys: ``(B, 2)`` keys of the episodes, see :func:`episode_keys`.
+        steps: ``(B,)`` steps taken.
+        stream: Number of the disturbance.
+        purpose: Number of the occasion on which it draws, from 0 to 255.
+    """
+
+    def __init__(self, keys: Keys, steps: Steps, stream: int, purpose: int) -> None:
+        self._keys, self._steps, self._stream = keys, steps, np.uint32(stream)
+        self._call = purpose << 16
+
+    def of(self, worlds: NDArray[np.intp]) -> Draws:
+        """The same for some of the worlds: they draw what they would draw here."""
+        part = Draws(self._keys[worlds], self._steps[worlds], int(self._stream), 0)
+        part._call = self._call
+        return part
+
+    def normal(self, *shape: int) -> FloatArray:
+        """``(B, *shape)`` independent standard normals."""
+        return self._filled(_kernels()[0], shape)
+
+    def uniform(self, *shape: int) -> FloatArray:
+        """``(B, *shape)`` independent numbers, uniform between 0 and 1, neither of which occurs."""
+        return self._filled(_kernels()[1], shape)
+
+    def whole(self, low: int, high: int, *shape: int) -> NDArray[np.int64]:
+        """``(B, *shape)`` independent whole numbers, uniform from ``low`` to ``high``, both included."""
+        numbers: NDArray[np.int64] = low + np.floor(self.uniform(*shape) * (high - low + 1)).astype(np.int64)
+        return np.minimum(numbers, high)
+
+    def direction(self, *shape: int) -> FloatArray:
+        """``(B, *shape)`` unit vectors along the last axis, uniform on the circle or the sphere."""
+        vectors = self.normal(*shape)
+        length = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True))
+        directions: FloatArray = vectors / np.maximum(length, np.float32(1e-12))
+        return directions
+
+    def _filled(self, kernel: Kernel, shape: tuple[int, ...]) -> FloatArray:
+        worlds = len(self._keys)
+        out: FloatArray = np.empty((worlds, *shape), np.float32)
+        kernel(self._keys, self._steps, self._stream, np.uint32(self._call), out.reshape(worlds, -1))
+        self._call += 1
+        return out

@@ -1,0 +1,166 @@
+"""Disturbances of what is seen: of observations and of ``env.state()`` alike, as by one tracking system for all. The
+truth stays in infos, rewards and metrics.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import numpy as np
+
+from d4orm_env.core.arrays import LARGEST, FloatArray, positive_number, whole_number
+from d4orm_env.core.observation_layout import ObservationLayout, Spare
+from d4orm_env.core.problem import Problem
+from d4orm_env.disturbances.disturbance import Disturbance, Memory, Scene, Seen
+from d4orm_env.disturbances.draws import Draws
+from d4orm_env.disturbances.levels import MAX_DELAY, standard_deviation
+
+_FARTHEST = 6.0
+"""No normal that is drawn lies so many standard deviations from zero."""
+
+
+class Scales(NamedTuple):
+    """Standard deviations of what is seen of robots ``(B, K, n)``, and of bodies ``(B, N, 2 d + 1)``."""
+
+    states: FloatArray
+    bodies: FloatArray
+
+
+@dataclass(frozen=True)
+class StateNoise(Disturbance[Scales]):
+    """Gaussian noise on what is measured of the robots, independent over steps, robots and components.
+
+    Bodies that are no robots are measured likewise. What the model of a robot has no state for is not measured but
+    known from its controls, as the velocity of ``velocity2d``.
+
+    Attributes:
+        position_std: Standard deviation of positions, per axis [m].
+        velocity_std: Of velocities per axis, or of the speed where the model has only that [m/s].
+        heading_std: Of headings [rad].
+    """
+
+    position_std: float
+    velocity_std: float = 0.0
+    heading_std: float = 0.0
+
+    def __post_init__(self) -> None:
+        for attribute in fields(self):
+            value = standard_deviation(getattr(self, attribute.name), f"StateNoise {attribute.name}")
+            object.__setattr__(self, attribute.name, value)
+
+    @property
+    def negligible(self) -> bool:
+        return not (self.position_std or self.velocity_std or self.heading_std)
+
+    def check(self, problem: Problem) -> None:
+        models = problem.team.robot_models
+        names = ", ".join(sorted(set(problem.team.models)))
+        if self.velocity_std and not any(model.speed_indices for model in models):
+            raise ValueError(
+                f"StateNoise velocity_std is {self.velocity_std:g}, and no state of {names} holds a velocity; leave it "
+                "out, or use a model that has one"
+            )
+        if self.heading_std and all(model.heading_index is None for model in models):
+            raise ValueError(
+                f"StateNoise heading_std is {self.heading_std:g}, and no state of {names} holds a heading; leave it "
+                "out, or use a model that has one"
+            )
+
+    def spare(self, problem: Problem) -> Spare:
+        return Spare(*(_FARTHEST * std for std in (self.position_std, self.velocity_std, self.heading_std)))
+
+    def begin(self, scene: Scene, draws: Draws) -> Scales:
+        scales, d = Scales(np.zeros_like(scene.states), np.zeros_like(scene.bodies)), scene.problem.dimension
+        scales.states[..., :d] = scales.bodies[..., :d] = self.position_std
+        scales.bodies[..., d : 2 * d] = self.velocity_std
+        for robot, model in enumerate(scene.problem.team.robot_models):
+            scales.states[:, robot, list(model.speed_indices)] = self.velocity_std
+            if model.heading_index is not None:
+                scales.states[:, robot, model.heading_index] = self.heading_std
+        return scales
+
+    def see(self, seen: Seen, memory: Scales, scene: Scene, draws: Draws) -> Seen:
+        states, bodies = seen.states + memory.states * draws.normal(*seen.states.shape[1:]), seen.bodies
+        if bodies.shape[1]:
+            bodies = bodies + memory.bodies * draws.normal(*bodies.shape[1:])
+        return Seen(states, seen.controls, bodies)
+
+
+class Past(NamedTuple):
+    """What was seen last, in rings ``(B, L, ...)``; moment ``t`` has place ``t mod L``."""
+
+    states: FloatArray
+    controls: FloatArray
+    bodies: FloatArray
+
+
+@dataclass(frozen=True)
+class StateDelay(Disturbance[Past]):
+    """What is seen is some time steps old: states, and the controls executed last. Goals, who has arrived and the clock
+    are known at once. Until the first measurement has come everything is seen as it began.
+
+    Attributes:
+        steps: Time steps, at most 1000.
+    """
+
+    steps: int
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "steps", whole_number(self.steps, "StateDelay steps", 0, MAX_DELAY))
+
+    @property
+    def negligible(self) -> bool:
+        return self.steps == 0
+
+    def begin(self, scene: Scene, draws: Draws) -> Past:
+        parts, length = (scene.states, scene.controls, scene.bodies), self.steps + 1
+        return Past(*(np.zeros((len(part), length, *part.shape[1:]), np.float32) for part in parts))
+
+    def see(self, seen: Seen, memory: Past, scene: Scene, draws: Draws) -> Seen:
+        worlds, length = np.arange(len(scene.steps)), self.steps + 1
+        for past, present in zip(memory, seen):
+            past[worlds, scene.steps % length] = present
+        # What is older than the episode stands where its first moment was written.
+        then = np.maximum(scene.steps - self.steps, 0) % length
+        return Seen(*(past[worlds, then] for past in memory))
+
+
+@dataclass(frozen=True)
+class Occlusion(Disturbance[Memory]):
+    """Sensors that do not reach far: a robot observes neither robots, bodies nor obstacles beyond their range.
+
+    Robots tell each other where they are, so that ``env.state()`` lacks only the bodies that no robot has in range.
+
+    Attributes:
+        range: Distance of centres, for obstacles of the centre from their surface [m].
+    """
+
+    range: float = math.inf
+
+    def __post_init__(self) -> None:
+        if self.range != math.inf:
+            object.__setattr__(self, "range", positive_number(self.range, "Occlusion range", most=LARGEST))
+
+    @property
+    def negligible(self) -> bool:
+        return self.range == math.inf
+
+    def see(self, seen: Seen, memory: Memory, scene: Scene, draws: Draws) -> Seen:
+        if not seen.bodies.shape[1]:
+            return seen
+        d = scene.problem.dimension
+        gaps = seen.bodies[:, :, None, :d] - seen.states[:, None, :, :d]
+        hidden = ((gaps * gaps).sum(axis=-1) > self.range**2).all(axis=-1)
+        return seen._replace(bodies=np.where(hidden[..., None], np.float32(0), seen.bodies))
+
+    def observe(self, observations: FloatArray, layout: ObservationLayout) -> FloatArray:
+        observations = observations.copy()
+        for rows, parts in (
+            (layout.neighbors(observations), layout.neighbor),
+            (layout.obstacles(observations), layout.obstacle),
+        ):
+            offsets = rows[..., parts.position]
+            rows *= (offsets * offsets).sum(axis=-1, keepdims=True) <= self.range**2
+        return observations

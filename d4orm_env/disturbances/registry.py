@@ -1,0 +1,121 @@
+"""Disturbances by name, as on the command line: ``delay``, ``push.speed``, ``package.module:Wind.speed``."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import MISSING, asdict, fields, is_dataclass
+from typing import Any
+
+from d4orm_env.core.arrays import shown
+from d4orm_env.core.registry import Registry
+from d4orm_env.disturbances.controls import Bias, ControlNoise, CorrelatedNoise, Delay, Dropout, Gain, Quantisation
+from d4orm_env.disturbances.disturbance import Disturbance
+from d4orm_env.disturbances.intruder import Intruder
+from d4orm_env.disturbances.perception import Occlusion, StateDelay, StateNoise
+from d4orm_env.disturbances.world import Drag, LimitMismatch, Push, Stall
+
+_BUILT_IN: tuple[type[Disturbance[Any]], ...] = (
+    ControlNoise, CorrelatedNoise, Bias, Delay, Dropout, Quantisation, Gain, StateNoise, StateDelay, Occlusion, Push,
+    Stall, Intruder, Drag, LimitMismatch,
+)  # fmt: skip
+
+
+def _admit(name: str, thing: object) -> type[Disturbance[Any]]:
+    if not (isinstance(thing, type) and issubclass(thing, Disturbance)):
+        raise ValueError(
+            f"disturbance {name!r} is {shown(thing)}; give a subclass of d4orm_env.disturbances.Disturbance"
+        )
+    return thing
+
+
+DISTURBANCES = Registry("disturbance", "d4orm.disturbances", _admit)
+"""Every class of disturbances by its name."""
+
+for _kind in _BUILT_IN:
+    DISTURBANCES.add(re.sub(r"(?<=.)(?=[A-Z])", "_", _kind.__name__).lower(), _kind)
+
+
+def register_disturbance(name: str, kind: type[Disturbance[Any]] | str) -> None:
+    """Let studies and the command line know disturbances of your own by a name.
+
+    Args:
+        name: Its name, such as ``"wind"``.
+        kind: The subclass of :class:`Disturbance`, or the text ``"package.module:Name"`` of one.
+
+    Raises:
+        ValueError: If the name is none or taken, or the class is no subclass.
+    """
+    DISTURBANCES.add(name, kind)
+
+
+def find_level(text: str) -> tuple[type[Disturbance[Any]], str]:
+    """The kind and the attribute that a name such as ``push.speed`` stands for; without one, the kind's first.
+
+    Raises:
+        ValueError: If there is no such kind, or it has no such attribute.
+    """
+    name, _, attribute = text.partition(".") if ":" not in text else _split_path(text)
+    kind = DISTURBANCES.find(name)
+    known = [field.name for field in fields(kind)] if is_dataclass(kind) else []
+    if not known:
+        raise ValueError(f"disturbance {name!r} has no attribute that could have a level; make it a dataclass")
+    if attribute and attribute not in known:
+        raise ValueError(f"disturbance {name!r} has no {attribute!r}; it has {', '.join(known)}")
+    return kind, attribute or known[0]
+
+
+def _split_path(text: str) -> tuple[str, str, str]:
+    place, colon, name = text.rpartition(":")
+    kind, dot, attribute = name.partition(".")
+    return place + colon + kind, dot, attribute
+
+
+def disturbance_at(text: str, level: object) -> Disturbance[Any]:
+    """The disturbance of a name at a level, all else as by default.
+
+    Args:
+        text: As for :func:`find_level`.
+        level: The value of the attribute; a list of two is a range for an attribute that takes one.
+
+    Raises:
+        ValueError: If there is no such disturbance, the level makes no sense, or another attribute has no default.
+    """
+    kind, attribute = find_level(text)
+    return _make(kind, {attribute: level}, text)
+
+
+def disturbances_at(levels: Mapping[str, object]) -> tuple[Disturbance[Any], ...]:
+    """Disturbances by name and level; what is said of several attributes of one kind is said of one disturbance.
+
+    Raises:
+        ValueError: As :func:`disturbance_at`.
+    """
+    kinds: dict[type[Disturbance[Any]], dict[str, object]] = {}
+    for text, level in levels.items():
+        kind, attribute = find_level(text)
+        kinds.setdefault(kind, {})[attribute] = level
+    return tuple(_make(kind, values, kind.__name__) for kind, values in kinds.items())
+
+
+def _make(kind: type[Disturbance[Any]], values: Mapping[str, object], text: str) -> Disturbance[Any]:
+    needed = [field.name for field in fields(kind) if field.default is MISSING and field.default_factory is MISSING]
+    missing = [name for name in needed if name not in values]
+    if missing:
+        raise ValueError(f"disturbance {text!r} needs {' and '.join(missing)} too; give instances of it in Python")
+    return kind(**values)
+
+
+def name_of(disturbance: Disturbance[Any]) -> str:
+    """What its kind is called here, or where it can be imported from."""
+    kind = type(disturbance)
+    for name in DISTURBANCES:
+        if DISTURBANCES.origin(name) in (kind, f"{kind.__module__}:{kind.__qualname__}"):
+            return name
+    return f"{kind.__module__}:{kind.__qualname__}"
+
+
+def attributes_of(disturbance: Disturbance[Any]) -> dict[str, object]:
+    """All attributes; what is infinite, which JSON does not have, as the text ``"inf"``."""
+    return {name: "inf" if value == math.inf else value for name, value in asdict(disturbance).items()}

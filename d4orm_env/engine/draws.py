@@ -1,0 +1,51 @@
+"""Random numbers of many worlds at once, from counters: what a world draws depends on nothing but its own key and the
+moment, so that it is the same alone and in any batch.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from d4orm_env.engine import noise, tiles
+from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.sampling import BIT_OPS
+from d4orm_env.engine.tiles import OPTIONS
+
+_SOURCES = fingerprint((noise, tiles))
+
+
+@cached_kernel(_SOURCES, **OPTIONS)
+def draw_normals(keys: Any, steps: Any, stream: Any, call: Any, out: Any) -> None:
+    """Fill ``out`` ``(B, N)`` with independent standard normals.
+
+    Args:
+        keys: ``(B, 2)`` uint32, one key per world.
+        steps: ``(B,)`` int64 steps taken since the episode began.
+        stream: uint32 number of the purpose.
+        call: uint32 number of the call in that step.
+        out: float32, output.
+    """
+    for b in range(out.shape[0]):
+        key = noise.stream_key(
+            keys[b, 0], keys[b, 1], np.uint32(steps[b]), np.uint32(stream), np.uint32(call), np.uint32(0), BIT_OPS
+        )
+        for i in range(0, out.shape[1], 2):
+            x, y = noise.normal_pair(np.uint32(i), key, BIT_OPS)
+            out[b, i] = x
+            if i + 1 < out.shape[1]:
+                out[b, i + 1] = y
+
+
+@cached_kernel(_SOURCES, **OPTIONS)
+def draw_uniforms(keys: Any, steps: Any, stream: Any, call: Any, out: Any) -> None:
+    """Fill ``out`` ``(B, N)`` with independent numbers, uniform in (0, 1); arguments as for :func:`draw_normals`."""
+    for b in range(out.shape[0]):
+        key = noise.stream_key(
+            keys[b, 0], keys[b, 1], np.uint32(steps[b]), np.uint32(stream), np.uint32(call), np.uint32(1), BIT_OPS
+        )
+        for i in range(out.shape[1]):
+            counter = np.uint32(np.uint32(i) * noise.GOLDEN)
+            bits = noise.hash32(np.uint32(counter ^ key[0]), key[1], BIT_OPS)
+            out[b, i] = noise.unit_interval(bits, BIT_OPS)

@@ -1,0 +1,111 @@
+"""Pictures of a study of disturbances, with matplotlib."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from d4orm_planners.evaluation.report import panels
+from d4orm_planners.evaluation.summary import SuccessRate
+from d4orm_planners.evaluation.tolerance import THRESHOLD
+
+
+def draw_disturbance(path: Path, name: str, rates: Sequence[SuccessRate]) -> None:
+    """Success against the level of one disturbance: one line per policy, one panel per scenario, team and noise.
+
+    Args:
+        path: Where to.
+        name: The disturbance.
+        rates: Those of its levels, at least one.
+    """
+    groups = _panels(rates)
+    figure, axes = _figure(len(groups), 4.8, 3.6)
+    for ax, (title, group) in zip(axes, groups.items()):
+        places = {level: place for place, level in enumerate(dict.fromkeys(rate.level for rate in group))}
+        # Levels that are no quantities, or lie apart by orders of magnitude, are places in a row.
+        levels = [level for level in places if level is not None and np.isfinite(level)]
+        even = len(levels) < len(places) or _uneven(levels)
+        for policy in dict.fromkeys(rate.label for rate in group):
+            line = [rate for rate in group if rate.label == policy]
+            x = [places[rate.level] if even else rate.level for rate in line]
+            (drawn,) = ax.plot(x, [rate.rate for rate in line], marker="o", label=policy, clip_on=False)
+            lower, upper = [rate.lower for rate in line], [rate.upper for rate in line]
+            ax.fill_between(x, lower, upper, color=drawn.get_color(), alpha=0.15, linewidth=0)
+        if even:
+            ax.set_xticks(range(len(places)), [_shown(level) for level in places])
+        elif levels[0] > levels[-1]:
+            ax.invert_xaxis()
+        ax.axhline(THRESHOLD, color="0.6", linewidth=0.8, linestyle=":")
+        ax.set(title=title, xlabel=name, ylabel="success rate", ylim=(0, 1))
+        ax.grid(alpha=0.3)
+    axes[0].legend(loc="best")
+    figure.savefig(path, dpi=150)
+
+
+def draw_map(path: Path, rates: Sequence[SuccessRate]) -> None:
+    """A heat map of success: a row per policy, a column per level of every disturbance, a panel as above."""
+    groups = _panels([rate for rate in rates if rate.disturbance])
+    columns = max(len({(rate.disturbance, rate.level) for rate in group}) for group in groups.values())
+    rows = max(len({rate.label for rate in group}) for group in groups.values())
+    figure, axes = _figure(len(groups), 1.6 + 0.42 * columns, 1.7 + 0.35 * rows, across=1)
+    for ax, (title, group) in zip(axes, groups.items()):
+        _draw_cells(ax, group)
+        ax.set_title(title, loc="left", pad=30)
+    figure.savefig(path, dpi=150)
+
+
+def _draw_cells(ax: Any, group: Sequence[SuccessRate]) -> None:
+    columns = list(dict.fromkeys((rate.disturbance, rate.level) for rate in group))
+    labels = list(dict.fromkeys(rate.label for rate in group))
+    shares = np.full((len(labels), len(columns)), np.nan)
+    for rate in group:
+        shares[labels.index(rate.label), columns.index((rate.disturbance, rate.level))] = rate.rate
+    ax.imshow(shares, cmap="RdYlBu", vmin=0, vmax=1, aspect="auto")
+    for (row, column), share in np.ndenumerate(shares):
+        if np.isfinite(share):
+            ink = "black" if 0.15 < share < 0.85 else "white"
+            ax.text(column, row, f"{100 * share:.0f}", ha="center", va="center", fontsize=8, color=ink)
+    ax.set_xticks(range(len(columns)), [_shown(level) for _, level in columns], fontsize=8)
+    ax.set_yticks(range(len(labels)), labels)
+    ax.tick_params(length=0)
+    edges = [place for place in range(len(columns)) if not place or columns[place][0] != columns[place - 1][0]]
+    for begin, end in pairwise([*edges, len(columns)]):
+        ax.text((begin + end - 1) / 2, -0.6, columns[begin][0].replace(".", "\n"), ha="center", va="bottom", fontsize=8)
+        ax.axvline(begin - 0.5, color="white", linewidth=4)
+    ax.set_xlabel("level; success in %")
+
+
+def _panels(rates: Sequence[SuccessRate]) -> dict[str, list[SuccessRate]]:
+    """As in the tables, but for levels of noise too."""
+    groups: dict[str, list[SuccessRate]] = {}
+    for title, group in panels(rates).items():
+        for rate in group:
+            noise = rate.control_noise_std
+            groups.setdefault(f"{title}, noise {noise:g}" if noise else title, []).append(rate)
+    return groups
+
+
+def _figure(count: int, width: float, height: float, across: int = 3) -> tuple[Any, Any]:
+    """A figure made without pyplot, which would keep state and want a display, and its axes."""
+    from matplotlib.figure import Figure
+
+    columns = min(count, across)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax in axes[count:]:
+        ax.set_visible(False)
+    return figure, axes
+
+
+def _uneven(levels: Sequence[float]) -> bool:
+    gaps = np.abs(np.diff(levels))
+    return bool(len(gaps) and gaps.max() > 20 * max(gaps.min(), 1e-12))
+
+
+def _shown(level: float | None) -> str:
+    return "-" if level is None else f"{level:g}"

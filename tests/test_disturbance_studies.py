@@ -1,0 +1,248 @@
+"""Studies of disturbances: what runs, what is stored, and what comes out."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from disturbance_support import Wind
+from env_support import line_problem
+from test_robustness import trial
+
+from d4orm_env import navigation_v0
+from d4orm_env.disturbances import Delay, Intruder, LimitMismatch, Push, Stall
+from d4orm_planners import cli, evaluate, run_episode
+from d4orm_planners.evaluation.conditions import Condition, conditions
+from d4orm_planners.evaluation.disturbance_report import write_disturbances
+from d4orm_planners.evaluation.evaluate import run_study
+from d4orm_planners.evaluation.leaderboard import leaderboard
+from d4orm_planners.evaluation.pairs import compare_pairs
+from d4orm_planners.evaluation.store import STORE, TrialStore
+from d4orm_planners.evaluation.study import Study
+from d4orm_planners.evaluation.summary import TrialGroup, success_rates
+from d4orm_planners.evaluation.tolerance import tolerances
+
+TINY: dict[str, Any] = {"num_robots": 2, "seeds": range(2), "workers": 1}
+Call = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def d4orm(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call:
+    """Runs a command inside ``tmp_path``; gives exit status, output and errors."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: str) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as exit_:
+            cli.main(list(arguments))
+        captured = capsys.readouterr()
+        return int(exit_.value.code or 0), captured.out, captured.err
+
+    return call
+
+
+def test_conditions_are_one_disturbance_at_a_time() -> None:
+    found = conditions([0.0, 0.1], {"delay": [0, 2], "push.speed": [0.3]})
+    assert [(one.control_noise_std, one.name, one.level, one.disturbances) for one in found] == [
+        (noise, name, level, (disturbance,))
+        for noise in (0.0, 0.1)
+        for name, level, disturbance in (
+            ("delay", 0, Delay(0)),
+            ("delay", 2, Delay(2)),
+            ("push.speed", 0.3, Push(speed=0.3)),
+        )
+    ]
+    assert found[0].text == "[]"
+    assert (
+        Condition(disturbances=(Stall(0.5),)).text
+        == '[["stall", {"duration": "inf", "probability": 0.5, "robots": null}]]'
+    )
+    assert json.loads(found[2].text) == [["push", {"rate": 0.2, "speed": 0.3}]]
+
+
+def test_instances_are_levels_too() -> None:
+    given = {"wind": [Wind(0.1), Wind(0.3)], "both": [[], [Delay(1), Wind()]], "late": [Delay(1), Delay((1, 3))]}
+    found = conditions(0.0, given)
+    assert [(one.name, one.level) for one in found] == [
+        ("wind", 0.1), ("wind", 0.3), ("both", 0), ("both", 1), ("late", 0), ("late", 1)
+    ]  # fmt: skip
+    ((name, attributes),) = json.loads(found[0].text)
+    assert name == "disturbance_support:Wind"
+    assert len(attributes["source"]) == 64
+    assert [Condition(disturbances=(one,)).replayable for one in (Delay(1), Wind(), Push(), Stall(0.1))] == [
+        True, False, False, True
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("disturbances", "complaint"),
+    [
+        ({}, "disturbances is empty"),
+        ({"delay": []}, r"disturbances\['delay'\] is empty"),
+        (["delay"], r"disturbances is \['delay'\]; give levels by name"),
+        ({"dely": [1]}, "disturbance 'dely' is unknown"),
+        ({"delay": [-1]}, "Delay steps is -1"),
+        ({"delay": ["much"]}, "Delay steps must be a whole number"),
+        ({"push.force": [1]}, "disturbance 'push' has no 'force'"),
+        ({"drag": [0.5]}, "Drag slows what has inertia, and robot_0, a velocity2d"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_before_anything_runs(tmp_path: Path, disturbances: Any, complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        evaluate("goal", line_problem([1.0]), out=tmp_path / "out", disturbances=disturbances)
+    assert not (tmp_path / "out").exists()
+
+
+def test_every_trial_is_stored_with_its_disturbance_and_run_once(tmp_path: Path) -> None:
+    counts: list[tuple[int, int]] = []
+    study: dict[str, Any] = {
+        **TINY,
+        "out": tmp_path,
+        "progress": lambda what, done, total: counts.append((done, total)),
+    }
+    rows = evaluate("goal", disturbances={"delay": [0, 1], "push.speed": [0.0, 0.4]}, **study)
+    assert [(row.disturbance, row.level, row.trials) for row in rows] == [
+        ("delay", 0, 2), ("delay", 1, 2), ("push.speed", 0, 2), ("push.speed", 0.4, 2)
+    ]  # fmt: skip
+    # Both at level zero are the undisturbed trials, which run once.
+    assert counts[-1] == (6, 6)
+    stored = TrialStore.existing(tmp_path).trials()
+    assert sorted({row.disturbances for row in stored}) == [
+        '[["delay", {"steps": 1}]]', '[["push", {"rate": 0.2, "speed": 0.4}]]', "[]"
+    ]  # fmt: skip
+    assert {row.disturbances: row.verified is None for row in stored}['[["push", {"rate": 0.2, "speed": 0.4}]]']
+    counts.clear()
+    more = evaluate("goal", disturbances={"delay": [0, 1, 2]}, **study)
+    assert counts[0] == (4, 6)
+    assert more[:2] == rows[:2]
+    assert all(row.disturbance == "" and row.trials == 2 for row in evaluate("goal", **study))
+    assert "delay steps=1" in leaderboard(TrialStore.existing(tmp_path).trials())
+
+
+def test_trials_are_those_of_the_environment(tmp_path: Path) -> None:
+    problem, disturbances = line_problem([1.0, 1.5], "holonomic2d"), [Delay(2), Intruder(2)]
+    ((group,), _) = (run_study(Study(policies="goal", scenarios=problem, seeds=[4], disturbances={"x": [one]}),
+                     tmp_path, workers=1) for one in (disturbances, disturbances))  # fmt: skip
+    episode = run_episode(navigation_v0.parallel_env(problem=problem, disturbances=disturbances), "goal", seed=4)
+    (row,) = group.trials
+    assert (row.travel_time, row.collided) == (episode.metrics["travel_time"], episode.metrics["collided"])
+
+
+def test_a_stalled_robot_does_not_spoil_the_trial(tmp_path: Path) -> None:
+    problem = line_problem([2.0] * 3, horizon=60)
+    (rate,) = evaluate("goal", problem, out=tmp_path, seeds=range(4), workers=1,
+                       disturbances={"one stalls": [Stall(1.0, robots=1)]})  # fmt: skip
+    assert rate.successes == 4
+    assert rate.late > 0
+
+
+def group(label: str, level: float | None, wins: str, disturbance: str = "delay", **changes: Any) -> TrialGroup:
+    """A group with a trial for every character, ``+`` for a success."""
+    rows = [trial(seed, label=label, success=mark == "+", **changes) for seed, mark in enumerate(wins)]
+    return TrialGroup(label, rows, disturbance, level)
+
+
+def test_the_level_at_which_success_falls_below_90_percent() -> None:
+    good, bad = "+" * 9 + "-", "+" * 8 + "--"
+    rates = success_rates(
+        [group("a", 0, good), group("a", 1, good), group("a", 2, bad), group("a", 4, good), group("b", 0, good),
+         group("b", 1, good), group("c", 0, bad), group("c", 1, bad), group("c", None, bad, "")]
+    )  # fmt: skip
+    assert [(one.label, one.stands, one.fails, one.text) for one in tolerances(rates)] == [
+        ("a", 1, 2, "2"), ("b", 1, None, "over 1"), ("c", None, 0, "0")
+    ]  # fmt: skip
+
+
+def test_pairs_are_compared_by_seed() -> None:
+    (pair,) = compare_pairs(
+        [group("a", 1, "+++++++++---", travel_time=5.0), group("b", 1, "++----------", travel_time=6.0)]
+    )
+    assert (pair.first, pair.second, pair.trials) == ("a", "b", 12)
+    assert (pair.only_first, pair.only_second) == (7, 0)
+    assert pair.p_value == pytest.approx(2 * 0.5**7)  # the exact binomial test of 7 out of 7
+    assert pair.difference == pytest.approx(7 / 12)
+    assert 0.2 < pair.lower < pair.difference < pair.upper < 0.95
+    assert (pair.slower, pair.slower_lower, pair.slower_upper) == (-1, -1, -1)
+    # Other problems, conditions and single policies have no pairs.
+    assert compare_pairs([group("a", 1, "+"), group("b", 2, "+"), group("c", 1, "+", problem="other")]) == []
+
+
+def test_the_files_of_a_study(tmp_path: Path) -> None:
+    groups = [
+        group(label, level, wins, name)
+        for label in ("a", "b")
+        for name in ("delay", "push.speed", "own thing")
+        for level, wins in ((0, "+++"), (1, "++-"))
+    ]
+    written = write_disturbances(tmp_path, groups)
+    assert [path.name for path in written] == [
+        "disturbances.md", "tolerance.csv", "tolerance.png", "pairs.csv", "disturbance-delay.png",
+        "disturbance-push.speed.png", "disturbance-own_thing.png",
+    ]  # fmt: skip
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in written if path.suffix == ".png")
+    with (tmp_path / "tolerance.csv").open(newline="") as file:
+        assert [(row["label"], row["disturbance"], row["fails"]) for row in csv.DictReader(file)][:2] == [
+            ("a", "delay", "1"), ("a", "push.speed", "1")
+        ]  # fmt: skip
+    assert "| a | 1 | 1 | 1 |" in (tmp_path / "disturbances.md").read_text()
+    assert len(write_disturbances(tmp_path, [one for one in groups if one.label == "a"])) == 6
+
+
+def test_the_command_line(d4orm: Call, tmp_path: Path) -> None:
+    options = ("--policy", "goal,random", "-k", "2", "--seeds", "2", "--workers", "1", "-q")
+    status, _, error = d4orm("evaluate", *options, "--disturb", "delay=0,2", "--disturb", "push.speed=0.3")
+    assert (status, error) == (0, "")
+    assert len(TrialStore.existing(tmp_path / "evaluation").trials()) == 2 * 2 * 3
+    assert (tmp_path / "evaluation" / "disturbance-delay.png").exists()
+    status, out, _ = d4orm("robustness", *options[:-1], "--out", "evaluation", "--disturb", "delay=0,2,[1, 3]")
+    assert status == 0
+    assert "delay 2" in out
+    assert (tmp_path / "evaluation" / "robustness.csv").exists()
+    assert len(TrialStore.existing(tmp_path / "evaluation").trials()) == 2 * 2 * 4
+
+
+def test_robustness_is_a_study_of_all(d4orm: Call, tmp_path: Path) -> None:
+    status, out, _ = d4orm("robustness", "--policy", "goal", "-k", "2", "--seeds", "1", "--workers", "1")
+    assert status == 0
+    assert "limit_mismatch 0.7" in out
+    stored = TrialStore.existing(tmp_path / "robustness" / STORE).trials()
+    assert len({row.disturbances for row in stored}) == len(stored) > 30
+    assert (tmp_path / "robustness" / "tolerance.png").exists()
+
+
+def test_an_episode_with_disturbances(d4orm: Call) -> None:
+    quiet = ("run", "--policy", "goal", "-k", "1", "--seed", "3")
+    outputs = {d4orm(*quiet, *more)[1] for more in ((), ("--disturb", "delay=0"), ("--disturb", "limit_mismatch=0.5"))}
+    assert len(outputs) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("evaluate", "--disturb", "delay"), "--disturb 'delay' is not of the form name=levels"),
+        (("evaluate", "--disturb", "delay="), "--disturb 'delay=' is not of the form"),
+        (("evaluate", "--disturb", "dely=1"), "disturbance 'dely' is unknown; choose one of"),
+        (("evaluate", "--disturb", "delay=1.5"), "Delay steps must be a whole number, not 1.5"),
+        (("evaluate", "--disturb", "delay=1", "--disturb", "delay=2"), "gives 'delay' twice"),
+        (("robustness", "--disturb", "dropout=2"), "Dropout probability is 2"),
+        (("run", "--disturb", "delay=1,2"), "an episode has one level, not 2"),
+        (("run", "--disturb", "drag=0.5", "--model", "velocity2d"), "Drag slows what has inertia"),
+        (("run", "--disturb", "state_noise.velocity_std=1"), "needs position_std too"),
+    ],
+)
+def test_bad_input_is_one_line(d4orm: Call, arguments: tuple[str, ...], complaint: str) -> None:
+    status, _, error = d4orm(*arguments)
+    assert status == 2
+    assert re.search(re.escape(complaint), error)
+    assert error.count("\n") == 1
+
+
+def test_limits_fall_from_left_to_right() -> None:
+    found = conditions(0.0, {"limit_mismatch": [1, 0.8]})
+    assert [one.level for one in found] == [1, 0.8]
+    assert found[0].text == "[]"
+    assert found[1].disturbances == (LimitMismatch(0.8),)
