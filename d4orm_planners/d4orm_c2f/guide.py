@@ -166,10 +166,9 @@ class Guide:
             initial[: len(rest), keep] = rest[:, keep]
         thorough = lost or bool(held_up.any())
         iterations = self._config.coarse_iterations if thorough else self._config.replan_iterations
-        if self.guidance.ordered:
-            # A way straight through walls is no beginning: the whole team's ways are found anew on the roadmap.
-            initial = None
-        self._follow(joint, self.plan(joint, initial, iterations, thorough), ~keep | lost)
+        # A way straight through walls is no beginning: there the whole team's ways are found anew on the roadmap.
+        guidance = self.plan(joint, None if self.guidance.ordered else initial, iterations, thorough)
+        self._follow(joint, guidance, ~keep | lost)
         return True
 
     def _due(self, joint: JointState) -> FloatArray:
