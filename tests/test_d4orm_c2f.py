@@ -17,6 +17,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_model import ACCELERATION
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
+from d4orm_env.disturbances import Delay, Intruder, Push
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.joint_state import JointState
@@ -212,10 +213,10 @@ def test_a_loop_that_is_late_goes_on_with_the_last_plan(monkeypatch: pytest.Monk
     policy = controller(deadline=1.0)
     in_time = Window.predict
 
-    def predict(self: Window, joint: Any, *arguments: Any) -> Any:
-        if joint.steps == 10:
+    def predict(self: Window, now: Any, seed: int) -> Any:
+        if now.joint.steps == 10:
             time.sleep(1.3)
-        return in_time(self, joint, *arguments)
+        return in_time(self, now, seed)
 
     monkeypatch.setattr(Window, "predict", predict)
     executed = episode(policy, problem)
@@ -338,6 +339,29 @@ def test_robots_within_the_margin_of_each_other_part() -> None:
     start = np.array([[0, 0, 0, 0], [0.33, 0, 0, 0]], np.float32)
     problem = Problem(Team(("holonomic2d",) * 2), start, start[:, :2] + [[-1, 0], [1, 0]], horizon=60, margin=0.05)
     executed = episode(controller(), problem)
+    assert executed.metrics["success"], executed.metrics
+
+
+def test_undisturbed_robots_are_where_they_are_expected() -> None:
+    policy = controller()
+    assert episode(policy, circle(3)).metrics["success"]
+    assert policy._deviation.speed < 1e-4
+    episode(policy, circle(3), disturbances=[Push(1.0, 0.3)])
+    assert 0.1 < policy._deviation.speed < 0.7
+
+
+def test_commands_under_way_are_counted() -> None:
+    policy = controller(delay=2)
+    assert episode(policy, circle(4), disturbances=[Delay(2)]).metrics["success"]
+    assert policy._deviation.speed < 1e-4
+    policy = controller()
+    episode(policy, circle(4), disturbances=[Delay(2)])
+    assert policy._deviation.speed > 0.01
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_intruders_are_avoided(seed: int) -> None:
+    executed = episode(controller(), circle(6), seed=seed, disturbances=[Intruder(1, 0.5)])
     assert executed.metrics["success"], executed.metrics
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.problem import Problem
+from d4orm_env.disturbances import Push
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import Search, make_planner, make_policy, run_episode
@@ -191,6 +192,8 @@ POLICY_CHANGES: dict[str, dict[str, tuple[Any, dict[str, Any]]]] = {
         "credit": ("team", {}),
         "penalty": (0.5, {}),
         "extra_margin": (0.2, {}),
+        "delay": (2, {}),
+        "reaction_time": (1.0, {"disturbances": [Push(2.0, 0.3)]}),
         "refine": ("sync", {}),
         "refine_every": (2, {"refine": "sync"}),
         "replan_distance": (0.05, {}),
@@ -221,7 +224,7 @@ def policy_settings() -> list[Any]:
 
 def executed(name: str, settings: dict[str, Any]) -> bytes:
     """What the team does by a policy."""
-    own = {"lifelong": False, "max_cycles": 40, "scenario": None}
+    own = {"lifelong": False, "max_cycles": 40, "scenario": None, "disturbances": ()}
     env = {key: settings.get(key, value) for key, value in own.items()}
     scenario = env.pop("scenario")
     problem = crossing() if scenario is None else make_problem(scenario, num_robots=4, horizon=50)

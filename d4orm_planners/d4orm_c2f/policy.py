@@ -14,9 +14,10 @@ from d4orm_env.engine.choice import get_engine
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.coarse import Guidance
+from d4orm_planners.d4orm_c2f.deviation import Deviation
 from d4orm_planners.d4orm_c2f.guide import Guide
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
-from d4orm_planners.d4orm_c2f.window import Prediction, Window
+from d4orm_planners.d4orm_c2f.window import Prediction, Situation, Window
 from d4orm_planners.policy import StatePolicy
 from d4orm_planners.settings import CheckedSettings
 
@@ -93,9 +94,11 @@ class D4ormC2F(StatePolicy):
         begin = time.perf_counter()
         self._guide = Guide(self.problem, self.config, seed, self._refiner, self._refinement)
         self._guide.begin(joint)
+        self._deviation = Deviation(self.problem, self._engine, self.config.delay)
         self.coarse_time = time.perf_counter() - begin
 
     def _controls(self, joint: JointState) -> FloatArray:
+        joint = self._deviation.observe(joint)
         if not self.loops or self._next >= self.config.execute_horizon:
             self._loop(joint)
         controls = self._plan[min(self._next, len(self._plan) - 1)]
@@ -104,6 +107,7 @@ class D4ormC2F(StatePolicy):
             noise = self._random.normal(0, self.config.control_noise_std, controls.shape)
             limit = self.problem.team.control_limits
             controls = np.clip(controls + noise, -limit, limit).astype(np.float32)
+        self._deviation.expect(controls)
         return controls
 
     def _loop(self, joint: JointState) -> None:
@@ -118,9 +122,11 @@ class D4ormC2F(StatePolicy):
         seed = derived_seed(self._seed, Stream.CONTROL_LOOP, joint.steps)
         stuck = guide.stuck & ~docked
         careful = guide.followed(joint, self._engine, len(base)) if stuck.any() else None
+        room = self._deviation.room(self.config.reaction_time)
+        now = Situation(joint, docked, subgoals, base, left, careful, stuck, room)
 
         def predict() -> Prediction:
-            return self._window.predict(joint, docked, subgoals, base, left, careful, stuck, seed)
+            return self._window.predict(now, seed)
 
         result: Prediction | None
         if self.config.deadline is None:

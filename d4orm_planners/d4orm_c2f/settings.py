@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
+from pydantic import Field
+
 from d4orm_planners.sampling.settings import DiffusionSettings, SoftmaxSettings
-from d4orm_planners.settings import Count, EngineName, NotNegative, Positive, Samples, Steps, one_of
+from d4orm_planners.settings import Count, EngineName, NotNegative, Positive, Samples, Steps, Whole, one_of
 
 Credit = Annotated[str, one_of(("robot", "team"))]
 Refinement = Annotated[str, one_of(("background", "sync", "off"))]
@@ -33,6 +35,9 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
         credit: ``"robot"`` or ``"team"``: whose reward weights the samples of a control loop.
         penalty: What a violation costs per step in a control loop, against the paper's one.
         extra_margin: Added to the problem's margin in control loops, as room for disturbances [m].
+        reaction_time: The margin in control loops grows by how far robots come within so many seconds from where they
+            were expected, by the largest deviation of late: nothing while they do as they are told [s].
+        delay: Steps late that commands are executed: control loops begin where those under way lead.
         refine: Whether the guidance is refined while it is followed: in a ``"background"`` thread, ``"sync"`` between
             control loops, which gives the same controls every time, or ``"off"``.
         refine_every: At most every so-manyth control loop a refinement begins: it takes time from control loops.
@@ -62,6 +67,8 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
     credit: Credit = "robot"
     penalty: Positive = 10.0
     extra_margin: NotNegative = 0.0
+    reaction_time: NotNegative = 0.4
+    delay: Annotated[Whole, Field(ge=0, le=100)] = 0
     refine: Refinement = "background"
     refine_every: Count = 5
     replan_distance: Positive = 1.0

@@ -9,7 +9,7 @@ import numpy as np
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.engine.base import Engine, SamplingRules, SamplingTask
+from d4orm_env.engine.base import Engine, MovingObstacles, SamplingRules, SamplingTask
 from d4orm_env.joint_state import JointState
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.steering import track_velocities
@@ -35,6 +35,30 @@ class Prediction(NamedTuple):
 
     controls: FloatArray
     gap: float
+
+
+class Situation(NamedTuple):
+    """What a control loop begins with.
+
+    Attributes:
+        joint: Where the robots are.
+        docked: ``(K,)`` who stays there.
+        subgoals: ``(K, d)`` [m].
+        base: ``(H_predict, K, m)`` controls to deform.
+        left: ``(T, K, m)`` controls that the robots had in mind, with the stop after them.
+        careful: ``(H_predict, K, m)`` controls for robots that are stuck, if any are.
+        stuck: ``(K,)`` who is; they may come as near as half of the margin.
+        room: Added to the margin of the samples [m].
+    """
+
+    joint: JointState
+    docked: BoolArray
+    subgoals: FloatArray
+    base: FloatArray
+    left: FloatArray
+    careful: FloatArray | None
+    stuck: BoolArray
+    room: float
 
 
 class Window:
@@ -65,58 +89,50 @@ class Window:
         shape = (self._config.predict_horizon, self._problem.num_robots, self._problem.control_size)
         return np.zeros(shape, np.float32)
 
-    def predict(
-        self,
-        joint: JointState,
-        docked: BoolArray,
-        subgoals: FloatArray,
-        base: FloatArray,
-        before: FloatArray,
-        careful: FloatArray | None,
-        stuck: BoolArray,
-        seed: int,
-    ) -> Prediction:
-        """Fine controls towards the subgoals.
-
-        Args:
-            joint: Where the robots are.
-            docked: ``(K,)`` who stays there.
-            subgoals: ``(K, d)`` [m].
-            base: ``(H_predict, K, m)`` controls to deform.
-            before: ``(T, K, m)`` controls that the robots had in mind, with the stop after them.
-            careful: ``(H_predict, K, m)`` controls for robots that are stuck, if any are.
-            stuck: ``(K,)`` who is; they may come as near as half of the margin.
-            seed: Of the samples.
-        """
+    def predict(self, now: Situation, seed: int) -> Prediction:
+        """Fine controls towards the subgoals."""
         problem, config = self._problem, self._config
-        task = self._task(joint, docked, subgoals, base)
         result = self._engine.denoise(
-            task, self._rules, np.zeros_like(base), self._noise_scale, config.num_samples, seed
+            self._task(now), self._rules, np.zeros_like(now.base), self._noise_scale, config.num_samples, seed
         )
         limit = problem.team.control_limits
-        controls = np.clip(base + result.mean, -limit, limit).astype(np.float32)
-        if careful is not None:
-            controls[:, stuck] = careful[:, stuck]
+        controls = np.clip(now.base + result.mean, -limit, limit).astype(np.float32)
+        if now.careful is not None:
+            controls[:, now.stuck] = now.careful[:, now.stuck]
         radius = problem.goal_radius if self._docks else NOT_AT_SUBGOALS
-        truth = problem.resumed_at(joint.states, joint.goals, horizon=config.predict_horizon, goal_radius=radius)
-        return self._safe_mix(truth, controls, before, docked, stuck)
+        joint, horizon = now.joint, config.predict_horizon
+        truth = problem.resumed_at(joint.states, joint.goals, horizon=horizon, goal_radius=radius)
+        return self._safe_mix(truth, controls, now)
 
-    def _task(self, joint: JointState, docked: BoolArray, subgoals: FloatArray, base: FloatArray) -> SamplingTask:
-        """Deform ``base`` so that everybody heads for its subgoal, or its goal where that is near."""
-        problem, config = self._problem, self._config
-        near = np.linalg.norm(subgoals - joint.goals, axis=1) <= problem.goal_radius
-        goals = np.where((near | docked)[:, None], joint.goals, subgoals)
+    def _task(self, now: Situation) -> SamplingTask:
+        """Deform the base so that everybody heads for its subgoal, or its goal where that is near."""
+        problem, config, goals = self._problem, self._config, now.joint.goals
+        near = np.linalg.norm(now.subgoals - goals, axis=1) <= problem.goal_radius
         window = problem.resumed_at(
-            joint.states,
-            goals,
+            now.joint.states,
+            np.where((near | now.docked)[:, None], goals, now.subgoals),
             horizon=config.predict_horizon,
-            margin=problem.margin + config.extra_margin,
+            margin=problem.margin + config.extra_margin + now.room,
             goal_radius=problem.goal_radius if near.any() and self._docks else NOT_AT_SUBGOALS,
         )
-        ahead = problem.dt * config.subgoal_offset * float(np.max(np.asarray(problem.team.max_speed)))
         return SamplingTask(
-            window, base, credit=config.credit, arrived=docked, penalty=config.penalty, reference_distance=ahead
+            window,
+            now.base,
+            credit=config.credit,
+            moving=self._bodies(now, config.predict_horizon),
+            arrived=now.docked,
+            penalty=config.penalty,
+            reference_distance=problem.dt * config.subgoal_offset * float(np.max(np.asarray(problem.team.max_speed))),
         )
+
+    def _bodies(self, now: Situation, horizon: int) -> MovingObstacles | None:
+        """Where bodies that are no robots will be, going on as they do; ``None`` if none is seen."""
+        d, bodies = self._problem.dimension, now.joint.bodies
+        seen = bodies[bodies[:, -1] > 0] if len(bodies) else bodies
+        if not len(seen):
+            return None
+        times = self._problem.dt * np.arange(1, horizon + 1, dtype=np.float32)[:, None, None]
+        return MovingObstacles(seen[:, :d] + times * seen[:, d : 2 * d], seen[:, -1])
 
     def _with_stop(self, window: Problem, controls: FloatArray, steps: int, docked: BoolArray) -> FloatArray:
         """The first ``steps`` controls, and after them those that bring everyone to rest as soon as can be.
@@ -133,9 +149,7 @@ class Window:
             states = self._engine.step(window.arrays, states, docked, stopping[t]).states
         return stopping
 
-    def _safe_mix(
-        self, window: Problem, fresh: FloatArray, left: FloatArray, docked: BoolArray, stuck: BoolArray
-    ) -> Prediction:
+    def _safe_mix(self, window: Problem, fresh: FloatArray, now: Situation) -> Prediction:
         """Fresh controls where they keep everyone apart; where not, robots stop earlier, or do as they had in mind.
 
         What they had in mind was free of violations, and ends at rest. So without disturbances there always is a mix
@@ -143,36 +157,39 @@ class Window:
         """
         horizon = len(fresh)
         before = np.zeros((horizon + self._stop_steps, *fresh.shape[1:]), np.float32)
-        before[: len(left)] = left
-        controls = self._with_stop(window, fresh, horizon, docked)
+        before[: len(now.left)] = now.left
+        controls = self._with_stop(window, fresh, horizon, now.docked)
         window_to_rest = window.resumed_at(window.start, window.goal, horizon=len(controls))
         # After how many fresh steps each robot stops.
         steps = np.full(window.num_robots, horizon)
-        trajectory, violated = self._violations(window_to_rest, controls, stuck)
+        trajectory, violated = self._violations(window_to_rest, controls, now)
         while (violating := violated & (steps > 0)).any():
             steps[violating] //= SHORTER
             steps[steps < self._config.execute_horizon] = 0
             for number in np.unique(steps[violating]):
-                fewer = self._with_stop(window, fresh, int(number), docked) if number else before
+                fewer = self._with_stop(window, fresh, int(number), now.docked) if number else before
                 chosen = violating & (steps == number)
                 controls[:, chosen] = fewer[:, chosen]
-            trajectory, violated = self._violations(window_to_rest, controls, stuck)
+            trajectory, violated = self._violations(window_to_rest, controls, now)
         return Prediction(controls, least_gap(window, trajectory.positions[1:]))
 
-    def _violations(self, window: Problem, controls: FloatArray, stuck: BoolArray) -> tuple[Trajectory, BoolArray]:
+    def _violations(self, window: Problem, controls: FloatArray, now: Situation) -> tuple[Trajectory, BoolArray]:
         """The rollout, and ``(K,)`` who comes too near to anything in it.
 
         That is within the margin; of half of it for those that are stuck; nearer than now for who is within it already.
         """
-        trajectory = self._engine.rollout(window, controls)
+        trajectory, radius = self._engine.rollout(window, controls), np.asarray(window.team.radius)
         violated: BoolArray = np.any(trajectory.margin_violated[1:], axis=0)
-        lenient = trajectory.margin_violated[0] | stuck
+        lenient = trajectory.margin_violated[0] | now.stuck
         if lenient.any():
             places = trajectory.positions[0]
-            clearance = window.world.clearance(places) - np.asarray(window.team.radius)
-            gap = min(least_gap(window, places[None]), float(clearance.min())) - ROUNDING
-            nearer = window.resumed_at(window.start, window.goal, margin=max(min(gap, window.margin / 2), 0.0))
+            gap = min(least_gap(window, places[None]), float((window.world.clearance(places) - radius).min()))
+            allowed = min(gap - ROUNDING, window.margin / 2 if now.stuck.any() else window.margin)
+            nearer = window.resumed_at(window.start, window.goal, margin=max(allowed, 0.0))
             violated[lenient] = self._engine.rollout(nearer, controls).margin_violated[1:, lenient].any(axis=0)
+        if (bodies := self._bodies(now, len(controls))) is not None:
+            away = np.linalg.norm(trajectory.positions[1:, :, None] - bodies.positions[:, None], axis=3)
+            violated |= (away <= radius[:, None] + bodies.radius + window.margin).any(axis=(0, 2))
         return trajectory, violated
 
 

@@ -50,23 +50,43 @@ def paired(first: Sequence[Trial], second: Sequence[Trial], cost: Callable[[Tria
     """
     from scipy import stats  # takes a second to import
 
-    others = {_circumstances(trial): trial for trial in second}
-    common = [(trial, others[_circumstances(trial)]) for trial in first if _circumstances(trial) in others]
+    common = in_common(first, second)
     if not common:
         raise ValueError("the two policies have no problem, seed and noise in common; give trials of the same study")
     only_first = sum(one.success and not other.success for one, other in common)
     only_second = sum(other.success and not one.success for one, other in common)
-    apart = only_first + only_second
     differences = np.array([cost(one) - cost(other) for one, other in common])
     moved = differences[differences != 0]
     return Paired(
         pairs=len(common),
         only_first=only_first,
         only_second=only_second,
-        success_p=float(stats.binomtest(only_first, apart).pvalue) if apart else 1.0,
+        success_p=mcnemar(only_first, only_second),
         difference=float(np.median(differences)),
         cost_p=float(stats.wilcoxon(moved).pvalue) if len(moved) else 1.0,
     )
+
+
+def in_common(first: Sequence[Trial], second: Sequence[Trial]) -> list[tuple[Trial, Trial]]:
+    """Pairs of trials of two policies with the same problem, seed, noise and disturbances."""
+    others = {_circumstances(trial): trial for trial in second}
+    return [(trial, others[_circumstances(trial)]) for trial in first if _circumstances(trial) in others]
+
+
+def mcnemar(only_first: int, only_second: int) -> float:
+    """How likely it is that two equally good policies differ so much in successes on the same trials, two-sided.
+
+    Q. McNemar, "Note on the sampling error of the difference between correlated proportions", Psychometrika 12, 1947;
+    exact, by the binomial distribution.
+
+    Args:
+        only_first: Trials in which only the first succeeded.
+        only_second: Those in which only the second did.
+    """
+    from scipy import stats  # takes a second to import
+
+    apart = only_first + only_second
+    return float(stats.binomtest(only_first, apart).pvalue) if apart else 1.0
 
 
 def _circumstances(trial: Trial) -> tuple[str, float, int, str]:

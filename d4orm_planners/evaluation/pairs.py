@@ -8,6 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
+from d4orm_planners.evaluation.comparison import in_common, mcnemar
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import TrialGroup
 
@@ -30,7 +31,7 @@ class PairedPolicies:
         trials: Pairs of trials.
         only_first: Pairs in which only the first succeeded.
         only_second: Those in which only the second did.
-        p_value: That rates of success are equal, two-sided: McNemar's exact test (Q. McNemar, Psychometrika 12, 1947).
+        p_value: That rates of success are equal, two-sided: :func:`~d4orm_planners.evaluation.comparison.mcnemar`.
         difference: Success rate of the first less that of the second.
         lower: Lower end of its 95% confidence interval, by a paired bootstrap (percentiles).
         upper: Upper end.
@@ -70,16 +71,11 @@ def compare_pairs(groups: Iterable[TrialGroup]) -> list[PairedPolicies]:
 
 
 def _compared(first: TrialGroup, second: TrialGroup) -> PairedPolicies | None:
-    others = {(trial.problem, trial.seed): trial for trial in second.trials}
-    met = [(one, others[key]) for one in first.trials if (key := (one.problem, one.seed)) in others]
+    met = in_common(first.trials, second.trials)
     if not met:
         return None
-    from scipy import stats  # takes a second to import
-
     won = np.array([(one.success, other.success) for one, other in met], float)
     only_first, only_second = int((won[:, 0] > won[:, 1]).sum()), int((won[:, 0] < won[:, 1]).sum())
-    discordant = only_first + only_second
-    p_value = stats.binomtest(only_first, discordant).pvalue if discordant else 1.0
     slower = [_time(one) - _time(other) for one, other in met if one.success and other.success]
     trial, lower, upper = first.trials[0], *_bootstrap(won[:, 0] - won[:, 1])
     slower_lower, slower_upper = _bootstrap(slower) if len(slower) > 1 else (None, None)
@@ -95,7 +91,7 @@ def _compared(first: TrialGroup, second: TrialGroup) -> PairedPolicies | None:
         trials=len(met),
         only_first=only_first,
         only_second=only_second,
-        p_value=float(p_value),
+        p_value=mcnemar(only_first, only_second),
         difference=float((won[:, 0] - won[:, 1]).mean()),
         lower=lower,
         upper=upper,
