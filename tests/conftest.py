@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from hypothesis import settings
@@ -35,3 +38,27 @@ def pytest_configure(config: pytest.Config) -> None:
     if examples is not None:
         # Read where the tests are imported, and by the processes of pytest-xdist.
         os.environ["FUZZ_EXAMPLES"] = str(examples)
+
+
+class Outcome(NamedTuple):
+    status: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def d4orm(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., Outcome]:
+    """Runs the command line inside ``tmp_path``; gives exit status, output and errors."""
+    from d4orm_planners import cli
+
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: str) -> Outcome:
+        with pytest.raises(SystemExit) as exit_:
+            cli.main(list(arguments))
+        captured = capsys.readouterr()
+        return Outcome(int(exit_.value.code or 0), captured.out, captured.err)
+
+    return call

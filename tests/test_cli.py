@@ -13,31 +13,9 @@ import numpy as np
 import pytest
 
 from d4orm_env import make_problem
-from d4orm_planners import cli
 from d4orm_planners.plan import Plan
 
 QUICK = ("--set", "num_samples=64", "--set", "num_steps=5", "--max-iterations", "1")
-
-
-class Outcome:
-    """Exit status and output of one call."""
-
-    def __init__(self, status: int, out: str, err: str) -> None:
-        self.status, self.out, self.err = status, out, err
-
-
-@pytest.fixture
-def d4orm(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Runs the command line inside ``tmp_path``."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: str) -> Outcome:
-        with pytest.raises(SystemExit) as exit_:
-            cli.main(list(arguments))
-        captured = capsys.readouterr()
-        return Outcome(int(exit_.value.code or 0), captured.out, captured.err)
-
-    return call
 
 
 def test_plan_writes_the_plan_and_its_pictures(d4orm, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from test_robustness import trial
 
 from d4orm_env import navigation_v0
 from d4orm_env.disturbances import Delay, Intruder, LimitMismatch, Push, Stall
-from d4orm_planners import cli, evaluate, run_episode
+from d4orm_planners import evaluate, run_episode
 from d4orm_planners.evaluation.conditions import Condition, conditions
 from d4orm_planners.evaluation.disturbance_report import write_disturbances
 from d4orm_planners.evaluation.evaluate import run_study
@@ -29,20 +29,6 @@ from d4orm_planners.evaluation.tolerance import tolerances
 
 TINY: dict[str, Any] = {"num_robots": 2, "seeds": range(2), "workers": 1}
 Call = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def d4orm(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call:
-    """Runs a command inside ``tmp_path``; gives exit status, output and errors."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: str) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as exit_:
-            cli.main(list(arguments))
-        captured = capsys.readouterr()
-        return int(exit_.value.code or 0), captured.out, captured.err
-
-    return call
 
 
 def test_conditions_are_one_disturbance_at_a_time() -> None:

@@ -21,7 +21,7 @@ import pytest
 from planner_support import program
 
 from d4orm_env import make_problem, save_problem
-from d4orm_planners import IterationRecord, cli, evaluate
+from d4orm_planners import IterationRecord, evaluate
 from d4orm_planners.evaluation import report, trials
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.leaderboard import leaderboard
@@ -46,20 +46,6 @@ def trial(seed: int = 0, **changes: Any) -> Trial:
     }
     outcome = {"success": True, "verified": True, "arrived": 2, "travel_time": 5.0, "steps": 60, "wall_time": 0.5}
     return Trial(**{**values, "label": "d4orm", "model": "holonomic2d", "dt": 0.1, **outcome, "seed": seed, **changes})
-
-
-@pytest.fixture
-def d4orm(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Runs the command line inside ``tmp_path``; gives exit status, output and errors."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: str) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as exit_:
-            cli.main(list(arguments))
-        captured = capsys.readouterr()
-        return int(exit_.value.code or 0), captured.out, captured.err
-
-    return call
 
 
 # Rows.

@@ -5,13 +5,14 @@ from __future__ import annotations
 import csv
 import json
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from d4orm_planners import cli, list_planners
+from d4orm_planners import list_planners
 from d4orm_planners.evaluation import evaluate
 from d4orm_planners.evaluation.store import Trial, TrialStore
 from d4orm_planners.reproduction.figure import Figure, Group, Section, reproduce
@@ -45,17 +46,9 @@ def figure(**changes: Any) -> Figure:
 
 
 @pytest.fixture
-def d4orm(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Runs ``d4orm reproduce`` inside ``tmp_path``; gives exit status, output and errors."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: str) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as exit_:
-            cli.main(["reproduce", *arguments])
-        captured = capsys.readouterr()
-        return int(exit_.value.code or 0), captured.out, captured.err
-
-    return call
+def d4orm(d4orm):
+    """Runs ``d4orm reproduce``."""
+    return partial(d4orm, "reproduce")
 
 
 def available(chosen: Figure) -> bool:

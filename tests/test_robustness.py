@@ -15,13 +15,14 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from d4orm_planners import cli, make_policy
+from d4orm_planners import make_policy
 from d4orm_planners.evaluation import evaluate as evaluate_module
 from d4orm_planners.evaluation import pool as pool_module
 from d4orm_planners.evaluation import store as store_module
@@ -59,17 +60,9 @@ def trial(seed: int = 0, **changes: Any) -> Trial:
 
 
 @pytest.fixture
-def d4orm(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Runs ``d4orm robustness`` inside ``tmp_path``; gives exit status, output and errors."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: str) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as exit_:
-            cli.main(["robustness", *arguments])
-        captured = capsys.readouterr()
-        return int(exit_.value.code or 0), captured.out, captured.err
-
-    return call
+def d4orm(d4orm):
+    """Runs ``d4orm robustness``."""
+    return partial(d4orm, "robustness")
 
 
 # Statistics.

@@ -103,36 +103,42 @@ class Watch(ABC):
     def observe(self, stretch: Stretch) -> None:
         """Judge a stretch. Only pairs that may touch, or come closer than any so far, are looked at closely."""
         self.select(stretch)
-        least, steps, pairs = self._near(stretch)
-        order = np.argsort(least, kind="stable")
-        size = max(1, MAX_NUMBERS // (stretch.path.shape[1] * stretch.path.shape[3]))
-        for some in (order[first : first + size] for first in range(0, len(order), size)):
-            if least[some[0]] >= max(self.minimum, 0.0):
-                break
-            self._look(stretch, steps[some], pairs[some])
-
-    def _near(self, stretch: Stretch) -> tuple[Floats, Indices, Indices]:
-        """``(N,)`` the least gap there may be, step and pair, where it may matter. Steps are taken many at a time
-        first, and fewer of those in which something may be near.
-        """
         travelled = np.concatenate([np.zeros((1, stretch.reach.shape[1])), np.cumsum(stretch.reach, axis=0)])
-        num_steps, num_pairs = len(stretch.path), len(self.rows)
-        steps = np.repeat(np.arange(0, num_steps, BLOCKS[0]), num_pairs)
-        pairs = np.tile(np.arange(num_pairs), len(range(0, num_steps, BLOCKS[0])))
-        for block, parts in zip(BLOCKS, (*BLOCKS[1:], 1), strict=True):
-            gap = self.gap(stretch, steps, pairs)
+        begins, pairs = np.arange(0, len(stretch.path), BLOCKS[0]), np.arange(len(self.rows))
+        steps, pairs = np.repeat(begins, len(pairs)), np.tile(pairs, len(begins))
+        size = max(1, MAX_NUMBERS // (stretch.path.shape[1] * stretch.path.shape[3]))
+        for least, near_steps, near_pairs in self._near(stretch, travelled, BLOCKS, steps, pairs):
+            order = np.argsort(least, kind="stable")
+            for some in (order[first : first + size] for first in range(0, len(order), size)):
+                if least[some[0]] >= max(self.minimum, 0.0):
+                    break
+                self._look(stretch, near_steps[some], near_pairs[some])
+
+    def _near(
+        self, stretch: Stretch, travelled: Floats, blocks: Sequence[int], steps: Indices, pairs: Indices
+    ) -> Iterator[tuple[Floats, Indices, Indices]]:
+        """Some at a time, the least gaps ``(N,)`` that there may be in a step, steps and pairs, where it may matter.
+
+        ``blocks[0]`` steps are taken at once from ``steps`` on, and fewer of those in which something may be near.
+        ``travelled`` is how far the bodies get, ``(T+1, B)`` added up.
+        """
+        block, num_steps = blocks[0], len(stretch.path)
+        # Each may leave as many as sixteen to look at, with fewer steps at once.
+        size = MAX_NUMBERS // 16
+        for first in range(0, len(steps), size):
+            begin, pair = steps[first : first + size], pairs[first : first + size]
+            gap = self.gap(stretch, begin, pair)
             self.minimum = min(self.minimum, float(gap.min(initial=np.inf)))
-            ends = np.minimum(steps + block, num_steps)
-            least = gap - sum(travelled[ends, body] - travelled[steps, body] for body in self.bodies(pairs)) - 1e-9
+            end = np.minimum(begin + block, num_steps)
+            least = gap - sum(travelled[end, body] - travelled[begin, body] for body in self.bodies(pair)) - 1e-9
             near = least < max(self.minimum, 0.0)
-            steps, pairs = steps[near], pairs[near]
             if block == 1:
-                return least[near], steps, pairs
-            steps = (steps[:, None] + np.arange(0, block, parts)).ravel()
-            pairs = np.repeat(pairs, block // parts)
-            inside = steps < num_steps
-            steps, pairs = steps[inside], pairs[inside]
-        raise AssertionError("the last block is one step")
+                yield least[near], begin[near], pair[near]
+                continue
+            parts = np.arange(0, block, blocks[1])
+            later, whose = (begin[near][:, None] + parts).ravel(), np.repeat(pair[near], len(parts))
+            inside = later < num_steps
+            yield from self._near(stretch, travelled, blocks[1:], later[inside], whose[inside])
 
     def _look(self, stretch: Stretch, steps: Indices, pairs: Indices) -> None:
         gap, fraction = self.approach(stretch, steps, pairs)

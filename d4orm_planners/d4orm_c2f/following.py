@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
@@ -64,42 +66,48 @@ def follow_slowly(
         indices: ``(K,)`` where on it they are.
         horizon: Steps.
     """
-    states, arrays = joint.states, problem.resumed_at(joint.states, joint.goals).arrays
-    nobody, every = np.zeros(len(indices), bool), np.arange(len(indices))
-    controls = np.empty((horizon, len(indices), problem.control_size), np.float32)
-    at = indices.copy()
-    for t in range(horizon):
+    every, at = np.arange(len(indices)), indices.copy()
+
+    def velocities(t: int, states: FloatArray) -> FloatArray:
         for _ in range(2):
             gap = np.linalg.norm(path[at, every] - states[:, : path.shape[2]], axis=1)
-            at = np.minimum(at + (gap < REACHED), len(path) - 1)
+            at[:] = np.minimum(at + (gap < REACHED), len(path) - 1)
         ahead = np.where((at == len(path) - 1)[:, None], joint.goals, path[at, every])
-        velocities = preferred_velocities(problem, states, ahead)
-        speed = np.linalg.norm(velocities, axis=1, keepdims=True)
-        controls[t] = track_velocities(problem, states, velocities * np.minimum(1, SPEED / np.maximum(speed, SPEED)))
-        states = engine.step(arrays, states, nobody, controls[t]).states
-    return controls
+        wanted = preferred_velocities(problem, states, ahead)
+        speed = np.linalg.norm(wanted, axis=1, keepdims=True)
+        slow: FloatArray = wanted * np.minimum(1, SPEED / np.maximum(speed, SPEED))
+        return slow
+
+    return _tracking(problem, engine, joint, velocities, horizon)
 
 
 def keep_time(
     problem: Problem, engine: Engine, joint: JointState, path: FloatArray, indices: IntArray, horizon: int
 ) -> FloatArray:
-    """``(horizon, K, m)`` controls that take every robot along its path in the path's own time.
+    """The same in the path's own time, which has a waypoint per time step; at ``indices`` each robot should be now."""
+    every, last = np.arange(len(indices)), len(path) - 1
 
-    Args:
-        problem: The robots.
-        engine: What moves them.
-        joint: Where they are.
-        path: ``(H+1, K, d)`` waypoints, one per time step [m].
-        indices: ``(K,)`` where on it each should be now.
-        horizon: Steps.
-    """
+    def velocities(t: int, states: FloatArray) -> FloatArray:
+        now = path[np.minimum(indices + t, last), every]
+        after = path[np.minimum(indices + t + 1, last), every]
+        wanted = (after - now) / problem.dt + CATCHING_UP * (now - states[:, : path.shape[2]])
+        return wanted.astype(np.float32)
+
+    return _tracking(problem, engine, joint, velocities, horizon)
+
+
+def _tracking(
+    problem: Problem,
+    engine: Engine,
+    joint: JointState,
+    velocities: Callable[[int, FloatArray], FloatArray],
+    horizon: int,
+) -> FloatArray:
+    """``(horizon, K, m)`` controls that track ``velocities(t, states)`` ``(K, d)``, as if nobody docked."""
     states, arrays = joint.states, problem.resumed_at(joint.states, joint.goals).arrays
-    nobody, every = np.zeros(len(indices), bool), np.arange(len(indices))
-    controls = np.empty((horizon, len(indices), problem.control_size), np.float32)
+    nobody = np.zeros(problem.num_robots, bool)
+    controls = np.empty((horizon, problem.num_robots, problem.control_size), np.float32)
     for t in range(horizon):
-        at, after = np.minimum(indices + t, len(path) - 1), np.minimum(indices + t + 1, len(path) - 1)
-        now = path[at, every]
-        velocities = (path[after, every] - now) / problem.dt + CATCHING_UP * (now - states[:, : path.shape[2]])
-        controls[t] = track_velocities(problem, states, velocities.astype(np.float32))
+        controls[t] = track_velocities(problem, states, velocities(t, states))
         states = engine.step(arrays, states, nobody, controls[t]).states
     return controls

@@ -157,19 +157,25 @@ class Guide:
         if not (changed | held_up).any() and not lost:
             return False
         changed |= held_up
-        present = coarse_problem(self._problem.resumed_at(joint.states, joint.goals), self._config.coarse_factor)
-        initial = straight_drives(present).controls[:, :, 0]
         keep = moving & ~changed
-        if not lost and keep.any():
-            rest = self.guidance.controls[self.index // self._config.coarse_factor :]
-            initial[:, keep] = 0
-            initial[: len(rest), keep] = rest[:, keep]
         thorough = lost or bool(held_up.any())
         iterations = self._config.coarse_iterations if thorough else self._config.replan_iterations
         # A way straight through walls is no beginning: there the whole team's ways are found anew on the roadmap.
-        guidance = self.plan(joint, None if self.guidance.ordered else initial, iterations, thorough)
+        initial = None if self.guidance.ordered else self._beginning(joint, keep & (not lost))
+        guidance = self.plan(joint, initial, iterations, thorough)
         self._follow(joint, guidance, ~keep | lost)
         return True
+
+    def _beginning(self, joint: JointState, keep: BoolArray) -> FloatArray:
+        """``(H_c, K, m)`` straight drives, but for those that ``keep`` ``(K,)`` what is left of their ways."""
+        factor = self._config.coarse_factor
+        present = coarse_problem(self._problem.resumed_at(joint.states, joint.goals), factor)
+        initial = straight_drives(present).controls[:, :, 0]
+        if keep.any():
+            rest = self.guidance.controls[self.index // factor :]
+            initial[:, keep] = 0
+            initial[: len(rest), keep] = rest[:, keep]
+        return initial
 
     def _due(self, joint: JointState) -> FloatArray:
         """``(K, d)`` where the robots should be by now: as far as the others, and half as far as planned."""
