@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-PATIENCE = 30.0
+PATIENCE = 120.0
 """Seconds that anything may take on a loaded machine."""
 
 
@@ -120,13 +120,19 @@ class Page:
     def drag(self, start: tuple[float, float], end: tuple[float, float], moves: int = 10) -> None:
         """Press at a place, move, and let go at another."""
         self.mouse("Moved", *start)
-        time.sleep(0.3)
+        # The page looks what the mouse is over when it draws.
+        self.frames(8)
         self.mouse("Pressed", *start)
         for move in range(1, moves + 1):
             x, y = (a + move / moves * (b - a) for a, b in zip(start, end))
             self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y, button="left", buttons=1)
-            time.sleep(0.03)
+            self.frames(1)
         self.mouse("Released", *end)
+
+    def frames(self, count: int) -> None:
+        """Wait until the page has drawn so many times."""
+        for _ in range(count):
+            self.evaluate("new Promise((done) => requestAnimationFrame(() => done(true)))")
 
     def screenshot(self, path: Path) -> None:
         """Write what is seen as a PNG."""
