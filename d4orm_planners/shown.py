@@ -66,9 +66,10 @@ class Shown:
         from d4orm_env.render.replay import motion
 
         title = self.title if title is None else title
-        goals = getattr(self, "goals", None)
+        goals, marks = getattr(self, "goals", None), getattr(self, "marks", None)
+        bodies = None if marks is None else marks.bodies
         figures = joined(self.key_figures)
-        return motion(self.problem, self.trajectory, title, figures, goals=goals, denoising=denoising)
+        return motion(self.problem, self.trajectory, title, figures, goals=goals, denoising=denoising, bodies=bodies)
 
     def animate(self: _HasMotion) -> Replay:
         """A replay that notebooks show where it is the last value of a cell."""

@@ -91,10 +91,11 @@ REPLAYS: dict[str, Callable[[], Replay]] = {
         {"seed 1": {"seed": 1}, "seed 2": {"seed": 2}, "seed 3": {"seed": 3}},
         scenario="random",
         num_robots=8,
+        randomize_instance=False,
     ),
     "models": lambda: drawn(
         "Other robots in one scenario",
-        {name: {"model": name} for name in ("holonomic2d", "velocity2d", "differential_drive", "car")},
+        {name: {"model": name} for name in ("holonomic2d", "differential_drive")},
         scenario="circle",
         num_robots=6,
     ),

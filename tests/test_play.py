@@ -202,6 +202,18 @@ def test_what_happened_becomes_a_replay(session: Session) -> None:
     assert "circle, 3 robots by goal" in session.replay().html
 
 
+def test_a_replay_shows_intruders_while_they_were_there(session: Session) -> None:
+    until(lambda: session.recorded_steps > 2)
+    assert "bodies" not in session.replay().motions[0].content
+    session.disturb({"intruder": 2})
+    until(lambda: session.levels)
+    steps = session.recorded_steps
+    until(lambda: session.recorded_steps > steps + 2)
+    bodies = session.replay().motions[0].content["bodies"]
+    assert bodies["count"] == 2
+    assert bodies["low"][-1] == 0, "at first there were none"
+
+
 def test_reset_begins_the_scene_anew(session: Session, scene: Problem) -> None:
     until(lambda: session.frame.moment.time > 0.2)
     session.pause(True)

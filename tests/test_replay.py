@@ -19,6 +19,7 @@ from hypothesis.extra.numpy import arrays
 
 from d4orm_env import Problem, Team, World, make_problem, navigation_v0
 from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.disturbances import Intruder
 from d4orm_env.render.replay import Replay, motion, rounded
 from d4orm_env.rollout import rollout
 from d4orm_planners import make_planner, run_episode
@@ -123,6 +124,25 @@ def test_changing_goals_are_shown(episode: Episode) -> None:
     scene = content(episode.animate().html)["scenes"][0]
     moments = len(episode.goals)
     assert len(scene["goals"]["data"]) >= moments * 3 * 2 * 2 * 4 / 3 - 4
+
+
+def test_a_replay_shows_what_moves_among_the_robots_and_is_none() -> None:
+    env = navigation_v0.parallel_env("circle", num_robots=2, disturbances=[Intruder(3, radius=0.2)], max_cycles=8)
+    episode = run_episode(env, "goal", seed=0)
+    bodies = content(episode.animate().html)["scenes"][0]["bodies"]
+    assert bodies["count"] == 3
+    raw = np.frombuffer(base64.b64decode(bodies["data"]), "<u2").reshape(-1, 3, 3)
+    read = bodies["low"] + raw * np.array(bodies["step"])
+    np.testing.assert_allclose(read[..., :2], episode.marks.bodies[: len(read), :, :2], atol=1e-3)
+    np.testing.assert_allclose(read[..., 2], 0.2, atol=1e-6)
+
+
+@pytest.mark.parametrize("bodies", [np.zeros((1, 2, 5)), np.zeros((4, 5)), np.full((41, 1, 5), np.nan)])
+def test_bodies_that_do_not_fit_are_refused(bodies: np.ndarray) -> None:
+    problem = make_problem("circle", num_robots=2, horizon=40)
+    trajectory = rollout(problem, np.zeros((40, 2, 2), np.float32))
+    with pytest.raises(ValueError, match="bodies have shape"):
+        motion(problem, trajectory, "still", bodies=bodies)
 
 
 def test_goals_that_do_not_fit_are_refused(plan: Plan) -> None:

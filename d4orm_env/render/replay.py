@@ -53,6 +53,7 @@ def motion(
     *,
     goals: ArrayLike | None = None,
     denoising: Denoising | None = None,
+    bodies: ArrayLike | None = None,
 ) -> ReplayMotion:
     """Take what a replay shows of a motion: up to a second after the last robot has arrived, or to its end.
 
@@ -63,9 +64,11 @@ def motion(
         figures: Key figures in a line.
         goals: ``(T+1, K, d)`` where they change on the way; the problem's by default.
         denoising: How a plan came about, shown before the motion.
+        bodies: ``(T+1, N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves among the robots and is
+            none; a radius of zero for what is not there.
 
     Raises:
-        ValueError: If the trajectory or the goals do not fit the problem, or are not finite.
+        ValueError: If the trajectory, the goals or the bodies do not fit the problem, or are not finite.
     """
     checked_trajectory(problem, trajectory)
     places = problem.goal[None] if goals is None else np.asarray(goals, np.float32)
@@ -86,7 +89,11 @@ def motion(
         "world_clearance": _clearance(problem, trajectory.positions[:end]),
         "flags": _text(flags[:end].astype(np.uint8)),
     }
-    return ReplayMotion(content if denoising is None else content | {"denoising": _denoising(denoising)})
+    if bodies is not None and np.size(bodies):
+        content["bodies"] = _bodies(problem, np.asarray(bodies, np.float32), len(trajectory.states), end)
+    if denoising is not None:
+        content["denoising"] = _denoising(denoising)
+    return ReplayMotion(content)
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,6 +192,17 @@ def _denoising(denoising: Denoising) -> dict[str, Any]:
         "samples": rounded(samples) if kept else {"low": [0.0], "step": [1.0], "data": ""},
         "alpha": np.round(denoising.alpha, 2).tolist(),
     }
+
+
+def _bodies(problem: Problem, bodies: FloatArray, steps: int, end: int) -> dict[str, Any]:
+    """Where what is no robot is, and its radius."""
+    d = problem.dimension
+    if bodies.ndim != 3 or len(bodies) != steps or bodies.shape[2] != 2 * d + 1 or not np.isfinite(bodies).all():
+        raise ValueError(
+            f"bodies have shape {bodies.shape}; they must be finite and of shape (T+1, N, 2 d + 1) = "
+            f"({steps}, N, {2 * d + 1})"
+        )
+    return {"count": bodies.shape[1], **rounded(np.concatenate([bodies[:end, :, :d], bodies[:end, :, -1:]], axis=2))}
 
 
 def _end(problem: Problem, trajectory: Trajectory) -> int:

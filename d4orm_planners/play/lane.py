@@ -98,7 +98,7 @@ class Lane:
 
     def frame(self, moment: Moment) -> Frame:
         """What is shown of the present."""
-        joint, bodies = self._joint, self._env.effect().bodies
+        joint = self._joint
         return Frame(
             moment=moment,
             policy=self.name,
@@ -114,7 +114,7 @@ class Lane:
             closest=closest_approach(self._scene, joint.states),
             guidance=guidance(self._policy, joint.steps),
             subgoals=getattr(self._policy, "subgoals", None),
-            bodies=_no_bodies(self._scene.dimension) if bodies is None else np.array(bodies[0]),
+            bodies=self._bodies,
         )
 
     @property
@@ -122,10 +122,12 @@ class Lane:
         """The truth, whatever the policy is told of it."""
         return split_state(self._scene, self._env.true_state())
 
+    @property
+    def _bodies(self) -> FloatArray:
+        """``(N, 2 d + 1)`` what moves about and is no robot."""
+        bodies = self._env.effect().bodies
+        return np.zeros((0, 2 * self._scene.dimension + 1), np.float32) if bodies is None else np.array(bodies[0])
+
     def _remember(self) -> None:
         joint, last = self._joint, self._env.last_step
-        self.recording.add(joint.states, joint.goals, joint.arrived, last.collided, last.margin_violated)
-
-
-def _no_bodies(dimension: int) -> FloatArray:
-    return np.zeros((0, 2 * dimension + 1), np.float32)
+        self.recording.add(joint.states, joint.goals, joint.arrived, last.collided, last.margin_violated, self._bodies)

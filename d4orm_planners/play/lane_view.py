@@ -234,7 +234,7 @@ class LaneView:
 
     def _color(self, frame: Frame) -> None:
         """Red in contact, paler when arrived, all lighter where it is dark."""
-        self._colors = self._own_colors + (0.4 * (255 - self._own_colors) if self._shown["dark"] else 0)
+        self._colors = self._own_colors + (0.5 * (255 - self._own_colors) if self._shown["dark"] else 0)
         colors = np.where(frame.arrived[:, None], 0.5 * (self._paper + self._colors), self._colors)
         colors = np.where(frame.collided[:, None], np.array(CONTACT), colors)
         self._nodes["robots"].batched_colors = linear(colors)

@@ -23,6 +23,7 @@ class _Moment(NamedTuple):
     arrived: BoolArray
     collided: BoolArray
     violated: BoolArray
+    bodies: FloatArray
 
 
 class Recording:
@@ -37,7 +38,12 @@ class Recording:
         return len(self._moments)
 
     def add(self, *moment: np.ndarray) -> None:
-        """Remember states ``(K, n)``, goals ``(K, d)``, and ``(K,)`` who has arrived, collided and come too close."""
+        """Remember a moment.
+
+        Args:
+            *moment: States ``(K, n)``, goals ``(K, d)``, ``(K,)`` who has arrived, who has collided and who has come
+                too close, and ``(N, 2 d + 1)`` what moves about and is no robot.
+        """
         with self._lock:
             self._moments.append(_Moment(*moment))
 
@@ -57,4 +63,9 @@ class Recording:
             margin_violated=np.stack([moment.violated for moment in moments]),
         )
         goals = np.stack([moment.goals for moment in moments])
-        return motion(problem, trajectory, f"{policy}, {steps * problem.dt:.1f} s", goals=goals)
+        bodies = np.zeros(
+            (len(moments), max(len(moment.bodies) for moment in moments), 2 * problem.dimension + 1), np.float32
+        )
+        for row, moment in zip(bodies, moments):
+            row[: len(moment.bodies)] = moment.bodies
+        return motion(problem, trajectory, f"{policy}, {steps * problem.dt:.1f} s", goals=goals, bodies=bodies)

@@ -22,6 +22,7 @@ class Scene {
     this.flags = bytesOf(data.flags);
     this.clearances = numbersOf(data.world_clearance);
     this.goals = numbersOf(data.goals);
+    this.others = data.bodies ? numbersOf(data.bodies) : [];
     this.moments = this.flags.length / this.robots;
     this.prelude = 0;
     if (data.denoising) {
@@ -57,6 +58,16 @@ class Scene {
   goal(step, robot) {
     const row = this.goals.length > this.robots * this.dimension ? step * this.robots + robot : robot;
     return [0, 1, 2].map((axis) => axis < this.dimension ? this.goals[row * this.dimension + axis] : 0);
+  }
+
+  /** Place and radius of something that moves among the robots and is none. */
+  body([step, share], index) {
+    const width = this.dimension + 1, count = this.bodies.count;
+    const at = (moment, part) => this.others[(moment * count + index) * width + part];
+    const jump = share > 0 && Math.hypot(...[0, 1].map((axis) => at(step + 1, axis) - at(step, axis))) > 10 * this.dt;
+    const place = [0, 1, 2].map((axis) => axis >= this.dimension ? 0
+      : at(step, axis) + (share && !jump ? share * (at(step + 1, axis) - at(step, axis)) : 0));
+    return { place, radius: at(step, this.dimension) };
   }
 
   speed(step, robot) {
@@ -217,6 +228,11 @@ class Painter {
       pen.closePath();
       pen.stroke();
       if (!denoising) this.paintTrail(moment, robot, place);
+    }
+    for (let index = 0; scene.bodies && !denoising && index < scene.bodies.count; index++) {
+      const { place, radius } = scene.body(moment, index);
+      pen.lineWidth = 1;
+      if (radius > 0.001) this.disc(place, radius, theme.obstacle, theme.ink);
     }
     for (const { robot, place } of order) {
       const flag = denoising ? 0 : scene.flag(now, robot), red = flag & COLLIDED;
