@@ -9,7 +9,9 @@ import numpy as np
 from numba import types
 
 from d4orm_env.core.arrays import FloatArray, IntArray
+from d4orm_env.core.metrics import arrival_steps
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.wavefront import make_space
 from d4orm_planners.guidance.execution import drive_along
 from d4orm_planners.guidance.lacam import Team
@@ -53,6 +55,13 @@ class Driven:
     controls: FloatArray
     places: Floats
     arrivals: IntArray
+
+    @classmethod
+    def of(cls, trajectory: Trajectory) -> Driven:
+        """How a team drives that docks."""
+        places = np.zeros((*trajectory.positions.shape[:2], 3))
+        places[..., : trajectory.positions.shape[2]] = trajectory.positions
+        return cls(trajectory.controls, places, arrival_steps(trajectory.arrived))
 
     def cost(self, horizon: int) -> tuple[int, int]:
         """Less is better: robots that come too late, and the sum of all arrival steps."""

@@ -11,6 +11,8 @@ ROUNDS = 96
 """Rounds of the search in an iteration: one annealing."""
 FIRST_ROUNDS = 4
 """Rounds for a plan that has just been found."""
+GUIDED_ROUNDS = 12
+"""The same for one that was found on a roadmap, with all its corners and stops."""
 
 
 def refined_iteration(search: Search) -> Iteration:
@@ -25,8 +27,8 @@ def refined_iteration(search: Search) -> Iteration:
     return Iteration(shorten_ways(team, search.iteration_seed(Stream.NEIGHBOURHOODS), ROUNDS))
 
 
-def shorten_first_ways(team: TeamPaths) -> None:
-    """Take what faster ways there are at once for a team in which nobody fails."""
+def shorten_first_ways(team: TeamPaths, rounds: int = FIRST_ROUNDS) -> None:
+    """Take what faster ways there are at once for a team in which nobody fails, in so many rounds."""
     from d4orm_planners.refinement.neighbourhoods import shorten_ways
 
-    shorten_ways(team, team.search.iteration_seed(Stream.NEIGHBOURHOODS), FIRST_ROUNDS, temperature=0.0)
+    shorten_ways(team, team.search.iteration_seed(Stream.NEIGHBOURHOODS), rounds, temperature=0.0)
