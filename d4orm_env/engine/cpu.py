@@ -17,6 +17,7 @@ from d4orm_env.engine import noise, sampling
 from d4orm_env.engine.base import (
     WATCHED_SAMPLES,
     DenoisingStep,
+    MovingObstacles,
     SamplingResult,
     SamplingRules,
     SamplingTask,
@@ -27,7 +28,7 @@ from d4orm_env.engine.base import (
 )
 from d4orm_env.engine.lanes import TILE
 from d4orm_env.engine.noise import DRAWS, TURNS
-from d4orm_env.engine.proximity import body_boxes, bound_boxes, make_scratch
+from d4orm_env.engine.proximity import bound_boxes, make_bodies
 from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_env.engine.worlds import View, WorldBatch, WorldKernels, Worlds, kernels_of_codes
 
@@ -149,43 +150,41 @@ class Sampling:
         self.task, self.threads = task, threads
         self.arrays = _typed(task.arrays)
         self.kernel = sampling.score_kernel(problem.team.models)
-        self.spaces: dict[int, tuple[Any, Any]] = {}
+        self.spaces: dict[int, sampling.Workspace] = {}
         self.base = np.ascontiguousarray(task.base, np.float32)
         docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
-        self.docked = np.ascontiguousarray(docked, bool)
-        if task.moving is None:
-            self.moving = np.zeros((len(self.base), 0, problem.dimension), np.float32)
-            self.moving_radius = np.zeros(0, np.float32)
-        else:
-            self.moving = np.ascontiguousarray(task.moving.positions, np.float32)
-            self.moving_radius = np.ascontiguousarray(task.moving.radius, np.float32)
-        self.static = bound_boxes(self.arrays)
-        self.body_boxes = body_boxes(self.moving, self.moving_radius, self.arrays.margin)
+        moving = task.moving or MovingObstacles(
+            np.zeros((len(self.base), 0, problem.dimension), np.float32), np.zeros(0, np.float32)
+        )
+        self.scoring = sampling.Scoring(
+            docked=np.ascontiguousarray(docked, bool),
+            collisions=task.collisions,
+            penalty=np.float32(task.penalty),
+            bodies=make_bodies(*moving, self.arrays.margin),
+            bounds=bound_boxes(self.arrays),
+        )
         self.seed = np.array(noise.seed_words(seed), np.uint32)
         self.rewards = np.empty((problem.num_robots, num_samples), np.float32)
         num_tiles, pairs = -(-num_samples // TILE), (problem.control_size + 1) // 2
         self.kept = np.empty((num_tiles, problem.num_robots, len(self.base), pairs, 2, DRAWS), np.float32)
 
-    def space(self, first: int) -> tuple[Any, Any]:
-        """Workspace and scratch of the thread whose tiles begin with this number."""
+    def space(self, first: int) -> sampling.Workspace:
+        """The workspace of the thread whose tiles begin with this number."""
         if first not in self.spaces:
-            (num_steps, num_robots, num_controls), dimension = self.base.shape, self.arrays.goal.shape[1]
-            workspace = sampling.make_workspace(num_steps, num_robots, num_controls, dimension)
-            self.spaces[first] = workspace, make_scratch(num_robots, dimension)
+            self.spaces[first] = sampling.make_workspace(*self.base.shape, self.arrays.goal.shape[1])
         return self.spaces[first]
 
     def score(self, step: int, mean: FloatArray, scale: FloatArray) -> FloatArray:
         """Rewards of this step's samples, ``(M,)`` for team credit and ``(K, M)`` for robot credit."""
         num_tiles = -(-self.rewards.shape[1] // TILE)
-        offset, scale = self.base + mean, np.ascontiguousarray(scale, np.float32)
+        scale = np.ascontiguousarray(scale, np.float32)
+        drawing = sampling.Drawing(self.base + mean, scale, self.seed, step)
         self.threads.over(
             num_tiles,
             lambda part: self.kernel(
-                self.arrays, offset, scale, self.docked, self.task.collisions, np.float32(self.task.penalty),
-                self.moving, self.moving_radius, self.body_boxes, self.static, self.seed, step, part,
-                *self.space(part[0]), self.kept, self.rewards,
+                self.arrays, self.scoring, drawing, part, self.space(part[0]), self.kept, self.rewards
             ),
-        )  # fmt: skip
+        )
         return self.rewards.mean(axis=0, keepdims=True) if self.task.credit == "team" else self.rewards
 
     def log_ratio(self, mean: FloatArray, scale: FloatArray) -> FloatArray:
