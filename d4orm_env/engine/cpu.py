@@ -171,7 +171,7 @@ class Sampling:
     def space(self, first: int) -> sampling.Workspace:
         """The workspace of the thread whose tiles begin with this number."""
         if first not in self.spaces:
-            self.spaces[first] = sampling.make_workspace(*self.base.shape, self.arrays.goal.shape[1])
+            self.spaces[first] = sampling.make_workspace(self.base.shape, self.arrays.goal.shape[1])
         return self.spaces[first]
 
     def score(self, step: int, mean: FloatArray, scale: FloatArray) -> FloatArray:

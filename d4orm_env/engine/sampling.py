@@ -109,8 +109,9 @@ class Drawing(NamedTuple):
     step: Any
 
 
-def make_workspace(num_steps: int, num_robots: int, num_controls: int, dimension: int) -> Workspace:
-    """A workspace."""
+def make_workspace(shape: tuple[int, ...], dimension: int) -> Workspace:
+    """A workspace for controls of this shape, ``(H, K, m)``."""
+    num_steps, num_robots, num_controls = shape
     return Workspace(
         tiles.aligned_zeros(num_robots * STRIDE), tiles.aligned_zeros(num_robots * BLOCK * dimension * TILE),
         tiles.aligned_zeros(BLOCK * 4 * DRAWS), tiles.aligned_zeros(BLOCK * CONTROL_ROWS * TILE),
