@@ -316,7 +316,7 @@ class Simulation:
     def _distances(self, states: FloatArray) -> FloatArray:
         """``(K,)`` to the present goals [m]."""
         offsets = self.arrays.goal - states[:, : self._dimension]
-        distances: FloatArray = np.sqrt((offsets * offsets).sum(axis=1))
+        distances: FloatArray = np.sqrt(np.add.reduce(offsets * offsets, axis=1))
         return distances
 
     def _report(self, rewards: FloatArray, arrived: BoolArray, margin_violated: BoolArray) -> TeamStep:
@@ -326,18 +326,15 @@ class Simulation:
 
     def _observe(self) -> FloatArray:
         """``(K, D)`` what the robots see, or believe to see."""
-        layout, states = self.layout, self.states
+        layout = self.layout
         time_left = max(0.0, 1.0 - self.steps / self.max_cycles)
-        if self._disturbed is None or not self._disturbed.alters_sight:
-            observations = self._engine.observe(self.arrays, layout, states, self.controls, self.arrived, time_left)
-        else:
-            self._seen = seen = self._disturbed.see(self._scene())
-            states = seen.states[0]
-            goal, left = self.arrays.goal[None].copy(), np.array([time_left], np.float32)
-            parts = (np.array(seen.states), np.array(seen.controls), self.arrived[None].copy(), np.array(seen.bodies))
-            sight = Sight(goal, *parts, left)
-            observations = np.empty((len(states), layout.size), np.float32)
-            self._engine.observe_worlds(self.arrays, layout, sight, observations[None])
+        states, controls, bodies = self.states, self.controls, None
+        if self._disturbed is not None and self._disturbed.alters_sight:
+            self._seen = self._disturbed.see(self._scene())
+            states, controls, bodies = (part[0] for part in self._seen)
+        sight = Sight.of_team(self.arrays.goal, states, controls, self.arrived, time_left, bodies)
+        observations: FloatArray = np.empty((len(self.states), layout.size), np.float32)
+        self._engine.observe_worlds(self.arrays, layout, sight, observations[None])
         if layout.observed_way:
             observe_ways(observations, layout, self.problem.ways, states[:, : self._dimension])
         return observations if self._disturbed is None else self._disturbed.observe(observations[None], layout)[0]
