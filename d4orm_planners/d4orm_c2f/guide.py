@@ -17,7 +17,6 @@ from d4orm_planners.d4orm_c2f.coarse import (
     coarse_problem,
     interpolate,
     nearest_indices,
-    passes_checks,
     rest_of,
     subgoal_indices,
 )
@@ -100,16 +99,17 @@ class Guide:
         planner = self._thorough if thorough else self._planner
         present = self._problem.resumed_at(joint.states, joint.goals)
         coarse = coarse_problem(present, self._config.coarse_factor)
-        search = Search(planner, coarse, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps), initial)
+        seed, interval = derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps), self._config.check_interval
+        search = Search(planner, coarse, seed, initial, check_interval=interval)
         chosen, ordered = search.current, False
         for number in range(iterations):
-            if passes_checks(chosen.trajectory, self._config.check_interval):
+            if not chosen.failed.any():
                 break
             search.advance()
             if number == 0:
                 ordered = isinstance(search.state, Ways)
             chosen = search.current if search.current.rank >= search.best.rank else search.best
-            if passes_checks(search.current.trajectory, self._config.check_interval):
+            if not search.current.failed.any():
                 chosen = search.current
         plan = chosen.trajectory
         path = interpolate(plan.positions, self._config.coarse_factor)
