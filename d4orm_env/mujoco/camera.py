@@ -23,7 +23,7 @@ class NoCameraError(RuntimeError):
     """OpenGL cannot draw without a screen here."""
 
 
-def _open_context(size: int) -> Any:
+def open_context(size: int) -> Any:
     """A context of OpenGL.
 
     Raises:
@@ -56,7 +56,7 @@ class Camera:
     """
 
     def __init__(self, model: mujoco.MjModel, problem: Problem) -> None:
-        self._gl = _open_context(SIZE)
+        self._gl = open_context(SIZE)
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._model = model
@@ -78,9 +78,7 @@ class Camera:
         self._gl.make_current()
         frame = np.empty((SIZE, SIZE, 3), np.uint8)
         view, whole = mujoco.MjvOption(), mujoco.MjrRect(0, 0, SIZE, SIZE)
-        mujoco.mjv_updateScene(
-            self._model, data, view, None, self._view, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
-        )
+        mujoco.mjv_updateScene(self._model, data, view, None, self._view, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene)
         mujoco.mjr_render(whole, self._scene, self._context)
         mujoco.mjr_readPixels(frame, None, whole, self._context)
         return frame[::-1].copy()

@@ -19,7 +19,7 @@ PUCKS, DRIVES = ("holonomic2d", "velocity2d"), ("differential_drive", "unicycle"
 
 WHEEL_RADIUS, HALF_TRACK, WHEEL_HALF_WIDTH, CASTER_RADIUS, CASTER_PLACE = 0.3, 0.65, 0.08, 0.1, 0.75
 CLEARANCE, HEIGHT, FRONT_GAP = 0.25, 0.85, 0.02
-"""Measures of a robot, over its radius. The caster is behind; one in front, a little off the floor, keeps the nose up."""
+"""Measures of a robot, over its radius. The caster is behind; one in front, off the floor, keeps the nose up."""
 WHEEL_SHARE, BATTERY_SHARE, BATTERY_PLACE = 0.1, 0.5, (-0.15, 0.0, 0.2)
 """Shares of the mass: of each wheel, and of what lies low and behind the axle."""
 _WALL = 1.0
@@ -116,17 +116,17 @@ def _solid(physics: Physics) -> dict[str, object]:
 
 
 def _cylinder(
-    body: mujoco.MjsBody, radius: float, low: float, high: float, physics: Physics, **attributes: object
+    body: mujoco.MjsBody,
+    radius: float,
+    low: float,
+    high: float,
+    physics: Physics,
+    place: tuple[float, float] = (0.0, 0.0),
+    **attributes: object,
 ) -> None:
     """A solid upright cylinder between two heights [m]."""
-    place = attributes.pop("place", (0.0, 0.0))
-    body.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-        size=[radius, (high - low) / 2, 0],
-        pos=[*place, (high + low) / 2],
-        **_solid(physics),
-        **attributes,
-    )
+    size, middle = [radius, (high - low) / 2, 0], [*place, (high + low) / 2]
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=size, pos=middle, **_solid(physics), **attributes)
 
 
 def _add_surroundings(spec: mujoco.MjSpec, world: World, top: float, physics: Physics) -> None:

@@ -128,7 +128,7 @@ class MujocoSimulation(Simulation):
     def _judged(
         self, arrays: ProblemArrays, states: FloatArray, controls: FloatArray, arrived: BoolArray, touched: BoolArray
     ) -> StepResult:
-        """What a step came to: the flags and rewards of a team that stands where it is now, and who has been touched."""
+        """What a step came to: flags and rewards of a team that stands where it is now, and who was touched."""
         still = np.ones(len(states), np.bool_)
         verdict = self._engine.step(arrays._replace(docks=np.bool_(True)), states, still, np.zeros_like(controls))
         return StepResult(

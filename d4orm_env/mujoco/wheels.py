@@ -1,10 +1,10 @@
 """The low-level control of a drive with two wheels.
 
 A command is a speed and a turn rate. The kinematics of the differential drive makes wheel speeds of them (R. Siegwart,
-I. R. Nourbakhsh and D. Scaramuzza, Introduction to Autonomous Mobile Robots, 2nd edition, section 3.2.3), and each wheel
-follows its own by PI control with feedforward. Its gains place both poles of a wheel, which is an integrator from torque
-to speed, at the inverse of the settling time, and its integral stands still while the motor is at its limit (K. J.
-Åström and R. M. Murray, Feedback Systems, sections 11.2 and 11.4).
+I. R. Nourbakhsh and D. Scaramuzza, Introduction to Autonomous Mobile Robots, 2nd edition, chapter 3), and each wheel
+follows its own by PI control with feedforward. Its gains place both poles of a wheel, an integrator from torque to
+speed, at the inverse of the settling time, and its integral stands still while the motor is at its limit (K. J. Åström
+and R. M. Murray, Feedback Systems, chapter "PID Control").
 """
 
 from __future__ import annotations
@@ -79,9 +79,7 @@ class WheelControl:
         ahead = np.where(speed == wanted, commands.acceleration, 0.0) / self.radius
         error = reference - spin
         integral = self._integral + step * error
-        torque = (
-            self._inertia * ahead[:, None] + self._proportional * error + self._integral_gain * integral
-        )
+        torque = self._inertia * ahead[:, None] + self._proportional * error + self._integral_gain * integral
         limited = np.clip(torque, -self._max_torque, self._max_torque)
         self._integral = np.where(limited == torque, integral, self._integral)
         return limited

@@ -18,7 +18,7 @@ from d4orm_planners.commands.inputs import (
     parse_levels,
     parse_settings,
 )
-from d4orm_planners.commands.options import Quiet, ScenarioSettings, TimeLimit
+from d4orm_planners.commands.options import Physics, Quiet, ScenarioSettings, TimeLimit
 
 if TYPE_CHECKING:
     from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup
@@ -64,6 +64,7 @@ class StudyOptions:
     ] = "50"
     control_noise_std: NoiseLevels = "0"
     disturb: DisturbanceLevels = None
+    physics: Physics = "model"
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="A setting of all policies that have it, or of one, as orca.time_horizon=2."),
@@ -101,6 +102,7 @@ class StudyOptions:
             model=names(self.model),
             scenario_settings=parse_settings(self.scenario_settings, "--scenario-set"),
             time_limit=self.time_limit,
+            physics=self.physics,
         )
         make_folder(self.out)
         with resumable(f"the finished trials are kept in {self.out}", enabled=not self.quiet) as progress:
