@@ -341,9 +341,10 @@ class Simulation:
         else:
             self._seen = seen = self._disturbed.see(self._scene())
             states = seen.states[0]
-            goal, left = self.arrays.goal[None].copy(), np.array([time_left], np.float32)
-            parts = (np.array(seen.states), np.array(seen.controls), self.arrived[None].copy(), np.array(seen.bodies))
-            sight = Sight(goal, *parts, left)
+            parts = (self.arrays.goal[None], seen.states, seen.controls, self.arrived[None], seen.bodies)
+            # The engine compiles anew for arrays that cannot be written to.
+            owned = (part if part.flags.writeable else part.copy() for part in parts)
+            sight = Sight(*owned, np.array([time_left], np.float32))
             observations = np.empty((len(states), layout.size), np.float32)
             self._engine.observe_worlds(self.arrays, layout, sight, observations[None])
         if layout.observed_way:
