@@ -30,7 +30,7 @@ NoiseLevels = Annotated[
 DisturbanceLevels = Annotated[
     list[str] | None,
     typer.Option(
-        "--disturb", help="Levels of a disturbance, as delay=0,1,2 or push(rate=0.5).speed=0.2,0.5; repeatable."
+        "--disturb", help="Levels of a disturbance, as delay=0,1,2 or push(rate=1).speed=0.2,0.5; repeatable."
     ),
 ]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to, and to go on from.")]
