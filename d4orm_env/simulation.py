@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, frozen_array, whole_number
 from d4orm_env.core.marks import Marks
-from d4orm_env.core.observation_layout import ObservationLayout
+from d4orm_env.core.observation_layout import ObservationLayout, Spare
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.problem_arrays import inverse_initial_distance
+from d4orm_env.core.problem_arrays import ProblemArrays, inverse_initial_distance
 from d4orm_env.disturbances.disturbance import Effect, Scene, Seen
 from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
 from d4orm_env.disturbances.marks import marks_of
@@ -52,7 +52,7 @@ class Simulation:
         self.problem = problem
         self.max_cycles = checked_cycles(problem.horizon if options.max_cycles is None else options.max_cycles)
         self.disturbances = options.disturbances_of(problem)
-        self._spare = total_spare(self.disturbances, problem)
+        self._spare = self._spare_of(problem)
         self.lifelong = options.lifelong
         self.reward = find_reward(options.reward)
         self.layout = ObservationLayout.for_problem(
@@ -183,7 +183,7 @@ class Simulation:
         if self.lifelong:
             # A goal radius that nothing is within: a robot under way to its next goal neither docks nor stops.
             arrays = arrays._replace(squared_goal_radius=np.float32(-1))
-        result = self._met(self._engine.step(arrays, states, self.arrived, controls))
+        result = self._met(self._move(arrays, states, controls))
         if self.lifelong:
             arrived = reached_goals(self.problem, self.arrays.goal, result.states, result.controls)
         else:
@@ -197,6 +197,14 @@ class Simulation:
             self._assign_goals(np.flatnonzero(arrived))
         self.record.add(rewards, arrived, result.collided, result.margin_violated)
         return self._report(rewards, arrived, result.margin_violated)
+
+    def _spare_of(self, problem: Problem) -> Spare:
+        """Room beyond the limits of the robots that the spaces need."""
+        return total_spare(self.disturbances, problem)
+
+    def _move(self, arrays: ProblemArrays, states: FloatArray, controls: FloatArray) -> StepResult:
+        """One step of the bodies, which another physics overrides; arguments as of the engine's step."""
+        return self._engine.step(arrays, states, self.arrived, controls)
 
     def set_state(self, states: ArrayLike) -> TeamStep:
         """Put the robots elsewhere in the middle of an episode; all else stays as it is.

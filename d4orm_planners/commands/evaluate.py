@@ -19,7 +19,7 @@ from d4orm_planners.commands.inputs import (
     parse_levels,
     parse_settings,
 )
-from d4orm_planners.commands.options import Quiet, ScenarioSettings, TimeLimit
+from d4orm_planners.commands.options import Physics, Quiet, ScenarioSettings, TimeLimit
 
 if TYPE_CHECKING:
     from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup
@@ -30,7 +30,9 @@ NoiseLevels = Annotated[
 ]
 DisturbanceLevels = Annotated[
     list[str] | None,
-    typer.Option("--disturb", help="Levels of a disturbance, as delay=0,1,2 or push.speed=0.2,0.5; repeatable."),
+    typer.Option(
+        "--disturb", help="Levels of a disturbance, as delay=0,1,2 or push(rate=1).speed=0.2,0.5; repeatable."
+    ),
 ]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to, and to go on from.")]
 
@@ -65,6 +67,7 @@ class StudyOptions:
     ] = "50"
     control_noise_std: NoiseLevels = "0"
     disturb: DisturbanceLevels = None
+    physics: Physics = "model"
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="A setting of all policies that have it, or of one, as orca.time_horizon=2."),
@@ -102,6 +105,7 @@ class StudyOptions:
             model=names(self.model),
             scenario_settings=parse_settings(self.scenario_settings, "--scenario-set"),
             time_limit=self.time_limit,
+            physics=self.physics,
         )
         make_folder(self.out)
         with resumable(f"the finished trials are kept in {self.out}", enabled=not self.quiet) as progress:

@@ -39,7 +39,9 @@ def parse_levels(texts: list[str] | None) -> dict[str, list[Any]] | None:
         return None
     levels: dict[str, list[Any]] = {}
     for text in texts:
-        name, separator, listed = (part.strip() for part in text.partition("="))
+        brackets, closed, rest = text.rpartition(")")  # what is in them has equals signs of its own
+        name, separator, listed = (part.strip() for part in rest.partition("="))
+        name = brackets + closed + name
         if not separator or not name or not listed:
             raise ValueError(f"--disturb {text!r} is not of the form name=levels, as delay=0,1,2 or push.speed=0.2,0.5")
         _add(levels, name, f"[{listed}]", "--disturb", f"{text!r}: the levels")
