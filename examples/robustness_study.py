@@ -5,7 +5,8 @@
 D4orm-C2F beside a plan of D4orm-D executed open loop, ORCA and PPO, each with the same seeds, on the circle, on random
 places and in rooms. Every disturbance is on by itself at one level, beside no disturbance at all. Written is for every
 policy, scenario and disturbance how many trials succeeded, with Wilson's 95% interval, in how many somebody touched
-anything, and how many ended too late; and a heat map. Trials are stored in the folder one by one, and a call that was
+anything, and how many ended too late; an overview of these, and a heat map. Seeds count once all policies have met
+them. Trials are stored in the folder one by one, and a call that was
 broken off, or one with more seeds or scenarios, goes on from there. `--trials FILE` makes table and heat map of trials
 that are in a Parquet file, such as those in `data/`.
 """
@@ -36,7 +37,7 @@ from d4orm_env.disturbances import (
 from d4orm_planners.evaluation.conditions import Condition
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.report import read_parquet, write_parquet
-from d4orm_planners.evaluation.store import Trial
+from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import wilson_interval
 
@@ -61,14 +62,16 @@ Cells = dict[tuple[str, str, str], list[Trial]]
 """Trials by scenario, policy and disturbance."""
 
 
-def run(scenarios: Iterable[str], policies: dict[str, dict[str, Any]], seeds: int, out: Path) -> list[Trial]:
-    """Trials of every policy under every disturbance."""
-    levels = {NOTHING: [[]], **{name: [[one]] for name, one in DISTURBANCES.items()}}
+def run(scenarios: Iterable[str], policies: dict[str, dict[str, Any]], seeds: int, out: Path) -> None:
+    """Trials of every policy under every disturbance, into the store."""
+    levels: dict[str, list[list[Disturbance[Any]]]] = {
+        NOTHING: [[]],
+        **{name: [[one]] for name, one in DISTURBANCES.items()},
+    }
     study = Study(
         policies=policies, scenarios=tuple(scenarios), num_robots=ROBOTS, seeds=range(seeds), disturbances=levels
     )
-    groups = run_study(study, out, workers=1, progress=tell)
-    return [trial for group in groups for trial in group.trials]
+    run_study(study, out, workers=1, progress=tell)
 
 
 def tell(what: str, done: int, total: int) -> None:
@@ -83,7 +86,8 @@ def by_cell(trials: Iterable[Trial]) -> Cells:
     for trial in trials:
         disturbance = named.get(trial.disturbances, NOTHING)
         cells.setdefault((trial.scenario, trial.label, disturbance), []).append(trial)
-    return cells
+    order = [SCENARIOS, tuple(POLICIES), (NOTHING, *DISTURBANCES)]
+    return dict(sorted(cells.items(), key=lambda cell: [known.index(one) for known, one in zip(order, cell[0])]))
 
 
 def rows_of(cells: Cells) -> list[dict[str, Any]]:
@@ -99,6 +103,28 @@ def rows_of(cells: Cells) -> list[dict[str, Any]]:
              "errors": sum(bool(trial.error) for trial in trials)}
         )  # fmt: skip
     return rows
+
+
+def overview(cells: Cells) -> list[dict[str, Any]]:
+    """A row per scenario and policy: how many trials succeeded under each disturbance, and in how many was contact."""
+    rows: dict[tuple[str, str], dict[str, Any]] = {}
+    for (scenario, policy, disturbance), trials in cells.items():
+        row = rows.setdefault((scenario, policy), {"scenario": scenario, "policy": policy, "trials": len(trials)})
+        touched = sum(trial.collided > 0 for trial in trials)
+        row[disturbance] = f"{sum(trial.success for trial in trials)}, {touched}"
+    return list(rows.values())
+
+
+def complete(trials: Iterable[Trial]) -> list[Trial]:
+    """Trials of those seeds that all policies in the scenario have met under every disturbance."""
+    found: dict[tuple[str, int], list[Trial]] = {}
+    policies: dict[str, set[str]] = {}
+    for trial in trials:
+        found.setdefault((trial.scenario, trial.seed), []).append(trial)
+        policies.setdefault(trial.scenario, set()).add(trial.label)
+    wanted = {scenario: len(labels) * (1 + len(DISTURBANCES)) for scenario, labels in policies.items()}
+    order = sorted(found, key=lambda key: (SCENARIOS.index(key[0]), key[1]))
+    return [trial for key in order if len(found[key]) == wanted[key[0]] for trial in found[key]]
 
 
 def draw(cells: Cells, path: Path) -> None:
@@ -137,9 +163,13 @@ def main() -> int:
     else:
         chosen = {"orca": {}} if arguments.quick else POLICIES
         scenarios, seeds = (SCENARIOS[:1], 1) if arguments.quick else (arguments.scenarios, arguments.seeds)
-        trials = run(scenarios, chosen, seeds, arguments.out)
+        run(scenarios, chosen, seeds, arguments.out)
+        # With those of calls before.
+        trials = TrialStore(arguments.out / STORE).trials()
+        trials = complete(trials)
         write_parquet(arguments.out / "robustness_study.parquet", trials)
     cells = by_cell(trials)
+    save_table(overview(cells), arguments.out / "robustness_overview.csv")
     save_table(rows_of(cells), arguments.out / "robustness_study.csv")
     draw(cells, arguments.out / "robustness_study.png")
     return 0
