@@ -176,15 +176,15 @@ def test_credit_and_update_are_crossed(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_policies_meet_every_disturbance(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    completed("robustness_study", out)
-    rows = table(out / "robustness_study.csv")
+    completed("disturbance_study", out)
+    rows = table(out / "disturbance_study.csv")
     assert len({row["disturbance"] for row in rows}) == len(rows) == 11
     assert {(row["scenario"], row["policy"], row["trials"], row["errors"]) for row in rows} == {
         ("circle", "orca", "1", "0")
     }
-    assert (out / "robustness_study.png").read_bytes().startswith(PNG)
-    completed("robustness_study", tmp_path / "again", "--trials", str(out / "robustness_study.parquet"))
-    assert table(tmp_path / "again" / "robustness_study.csv") == rows
+    assert (out / "disturbance_study.png").read_bytes().startswith(PNG)
+    completed("disturbance_study", tmp_path / "again", "--trials", str(out / "disturbance_study.parquet"))
+    assert table(tmp_path / "again" / "disturbance_study.csv") == rows
 
 
 @pytest.mark.slow
@@ -193,12 +193,12 @@ def test_policies_meet_every_disturbance(tmp_path: Path) -> None:
     [
         ("tune_rivals", "tuning"),
         ("credit_by_update", "credit_by_update"),
-        ("robustness_study", "robustness_study"),
-        ("robustness_study", "robustness_overview"),
+        ("disturbance_study", "disturbance_study"),
+        ("disturbance_study", "disturbance_overview"),
     ],
 )
 def test_the_tables_of_the_docs_are_those_of_the_data(tmp_path: Path, program: str, name: str) -> None:
-    data = "robustness_study" if program == "robustness_study" else name
+    data = "disturbance_study" if program == "disturbance_study" else name
     completed(program, tmp_path / "out", "--trials", str(ROOT / "data" / f"{data}.parquet"))
     for kind in ("csv", "md"):
         committed = ROOT / "docs" / "tables" / f"{name}.{kind}"

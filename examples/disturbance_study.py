@@ -1,6 +1,6 @@
 """How often do controllers bring eight robots home when something goes wrong: ten disturbances, three scenarios.
 
-    python examples/robustness_study.py --seeds 50 --out robustness_study
+    python examples/disturbance_study.py --seeds 50 --out disturbance_study
 
 D4orm-C2F beside a plan of D4orm-D executed open loop, ORCA and PPO, each with the same seeds, on the circle, on random
 places and in rooms. Every disturbance is on by itself at one level, beside no disturbance at all. Written is for every
@@ -167,11 +167,11 @@ def main() -> int:
         # With those of calls before.
         trials = TrialStore(arguments.out / STORE).trials()
         trials = complete(trials)
-        write_parquet(arguments.out / "robustness_study.parquet", trials)
+        write_parquet(arguments.out / "disturbance_study.parquet", trials)
     cells = by_cell(trials)
-    save_table(overview(cells), arguments.out / "robustness_overview.csv")
-    save_table(rows_of(cells), arguments.out / "robustness_study.csv")
-    draw(cells, arguments.out / "robustness_study.png")
+    save_table(overview(cells), arguments.out / "disturbance_overview.csv")
+    save_table(rows_of(cells), arguments.out / "disturbance_study.csv")
+    draw(cells, arguments.out / "disturbance_study.png")
     return 0
 
 
