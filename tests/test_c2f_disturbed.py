@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -70,7 +71,7 @@ def drifting(walk: float, noise: float, steps: int = 300) -> tuple[Any, Any, Sta
     truth = np.cumsum(random.normal(0, walk, (steps, 3, 4)), axis=0)
     seen = (truth + random.normal(0, noise, truth.shape)).astype(np.float32)
     estimates = [seen[0]]
-    for before, now in zip(seen, seen[1:]):
+    for before, now in pairwise(seen):
         estimates.append(filter_.update(now, before, estimates[-1], ALL))
     return truth, np.array(estimates), filter_
 
