@@ -144,8 +144,10 @@ class parallel_env(EnvironmentShell, ParallelEnv[str, FloatArray, FloatArray]):
         if not acting:
             return {}, {}, {}, {}, {}
         robots = [self._robots[agent] for agent in acting]
-        controls = np.zeros((len(self.possible_agents), self._control_size), np.float32)
-        controls[robots] = self._collect(actions)
+        controls = self._collect(actions)
+        if len(robots) < len(self.possible_agents):
+            acted, controls = controls, np.zeros((len(self.possible_agents), self._control_size), np.float32)
+            controls[robots] = acted
         step = simulation.step(controls)
         observations, rewards, finished = step.observations, step.rewards.tolist(), simulation.finished.tolist()
         terminations = {agent: finished[robot] for agent, robot in zip(acting, robots)}

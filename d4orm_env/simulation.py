@@ -62,6 +62,7 @@ class Simulation:
             observed_way=options.observed_way,
             spare=self._spare,
         )
+        self._disturbed: DisturbedWorlds | None = None
         self._disturb(0)  # to know what bodies there are
         # In an open world the two are the same.
         self.along_ways = options.progress == "way" and problem.world.num_obstacles > 0
@@ -269,13 +270,14 @@ class Simulation:
 
     def _disturb(self, seed: int) -> None:
         """Begin the disturbances of an episode."""
-        self._disturbed: DisturbedWorlds | None = None
         self._seen: Seen | None = None
-        if self.disturbances:
-            problem = self.problem
-            self._disturbed = DisturbedWorlds(self.disturbances, problem, 1, self.max_cycles)
-            self._disturbed.begin(np.arange(1), [seed], problem.start[None], problem.goal[None])
-            self._true_limits = self._disturbed.true_limits(problem.arrays.limits)
+        if not self.disturbances:
+            return
+        problem, disturbed = self.problem, self._disturbed
+        if disturbed is None or disturbed.problem is not problem or disturbed.max_cycles != self.max_cycles:
+            self._disturbed = disturbed = DisturbedWorlds(self.disturbances, problem, 1, self.max_cycles)
+            self._true_limits = disturbed.true_limits(problem.arrays.limits)
+        disturbed.begin(np.arange(1), [seed], problem.start[None], problem.goal[None])
 
     def _scene(self) -> Scene:
         assert self._disturbed is not None
@@ -324,7 +326,7 @@ class Simulation:
     def _distances(self, states: FloatArray) -> FloatArray:
         """``(K,)`` to the present goals [m]."""
         offsets = self.arrays.goal - states[:, : self._dimension]
-        distances: FloatArray = np.sqrt((offsets * offsets).sum(axis=1))
+        distances: FloatArray = np.sqrt(np.add.reduce(offsets * offsets, axis=1))
         return distances
 
     def _report(self, rewards: FloatArray, arrived: BoolArray, margin_violated: BoolArray) -> TeamStep:
@@ -334,19 +336,15 @@ class Simulation:
 
     def _observe(self) -> FloatArray:
         """``(K, D)`` what the robots see, or believe to see."""
-        layout, states = self.layout, self.states
+        layout = self.layout
         time_left = max(0.0, 1.0 - self.steps / self.max_cycles)
-        if self._disturbed is None or not self._disturbed.alters_sight:
-            observations = self._engine.observe(self.arrays, layout, states, self.controls, self.arrived, time_left)
-        else:
-            self._seen = seen = self._disturbed.see(self._scene())
-            states = seen.states[0]
-            parts = (self.arrays.goal[None], seen.states, seen.controls, self.arrived[None], seen.bodies)
-            # The engine compiles anew for arrays that cannot be written to.
-            owned = (part if part.flags.writeable else part.copy() for part in parts)
-            sight = Sight(*owned, np.array([time_left], np.float32))
-            observations = np.empty((len(states), layout.size), np.float32)
-            self._engine.observe_worlds(self.arrays, layout, sight, observations[None])
+        states, controls, bodies = self.states, self.controls, None
+        if self._disturbed is not None and self._disturbed.alters_sight:
+            self._seen = self._disturbed.see(self._scene())
+            states, controls, bodies = (part[0] for part in self._seen)
+        sight = Sight.of_team(self.arrays.goal, states, controls, self.arrived, time_left, bodies)
+        observations: FloatArray = np.empty((len(self.states), layout.size), np.float32)
+        self._engine.observe_worlds(self.arrays, layout, sight, observations[None])
         if layout.observed_way:
             observe_ways(observations, layout, self.problem.ways, states[:, : self._dimension])
         return observations if self._disturbed is None else self._disturbed.observe(observations[None], layout)[0]

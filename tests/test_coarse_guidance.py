@@ -107,7 +107,13 @@ def test_the_rest_begins_at_the_next_coarse_step(index: int, step: int) -> None:
     coarse = coarse_problem(problem, 2)
     controls = np.random.default_rng(1).uniform(-0.5, 0.5, (15, 2, 2)).astype(np.float32)
     plan = get_engine("cpu").rollout(coarse, controls)
-    guidance = Guidance(coarse, plan.controls, plan.states, interpolate(plan.positions, 2))
+    guidance = Guidance(
+        problem=coarse,
+        controls=plan.controls,
+        states=plan.states,
+        path=interpolate(plan.positions, 2),
+        ordered=False,
+    )
     left, rest = rest_of(guidance, index, 2)
     assert left.horizon == len(rest) == 15 - step
     np.testing.assert_array_equal(left.start, plan.states[step])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -116,21 +117,31 @@ class StudyOptions:
 @takes(StudyOptions)
 def evaluate(options: StudyOptions) -> None:
     """Compare policies on scenarios, team sizes, seeds, noise and disturbances; goes on where it was stopped."""
+    from d4orm_planners.evaluation.report import PARQUET_HINT, write_results
+
+    rates, written = report(options, write_results)
+    if options.out / "trials.parquet" not in written:
+        typer.echo(PARQUET_HINT, err=True)
+    require_trials(rates)
+
+
+def report(
+    options: StudyOptions, write: Callable[[Path, list[SuccessRate]], list[Path]]
+) -> tuple[list[SuccessRate], list[Path]]:
+    """Run the trials and write what they came to; the success rates and what was written."""
     from d4orm_planners.commands.progress import tell_results
     from d4orm_planners.evaluation.disturbance_report import write_disturbances
-    from d4orm_planners.evaluation.report import PARQUET_HINT, markdown, write_results
+    from d4orm_planners.evaluation.report import markdown
     from d4orm_planners.evaluation.summary import success_rates
 
     groups = options.run()
     rates = success_rates(groups)
-    written = write_results(options.out, rates)
+    written = write(options.out, rates)
     if options.disturb is not None:
         written += write_disturbances(options.out, groups)
     if not options.quiet:
         tell_results(markdown(rates), written)
-    if options.out / "trials.parquet" not in written:
-        typer.echo(PARQUET_HINT, err=True)
-    require_trials(rates)
+    return rates, written
 
 
 def require_trials(rates: list[SuccessRate]) -> None:

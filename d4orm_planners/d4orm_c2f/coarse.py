@@ -11,23 +11,32 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 
 
-@dataclass(frozen=True, eq=False)
-class Guidance:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Waypoints:
+    """What a team follows.
+
+    Attributes:
+        path: ``(H+1, K, d)`` waypoints, one per time step of the control loop [m].
+        ordered: Whether the ways were found on a roadmap, where who waits for whom decides.
+    """
+
+    path: FloatArray
+    ordered: bool
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Guidance(Waypoints):
     """A coarse plan and the path made from it.
 
     Attributes:
         problem: The coarse problem: larger time steps from where the plan begins.
         controls: ``(H_c, K, m)`` of the coarse plan.
         states: ``(H_c+1, K, n)``.
-        path: ``(H+1, K, d)`` waypoints, one per time step of the control loop [m].
-        ordered: Whether the ways were found on a roadmap, where who waits for whom decides.
     """
 
     problem: Problem
     controls: FloatArray
     states: FloatArray
-    path: FloatArray
-    ordered: bool = False
 
 
 def coarse_problem(problem: Problem, factor: int) -> Problem:

@@ -14,6 +14,7 @@ from d4orm_env.joint_state import JointState
 from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.coarse import (
     Guidance,
+    Waypoints,
     coarse_problem,
     interpolate,
     nearest_indices,
@@ -27,6 +28,7 @@ from d4orm_planners.d4orm_c2f.sight import within_sight
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
 from d4orm_planners.guidance.planner import Guide as Ways
+from d4orm_planners.guidance.relay import relay_ways
 from d4orm_planners.search import Search
 from d4orm_planners.steering import straight_drives
 
@@ -46,6 +48,7 @@ class Guide:
         seed: Of the episode.
         refiner: What refinements roll out and sample with.
         background: Where they are made, if not between control loops.
+        lifelong: Whether robots that arrive get new goals.
 
     Attributes:
         guidance: What is followed at present.
@@ -54,15 +57,21 @@ class Guide:
         stuck: ``(K,)`` robots that do not get on, or did not until a short while ago.
     """
 
-    guidance: Guidance
+    guidance: Waypoints
     index: int
     anew: BoolArray
     stuck: BoolArray
 
     def __init__(
-        self, problem: Problem, config: D4ormC2FConfig, seed: int, refiner: Engine, background: Background[Guidance]
+        self,
+        problem: Problem,
+        config: D4ormC2FConfig,
+        seed: int,
+        refiner: Engine,
+        background: Background[Guidance],
+        lifelong: bool,
     ) -> None:
-        self._problem, self._config, self._seed = problem, config, seed
+        self._problem, self._config, self._seed, self._lifelong = problem, config, seed, lifelong
         self._refiner, self._background = refiner, background
         # Ways that fit between others to the centimetre are no guidance: fine plans cannot keep to them. But where
         # the team does not get on there may be no other ways.
@@ -84,10 +93,11 @@ class Guide:
     def begin(self, joint: JointState) -> None:
         """Plan for the episode."""
         self._patience = Patience(joint)
-        guidance = self.plan(joint, None, self._config.coarse_iterations)
-        self._follow(joint, guidance, np.ones(self._problem.num_robots, bool))
+        self.guidance, self.index = self.plan(joint, None, self._config.coarse_iterations), 0
+        everybody = np.ones(self._problem.num_robots, bool)
+        self._follow(joint, self._relayed(joint, everybody) or self.guidance, everybody)
 
-    def _follow(self, joint: JointState, guidance: Guidance, anew: BoolArray) -> None:
+    def _follow(self, joint: JointState, guidance: Waypoints, anew: BoolArray) -> None:
         """Begin at the beginning of a guidance, which sends the robots ``anew`` ``(K,)`` another way than before."""
         self.anew = anew
         self.guidance = guidance
@@ -113,7 +123,7 @@ class Guide:
                 chosen = search.current
         plan = chosen.trajectory
         path = interpolate(plan.positions, self._config.coarse_factor)
-        return Guidance(coarse, plan.controls, plan.states, path, ordered)
+        return Guidance(problem=coarse, controls=plan.controls, states=plan.states, path=path, ordered=ordered)
 
     def subgoals(self, joint: JointState, docked: BoolArray) -> IntArray:
         """``(K,)`` waypoints that the robots head for; finds out where on the path they are (Algorithm 4, line 6)."""
@@ -138,7 +148,7 @@ class Guide:
 
     def fresh_start(self, base: FloatArray) -> None:
         """Have those that are sent another way begin ``base`` ``(H_predict, K, m)`` with the coarse plan's controls."""
-        if self.anew.any():
+        if self.anew.any() and isinstance(self.guidance, Guidance):
             # Each is held for as long as it stands for.
             held = np.repeat(self.guidance.controls, self._config.coarse_factor, axis=0)[: len(base)]
             base[:, self.anew] = 0
@@ -158,16 +168,33 @@ class Guide:
             return False
         changed |= held_up
         keep = moving & ~changed
+        relayed = self._relayed(joint, ~keep | lost) or self._relayed(joint, np.ones_like(keep))
+        if relayed is not None:
+            self._follow(joint, relayed, changed)
+            return True
         thorough = lost or bool(held_up.any())
         iterations = self._config.coarse_iterations if thorough else self._config.replan_iterations
-        # A way straight through walls is no beginning: there the whole team's ways are found anew on the roadmap.
-        initial = None if self.guidance.ordered else self._beginning(joint, keep & (not lost))
+        initial = self._beginning(joint, keep & (not lost))
         guidance = self.plan(joint, initial, iterations, thorough)
         self._follow(joint, guidance, ~keep | lost)
         return True
 
-    def _beginning(self, joint: JointState, keep: BoolArray) -> FloatArray:
-        """``(H_c, K, m)`` straight drives, but for those that ``keep`` ``(K,)`` what is left of their ways."""
+    def _relayed(self, joint: JointState, changed: BoolArray) -> Waypoints | None:
+        """New ways on the roadmap for those ``changed`` ``(K,)``, around all others on theirs, where goals are many."""
+        if not (self._lifelong and self.guidance.ordered):
+            return None
+        factor, seed = self._config.coarse_factor, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps)
+        present = coarse_problem(self._problem.resumed_at(joint.states, joint.goals), factor)
+        ways = relay_ways(present, self.guidance.path[self.index :: factor], changed, seed)
+        return None if ways is None else Waypoints(path=interpolate(ways, factor), ordered=True)
+
+    def _beginning(self, joint: JointState, keep: BoolArray) -> FloatArray | None:
+        """``(H_c, K, m)`` straight drives, but for those that ``keep`` ``(K,)`` what is left of their ways.
+
+        ``None`` among walls: there the whole team's ways are found anew on the roadmap.
+        """
+        if self.guidance.ordered or not isinstance(self.guidance, Guidance):
+            return None
         factor = self._config.coarse_factor
         present = coarse_problem(self._problem.resumed_at(joint.states, joint.goals), factor)
         initial = straight_drives(present).controls[:, :, 0]
@@ -200,6 +227,8 @@ class Guide:
         """Take over what the refinement has done meanwhile, and give it more to do if that is ``due``."""
         index = self.index + self._config.subgoal_offset
         if self._config.refine == "off" or index >= len(self.guidance.path) - 1:
+            return False
+        if not isinstance(self.guidance, Guidance):
             return False
         guidance, seed = self.guidance, derived_seed(self._seed, Stream.REFINEMENT, step)
         if self._config.refine == "sync":

@@ -13,7 +13,7 @@ from d4orm_env.core.seeds import Stream, derived_seed, generator
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_planners.d4orm_c2f.background import Background
-from d4orm_planners.d4orm_c2f.coarse import Guidance
+from d4orm_planners.d4orm_c2f.coarse import Guidance, Waypoints
 from d4orm_planners.d4orm_c2f.deviation import Deviation
 from d4orm_planners.d4orm_c2f.guide import Guide
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
@@ -76,7 +76,7 @@ class D4ormC2F(StatePolicy):
         return sum(loop.missed for loop in self.loops)
 
     @property
-    def guidance(self) -> Guidance:
+    def guidance(self) -> Waypoints:
         """What is followed at present."""
         return self._guide.guidance
 
@@ -87,12 +87,13 @@ class D4ormC2F(StatePolicy):
         self._control.forget()
         self.loops: list[LoopRecord] = []
         joint = split_state(self.problem, env.state())
-        self._window = Window(self.problem, self.config, self._engine, docks=not env.unwrapped.lifelong)
+        lifelong = env.unwrapped.lifelong
+        self._window = Window(self.problem, self.config, self._engine, docks=not lifelong)
         self._window.prepare(joint)
         self._plan, self._next = self._window.no_controls(), 0
         self.subgoals: FloatArray = joint.states[:, : self.problem.dimension]
         begin = time.perf_counter()
-        self._guide = Guide(self.problem, self.config, seed, self._refiner, self._refinement)
+        self._guide = Guide(self.problem, self.config, seed, self._refiner, self._refinement, lifelong)
         self._guide.begin(joint)
         self._deviation = Deviation(self.problem, self._engine, self.config.delay)
         self.coarse_time = time.perf_counter() - begin
