@@ -15,8 +15,8 @@ Keys = NDArray[np.uint32]
 Steps = NDArray[np.int64]
 Kernel = Callable[..., Any]
 Ahead = dict[tuple[int, int, int, tuple[int, ...]], tuple[int, FloatArray]]
-"""What a single world has drawn ahead in its episode: by kind of number, stream, call and shape the first step, and rows
-of numbers, one for each step from there on."""
+"""What a single world has drawn ahead in its episode: by kind of number, stream, call and shape the first step, and
+rows of numbers, one for each step from there on."""
 
 _NORMAL, _UNIFORM = range(2)
 """Kinds of number."""
