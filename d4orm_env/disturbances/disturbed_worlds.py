@@ -17,9 +17,11 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import Disturbance, Effect, Memory, Scene, Seen
-from d4orm_env.disturbances.draws import Draws, Keys, Steps, episode_keys
+from d4orm_env.disturbances.draws import Ahead, Draws, Keys, Steps, episode_keys
 
 Worlds = NDArray[np.intp]
+
+_FLOAT32 = np.dtype(np.float32)
 
 
 class _Purpose(IntEnum):
@@ -33,10 +35,11 @@ class _Purpose(IntEnum):
 
 @dataclass(eq=False)
 class _Running:
-    """A disturbance at work: its stream of random numbers, and what it remembers."""
+    """A disturbance at work: its stream of random numbers, what it draws by purpose, and what it remembers."""
 
     disturbance: Disturbance[Any]
     stream: int
+    draws: dict[_Purpose, Draws] = field(default_factory=dict)
     memory: Memory = field(default=())
 
     def remember(self, memory: Memory, worlds: Worlds, first: bool = False) -> None:
@@ -88,6 +91,7 @@ class DisturbedWorlds:
         self._bodies: FloatArray = np.zeros((num_worlds, 0, 2 * problem.dimension + 1), np.float32)
         self._bringing: list[_Running] = []
         self._begun = False
+        self._ahead: Ahead | None = {} if num_worlds == 1 else None
 
     @property
     def bodies(self) -> FloatArray:
@@ -129,6 +133,8 @@ class DisturbedWorlds:
             goal: ``(b, K, d)`` [m].
         """
         self._keys[worlds] = keys = episode_keys(seeds)
+        if self._ahead is not None:
+            self._ahead.clear()
         count, robots = start.shape[:2]
         still = np.zeros((count, robots, self.problem.control_size), np.float32)
         none, new = np.zeros((count, 0, 2 * self.problem.dimension + 1), np.float32), np.zeros(count, np.int64)
@@ -204,7 +210,8 @@ class DisturbedWorlds:
         seen = Seen(part.states, part.controls, part.bodies)
         for one in self._seeing:
             memory = one.memory if worlds is None else one.memory_of(worlds)
-            draws = Draws(self._keys if worlds is None else self._keys[worlds], part.steps, one.stream, _Purpose.SEE)
+            draws = self._draws(one, scene, _Purpose.SEE)
+            draws = draws if worlds is None else draws.of(worlds)
             changed = one.disturbance.see(seen, memory, part, draws)
             states, controls, bodies = changed
             seen = Seen(
@@ -226,7 +233,11 @@ class DisturbedWorlds:
         return observations
 
     def _draws(self, one: _Running, scene: Scene, purpose: _Purpose) -> Draws:
-        return Draws(self._keys, scene.steps, one.stream, purpose)
+        draws = one.draws.get(purpose)
+        if draws is None:
+            one.draws[purpose] = draws = Draws(self._keys, scene.steps, one.stream, purpose, self._ahead)
+        draws.turn_to(scene.steps)
+        return draws
 
 
 @cache
@@ -246,7 +257,7 @@ def _together(join: Any, parts: Sequence[Any]) -> Any:
 
 def _checked(values: ArrayLike, shape: tuple[int, ...], one: _Running, method: str) -> FloatArray:
     """What a disturbance returned, as float32."""
-    array = values if isinstance(values, np.ndarray) and values.dtype == np.float32 else as_float32(values)
+    array = values if isinstance(values, np.ndarray) and values.dtype == _FLOAT32 else as_float32(values)
     if array.shape != shape:
         name = type(one.disturbance).__name__
         raise ValueError(f"disturbance {name}: {method} returned shape {array.shape}; expected {shape}")
