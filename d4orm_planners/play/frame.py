@@ -22,6 +22,7 @@ class Moment:
         pace: Seconds from one step to the next at this speed.
         state: ``"running"``, ``"paused"``, ``"planning"`` or ``"arrived"``.
         message: What went wrong last, for people.
+        refused: Counts what was asked for and could not be.
     """
 
     generation: int
@@ -31,6 +32,7 @@ class Moment:
     pace: float
     state: str
     message: str
+    refused: int
 
 
 @dataclass(frozen=True, eq=False)

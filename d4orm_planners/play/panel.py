@@ -53,7 +53,7 @@ class Panel:
         self._gui, self._session, self._view = server.gui, session, view
         self._random = np.random.default_rng(0)
         self._status_at = 0.0
-        self._text = self._told = ""
+        self._text, self._refused = "", 0
         self._status = self._gui.add_markdown("")
         with self._gui.add_folder("Clock"):
             self._add_clock()
@@ -80,12 +80,11 @@ class Panel:
         text = status_text(frames)
         if text != self._text:
             self._text = self._status.content = text
-        message = frames[0].moment.message
-        if message != self._told:
-            self._told = message
-            if message:  # something was refused, and the controls say what is
-                self._dials.follow()
-                self._follow_policies()
+        refused = frames[0].moment.refused
+        if refused != self._refused:  # the controls say what is
+            self._refused = refused
+            self._dials.follow()
+            self._follow_policies()
 
     def _add_clock(self) -> None:
         self.paused: Any = self._gui.add_checkbox("Paused", False)

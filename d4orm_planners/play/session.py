@@ -56,7 +56,7 @@ class Session:
         self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._wake, self._closing = threading.Event(), threading.Event()
         self._paused, self._steps_wanted, self._speed = False, 0, 1.0
-        self._moment = Moment(0, 0, 0.0, 0.0, problem.dt, "planning", "")
+        self._moment = Moment(0, 0, 0.0, 0.0, problem.dt, "planning", "", 0)
         self._frames: tuple[Frame, ...] = ()
         self._lanes: tuple[Lane, ...] = ()
         self.failure: BaseException | None = None
@@ -258,6 +258,7 @@ class Session:
             try:
                 self._commands.get()()
             except (ValueError, RuntimeError, ImportError) as error:
+                self._moment = replace(self._moment, refused=self._moment.refused + 1)
                 self._show(self._state, first_line(error))
         return obeyed
 
