@@ -256,25 +256,23 @@ def test_goals_are_dragged_in_space(page: Page) -> None:
 def test_policies_are_ticked_and_drive_side_by_side(page: Page, tmp_path: Path) -> None:
     with running(make_problem("circle", num_robots=3, seed=0), "goal") as playground:
         session = playground.session
+        session.pause(True)  # nobody stands on a goal yet
         page.look()
         page.offline(False)
         page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
         page.open(playground.address)
-        page.until("document.body.textContent.includes('circle, 3 robots, goal')")
+        page.until("document.body.textContent.includes('circle, 3 robots, goal: paused')")
         wait_for(lambda: len(playground.clients) == 1)
         click(page, "Who drives")
         tick(page, "D4orm-C2F")
         wait_for(lambda: session.policies == ("goal", "d4orm-c2f"))
         page.until("document.body.textContent.includes('circle, 3 robots, goal, d4orm-c2f')")
-        session.pause(True)
-        wait_for(lambda: session.frame.moment.state == "paused")
+        wait_for(lambda: len(playground._view._lanes) == 2)
         offset = playground._view._lanes[1]._nodes[""].position[:2]
         goal = session.frames[1].goals[0]
         wait_for(lambda: abs(pixel(playground, goal + offset)[0]) < 1200)
         page.frames(8)
-        page.drag(
-            pixel(playground, goal + offset + np.array([0.0, 0.19])), pixel(playground, offset + np.array([0.3, 0.5]))
-        )
+        page.drag(pixel(playground, goal + offset), pixel(playground, offset + np.array([0.3, 0.5])))
         wait_for(lambda: not np.array_equal(session.frame.goals[0], goal))
         np.testing.assert_array_equal(session.frame.goals, session.frames[1].goals)
         click(page, "Files")
