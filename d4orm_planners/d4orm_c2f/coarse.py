@@ -8,7 +8,6 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.trajectory import Trajectory
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -59,12 +58,6 @@ def interpolate(path: FloatArray, factor: int) -> FloatArray:
     share = (np.arange(factor, dtype=path.dtype) / factor)[None, :, None, None]
     between = path[:-1, None] * (1 - share) + path[1:, None] * share
     return np.concatenate([between.reshape(-1, *path.shape[1:]), path[-1:]])
-
-
-def passes_checks(trajectory: Trajectory, interval: int) -> bool:
-    """Whether everyone arrives, and nobody violates the margin at any ``interval``-th step (paper, section VI-A)."""
-    arrives = bool(trajectory.arrived[-1].all())
-    return arrives and not trajectory.margin_violated[interval::interval].any()
 
 
 def nearest_indices(path: FloatArray, positions: FloatArray, last: IntArray, window: int) -> IntArray:

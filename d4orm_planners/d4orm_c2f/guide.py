@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,6 @@ from d4orm_planners.d4orm_c2f.coarse import (
     coarse_problem,
     interpolate,
     nearest_indices,
-    passes_checks,
     rest_of,
     subgoal_indices,
 )
@@ -31,9 +31,6 @@ from d4orm_planners.guidance.planner import Guide as Ways
 from d4orm_planners.guidance.relay import relay_ways
 from d4orm_planners.search import Search
 from d4orm_planners.steering import straight_drives
-
-LAG = 5
-"""Waypoints that a robot may be behind the others without its subgoal staying behind too."""
 
 NEARER = 0.05
 """What counts as coming nearer to the goals, all robots together [m]."""
@@ -51,6 +48,7 @@ class Guide:
         lifelong: Whether robots that arrive get new goals.
 
     Attributes:
+        problem: The problem, with the limits that the robots are believed to have now.
         guidance: What is followed at present.
         index: Waypoint at which the team is.
         anew: ``(K,)`` robots that are sent another way than before, until :meth:`fresh_start` has reported it.
@@ -71,30 +69,17 @@ class Guide:
         background: Background[Guidance],
         lifelong: bool,
     ) -> None:
-        self._problem, self._config, self._seed, self._lifelong = problem, config, seed, lifelong
+        self.problem, self._config, self._seed, self._lifelong = problem, config, seed, lifelong
         self._refiner, self._background = refiner, background
         # Ways that fit between others to the centimetre are no guidance: fine plans cannot keep to them. But where
         # the team does not get on there may be no other ways.
-        self._planner, self._thorough = (
-            D4ormD(
-                D4ormDConfig(
-                    engine=config.engine,
-                    num_samples=config.coarse_samples,
-                    num_steps=config.coarse_steps,
-                    repair_steps=config.coarse_repair_steps,
-                    improve=True,
-                    reroute=reroute,
-                    shorten=False,
-                )
-            )
-            for reroute in (False, True)
-        )
+        self._planner, self._thorough = (_coarse_planner(config, reroute=reroute) for reroute in (False, True))
 
     def begin(self, joint: JointState) -> None:
         """Plan for the episode."""
-        self._patience = Patience(joint)
+        everybody = np.ones(self.problem.num_robots, bool)
+        self._patience, self.stuck = Patience(joint), ~everybody
         self.guidance, self.index = self.plan(joint, None, self._config.coarse_iterations), 0
-        everybody = np.ones(self._problem.num_robots, bool)
         self._follow(joint, self._relayed(joint, everybody) or self.guidance, everybody)
 
     def _follow(self, joint: JointState, guidance: Waypoints, anew: BoolArray) -> None:
@@ -108,18 +93,19 @@ class Guide:
     def plan(self, joint: JointState, initial: FloatArray | None, iterations: int, thorough: bool = False) -> Guidance:
         """Plan for the whole team from where it is, until a plan passes the checks (Algorithm 4, lines 1 to 3)."""
         planner = self._thorough if thorough else self._planner
-        present = self._problem.resumed_at(joint.states, joint.goals)
+        present = self.problem.resumed_at(joint.states, joint.goals)
         coarse = coarse_problem(present, self._config.coarse_factor)
-        search = Search(planner, coarse, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps), initial)
+        seed, interval = derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps), self._config.check_interval
+        search = Search(planner, coarse, seed, initial, check_interval=interval)
         chosen, ordered = search.current, False
         for number in range(iterations):
-            if passes_checks(chosen.trajectory, self._config.check_interval):
+            if not chosen.failed.any():
                 break
             search.advance()
             if number == 0:
                 ordered = isinstance(search.state, Ways)
             chosen = search.current if search.current.rank >= search.best.rank else search.best
-            if passes_checks(search.current.trajectory, self._config.check_interval):
+            if not search.current.failed.any():
                 chosen = search.current
         plan = chosen.trajectory
         path = interpolate(plan.positions, self._config.coarse_factor)
@@ -128,23 +114,28 @@ class Guide:
     def subgoals(self, joint: JointState, docked: BoolArray) -> IntArray:
         """``(K,)`` waypoints that the robots head for; finds out where on the path they are (Algorithm 4, line 6)."""
         path, offset = self.guidance.path, self._config.subgoal_offset
-        positions = joint.states[:, : self._problem.dimension]
+        positions = joint.states[:, : self.problem.dimension]
         self._indices = nearest_indices(path, positions, self._indices, offset)
         going = ~docked & ~self.stuck
         if going.any():
             self.index = round(float(self._indices[going].mean()))
-        targets = subgoal_indices(self._indices, self.index, offset, LAG, len(path) - 1)
+        lag = len(path) if self._config.max_lag is None else self._config.max_lag
+        targets = subgoal_indices(self._indices, self.index, offset, lag, len(path) - 1)
+        if not self._config.sight:
+            return targets
         walls = self.guidance.ordered
-        return within_sight(self._problem, positions, path, self._indices, targets, docked, walls)
+        return within_sight(self.problem, positions, path, self._indices, targets, docked, walls)
 
     def followed(self, joint: JointState, engine: Engine, horizon: int) -> FloatArray:
         """``(horizon, K, m)`` controls that take every robot slowly along its path."""
-        return follow_slowly(self._problem, engine, joint, self.guidance.path, self._indices, horizon)
+        return follow_slowly(self.problem, engine, joint, self.guidance.path, self._indices, horizon)
 
     def timed(self, joint: JointState, engine: Engine, horizon: int) -> FloatArray:
         """``(horizon, K, m)`` controls that take every robot along its path in the team's time."""
-        clock = np.minimum(self.index, self._indices + LAG)
-        return keep_time(self._problem, engine, joint, self.guidance.path, clock, horizon)
+        clock = np.full_like(self._indices, self.index)
+        if self._config.max_lag is not None:
+            clock = np.minimum(clock, self._indices + self._config.max_lag)
+        return keep_time(self.problem, engine, joint, self.guidance.path, clock, horizon)
 
     def fresh_start(self, base: FloatArray) -> None:
         """Have those that are sent another way begin ``base`` ``(H_predict, K, m)`` with the coarse plan's controls."""
@@ -159,10 +150,14 @@ class Guide:
         """Plan anew for robots with new goals or stuck, for a team that lost the guidance or has come to its end."""
         changed = (joint.goals != self._goals).any(axis=1)
         moving = ~docked
-        stuck, self.stuck = self._patience.observe(joint, self._due(joint))
+        stuck, lost = np.zeros_like(docked), False
+        if self._config.replan:
+            stuck, self.stuck = self._patience.observe(joint, self._due(joint))
+            lost = bool(moving.any()) and self._is_lost(joint, moving)
         if not moving.any():
             return False
-        lost = self._is_lost(joint, moving)
+        if self._config.replan:
+            changed |= moving & (self._away(joint) > self._config.replan_distance)
         held_up = moving & stuck & (joint.steps - self._began > STUCK_AFTER)
         if not (changed | held_up).any() and not lost:
             return False
@@ -184,7 +179,7 @@ class Guide:
         if not (self._lifelong and self.guidance.ordered):
             return None
         factor, seed = self._config.coarse_factor, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps)
-        present = coarse_problem(self._problem.resumed_at(joint.states, joint.goals), factor)
+        present = coarse_problem(self.problem.resumed_at(joint.states, joint.goals), factor)
         ways = relay_ways(present, self.guidance.path[self.index :: factor], changed, seed)
         return None if ways is None else Waypoints(path=interpolate(ways, factor), ordered=True)
 
@@ -196,7 +191,7 @@ class Guide:
         if self.guidance.ordered or not isinstance(self.guidance, Guidance):
             return None
         factor = self._config.coarse_factor
-        present = coarse_problem(self._problem.resumed_at(joint.states, joint.goals), factor)
+        present = coarse_problem(self.problem.resumed_at(joint.states, joint.goals), factor)
         initial = straight_drives(present).controls[:, :, 0]
         if keep.any():
             rest = self.guidance.controls[self.index // factor :]
@@ -211,17 +206,23 @@ class Guide:
 
     def _is_lost(self, joint: JointState, moving: BoolArray) -> bool:
         """Whether the robots under way are far from their waypoints, at the end of the path, or get no nearer."""
-        positions = joint.states[:, : self._problem.dimension]
+        positions = joint.states[:, : self.problem.dimension]
         distance = float(np.linalg.norm((joint.goals - positions)[moving], axis=1).sum())
         if distance < self._nearest - NEARER:
             self._nearest, self._nearest_at = distance, joint.steps
-        waypoints = self.guidance.path[self._indices, np.arange(len(moving))]
-        away = np.linalg.norm(positions - waypoints, axis=1)[moving].mean()
         return bool(
-            away > self._config.replan_distance
+            self._away(joint)[moving].mean() > self._config.replan_distance
             or self.index >= len(self.guidance.path) - 1
             or joint.steps - self._nearest_at > self._config.patience
         )
+
+    def _away(self, joint: JointState) -> FloatArray:
+        """``(K,)`` how far the robots are from their waypoints [m]."""
+        positions = joint.states[:, : self.problem.dimension]
+        away: FloatArray = np.linalg.norm(
+            positions - self.guidance.path[self._indices, np.arange(len(positions))], axis=1
+        )
+        return away
 
     def refine(self, step: int, due: bool) -> bool:
         """Take over what the refinement has done meanwhile, and give it more to do if that is ``due``."""
@@ -255,3 +256,18 @@ class Guide:
         all_controls = np.concatenate([guidance.controls[:done], after.controls])
         path = interpolate(positions, self._config.coarse_factor)
         return replace(guidance, controls=all_controls, states=states, path=path)
+
+
+def _coarse_planner(config: D4ormC2FConfig, reroute: bool) -> D4ormD:
+    """D4orm-D as it plans coarsely, with or without looking for ways around all others."""
+    given: dict[str, Any] = {} if config.coarse_preset is None else {**D4ormD.presets[config.coarse_preset]}
+    given |= {
+        "engine": config.engine,
+        "num_samples": config.coarse_samples,
+        "num_steps": config.coarse_steps,
+        "repair_steps": config.coarse_repair_steps,
+        "improve": True,
+        "reroute": reroute,
+        "shorten": False,
+    }
+    return D4ormD(D4ormDConfig(**given))

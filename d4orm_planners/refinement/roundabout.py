@@ -1,7 +1,8 @@
 """A roundabout: everybody drives round the place where most ways cross, on the same side.
 
 The oldest rule for many who cross at one place, as in L. Pallottino, V. G. Scordio, A. Bicchi and E. Frazzoli,
-*Decentralized cooperative policy for conflict resolution in multivehicle systems* (IEEE Transactions on Robotics, 2007).
+*Decentralized cooperative policy for conflict resolution in multivehicle systems* (IEEE Transactions on Robotics,
+2007).
 Search among single robots' ways does not find it, because nobody gains by beginning alone.
 """
 
