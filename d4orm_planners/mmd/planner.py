@@ -56,7 +56,7 @@ class MMDConfig(PlannerConfig):
     constraint_radius: Stretch = 1.2
     clearance: NotNegative = 0.03
     quickest: Stretch = 1.1
-    slowest: Stretch = 2.0
+    slowest: Stretch = 3.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
