@@ -4,6 +4,7 @@
     python examples/solve_rates.py --seeds 20 --cases big --planner d4orm-d
     python examples/solve_rates.py --seeds 20 --cases big --planner d4orm-d --improve 3
     python examples/solve_rates.py --seeds 20 --cases walls --planner d4orm-d
+    python examples/solve_rates.py --seeds 5 --cases few --planner mmd
 
 Random instances differ by seed; those of the AMSwarm comparison have their starts jittered by 5 mm. Every plan that
 counts as solved has passed ``verify()``. Iterations and seconds are those to the first solution, compilation not
@@ -54,7 +55,17 @@ WALLS: list[tuple[str, str, dict[str, Any], int]] = [
     ("forest in space, 16", "forest", {"num_robots": 16, "model": "holonomic3d"}, 200),
     ("forest, 16 differential drives", "forest", {"num_robots": 16, "model": "differential_drive"}, 200),
 ]
-SETS = {"paper": CASES, "big": BIG, "walls": WALLS}
+FEW: list[tuple[str, str, dict[str, Any], int]] = [
+    ("circle, 8", "circle", {"num_robots": 8}, 60),
+    ("random with 4 obstacles, 8", "random", {"num_robots": 8, "num_obstacles": 4}, 60),
+    ("random with 4 obstacles, 16", "random", {"num_robots": 16, "num_obstacles": 4}, 60),
+    ("forest, 8", "forest", {"num_robots": 8}, 60),
+    ("warehouse, 8", "warehouse", {"num_robots": 8}, 60),
+    ("warehouse, 16", "warehouse", {"num_robots": 16}, 60),
+    ("rooms, 4", "rooms", {"num_robots": 4}, 60),
+    ("rooms, 8", "rooms", {"num_robots": 8}, 60),
+]
+SETS = {"paper": CASES, "big": BIG, "walls": WALLS, "few": FEW}
 JITTER = 0.005
 
 

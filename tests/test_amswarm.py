@@ -115,6 +115,14 @@ def test_the_alternation_is_the_publications() -> None:
     assert violation == pytest.approx(max(0, *(-gap.min() for gap in gaps), *(speed.max() for speed in speeds)))
 
 
+def test_the_weight_of_constraints_stops_growing_before_it_overflows() -> None:
+    plan = make_planner("amswarm", engine="cpu", growth=10.0, alternations=400, tolerance=1e-12).solve(
+        swap_problem(horizon=10), max_iterations=1
+    )
+    assert plan.status == "iteration_limit"
+    assert np.isfinite(float(plan.history[0].note.split()[-1]))
+
+
 # What it plans.
 
 

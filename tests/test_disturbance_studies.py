@@ -130,7 +130,7 @@ def test_the_same_trial_in_another_physics_is_another_one(tmp_path: Path) -> Non
     episode = run_episode(mujoco.parallel_env(problem=problem), "goal", seed=4)
     assert (theirs.travel_time, theirs.reward) == (episode.metrics["travel_time"], episode.metrics["reward"])
     assert theirs.reward != ours.reward
-    assert "no noise, in mujoco" in leaderboard([ours, theirs])
+    assert "custom, 2 robots, differential_drive, in mujoco" in leaderboard([ours, theirs], [1.0])
 
 
 @pytest.mark.parametrize(("physics", "complaint"), [("bullet", "physics is 'bullet'"), ("mujoco", "robot_0 is a car")])

@@ -21,7 +21,7 @@ from d4orm_planners import Plan, make_planner
 from d4orm_planners.mmd.conflicts import count_conflicts, first_conflict
 from d4orm_planners.mmd.constraint_tree import Constraint, Planning
 from d4orm_planners.mmd.dataset import draw_examples, modes_of
-from d4orm_planners.mmd.denoising import Batch, Denoiser
+from d4orm_planners.mmd.denoising import Denoiser
 from d4orm_planners.mmd.guiding import Surroundings, guide
 from d4orm_planners.mmd.planner import MMDConfig
 from d4orm_planners.mmd.prior import (
@@ -58,6 +58,7 @@ def test_the_network_is_a_residual_perceptron() -> None:
     np.testing.assert_allclose(clean, np.clip(expected, -CLIP, CLIP), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_training_writes_what_the_planner_reads(tmp_path: Path) -> None:
     pytest.importorskip("torch")
     from d4orm_planners.mmd.dataset import Examples
@@ -69,9 +70,9 @@ def test_training_writes_what_the_planner_reads(tmp_path: Path) -> None:
     modes = np.tile(0.1 * np.sign(features[:, :1]), (1, SIZE)).reshape(-1, 2, MODES).astype(np.float32)
     losses: list[float] = []
     prior = train(
-        Examples(features, modes), 501, seed=0, width=32, layers=1, progress=lambda _, loss: losses.append(loss)
+        Examples(features, modes), 201, seed=0, width=16, layers=1, progress=lambda _, loss: losses.append(loss)
     )
-    assert losses[-1] < 0.6 * losses[0]
+    assert losses[-1] < 0.8 * losses[0]
     save_prior(prior, tmp_path / "weights.npz")
     for kept, loaded in zip(prior, load_prior(tmp_path / "weights.npz"), strict=True):
         np.testing.assert_array_equal(kept, loaded)
@@ -327,19 +328,17 @@ def test_without_a_conflict_who_fails_plans_anew() -> None:
         assert [a is b for a, b in zip(node.motions, child.motions, strict=True)].index(False) == robot
 
 
-def test_planning_again_reuses_what_was_planned() -> None:
-    problem = lone_problem()
-    steps, changes = {}, {}
+def test_planning_again_begins_with_what_was_planned() -> None:
+    problem, frame = lone_problem(), frame_of(lone_problem())
+    before = np.zeros((8, SIZE), np.float32)
+    before[:, MODES] = 2.0  # far to the left
+    found = {}
     for reuse in (3, None):
-        config = MMDConfig(num_samples=8, num_steps=20, reuse_steps=reuse)
-        denoiser = Denoiser(problem, config, lambda: False)
-        first: Batch = denoiser.denoise(0, frame_of(problem), surroundings(problem), 1)
-        before = None if reuse is None else first.motions
-        again = denoiser.denoise(0, frame_of(problem), surroundings(problem), 2, before)
-        steps[reuse] = again.steps
-        changes[reuse] = np.abs(again.motions - first.motions).mean()
-    assert steps == {3: 3, None: 20}
-    assert changes[3] < 0.7 * changes[None]
+        denoiser = Denoiser(problem, MMDConfig(num_samples=8, reuse_steps=reuse), lambda: False)
+        batch = denoiser.denoise(0, frame, surroundings(problem), 2, before if reuse else None)
+        found[batch.steps] = batch.driven.places[:, 25, 1]
+    # Every second motion is its neighbour's mirror image.
+    assert abs(found[3][::2]).min() > 3 * abs(found[25]).mean()
 
 
 # What it plans.

@@ -271,6 +271,7 @@ def test_a_disturbance_slows_the_bodies_themselves() -> None:
     [
         ({"scenario": "sphere"}, "robot_0 is a holonomic3d, which has no body in MuJoCo; use one of holonomic2d"),
         ({"model": "car"}, "robot_0 is a car, which has no body in MuJoCo"),
+        ({"problem": Problem(Team(("velocity2d",), radius=1e-5), [[0, 0]], [[1, 1]])}, "radius of robot_0 is 1e-05"),
         ({"physics": {"drag": 1}}, r"physics is \{'drag': 1\}; give d4orm_env.mujoco.Physics"),
         ({"renderer": "opengl"}, "renderer is 'opengl'; choose one of auto, mujoco, pictures"),
     ],

@@ -96,13 +96,21 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "smoothness": (0.1, {}),
     "growth": (1.5, {}),
     "alternations": (5, {}),
+    "guide_from": (1.0, {}),
+    "guide_steps": (1, {}),
+    "noise_scale": (1.0, {}),
+    "reuse_steps": (2, {"max_iterations": 4}),
+    "soft_pull": (0.1, {}),
+    "constraint_radius": (1.5, {}),
+    "quickest": (1.3, {}),
+    "slowest": (2.0, {}),
 }
 """By setting, another value, and the settings beside which it means something."""
 
 
-def crossing(num_robots: int = 4) -> Problem:
+def crossing(num_robots: int = 4, num_obstacles: int = 0) -> Problem:
     """Robots that meet in the middle."""
-    return make_problem("circle", num_robots=num_robots, diameter=3.0, horizon=50)
+    return make_problem("circle", num_robots=num_robots, diameter=3.0, horizon=50, num_obstacles=num_obstacles)
 
 
 def planner_settings() -> list[Any]:
@@ -121,8 +129,9 @@ def base_settings(name: str, setting: str) -> dict[str, Any]:
 
 def outcomes(name: str, settings: dict[str, Any]) -> Generator[Any]:
     """What each iteration of a solve gives and says, but for its time, and at last who worked on it."""
-    # The first plan of four robots that are guided is hard to make better.
-    search = Search(make_planner(name, **settings), crossing(8 if name == "guided" else 4), 1)
+    # The first plan of four robots that are guided is hard to make better, and the first batch holds one for them.
+    crowd = {"guided": (8,), "mmd": (8, 2)}.get(name, (4,))
+    search = Search(make_planner(name, **settings), crossing(*crowd), 1)
     try:
         for _ in range(settings["max_iterations"]):
             record = search.advance()

@@ -50,18 +50,24 @@ class Scene(NamedTuple):
 
 
 OBSTACLE, NOT_SOLID = -1, -2
+LEAST_RADIUS = 1e-3
+"""Of a robot [m]: MuJoCo divides by masses."""
 
 
 def check_problem(problem: Problem) -> None:
     """Refuse what has no bodies here.
 
     Raises:
-        ValueError: For a problem in space, or a robot whose model has none.
+        ValueError: For a robot whose model has none, as in space, or which is too small for one.
     """
     for robot, name in enumerate(problem.team.models):
         if name not in PUCKS + DRIVES:
             raise ValueError(
                 f"robot_{robot} is a {name}, which has no body in MuJoCo; use one of {', '.join(PUCKS + DRIVES)}"
+            )
+        if problem.team.radius[robot] < LEAST_RADIUS:
+            raise ValueError(
+                f"radius of robot_{robot} is {problem.team.radius[robot]:g}; bodies in MuJoCo need {LEAST_RADIUS:g} m"
             )
 
 
@@ -73,6 +79,9 @@ def build_scene(problem: Problem, physics: Physics, body_radius: FloatArray, ste
         physics: What bodies are made of.
         body_radius: ``(N,)`` of bodies that are no robots and move as they like [m].
         step: Of MuJoCo [s].
+
+    Raises:
+        ValueError: If MuJoCo cannot make bodies of the obstacles.
     """
     spec = mujoco.MjSpec()
     spec.option.timestep = step
@@ -94,7 +103,12 @@ def build_scene(problem: Problem, physics: Physics, body_radius: FloatArray, ste
     for robot, name in enumerate(problem.team.models):
         add = _add_puck if name in PUCKS else _add_drive
         add(spec, robot, float(radius[robot]), top, physics)
-    return _addresses(spec.compile(), problem, physics)
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"MuJoCo makes no bodies of problem {problem.name!r}: {reason}") from error
+    return _addresses(model, problem, physics)
 
 
 def _addresses(model: mujoco.MjModel, problem: Problem, physics: Physics) -> Scene:

@@ -17,6 +17,9 @@ import numpy as np
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS, compiled
 
+MOST_PENALTY = 5e7
+"""What the weight of the constraints grows to at most, as in the authors' code: it would overflow in the end."""
+
 
 class Method(NamedTuple):
     """Weights and limits of the alternation, with its basis.
@@ -128,7 +131,7 @@ def alternate(method: Any, bodies: Any, robot: Any, limits: Any, goal: Any, fixe
                 for j in range(size):
                     now += squares[i, j] * motion[j, axis]
                 multiplier[i, axis] -= penalty * (now - right[i, axis])
-        penalty *= method.growth
+        penalty = min(penalty * method.growth, MOST_PENALTY)
     return violation
 
 

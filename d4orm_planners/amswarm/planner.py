@@ -31,8 +31,7 @@ class AMSwarmConfig(PlannerConfig):
         goal_weight: Weight of their squared distances from it.
         smoothness: Weight of the squared jerk.
         barrier: Share of its distance to a body's reach that a robot may use up in a step; 1 allows all of it.
-        lookout: Bodies are minded that are predicted to come this near to the reach [m]; ``None`` minds all, as in the
-            publication.
+        lookout: Bodies are minded that are predicted to come this near to the reach [m]; ``None`` minds all.
         clearance: Added to every distance to keep, for what is driven between the steps [m].
         perturbation: What every guess is moved by at most, so that symmetric teams do not block themselves [m].
         penalty: First weight of the constraints.
@@ -69,7 +68,22 @@ class AMSwarm(Planner):
 
     name: ClassVar[str] = "amswarm"
     config_class = AMSwarmConfig
-    presets: ClassVar = {"paper": {"lookout": None}}
+    presets: ClassVar = {
+        # The authors' code (utiasDSL/AMSwarm, config_am_swarm.yaml), but for the smoothness, which is of snap there.
+        "paper": {
+            "lookahead": 30,
+            "goal_steps": 15,
+            "goal_weight": 7000.0,
+            "smoothness": 0.7,
+            "barrier": 1.0,
+            "lookout": 0.2,
+            "clearance": 0.06,
+            "penalty": 1.0,
+            "growth": 1.3,
+            "alternations": 3000,
+            "tolerance": 0.01,
+        }
+    }
     config: AMSwarmConfig
 
     def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:

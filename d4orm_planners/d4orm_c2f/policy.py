@@ -138,13 +138,15 @@ class D4ormC2F(StatePolicy):
         # A late loop may still be reading the plan.
         self._plan = self._plan.copy()
         self._plan[now:, touching] = self._window.stop(joint, docked)[: len(self._plan) - now, touching]
-        controls = np.where(touching[:, None], self._plan[now], controls)
+        # Now they are told all that they may be able to do, whatever they are believed to be.
+        braking = track_velocities(self.problem, joint.states, np.zeros_like(joint.goals))
+        controls = np.where(touching[:, None], braking, controls)
         ahead = self._engine.step(problem.resumed_at(joint.states, joint.goals).arrays, joint.states, docked, controls)
         wanted = present_velocities(problem, ahead.states, ahead.controls)
         # Other velocities are reached by the next step, by which everybody will be elsewhere.
         safe = safe_velocities(problem, joint._replace(states=ahead.states), wanted, ~docked, gap)
         evading = np.abs(safe - wanted).max(axis=1) > NEARLY
-        return np.where(evading[:, None], track_velocities(problem, joint.states, safe), controls)
+        return np.where(evading[:, None], track_velocities(self.problem, joint.states, safe), controls)
 
     def _loop(self, joint: JointState) -> None:
         """One control loop (Algorithm 4, lines 6 to 9)."""

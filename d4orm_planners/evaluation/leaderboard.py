@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeAlias
 
-from d4orm_planners.evaluation.report import deadline_table, errors, panels, rate_table, share, table
+from d4orm_planners.evaluation.report import deadline_table, errors, in_physics, panels, rate_table, share, table
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_by, success_rates
 
@@ -49,25 +49,26 @@ def leaderboard(trials: Sequence[Trial], deadlines: Sequence[float] = ()) -> str
     return "\n\n".join([*blocks, *errors((rate.label, rate.error) for rate in rates), origin(trials)]) + "\n"
 
 
-Key: TypeAlias = tuple[str, str, int, str, float, str]
+Key: TypeAlias = tuple[str, str, int, str, str, float, str]
 
 
 def _groups(trials: Sequence[Trial]) -> dict[Key, list[Trial]]:
-    """Trials by label, scenario, team size, models, noise and disturbances, in the order of all but the label."""
+    """Trials by label, scenario, team, physics, noise and disturbances, in the order of all but the label."""
     labels = _labels(trials)
     groups: dict[Key, list[Trial]] = {}
     for trial in trials:
         label = labels[trial.label, trial.config]
-        key = (label, trial.scenario, trial.num_robots, trial.model, trial.control_noise_std, told(trial))
-        groups.setdefault(key, []).append(trial)
+        where = (trial.scenario, trial.num_robots, trial.model, trial.physics)
+        groups.setdefault((label, *where, trial.control_noise_std, told(trial.disturbances)), []).append(trial)
     return {key: groups[key] for key in sorted(groups, key=lambda key: (*key[1:], key[0]))}
 
 
-def told(trial: Trial) -> str:
-    """Disturbances and another physics, in words: ``"push rate=0.2, speed=0.5; delay steps=2; in mujoco"``."""
-    listed = json.loads(trial.disturbances)
-    words = [f"{name} " + ", ".join(f"{key}={value}" for key, value in values.items()) for name, values in listed]
-    return "; ".join([*words, *([f"in {trial.physics}"] if trial.physics != "model" else [])])
+def told(disturbances: str) -> str:
+    """Disturbances as they are stored, in words: ``"push rate=0.2, speed=0.5; delay steps=2"``."""
+    listed = json.loads(disturbances)
+    return "; ".join(
+        f"{name} " + ", ".join(f"{key}={value}" for key, value in values.items()) for name, values in listed
+    )
 
 
 def _condition(rate: SuccessRate) -> tuple[float, str]:
@@ -113,8 +114,9 @@ def _matrices(rates: Sequence[SuccessRate]) -> list[str]:
 
 def _deadlines(groups: Mapping[Key, Sequence[Trial]], deadlines: Sequence[float]) -> list[str]:
     blocks: dict[str, list[tuple[str, Sequence[Trial]]]] = {}
-    for (label, scenario, robots, model, noise, disturbance), group in groups.items():
-        title = f"{scenario}, {robots} robots, {model}, noise {noise:g}{disturbance and ', '}{disturbance}"
+    for (label, scenario, robots, model, physics, noise, disturbance), group in groups.items():
+        where = f"{scenario}, {robots} robots, {model}{in_physics(physics)}"
+        title = f"{where}, noise {noise:g}{disturbance and ', '}{disturbance}"
         blocks.setdefault(title, []).append((label, group))
     return [
         deadline_table(title, [(label, [success_by(group, limit) for limit in deadlines]) for label, group in lines])

@@ -199,11 +199,17 @@ def deadline_table(title: str, rows: Iterable[tuple[str, Sequence[SuccessWithin]
 
 
 def panels(rates: Iterable[SuccessRate]) -> dict[str, list[SuccessRate]]:
-    """Rates by scenario, team size and models, as titles, in order of appearance."""
+    """Rates by scenario, team size, models and physics, as titles, in order of appearance."""
     groups: dict[str, list[SuccessRate]] = {}
     for rate in rates:
-        groups.setdefault(f"{rate.scenario}, {rate.num_robots} robots, {rate.model}", []).append(rate)
+        title = f"{rate.scenario}, {rate.num_robots} robots, {rate.model}{in_physics(rate.physics)}"
+        groups.setdefault(title, []).append(rate)
     return groups
+
+
+def in_physics(physics: str) -> str:
+    """What moved the robots, to put behind a title; nothing for what planners believe in."""
+    return "" if physics == "model" else f", in {physics}"
 
 
 def errors(found: Iterable[tuple[str, str]]) -> list[str]:

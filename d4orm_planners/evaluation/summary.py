@@ -42,6 +42,7 @@ class Compared:
         control_noise_std: Standard deviation of the execution noise, in the controls' units.
         disturbance: What else went wrong, such as ``"push.speed"``; empty for nothing.
         level: How much of it.
+        physics: What moved the robots, one of :data:`d4orm_planners.episode.PHYSICS`.
         trials: Trials, those with an error included.
         successes: Those that succeeded.
         lower: Lower end of the 95% confidence interval of the success rate (Wilson).
@@ -58,6 +59,7 @@ class Compared:
     control_noise_std: float
     disturbance: str = ""
     level: float | None = None
+    physics: str = "model"
     trials: int
     successes: int
     lower: float
@@ -74,7 +76,7 @@ class Compared:
         """What the trials, at least one, have in common, so many of which succeeded."""
         first, errors = trials[0], [trial.error for trial in trials if trial.error]
         lower, upper = wilson_interval(successes, len(trials))
-        same = ("policy", "scenario", "num_robots", "model", "control_noise_std")
+        same = ("policy", "scenario", "num_robots", "model", "control_noise_std", "physics")
         return Compared(
             label=label,
             **{name: getattr(first, name) for name in same},

@@ -118,6 +118,9 @@ class Planning:
         denoiser: What denoises motions.
         frames: Of the robots.
         space: The world.
+
+    Attributes:
+        steps: Denoising steps so far.
     """
 
     def __init__(

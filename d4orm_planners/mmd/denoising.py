@@ -43,7 +43,7 @@ class Denoiser:
     Args:
         problem: The team.
         config: The method's settings.
-        should_stop: Asked between denoising steps whether to leave the motions as the network takes them to be.
+        should_stop: Asked between denoising steps whether to leave motions as noisy as they are.
     """
 
     def __init__(self, problem: Problem, config: MMDConfig, should_stop: Callable[[], bool]) -> None:

@@ -56,7 +56,7 @@ class MMDConfig(PlannerConfig):
     constraint_radius: Stretch = 1.2
     clearance: NotNegative = 0.03
     quickest: Stretch = 1.1
-    slowest: Stretch = 2.0
+    slowest: Stretch = 3.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -108,7 +108,7 @@ class MMD(Planner):
             unlucky = int(failed[0]) if len(failed) else search.iteration % problem.num_robots
             added = planning.children(state.nodes[0], state.made, _seeds(search, 2), unlucky)
         best = min(added)
-        note = f"{best.conflicts} conflicts, {len(best.constraints)} robots, {state.made + len(added)} nodes"
+        note = f"{best.conflicts} conflicts, {state.made + len(added)} nodes"
         return state.with_nodes(added), Iteration(best.controls, planning.steps, note=note)
 
 
@@ -122,7 +122,8 @@ def _begin(search: Search) -> Tree | NoWays:
         problem.check_reachable()
     except ValueError as error:
         return NoWays(str(error))
-    turns = generator(search.seed, Stream.SAMPLES, 0, 0).uniform(-1, 1, (problem.num_robots, 3))
+    # The first numbers are the robots'.
+    turns = generator(search.seed, Stream.SAMPLES, 0, problem.num_robots).uniform(-1, 1, (problem.num_robots, 3))
     frames = [make_frame(problem, robot, space, turn) for robot, turn in enumerate(turns)]
     return Tree(tuple(frame for frame in frames if frame is not None), space, (), 0)
 

@@ -89,7 +89,7 @@ def train(
         schedule.step()
         if step >= steps // 2:
             average.update_parameters(network)
-        if step % 500 == 0:
+        if step % 100 == 0:
             progress(step, float(loss.detach()))
     network.load_state_dict(average.module.state_dict())
     return _weights(network, deviation, mean, spread)
@@ -116,8 +116,8 @@ def save_prior(prior: Prior, path: Path) -> None:
 def main() -> None:
     """Draw examples, train and write the weights."""
     parser = argparse.ArgumentParser(description="Train MMD's diffusion model on plans of single robots.")
-    parser.add_argument("--examples", type=int, default=4000, help="two per plan")
-    parser.add_argument("--steps", type=int, default=15_000, help="minibatches")
+    parser.add_argument("--examples", type=int, default=3772, help="two per plan")
+    parser.add_argument("--steps", type=int, default=6000, help="minibatches")
     parser.add_argument("--seed", type=int, default=100_000, help="of maps, plans and training")
     parser.add_argument("--out", type=Path, default=Path("weights.npz"), help="file to write")
     given = parser.parse_args()
@@ -127,7 +127,8 @@ def main() -> None:
             print(f"{done} examples", flush=True)  # noqa: T201
 
     def trained(step: int, loss: float) -> None:
-        print(f"step {step}: loss {loss:.3f}", flush=True)  # noqa: T201
+        if step % 500 == 0:
+            print(f"step {step}: loss {loss:.3f}", flush=True)  # noqa: T201
 
     prior = train(draw_examples(given.examples, given.seed, drawn), given.steps, given.seed, progress=trained)
     save_prior(prior, given.out)

@@ -48,6 +48,7 @@ CASES = {
     "in space": Case("d4orm", {}, "sphere", {"num_robots": 8}),
     "among walls": Case("d4orm-d", {"improve": True}, "rooms", {"num_robots": 8}, 3),
     "amswarm": Case("amswarm", {}, "amswarm_3", {}, 1),
+    "mmd": Case("mmd", {"improve": True}, "rooms", {"num_robots": 5}, 4),
     "through a corridor": Case("guided", {"improve": True}, "corridor", {"num_robots": 6}, 2),
 }
 
