@@ -61,6 +61,19 @@ def parse_levels(texts: list[str] | None) -> dict[str, list[Any]] | None:
     return levels
 
 
+def single_levels(texts: list[str] | None) -> dict[str, Any]:
+    """The same where every name has one level.
+
+    Raises:
+        ValueError: As :func:`parse_levels`; also if a name has several.
+    """
+    levels = parse_levels(texts) or {}
+    for name, values in levels.items():
+        if len(values) != 1:
+            raise ValueError(f"--disturb {name}: an episode has one level, not {len(values)}; use d4orm evaluate")
+    return {name: values[0] for name, values in levels.items()}
+
+
 def refuse_options(context: typer.Context, options: Iterable[str], reason: str) -> None:
     """Refuse what was given on the command line although it would count for nothing.
 
@@ -107,6 +120,23 @@ def decimals(option: str, text: str) -> tuple[float, ...]:
         return tuple(float(number) for number in text.split(","))
     except ValueError:
         raise ValueError(f"{option} {text!r} is not a list of numbers, as 0,0.05,0.1") from None
+
+
+def seed_list(text: str) -> list[int]:
+    """Seeds of ``--seeds``: how many, a range or a list.
+
+    Raises:
+        ValueError: If it is something else, or asks for too many.
+    """
+    try:
+        if "," in text:
+            return [int(number) for number in text.split(",")]
+        first, last = (int(number) for number in text.split("-")) if "-" in text.strip()[1:] else (0, int(text) - 1)
+    except ValueError:
+        raise ValueError(f"--seeds {text!r} is neither a number, as 50, nor a range, as 10-19, nor a list") from None
+    if last - first >= MOST_SEEDS:
+        raise ValueError(f"--seeds {text!r} asks for more than {MOST_SEEDS} seeds; give fewer")
+    return list(range(first, last + 1))
 
 
 def make_folder(folder: Path) -> None:
