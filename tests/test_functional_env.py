@@ -33,13 +33,13 @@ def apart(problem: Problem) -> Problem:
 TRIANGLES = World(
     2, polygons=[[[-0.5, 1], [0.5, 1], [0, 1.6]], [[1, -1], [2, -1], [2, -0.5]]], lower=[-4, -4], upper=[4, 4]
 )
-EVERY_MODEL = ("velocity2d", "unicycle", "car", "differential_drive", "holonomic2d")
+EVERY_MODEL = ("velocity2d", "unicycle", "car", "holonomic2d")
 
 
 def every_model() -> Problem:
     team = Team(EVERY_MODEL)
-    start = np.zeros((5, team.state_size), np.float32)
-    start[:, :2] = np.random.default_rng(2).uniform(-2, 2, (5, 2))
+    start = np.zeros((4, team.state_size), np.float32)
+    start[:, :2] = np.random.default_rng(2).uniform(-2, 2, (4, 2))
     return Problem(team, start, start[::-1, :2] + np.array([0.3, 0.1]), arrival="stay")
 
 
@@ -168,9 +168,13 @@ def test_who_has_arrived_is_done_and_a_contact_spoils_it() -> None:
 def test_noise_is_drawn_from_the_key() -> None:
     quiet, noisy = FunctionalEnv("circle", 2), FunctionalEnv("circle", 2, disturbances=[ControlNoise(0.3)])
     state, _ = quiet.reset(KEY)
-    moves = [noisy.step(key, state, jnp.zeros((2, 2)))[0].team.controls for key in jax.random.split(KEY, 400)[:400:8]]
-    assert 0.2 < float(jnp.std(jnp.stack(moves))) < 0.4
-    assert not np.asarray(quiet.step(KEY, state, jnp.zeros((2, 2)))[0].team.controls).any()
+    keys = jax.random.split(KEY, 50)
+
+    def executed(env: FunctionalEnv) -> Any:
+        return jax.jit(jax.vmap(lambda key: env.step(key, state, jnp.zeros((2, 2)))[0].team.controls))(keys)
+
+    assert 0.2 < float(jnp.std(executed(noisy))) < 0.4
+    assert not np.asarray(executed(quiet)).any()
 
 
 @pytest.mark.parametrize(
