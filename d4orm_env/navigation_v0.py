@@ -61,7 +61,7 @@ class parallel_env(EnvironmentShell, ParallelEnv[str, FloatArray, FloatArray]):
         self._control_size = self.problem.control_size
         self._make_spaces()
         self._np_random: np.random.Generator | None = None
-        self.turn_taker: _TurnByTurn | None = None
+        self.turn_taker: TurnByTurn | None = None
 
     def _make_spaces(self) -> None:
         layout = self._simulation.layout
@@ -144,8 +144,10 @@ class parallel_env(EnvironmentShell, ParallelEnv[str, FloatArray, FloatArray]):
         if not acting:
             return {}, {}, {}, {}, {}
         robots = [self._robots[agent] for agent in acting]
-        controls = np.zeros((len(self.possible_agents), self._control_size), np.float32)
-        controls[robots] = self._collect(actions)
+        controls = self._collect(actions)
+        if len(robots) < len(self.possible_agents):
+            acted, controls = controls, np.zeros((len(self.possible_agents), self._control_size), np.float32)
+            controls[robots] = acted
         step = simulation.step(controls)
         observations, rewards, finished = step.observations, step.rewards.tolist(), simulation.finished.tolist()
         terminations = {agent: finished[robot] for agent, robot in zip(acting, robots)}
@@ -234,7 +236,7 @@ class parallel_env(EnvironmentShell, ParallelEnv[str, FloatArray, FloatArray]):
         return ""
 
 
-class _TurnByTurn(parallel_to_aec_wrapper):
+class TurnByTurn(parallel_to_aec_wrapper):
     """PettingZoo's conversion, with a bad action refused when it is given, and by the name of who gave it."""
 
     def __init__(self, environment: parallel_env) -> None:
@@ -261,7 +263,7 @@ def raw_env(
     scenario: ScenarioLike | None = None, num_robots: int | None = None, **options: object
 ) -> AECEnv[str, FloatArray, FloatArray | None]:
     """The robots act in turn and move together when the last has chosen; arguments of :class:`parallel_env`."""
-    return _TurnByTurn(parallel_env(scenario, num_robots, **options))
+    return TurnByTurn(parallel_env(scenario, num_robots, **options))
 
 
 def env(

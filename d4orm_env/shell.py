@@ -18,9 +18,16 @@ class EnvironmentShell:
 
     def _begin(self, options: EnvOptions) -> None:
         self.render_mode = options.render_mode
-        self._viewer = Viewer(options.render_mode)
-        self._simulation = Simulation(options)
+        self._viewer = self._make_viewer(options)
+        self._simulation = self._make_simulation(options)
         self.metadata = type(self).metadata | {"render_fps": max(1, round(1 / self.problem.dt))}
+
+    def _make_simulation(self, options: EnvOptions) -> Simulation:
+        """What the environment runs; one with another physics overrides it."""
+        return Simulation(options)
+
+    def _make_viewer(self, options: EnvOptions) -> Viewer:
+        return Viewer(options.render_mode)
 
     @property
     def problem(self) -> Problem:

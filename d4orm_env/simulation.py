@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, frozen_array, whole_number
 from d4orm_env.core.marks import Marks
-from d4orm_env.core.observation_layout import ObservationLayout
+from d4orm_env.core.observation_layout import ObservationLayout, Spare
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.problem_arrays import inverse_initial_distance
+from d4orm_env.core.problem_arrays import ProblemArrays, inverse_initial_distance
 from d4orm_env.disturbances.disturbance import Effect, Scene, Seen
 from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
 from d4orm_env.disturbances.marks import marks_of
@@ -61,7 +61,7 @@ class Simulation:
         self.problem = problem
         self.max_cycles = checked_cycles(problem.horizon if options.max_cycles is None else options.max_cycles)
         self.disturbances = options.disturbances_of(problem)
-        self._spare = total_spare(self.disturbances, problem)
+        self._spare = self._spare_of(problem)
         self.lifelong = options.lifelong
         self.reward = find_reward(options.reward)
         self.layout = ObservationLayout.for_problem(
@@ -193,7 +193,7 @@ class Simulation:
         if self.lifelong:
             # A goal radius that nothing is within: a robot under way to its next goal neither docks nor stops.
             arrays = arrays._replace(squared_goal_radius=np.float32(-1))
-        result = self._met(self._engine.step(arrays, states, self.arrived, controls))
+        result = self._met(self._move(arrays, states, controls))
         if self.lifelong:
             arrived = reached_goals(self.problem, self.arrays.goal, result.states, result.controls)
         else:
@@ -207,6 +207,14 @@ class Simulation:
             self._assign_goals(np.flatnonzero(arrived))
         self.record.add(rewards, arrived, result.collided, result.margin_violated)
         return self._report(rewards, arrived, result.margin_violated)
+
+    def _spare_of(self, problem: Problem) -> Spare:
+        """Room beyond the limits of the robots that the spaces need."""
+        return total_spare(self.disturbances, problem)
+
+    def _move(self, arrays: ProblemArrays, states: FloatArray, controls: FloatArray) -> StepResult:
+        """One step of the bodies, which another physics overrides; arguments as of the engine's step."""
+        return self._engine.step(arrays, states, self.arrived, controls)
 
     def set_state(self, states: ArrayLike) -> TeamStep:
         """Put the robots elsewhere in the middle of an episode; all else stays as it is.
@@ -329,7 +337,7 @@ class Simulation:
     def _distances(self, states: FloatArray) -> FloatArray:
         """``(K,)`` to the present goals [m]."""
         offsets = self.arrays.goal - states[:, : self._dimension]
-        distances: FloatArray = np.sqrt((offsets * offsets).sum(axis=1))
+        distances: FloatArray = np.sqrt(np.add.reduce(offsets * offsets, axis=1))
         return distances
 
     def _report(self, rewards: FloatArray, arrived: BoolArray, margin_violated: BoolArray) -> TeamStep:
@@ -339,18 +347,15 @@ class Simulation:
 
     def _observe(self) -> FloatArray:
         """``(K, D)`` what the robots see, or believe to see."""
-        layout, states = self.layout, self.states
+        layout = self.layout
         time_left = max(0.0, 1.0 - self.steps / self.max_cycles)
-        if self._disturbed is None or not self._disturbed.alters_sight:
-            observations = self._engine.observe(self.arrays, layout, states, self.controls, self.arrived, time_left)
-        else:
-            self._seen = seen = self._disturbed.see(self._scene())
-            states = seen.states[0]
-            goal, left = self.arrays.goal[None].copy(), np.array([time_left], np.float32)
-            parts = (np.array(seen.states), np.array(seen.controls), self.arrived[None].copy(), np.array(seen.bodies))
-            sight = Sight(goal, *parts, left)
-            observations = np.empty((len(states), layout.size), np.float32)
-            self._engine.observe_worlds(self.arrays, layout, sight, observations[None])
+        states, controls, bodies = self.states, self.controls, None
+        if self._disturbed is not None and self._disturbed.alters_sight:
+            self._seen = self._disturbed.see(self._scene())
+            states, controls, bodies = (part[0] for part in self._seen)
+        sight = Sight.of_team(self.arrays.goal, states, controls, self.arrived, time_left, bodies)
+        observations: FloatArray = np.empty((len(self.states), layout.size), np.float32)
+        self._engine.observe_worlds(self.arrays, layout, sight, observations[None])
         if layout.observed_way:
             observe_ways(observations, layout, self.problem.ways, states[:, : self._dimension])
         return observations if self._disturbed is None else self._disturbed.observe(observations[None], layout)[0]

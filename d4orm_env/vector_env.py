@@ -315,7 +315,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             one = slice(row, row + 1)
             self._engine.observe_worlds(self._arrays[world], layout, sight.of(one), seen[one])
         if layout.observed_way:
-            self._observe_ways(worlds, sight.states, seen)
+            self._observe_ways(worlds, sight.state, seen)
         seen = self._disturbances.observe(seen, layout)
         if seen is not out:
             out[worlds] = seen

@@ -26,7 +26,7 @@ class Candidate:
         controls: ``(H, K, m)`` as executed: inside the limits, zero once docked.
         trajectory: Their rollout.
         solved: Whether everyone arrives, the margin is kept at every step, and :func:`d4orm_env.verify` agrees.
-        failed: ``(K,)`` robots that do not arrive, or violate the margin at some step.
+        failed: ``(K,)`` robots that do not arrive, or violate the margin at some step that was checked.
     """
 
     planned: FloatArray
@@ -46,13 +46,13 @@ class Candidate:
         return (True, 0, self.reward) if self.solved else (False, -int(self.failed.sum()), self.reward)
 
 
-def evaluate_controls(engine: Engine, problem: Problem, controls: FloatArray) -> Candidate:
-    """Roll controls ``(H, K, m)`` out and judge them."""
+def evaluate_controls(engine: Engine, problem: Problem, controls: FloatArray, check_interval: int = 1) -> Candidate:
+    """Roll controls ``(H, K, m)`` out and judge them: who fails by every so-manyth step, the solution by all."""
     reach = PLAN_REACH * problem.team.control_limits
     bounded = np.clip(controls, -reach, reach)
     trajectory = engine.rollout(problem, bounded)
     docked = trajectory.arrived[:-1, :, None] & problem.docks
     planned = np.where(docked, np.float32(0), bounded)
-    failed = failed_robots(trajectory)
-    solved = not failed.any() and verify(problem, trajectory.controls).ok
+    failed = failed_robots(trajectory, check_interval)
+    solved = not failed_robots(trajectory).any() and verify(problem, trajectory.controls).ok
     return Candidate(planned, trajectory.controls, trajectory, solved, failed)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, whole_number
+from d4orm_env import navigation_v0
+from d4orm_env.core.arrays import BoolArray, FloatArray, shown, whole_number
 from d4orm_env.core.marks import Marks
 from d4orm_env.core.metrics import mean_squared_jerk, mean_stretch
 from d4orm_env.core.problem import Problem
@@ -22,6 +23,9 @@ from d4orm_planners.shown import Shown
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
+
+PHYSICS = ("model", "mujoco")
+"""What moves robots: the equations that planners know, or rigid bodies in MuJoCo."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -65,6 +69,41 @@ class Episode(Shown):
         In lifelong mode, where goals change, it means nothing.
         """
         return mean_stretch(self.problem, self.trajectory)
+
+
+def check_physics(problem: Problem, physics: str) -> None:
+    """Refuse what is no physics, or none for a problem.
+
+    Raises:
+        ValueError: If it is not one of :data:`PHYSICS`, or robots have no bodies in it.
+        ImportError: If it needs a library that is not installed.
+    """
+    if physics not in PHYSICS:
+        raise ValueError(f"physics is {shown(physics)}; choose one of {', '.join(PHYSICS)}")
+    if physics == "mujoco":
+        from d4orm_env.mujoco import check_problem
+
+        check_problem(problem)
+
+
+def open_env(problem: Problem, physics: str = "model", **options: Any) -> ParallelEnv:
+    """An environment of a problem.
+
+    Args:
+        problem: The problem.
+        physics: What moves the robots, one of :data:`PHYSICS`.
+        **options: Further arguments of :class:`d4orm_env.navigation_v0.parallel_env`.
+
+    Raises:
+        ValueError: As :func:`check_physics`, or for a bad argument.
+        ImportError: If the physics needs a library that is not installed.
+    """
+    check_physics(problem, physics)
+    if physics == "mujoco":
+        from d4orm_env import mujoco
+
+        return mujoco.parallel_env(problem=problem, **options)
+    return navigation_v0.parallel_env(problem=problem, **options)
 
 
 def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0) -> Episode:

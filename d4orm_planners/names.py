@@ -78,6 +78,7 @@ for _name, _path in {
     "ipopt": "ipopt:Ipopt",
     "guided": "guidance.planner:Guided",
     "amswarm": "amswarm.planner:AMSwarm",
+    "mmd": "mmd.planner:MMD",
 }.items():
     register_planner(_name, f"d4orm_planners.{_path}")
 

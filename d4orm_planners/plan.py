@@ -237,12 +237,13 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     return Plan.load(path)
 
 
-def failed_robots(trajectory: Trajectory) -> BoolArray:
-    """``(K,)`` who does not arrive, or violates the margin at some step.
+def failed_robots(trajectory: Trajectory, check_interval: int = 1) -> BoolArray:
+    """``(K,)`` who does not arrive, or violates the margin at some ``check_interval``-th step.
 
     The start itself cannot be planned away, so it does not count.
     """
-    failed: BoolArray = ~trajectory.arrived[-1] | trajectory.margin_violated[1:].any(axis=0)
+    violated = trajectory.margin_violated[check_interval::check_interval]
+    failed: BoolArray = ~trajectory.arrived[-1] | violated.any(axis=0)
     return failed
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, ClassVar
 
@@ -36,9 +36,11 @@ class Policy(ABC):
         problem: Problem of the present episode, from the reset on.
         config_class: :class:`~d4orm_planners.settings.CheckedSettings` of the policy, of which the constructor then
             takes an instance. Without one, settings are keyword arguments of the constructor.
+        presets: By name, settings of ``config_class`` for :func:`~d4orm_planners.make_policy`.
     """
 
     config_class: ClassVar[type[CheckedSettings] | None] = None
+    presets: ClassVar[Mapping[str, Mapping[str, object]]] = {}
     problem: Problem
 
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from typing import Any, TypeAlias, TypeGuard
+from typing import Any, TypeAlias, TypeGuard, TypeVar
 
 from d4orm_env.core.arrays import duration, shown
 from d4orm_env.core.errors import UnknownKeywordError
@@ -13,10 +13,15 @@ from d4orm_planners.names import PLANNERS, POLICIES, is_planner_class
 from d4orm_planners.planner import Planner
 from d4orm_planners.policy import OpenLoop, Policy, RobotFunction, TeamFunction, plain_attributes
 from d4orm_planners.references import source_digest, written
-from d4orm_planners.settings import NOTHING
+from d4orm_planners.settings import NOTHING, CheckedSettings
 
 RECOMMENDED = "d4orm-d"
 """The planner that solves most problems, and soonest."""
+
+Presets: TypeAlias = Mapping[str, Mapping[str, object]]
+"""By name, settings."""
+
+Config = TypeVar("Config", bound=CheckedSettings)
 
 PolicyLike: TypeAlias = str | Policy | Planner | type[object] | Callable[..., object]
 """What :func:`make_policy` takes; other objects with ``reset`` and ``act`` as well."""
@@ -57,12 +62,7 @@ def make_planner(name: str | type[Planner] = RECOMMENDED, *, preset: str | None 
         TypeError: For an unknown setting.
     """
     kind, owner = _planner_class(name), f"planner {_called(name)!r}"
-    if preset is not None and not (isinstance(preset, str) and preset in kind.presets):
-        raise ValueError(f"preset {shown(preset)} of {owner} is unknown; choose one of {', '.join(kind.presets)}")
-    settings = {} if preset is None else kind.presets[preset]
-    known = kind.config_class.setting_names({**settings, **config})
-    applying = {name: value for name, value in settings.items() if name in known}
-    planner = kind(kind.config_class.from_keywords({**applying, **config}, owner))
+    planner = kind(_configured(kind.config_class, kind.presets, preset, config, owner))
     planner.preset = preset
     return planner
 
@@ -76,10 +76,11 @@ def make_policy(name: PolicyLike, **config: Any) -> Policy:
             class of these; a function ``(observations, state) -> actions`` of the team, ``observation -> action`` of
             every robot by itself, or without required positional parameters, which makes a policy.
         **config: For a planner, its settings and ``preset``, and the budget of the solve (``time_limit``,
-            ``max_iterations``); for a policy class, its own settings; for a function that makes one, its keywords.
+            ``max_iterations``); for a policy class, its own settings, and ``preset`` if it has presets; for a function
+            that makes one, its keywords.
 
     Raises:
-        ValueError: For an unknown name, an import path that leads nowhere, something that does not act, or a setting
+        ValueError: For an unknown name or preset, an import path that leads nowhere, something that does not act, or a setting
             that makes no sense.
         TypeError: For an unknown setting.
     """
@@ -91,7 +92,7 @@ def make_policy(name: PolicyLike, **config: Any) -> Policy:
         _refuse_settings(config, owner)
         return _as_policy(kind, owner)
     if (config_class := getattr(kind, "config_class", None)) is not None:
-        return _as_policy(kind(config_class.from_keywords(config, owner)), owner)
+        return _as_policy(kind(_policy_config(kind, config_class, config, owner)), owner)
     _check_keywords(kind, config, owner)
     return _as_policy(kind(**config), owner)
 
@@ -150,7 +151,7 @@ def setting_names(policy: object, given: Mapping[str, object] = NOTHING) -> tupl
     if not makes_policy(kind):
         return ()
     if (config_class := getattr(kind, "config_class", None)) is not None:
-        return tuple(config_class.setting_names(given))
+        return (*config_class.setting_names(given), *(("preset",) if _presets(kind) else ()))
     return tuple(inspect.signature(kind).parameters)
 
 
@@ -187,13 +188,43 @@ def policy_settings(name: object, **config: Any) -> dict[str, object]:
         policy = _as_policy(kind, owner)
         settings = policy.identity() if isinstance(kind, Policy | Planner) else plain_attributes(kind)
     elif (config_class := getattr(kind, "config_class", None)) is not None:
-        settings = config_class.from_keywords(config, owner).keywords()
+        settings = _policy_config(kind, config_class, config, owner).keywords()
     else:
         _check_keywords(kind, config, owner)
         settings = dict(config)
     code = written(kind.planner if isinstance(kind, OpenLoop) and kind.planner is not None else kind)
     foreign = code.__module__.partition(".")[0] != __name__.partition(".")[0]
     return {**settings, "source": source_digest(code)} if foreign else settings
+
+
+def _presets(kind: object) -> Presets:
+    """Of a planner's or policy's class; none where it has none."""
+    presets: Presets = getattr(kind, "presets", {})
+    return presets
+
+
+def _policy_config(kind: object, config_class: type[Config], given: Mapping[str, object], owner: str) -> Config:
+    """A policy's settings; one that has presets may be given one beside them."""
+    config, presets = dict(given), _presets(kind)
+    preset = config.pop("preset", None) if presets else None
+    return _configured(config_class, presets, preset, config, owner)
+
+
+def _configured(
+    config_class: type[Config], presets: Presets, preset: object, config: Mapping[str, object], owner: str
+) -> Config:
+    """Settings as given, on top of those of a preset.
+
+    Raises:
+        ValueError: For an unknown preset, or a setting that makes no sense.
+        TypeError: For an unknown setting.
+    """
+    if preset is not None and not (isinstance(preset, str) and preset in presets):
+        raise ValueError(f"preset {shown(preset)} of {owner} is unknown; choose one of {', '.join(presets)}")
+    settings = NOTHING if preset is None else presets[preset]
+    known = config_class.setting_names({**settings, **config})
+    applying = {name: value for name, value in settings.items() if name in known}
+    return config_class.from_keywords({**applying, **config}, owner)
 
 
 def _planner_class(name: object) -> type[Planner]:

@@ -44,6 +44,8 @@ class Search:
         initial_controls: ``(H, K, m)`` to start from; zeros by default.
         engine: What rolls out and samples, if not the planner's own.
         judge: What makes a candidate of an iteration's controls, if not :func:`evaluate_controls`.
+        check_interval: Only at every so-manyth step is looked who fails (paper, section VI-A); a solution keeps the
+            margin at all steps.
 
     Attributes:
         problem: The problem.
@@ -68,6 +70,7 @@ class Search:
         initial_controls: ArrayLike | None = None,
         engine: Engine | None = None,
         judge: Callable[[FloatArray], Candidate] | None = None,
+        check_interval: int = 1,
     ) -> None:
         self.planner = planner
         self.problem = problem
@@ -85,8 +88,11 @@ class Search:
         with self.watch.paused():
             # The first rollout may compile.
             self.engine.rollout(problem, controls)
-        self.current = self.best = evaluate_controls(self.engine, problem, controls)
-        self._judge = judge or partial(evaluate_controls, self.engine, problem)
+        # A plan of fewer steps is looked at where it ends.
+        self.check_interval = min(check_interval, problem.horizon)
+        evaluate = partial(evaluate_controls, self.engine, problem, check_interval=self.check_interval)
+        self.current = self.best = evaluate(controls)
+        self._judge = judge or evaluate
         self.iteration = 0
         self.denoising_steps = 0
         self.history: list[IterationRecord] = []

@@ -10,12 +10,15 @@ from typing import Any
 import jax
 import numpy as np
 
+from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.robot_model import Ops
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.engine import noise
-from d4orm_env.engine.base import Engine, SamplingRules, SamplingTask, StepResult
+from d4orm_env.engine.base import Engine, SamplingRules, SamplingTask, Sight, StepResult
+from d4orm_env.engine.choice import get_engine
 
 ENGINE_NAMES = ("cpu", "jax")
 MODEL_NAMES = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive")
@@ -32,6 +35,16 @@ NUMPY_BITS = noise.BitOps(
     bits_float=lambda x: np.asarray(x, np.int32).view(np.float32),
     sqrt=np.sqrt,
 )
+
+
+def observe_team(
+    arrays: ProblemArrays, layout: ObservationLayout, states: Any, controls: Any, arrived: Any, time_left: float
+) -> np.ndarray:
+    """``(K, D)`` what the robots of one team see."""
+    out = np.empty((1, len(states), layout.size), np.float32)
+    sight = Sight.of_team(arrays.goal, states, controls, arrived, time_left)
+    get_engine("cpu").observe_worlds(arrays, layout, sight, out)
+    return out[0]
 
 
 def words(*values: int) -> list[np.ndarray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,16 @@ from d4orm_planners.d4orm_c2f.coarse import (
     coarse_problem,
     interpolate,
     nearest_indices,
-    passes_checks,
     rest_of,
     subgoal_indices,
 )
 from d4orm_planners.d4orm_c2f.following import STUCK_AFTER, Patience, follow_slowly, keep_time
 from d4orm_planners.d4orm_c2f.sight import LEAST, within_sight
+from d4orm_planners.d4orm_d.planner import D4ormD
+from d4orm_planners.d4orm_d.settings import D4ormDConfig
+from d4orm_planners.plan import failed_robots
+from d4orm_planners.refinement.team import TeamPaths
+from d4orm_planners.search import Search
 
 
 @pytest.mark.parametrize(
@@ -80,7 +85,29 @@ def trajectory(arrived: Any, violated: Any) -> Trajectory:
     ],
 )
 def test_coarse_plans_are_checked_at_intervals(arrived: bool, violated: list[int], interval: int, passes: bool) -> None:
-    assert passes_checks(trajectory(arrived, violated), interval) is passes
+    assert not failed_robots(trajectory(arrived, violated), interval).any() is passes
+
+
+@pytest.mark.parametrize(("interval", "meets"), [(1, True), (2, True), (3, False), (7, False)])
+def test_who_meets_whom_is_looked_for_at_intervals_too(interval: int, meets: bool) -> None:
+    """Two robots that are near each other at steps 2 and 4 to 5 of ten; the third keeps away."""
+    problem = hop_problem(3, horizon=10)
+    apart = np.array([[0, 0], [0, 5], [0, 10]], np.float32)
+    places = np.repeat(apart[None], 11, axis=0)
+    places[[2, 4, 5], 1] = places[[2, 4, 5], 0] + [0.1, 0]
+    search = Search(D4ormD(D4ormDConfig(engine="cpu")), problem, 0, check_interval=interval)
+    states = np.concatenate([places, np.zeros_like(places)], axis=2)
+    home = np.ones((11, 3), bool)
+    here = search.current.trajectory
+    team = TeamPaths(search, replace(here, states=states, positions=places, arrived=home))
+    faults, first = team.faults(np.arange(3))
+    np.testing.assert_array_equal(faults, [meets, meets, 0])
+    assert team.conflicts() == ((frozenset({1}), frozenset({0}), frozenset()) if meets else (frozenset(),) * 3)
+    if meets:
+        np.testing.assert_array_equal(first[:2], 2)
+    else:
+        team.move([0], here.controls[:, :1], np.roll(states, 1, axis=0)[:, [1]], [True])
+        np.testing.assert_array_equal(team.faults(np.arange(2))[0], [1, 1])
 
 
 def test_nearest_waypoints_are_looked_for_ahead_only() -> None:
@@ -107,7 +134,13 @@ def test_the_rest_begins_at_the_next_coarse_step(index: int, step: int) -> None:
     coarse = coarse_problem(problem, 2)
     controls = np.random.default_rng(1).uniform(-0.5, 0.5, (15, 2, 2)).astype(np.float32)
     plan = get_engine("cpu").rollout(coarse, controls)
-    guidance = Guidance(coarse, plan.controls, plan.states, interpolate(plan.positions, 2))
+    guidance = Guidance(
+        problem=coarse,
+        controls=plan.controls,
+        states=plan.states,
+        path=interpolate(plan.positions, 2),
+        ordered=False,
+    )
     left, rest = rest_of(guidance, index, 2)
     assert left.horizon == len(rest) == 15 - step
     np.testing.assert_array_equal(left.start, plan.states[step])

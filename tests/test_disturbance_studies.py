@@ -14,7 +14,7 @@ from disturbance_support import Wind
 from env_support import line_problem
 from test_robustness import trial
 
-from d4orm_env import navigation_v0
+from d4orm_env import mujoco, navigation_v0
 from d4orm_env.disturbances import Delay, Intruder, LimitMismatch, Push, Stall
 from d4orm_planners import evaluate, run_episode
 from d4orm_planners.evaluation.conditions import Condition, conditions
@@ -116,6 +116,38 @@ def test_trials_are_those_of_the_environment(tmp_path: Path) -> None:
     episode = run_episode(navigation_v0.parallel_env(problem=problem, disturbances=disturbances), "goal", seed=4)
     (row,) = group.trials
     assert (row.travel_time, row.collided) == (episode.metrics["travel_time"], episode.metrics["collided"])
+
+
+def test_the_same_trial_in_another_physics_is_another_one(tmp_path: Path) -> None:
+    problem = line_problem([1.0, 1.5], "differential_drive")
+    for physics in ("model", "mujoco", "mujoco"):
+        evaluate("goal", problem, seeds=[4], workers=1, out=tmp_path, physics=physics)
+    ours, theirs = TrialStore.existing(tmp_path).trials()
+    assert (ours.physics, theirs.physics) == ("model", "mujoco")
+    assert ours.key == theirs.key._replace(physics="model")
+    assert ours.verified
+    assert theirs.verified is None
+    episode = run_episode(mujoco.parallel_env(problem=problem), "goal", seed=4)
+    assert (theirs.travel_time, theirs.reward) == (episode.metrics["travel_time"], episode.metrics["reward"])
+    assert theirs.reward != ours.reward
+    assert "no noise, in mujoco" in leaderboard([ours, theirs])
+
+
+@pytest.mark.parametrize(("physics", "complaint"), [("bullet", "physics is 'bullet'"), ("mujoco", "robot_0 is a car")])
+def test_a_physics_that_cannot_be_is_refused_before_anything_runs(tmp_path: Path, physics: str, complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        evaluate("goal", line_problem([1.0], "car"), out=tmp_path / "out", physics=physics)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_physics_on_the_command_line(tmp_path: Path, d4orm: Call) -> None:
+    options = ["-k", "2", "--physics", "mujoco", "--policy", "goal"]
+    assert d4orm("run", *options, "--model", "differential_drive")[0] in (0, 1)
+    assert d4orm("evaluate", *options, "-n", "1", "-j", "1", "-o", str(tmp_path))[0] == 0
+    assert [trial.physics for trial in TrialStore.existing(tmp_path).trials()] == ["mujoco"]
+    for command in (["run"], ["evaluate", "-o", str(tmp_path)]):
+        status, _, complaint = d4orm(*command, *options[:2], "--policy", "goal", "--physics", "bullet")
+        assert (status, complaint) == (2, "d4orm: physics is 'bullet'; choose one of model, mujoco\n")
 
 
 def test_a_stalled_robot_does_not_spoil_the_trial(tmp_path: Path) -> None:

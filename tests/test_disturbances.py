@@ -671,6 +671,12 @@ def test_disturbances_by_name_and_level() -> None:
     assert disturbance_at("push.speed", 0.5) == Push(speed=0.5)
     assert disturbances_at({"push.speed": 0.5, "delay": 1, "push.rate": 2}) == (Push(2, 0.5), Delay(1))
     assert disturbance_at(f"{Wind.__module__}:Wind.speed", 0.3) == Wind(0.3)
+    assert disturbance_at("push(rate=0.5).speed", 0.2) == Push(0.5, 0.2)
+    assert disturbance_at("stall(duration=inf, robots=1)", 0.5) == Stall(0.5, math.inf, 1)
+    assert disturbance_at(f"{CorrelatedNoise.__module__}:CorrelatedNoise(std=[0.1, 0.2]).time_constant", 2) == (
+        CorrelatedNoise((0.1, 0.2), 2.0)
+    )
+    assert disturbances_at({"stall(robots=1)": 1, "stall.duration": 2}) == (Stall(1.0, 2.0, 1),)
     assert [name_of(one) for one in (Delay(1), Push(1, 1), Wind())] == ["delay", "push", "disturbance_support:Wind"]
     with forgetting(DISTURBANCES):
         register_disturbance("wind", Wind)
@@ -686,11 +692,23 @@ def test_disturbances_by_name_and_level() -> None:
         ("state_noise.velocity_std", "needs position_std too"),
         ("no.such:Wind", "disturbance 'no.such:Wind' cannot be imported"),
         ("math:pi", "disturbance 'math:pi' is 3.14"),
+        ("push(rate=1", r"disturbance 'push\(rate=1' is not of the form push\(rate=0.5\).speed"),
+        ("push(rate=1)speed", "is not of the form"),
+        ("push(rate).speed", "write what is in brackets as name=value"),
+        ("push(rate=[).speed", "what is in brackets is not YAML"),
+        ("push(force=1).speed", "disturbance 'push' has no 'force'"),
+        ("push(speed=1).speed", "gives speed twice"),
+        ("push(rate=-1).speed", "Push rate is -1"),
     ],
 )
 def test_names_that_mean_nothing(text: str, complaint: str) -> None:
     with pytest.raises(ValueError, match=complaint):
         disturbance_at(text, 0.1)
+
+
+def test_an_attribute_is_given_once() -> None:
+    with pytest.raises(ValueError, match=r"disturbance 'push\(rate=2\).speed' gives rate once more"):
+        disturbances_at({"push.rate": 1, "push(rate=2).speed": 1})
 
 
 # What pictures and records of an execution show

@@ -215,7 +215,7 @@ def test_a_way_in_space_and_time_lets_others_pass(fault: str) -> None:
         places[200:, 1] = [3, 3, 0]
     others = Others(places, np.full(2, 0.41))
     bodies = replanning.bodies
-    way = find_way(roadmap, replanning.cells, bodies, bodies.costs[0], others, 0, 0.09, 4, 400)
+    way = find_way(roadmap, replanning.cells, bodies, bodies.costs[0], others, 0, 0.09, 4, 400, -1)
     assert way[0].tolist() == [roadmap.starts[0], 0, 0]
     assert way[-1, 0] == roadmap.goals[0]
     assert (way[1:, 1] >= way[:-1, 2]).all()

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from engine_support import ENGINE_NAMES, PYTHON_OPS, random_controls
+from engine_support import ENGINE_NAMES, PYTHON_OPS, observe_team, random_controls
 from registry_support import forgetting
 
 from d4orm_env import (
@@ -159,7 +159,7 @@ def test_a_registered_model_moves_in_a_mixed_team(engine: str, boat: Model) -> N
     states = rollout(problem, controls, engine=engine).states
     np.testing.assert_allclose(states[-1], [[0.5, -1, 0, 0], [0.5, 2, 1, 0]], atol=1e-6)
     layout = ObservationLayout.for_problem(problem)
-    seen = get_engine("cpu").observe(problem.arrays, layout, states[-1], controls[-1], np.zeros(2, bool), 1.0)
+    seen = observe_team(problem.arrays, layout, states[-1], controls[-1], np.zeros(2, bool), 1.0)
     np.testing.assert_allclose(seen[:, :2], [[0.5, -1], [1, 0]], atol=1e-6)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from engine_support import random_controls
+from engine_support import observe_team, random_controls
 from env_support import mixed_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -37,7 +37,7 @@ def observe(
     states = problem.start if states is None else np.array(states, np.float32)
     controls = np.zeros((problem.num_robots, problem.control_size)) if controls is None else np.array(controls)
     arrived = np.zeros(problem.num_robots, bool) if arrived is None else np.array(arrived)
-    values = ENGINE.observe(problem.arrays, layout, states, controls.astype(np.float32), arrived, time_left)
+    values = observe_team(problem.arrays, layout, states, controls.astype(np.float32), arrived, time_left)
     assert values.dtype == np.float32
     assert values.shape == (problem.num_robots, layout.size)
     assert (layout.low <= values).all()
@@ -278,7 +278,7 @@ def test_the_nearest_obstacles_are_found_from_any_distance(name: str) -> None:
         state = np.zeros_like(problem.start)
         state[:, :d] = random.uniform(-distance, distance, (robots, d))
         seen = [
-            ENGINE.observe(arrays, layout, state, np.zeros((robots, d)), np.zeros(robots, bool), 0.5)
+            observe_team(arrays, layout, state, np.zeros((robots, d)), np.zeros(robots, bool), 0.5)
             for arrays in (problem.arrays, problem.arrays_to_observe(4))
         ]
         np.testing.assert_array_equal(*seen)
@@ -288,7 +288,7 @@ def test_the_plain_function_and_the_compiled_one_agree() -> None:
     problem = mixed_problem().replace(world=World(2, circles=[[5, 5, 1]], boxes=[[-4, -4, -3, -3]]))
     layout = ObservationLayout.for_problem(problem, 3, 3)
     controls = random_controls(problem, 0)[0]
-    compiled = ENGINE.observe(problem.arrays, layout, problem.start, controls, np.zeros(3, bool), 0.5)
+    compiled = observe_team(problem.arrays, layout, problem.start, controls, np.zeros(3, bool), 0.5)
     position = problem.start[:, :2]
     # By hand: the velocity2d robot moves as told, the drive heads along angle 0.5 at rest.
     velocity = np.array([controls[0], [0, 0], problem.start[2, 2:]], np.float32)
@@ -320,7 +320,7 @@ def unclipped(problem: Problem, controls: Any, layout: ObservationLayout, every:
     unbounded = np.full(layout.size, np.inf, np.float32)
     loose = dataclasses.replace(layout, low=-unbounded, high=unbounded)
     return [
-        ENGINE.observe(
+        observe_team(
             problem.arrays, loose, trajectory.states[t + 1], trajectory.controls[t], trajectory.arrived[t + 1],
             1 - (t + 1) / problem.horizon,
         )

@@ -20,12 +20,13 @@ import pytest
 
 from d4orm_env import World, make_problem
 from d4orm_env.core.problem import Problem
-from d4orm_env.render.replay import Replay
+from d4orm_env.disturbances.registry import DISTURBANCES
 from d4orm_env.scenarios.files import scenario_text
 from d4orm_planners.play import edits
 from d4orm_planners.play.frame import closest_approach
 from d4orm_planners.play.gate import Gate
 from d4orm_planners.play.session import Session
+from d4orm_planners.policy import DriveToGoal
 
 PATIENCE = 60.0
 
@@ -135,37 +136,37 @@ def test_obstacles_move(scene: Problem, world: World) -> None:
 
 
 def test_the_clock_runs_pauses_and_steps(session: Session) -> None:
-    until(lambda: session.frame.time > 0.2)
+    until(lambda: session.frame.moment.time > 0.2)
     session.pause(True)
-    until(lambda: session.frame.state == "paused")
+    until(lambda: session.frame.moment.state == "paused")
     before = session.frame
     time.sleep(0.3)
     assert session.frame is before, "pause pauses"
     session.step()
-    until(lambda: session.frame.number > before.number)
-    assert session.frame.time == pytest.approx(before.time + 0.1)
-    assert session.frame.state == "paused"
+    until(lambda: session.frame.moment.number > before.moment.number)
+    assert session.frame.moment.time == pytest.approx(before.moment.time + 0.1)
+    assert session.frame.moment.state == "paused"
 
 
 def test_a_team_goes_on_from_where_it_is(session: Session) -> None:
-    until(lambda: session.frame.time > 0.4)
+    until(lambda: session.frame.moment.time > 0.4)
     session.pause(True)
-    until(lambda: session.frame.state == "paused")
-    states, elapsed = session.frame.states, session.frame.time
+    until(lambda: session.frame.moment.state == "paused")
+    states, elapsed = session.frame.states, session.frame.moment.time
     session.edit(lambda scene: edits.move_goal(scene, 0, [0.7, 0.9]))
     until(lambda: np.allclose(session.frame.goals[0], [0.7, 0.9]))
     np.testing.assert_array_equal(session.frame.states, states)
-    assert session.frame.time == elapsed
+    assert session.frame.moment.time == elapsed
     assert session.frame.replanned >= 0
 
 
 def test_a_change_that_is_refused_leaves_the_scene_and_says_why(session: Session) -> None:
     session.edit(lambda scene: edits.move_goal(scene, 0, scene.goal[1]))
-    until(lambda: session.frame.message)
-    assert "would touch" in session.frame.message
+    until(lambda: session.frame.moment.message)
+    assert "would touch" in session.frame.moment.message
     session.choose("nobody")
-    until(lambda: "nobody" in session.frame.message)
-    assert session.policy == "goal"
+    until(lambda: "nobody" in session.frame.moment.message)
+    assert session.policies == ("goal",)
     assert session.failure is None
 
 
@@ -174,38 +175,38 @@ def test_a_step_that_fails_pauses_and_says_why(session: Session, monkeypatch: py
         raise RuntimeError("no room for a goal")
 
     with monkeypatch.context() as patch:
-        patch.setattr(session._env, "step", fail)
-        until(lambda: session.frame.message)
-    assert session.frame.message == "no room for a goal"
-    assert session.frame.state == "paused"
+        patch.setattr(session._lanes[0]._env, "step", fail)
+        until(lambda: session.frame.moment.message)
+    assert session.frame.moment.message == "no room for a goal"
+    assert session.frame.moment.state == "paused"
     session.pause(False)
-    until(lambda: session.frame.state == "running" and not session.frame.message)
+    until(lambda: session.frame.moment.state == "running" and not session.frame.moment.message)
 
 
 def test_everybody_arrives_and_is_sent_on(session: Session) -> None:
     session.set_speed(50)
-    until(lambda: session.frame.state == "arrived")
+    until(lambda: session.frame.moment.state == "arrived")
     session.edit(lambda scene: edits.move_goal(scene, 0, [0.7, 0.9]))
-    until(lambda: session.frame.state == "running")
-    until(lambda: session.frame.state == "arrived")
+    until(lambda: session.frame.moment.state == "running")
+    until(lambda: session.frame.moment.state == "arrived")
     assert np.linalg.norm(session.frame.states[0, :2] - [0.7, 0.9]) < 0.1
     session.set_lifelong(True)
-    until(lambda: session.frame.state == "running")
+    until(lambda: session.frame.moment.state == "running")
 
 
 def test_what_happened_becomes_a_replay(session: Session) -> None:
-    until(lambda: len(session.recording) > 3)
-    assert "circle, 4 robots by goal" in session.recording.replay(session.policy).html
+    until(lambda: session.recorded_steps > 2)
+    assert "circle, 4 robots by goal" in session.replay().html
     session.edit(edits.remove_robot)
     until(lambda: session.frame.problem.num_robots == 3)
-    assert "circle, 3 robots by goal" in session.recording.replay(session.policy).html
+    assert "circle, 3 robots by goal" in session.replay().html
 
 
 def test_reset_begins_the_scene_anew(session: Session, scene: Problem) -> None:
-    until(lambda: session.frame.time > 0.2)
+    until(lambda: session.frame.moment.time > 0.2)
     session.pause(True)
     session.reset()
-    until(lambda: session.frame.time == 0)
+    until(lambda: session.frame.moment.time == 0)
     np.testing.assert_array_equal(session.frame.states, scene.start)
 
 
@@ -218,35 +219,131 @@ def test_another_scene_is_loaded(session: Session) -> None:
 def test_a_scene_that_the_policy_cannot_drive_in_is_left(session: Session) -> None:
     pytest.importorskip("pyrvo")
     session.choose("orca")
-    until(lambda: session.policy == "orca")
+    until(lambda: session.policies == ("orca",))
     session.load(lambda: make_problem("sphere", num_robots=2))
-    until(lambda: session.frame.message)
-    assert "orca" in session.frame.message
-    moment = session.frame.time
-    until(lambda: session.frame.time > moment + 0.3)
+    until(lambda: session.frame.moment.message)
+    assert "orca" in session.frame.moment.message
+    moment = session.frame.moment.time
+    until(lambda: session.frame.moment.time > moment + 0.3)
     assert session.frame.problem.dimension == 2
 
 
-def test_policies_are_compared_on_the_scene_that_was_loaded(session: Session, scene: Problem) -> None:
-    replays: list[Replay] = []
-    session.edit(lambda scene: edits.move_goal(scene, 0, [0.7, 0.9]))
-    session.compare(("goal", "random"), replays.append)
-    until(lambda: replays)
-    assert [motion.content["title"] for motion in replays[0].motions] == ["goal", "random"]
-    until(lambda: session.frame.state == "running")
+def test_policies_drive_side_by_side_with_the_same_seed(session: Session, scene: Problem) -> None:
+    until(lambda: session.frame.moment.time > 0.3)
+    session.choose("goal", "random")
+    session.reset()
+    until(lambda: len(session.frames) == 2 and session.recorded_steps > 3)
+    session.pause(True)
+    until(lambda: session.frame.moment.state == "paused")
+    first, second = session.frames
+    assert [frame.policy for frame in session.frames] == ["goal", "random"]
+    assert not np.array_equal(first.states, second.states)
+    assert first.moment is second.moment
+    motions = session.replay().motions
+    assert [motion.content["title"].partition(",")[0] for motion in motions] == ["goal", "random"]
+    session.choose("random")
+    until(lambda: len(session.frames) == 1)
+    np.testing.assert_array_equal(session.frame.states, second.states, "and goes on alone")
+    session.choose("random", "goal")
+    session.reset()
+    until(lambda: len(session.frames) == 2 and np.array_equal(session.frame.states, scene.start))
+    np.testing.assert_array_equal(session.frames[1].states, scene.start, "both from the same start")
+
+
+def test_what_is_changed_for_one_is_changed_for_all(session: Session) -> None:
+    session.choose("goal", "random")
+    session.set_speed(5)
+    until(lambda: len(session.frames) == 2 and session.recorded_steps > 25)
+    session.pause(True)
+    until(lambda: session.frame.moment.state == "paused")
+    before = session.frames
+    session.edit(lambda scene: edits.move_goal(scene, 0, [0.7, 0.9]), lane=1)
+    until(lambda: np.allclose(session.frame.goals[0], [0.7, 0.9]))
+    for old, new in zip(before, session.frames, strict=True):
+        np.testing.assert_array_equal(new.states, old.states)
+        assert np.allclose(new.goals[0], [0.7, 0.9])
+    session.edit(lambda scene: edits.add_robot(scene, np.random.default_rng(0)))
+    until(lambda: session.frame.problem.num_robots == 5)
+    assert session.frames[1].problem.team == session.frame.problem.team
+    session.edit(lambda scene: edits.add_obstacle(scene, "box", np.random.default_rng(1)))
+    until(lambda: session.frame.problem.world.num_obstacles == 1)
+    assert session.frames[1].problem.world == session.frame.problem.world
+    occupied = session.frames[1].states[2, :2]
+    session.edit(lambda scene: edits.move_robot(scene, 0, occupied))
+    until(lambda: session.frame.moment.message)
+    assert session.frame.moment.message.startswith("random: the robot of robot_0 would touch")
+
+
+@pytest.mark.parametrize("policies", [(), ("goal", "goal"), ("goal", "nobody")])
+def test_a_choice_that_cannot_be_leaves_who_drives(session: Session, policies: tuple[str, ...]) -> None:
+    session.choose(*policies)
+    until(lambda: session.frame.moment.message)
+    assert session.policies == ("goal",)
+    moment = session.frame.moment.time
+    session.pause(False)
+    until(lambda: session.frame.moment.time > moment)
+
+
+@pytest.mark.parametrize("name", sorted(DISTURBANCES))
+def test_whatever_goes_wrong_goes_wrong_from_the_next_step_on(session: Session, name: str) -> None:
+    level = {"delay": 2, "state_delay": 2, "intruder": 2, "limit_mismatch": 0.5, "occlusion": 1.0}.get(name, 0.3)
+    session.set_speed(20)
+    session.disturb({name: level})
+    until(lambda: session.levels == {name: level})
+    assert session._lanes[0]._env.unwrapped._simulation.disturbances
+    assert len(session.frame.bodies) == (2 if name == "intruder" else 0)
+    moment = session.frame.moment
+    assert not moment.message
+    until(lambda: session.frame.moment.time > moment.time or session.frame.finished)
+    session.disturb({})
+    until(lambda: not session.levels)
+    assert not session._lanes[0]._env.unwrapped._simulation.disturbances
+
+
+def test_the_page_shows_the_truth_and_not_what_the_policy_sees(session: Session) -> None:
+    session.pause(True)
+    until(lambda: session.frame.moment.state == "paused")
+    states = session.frame.states
+    session.disturb({"state_noise": 0.2})
+    until(lambda: session.levels)
+    np.testing.assert_array_equal(session.frame.states, states)
+    np.testing.assert_array_equal(session.scene.start, states)
+
+
+def test_a_level_that_makes_no_sense_is_left(session: Session) -> None:
+    session.disturb({"dropout": 0.5})
+    session.disturb({"dropout": 7.0})
+    until(lambda: session.frame.moment.message)
+    assert session.levels == {"dropout": 0.5}
+
+
+def test_a_slow_planner_holds_nobody_up(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on = threading.Event()
+    monkeypatch.setattr(DriveToGoal, "_begin", lambda *_: go_on.wait(PATIENCE))
+    session.reset()
+    until(lambda: session.frame.moment.state == "planning")
+    begin = time.monotonic()
+    session.set_speed(2)
+    session.disturb({})
+    assert session.replay().html
+    assert session.scene.num_robots == 4
+    assert time.monotonic() - begin < PATIENCE, "nobody waits for the planner"
+    assert session.frame.moment.state == "planning"
+    go_on.set()
+    until(lambda: session.frame.moment.state == "running")
 
 
 def test_a_policy_that_predicts_looks_as_far_as_it_is_told(scene: Problem) -> None:
     session = Session(scene, "d4orm-c2f")
     session.start()
     session.set_horizon(7)
-    until(lambda: session.frame.number > 2)
+    until(lambda: session.frame.moment.number > 2)
     session.choose("goal")
-    until(lambda: session.policy == "goal" and session.frame.guidance is None)
+    until(lambda: session.policies == ("goal",) and session.frame.guidance is None)
     session.set_horizon(0)
     session.choose("d4orm-c2f")
-    until(lambda: session.frame.message)
-    assert "predict_horizon" in session.frame.message
+    until(lambda: session.frame.moment.message)
+    assert "predict_horizon" in session.frame.moment.message
     session.close()
     assert session.failure is None
 

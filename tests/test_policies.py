@@ -11,7 +11,7 @@ import pytest
 from env_support import case_name, scenario_cases
 from planner_support import CHEAP, cheap_planner, hop_problem
 
-from d4orm_env import navigation_v0
+from d4orm_env import mujoco, navigation_v0
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
@@ -41,8 +41,12 @@ def wrapped(**arguments: Any) -> Any:
     return GaussianControlNoise(navigation_v0.parallel_env(**arguments), 0.3)
 
 
+def rigid(**arguments: Any) -> Any:
+    return mujoco.parallel_env(control_noise_std=0.3, **arguments)
+
+
 ENVIRONMENTS = pytest.mark.parametrize(
-    "make_env", [pytest.param(navigation_v0.parallel_env, id="plain"), noisy, wrapped]
+    "make_env", [pytest.param(navigation_v0.parallel_env, id="plain"), noisy, wrapped, rigid]
 )
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from d4orm_env import World, make_problem
 from d4orm_env.engine import proximity
 from d4orm_env.engine.lanes import BLOCK, TILE
-from d4orm_env.engine.proximity import body_boxes, bound_boxes, make_scratch
+from d4orm_env.engine.proximity import bound_boxes, make_bodies, make_scratch
 from d4orm_env.engine.tiles import aligned_zeros
 
 
@@ -20,8 +20,8 @@ def _enclose(radius, margin, dimension, places, scratch):
 
 
 @numba.njit
-def _mark(radius, margin, moving, moving_radius, boxes, first, count, places, scratch):
-    proximity.mark_robots(radius, margin, moving, moving_radius, boxes, first, count, places, scratch)
+def _mark(radius, margin, bodies, first, count, places, scratch):
+    proximity.mark_robots(radius, margin, bodies, first, count, places, scratch)
 
 
 @numba.njit
@@ -68,8 +68,7 @@ def test_whoever_is_within_the_margin_is_flagged_and_nobody_else(
     moving_radius = random.uniform(0.05, 0.3, num_bodies).astype(np.float32)
     scratch, places = make_scratch(num_robots, dimension), places_of(positions)
     _enclose(radius, margin, dimension, places, scratch)
-    boxes = body_boxes(moving, moving_radius, margin)
-    _mark(radius, margin, moving, moving_radius, boxes, first, count, places, scratch)
+    _mark(radius, margin, make_bodies(moving, moving_radius, margin), first, count, places, scratch)
 
     steps = np.minimum(first + np.arange(BLOCK), first + count - 1)
     bodies = moving[steps].astype(np.float64).transpose(1, 0, 2)[:, :, None]

@@ -141,8 +141,9 @@ def test_the_table_is_that_of_the_files_that_are_out_there(tmp_path: Path) -> No
     for former, name in (("noise", "control_noise_std"), ("robots", "num_robots")):
         made = made.replace(name, former)
     # Files that lack these columns get them.
-    made = made.replace(" stretch REAL,", "").replace(" disturbances TEXT NOT NULL,", "")
-    assert made.replace("seed, disturbances)", "seed)").split() == FIRST_SCHEMA.split()
+    for column in (" stretch REAL,", " disturbances TEXT NOT NULL,", " physics TEXT NOT NULL,"):
+        made = made.replace(column, "")
+    assert made.replace("seed, disturbances, physics)", "seed)").split() == FIRST_SCHEMA.split()
 
 
 def test_a_store_of_the_version_before_is_read_as_it_is_and_goes_on(tmp_path: Path) -> None:
@@ -166,7 +167,7 @@ def test_a_store_of_the_version_before_is_read_as_it_is_and_goes_on(tmp_path: Pa
     assert TrialStore.existing(path).trials() == [trial(), trial(1), trial(2)]
 
 
-LATER = ("stretch", "disturbances")
+LATER = ("stretch", "disturbances", "physics")
 """Columns that version 4 had not."""
 
 FIRST_SCHEMA = """

@@ -17,7 +17,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import Disturbance, Effect, Memory, Scene, Seen
-from d4orm_env.disturbances.draws import Draws, Keys, Steps, episode_keys
+from d4orm_env.disturbances.draws import Ahead, Draws, Keys, Steps, episode_keys
 
 Worlds = NDArray[np.intp]
 
@@ -88,6 +88,7 @@ class DisturbedWorlds:
         self._bodies: FloatArray = np.zeros((num_worlds, 0, 2 * problem.dimension + 1), np.float32)
         self._bringing: list[_Running] = []
         self._begun = False
+        self._ahead: Ahead | None = {} if num_worlds == 1 else None
 
     @property
     def bodies(self) -> FloatArray:
@@ -129,6 +130,8 @@ class DisturbedWorlds:
             goal: ``(b, K, d)`` [m].
         """
         self._keys[worlds] = keys = episode_keys(seeds)
+        if self._ahead is not None:
+            self._ahead.clear()
         count, robots = start.shape[:2]
         still = np.zeros((count, robots, self.problem.control_size), np.float32)
         none, new = np.zeros((count, 0, 2 * self.problem.dimension + 1), np.float32), np.zeros(count, np.int64)
@@ -204,7 +207,8 @@ class DisturbedWorlds:
         seen = Seen(part.states, part.controls, part.bodies)
         for one in self._seeing:
             memory = one.memory if worlds is None else one.memory_of(worlds)
-            draws = Draws(self._keys if worlds is None else self._keys[worlds], part.steps, one.stream, _Purpose.SEE)
+            draws = self._draws(one, scene, _Purpose.SEE)
+            draws = draws if worlds is None else draws.of(worlds)
             changed = one.disturbance.see(seen, memory, part, draws)
             states, controls, bodies = changed
             seen = Seen(
@@ -226,7 +230,7 @@ class DisturbedWorlds:
         return observations
 
     def _draws(self, one: _Running, scene: Scene, purpose: _Purpose) -> Draws:
-        return Draws(self._keys, scene.steps, one.stream, purpose)
+        return Draws(self._keys, scene.steps, one.stream, purpose, self._ahead)
 
 
 @cache

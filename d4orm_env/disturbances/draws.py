@@ -14,6 +14,12 @@ from d4orm_env.core.arrays import FloatArray
 Keys = NDArray[np.uint32]
 Steps = NDArray[np.int64]
 Kernel = Callable[..., Any]
+Ahead = dict[tuple[Kernel, int, int, tuple[int, ...]], tuple[int, FloatArray]]
+"""What a single world has drawn ahead in its episode: by kernel, stream, call and shape the first step, and rows of
+numbers, one for each step from there on."""
+
+_AHEAD = 16
+"""Steps that a single world draws for at once: calling a kernel takes longer than what it does there."""
 
 
 def episode_keys(seeds: Sequence[int]) -> Keys:
@@ -30,6 +36,9 @@ def _kernels() -> tuple[Kernel, Kernel]:
     return draw_normals, draw_uniforms
 
 
+_NOTHING: FloatArray = np.empty((0,), np.float32)
+
+
 class Draws:
     """Random numbers of one disturbance at one moment of ``B`` worlds.
 
@@ -41,15 +50,16 @@ class Draws:
         steps: ``(B,)`` steps taken.
         stream: Number of the disturbance.
         purpose: Number of the occasion on which it draws, from 0 to 255.
+        ahead: What the episode of a single world has drawn ahead, which this adds to; ``None`` draws as it is asked.
     """
 
-    def __init__(self, keys: Keys, steps: Steps, stream: int, purpose: int) -> None:
-        self._keys, self._steps, self._stream = keys, steps, np.uint32(stream)
+    def __init__(self, keys: Keys, steps: Steps, stream: int, purpose: int, ahead: Ahead | None = None) -> None:
+        self._keys, self._steps, self._stream, self._ahead = keys, steps, stream, ahead
         self._call = purpose << 16
 
     def of(self, worlds: NDArray[np.intp]) -> Draws:
         """The same for some of the worlds: they draw what they would draw here."""
-        part = Draws(self._keys[worlds], self._steps[worlds], int(self._stream), 0)
+        part = Draws(self._keys[worlds], self._steps[worlds], self._stream, 0)
         part._call = self._call
         return part
 
@@ -74,8 +84,26 @@ class Draws:
         return directions
 
     def _filled(self, kernel: Kernel, shape: tuple[int, ...]) -> FloatArray:
-        worlds = len(self._keys)
-        out: FloatArray = np.empty((worlds, *shape), np.float32)
-        kernel(self._keys, self._steps, self._stream, np.uint32(self._call), out.reshape(worlds, -1))
+        if self._ahead is None:
+            out = self._drawn(kernel, self._keys, self._steps, shape)
+        else:
+            out = self._taken(kernel, shape, self._ahead)
         self._call += 1
         return out
+
+    def _drawn(self, kernel: Kernel, keys: Keys, steps: Steps, shape: tuple[int, ...]) -> FloatArray:
+        """``(R, *shape)`` numbers, a row for each of the keys ``(R, 2)`` at its step ``(R,)``."""
+        rows = len(keys)
+        out: FloatArray = np.empty((rows, *shape), np.float32)
+        kernel(keys, steps, np.uint32(self._stream), np.uint32(self._call), out.reshape(rows, -1))
+        return out
+
+    def _taken(self, kernel: Kernel, shape: tuple[int, ...], ahead: Ahead) -> FloatArray:
+        """``(1, *shape)`` numbers of a single world, drawn ahead if they are not yet."""
+        step, place = int(self._steps[0]), (kernel, self._stream, self._call, shape)
+        first, rows = ahead.get(place, (0, _NOTHING))
+        if not first <= step < first + len(rows):
+            first, steps = step, np.arange(step, step + _AHEAD)
+            rows = self._drawn(kernel, self._keys.repeat(_AHEAD, axis=0), steps, shape)
+            ahead[place] = first, rows
+        return rows[step - first : step - first + 1].copy()  # the caller's to change

@@ -82,7 +82,9 @@ class StateNoise(Disturbance[Scales]):
         return scales
 
     def see(self, seen: Seen, memory: Scales, scene: Scene, draws: Draws) -> Seen:
-        states, bodies = seen.states + memory.states * draws.normal(*seen.states.shape[1:]), seen.bodies
+        states, bodies = draws.normal(*seen.states.shape[1:]), seen.bodies
+        states *= memory.states
+        states += seen.states
         if bodies.shape[1]:
             bodies = bodies + memory.bodies * draws.normal(*bodies.shape[1:])
         return Seen(states, seen.controls, bodies)

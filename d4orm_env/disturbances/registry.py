@@ -6,10 +6,11 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import MISSING, asdict, fields, is_dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.registry import Registry
+from d4orm_env.core.yaml_text import parse_yaml
 from d4orm_env.disturbances.controls import Bias, ControlNoise, CorrelatedNoise, Delay, Dropout, Gain, Quantisation
 from d4orm_env.disturbances.disturbance import Disturbance
 from d4orm_env.disturbances.intruder import Intruder
@@ -50,20 +51,58 @@ def register_disturbance(name: str, kind: type[Disturbance[Any]] | str) -> None:
     DISTURBANCES.add(name, kind)
 
 
-def find_level(text: str) -> tuple[type[Disturbance[Any]], str]:
+class Level(NamedTuple):
+    """What a name such as ``push(rate=0.5).speed`` stands for.
+
+    Attributes:
+        kind: The kind of disturbance.
+        attribute: What the level is of.
+        fixed: Values of other attributes.
+    """
+
+    kind: type[Disturbance[Any]]
+    attribute: str
+    fixed: dict[str, object]
+
+
+def find_level(text: str) -> Level:
     """The kind and the attribute that a name such as ``push.speed`` stands for; without one, the kind's first.
 
+    Other attributes may be given in brackets behind the kind, as YAML reads values: ``push(rate=0.5).speed``.
+
     Raises:
-        ValueError: If there is no such kind, or it has no such attribute.
+        ValueError: If there is no such kind, it has no such attribute, or one is given twice.
     """
-    name, _, attribute = text.partition(".") if ":" not in text else _split_path(text)
+    place, opened, behind = text.partition("(")
+    given, closed, rest = behind.partition(")")
+    if opened and (not closed or (rest and not rest.startswith("."))):
+        raise ValueError(f"disturbance {text!r} is not of the form push(rate=0.5).speed")
+    name, _, attribute = _split_path(place) if ":" in place else place.partition(".")
+    if opened:
+        attribute = attribute or rest[1:]
     kind = DISTURBANCES.find(name)
     known = [field.name for field in fields(kind)] if is_dataclass(kind) else []
     if not known:
         raise ValueError(f"disturbance {name!r} has no attribute that could have a level; make it a dataclass")
-    if attribute and attribute not in known:
-        raise ValueError(f"disturbance {name!r} has no {attribute!r}; it has {', '.join(known)}")
-    return kind, attribute or known[0]
+    fixed = _fixed(given, text) if opened else {}
+    for one in filter(None, (attribute, *fixed)):
+        if one not in known:
+            raise ValueError(f"disturbance {name!r} has no {one!r}; it has {', '.join(known)}")
+    level = Level(kind, attribute or known[0], fixed)
+    if level.attribute in fixed:
+        raise ValueError(f"disturbance {text!r} gives {level.attribute} twice; the levels are of it already")
+    return level
+
+
+def _fixed(given: str, text: str) -> dict[str, object]:
+    """The attributes in ``rate=0.5, speed=0.3``."""
+    try:
+        values = parse_yaml("{" + given.replace("=", ": ") + "}")
+    except ValueError as error:
+        raise ValueError(f"disturbance {text!r}: what is in brackets {error}") from None
+    if not isinstance(values, dict) or not all(isinstance(name, str) for name in values) or None in values.values():
+        raise ValueError(f"disturbance {text!r}: write what is in brackets as name=value, as in push(rate=0.5).speed")
+    return {name: math.inf if value == "inf" else value for name, value in values.items()}
 
 
 def _split_path(text: str) -> tuple[str, str, str]:
@@ -82,20 +121,24 @@ def disturbance_at(text: str, level: object) -> Disturbance[Any]:
     Raises:
         ValueError: If there is no such disturbance, the level makes no sense, or another attribute has no default.
     """
-    kind, attribute = find_level(text)
-    return _make(kind, {attribute: level}, text)
+    kind, attribute, fixed = find_level(text)
+    return _make(kind, {**fixed, attribute: level}, text)
 
 
 def disturbances_at(levels: Mapping[str, object]) -> tuple[Disturbance[Any], ...]:
     """Disturbances by name and level; what is said of several attributes of one kind is said of one disturbance.
 
     Raises:
-        ValueError: As :func:`disturbance_at`.
+        ValueError: As :func:`disturbance_at`, or if an attribute is given twice.
     """
     kinds: dict[type[Disturbance[Any]], dict[str, object]] = {}
     for text, level in levels.items():
-        kind, attribute = find_level(text)
-        kinds.setdefault(kind, {})[attribute] = level
+        kind, attribute, fixed = find_level(text)
+        values = kinds.setdefault(kind, {})
+        for name, value in {**fixed, attribute: level}.items():
+            if name in values:
+                raise ValueError(f"disturbance {text!r} gives {name} once more; give it once")
+            values[name] = value
     return tuple(_make(kind, values, kind.__name__) for kind, values in kinds.items())
 
 
@@ -103,7 +146,10 @@ def _make(kind: type[Disturbance[Any]], values: Mapping[str, object], text: str)
     needed = [field.name for field in fields(kind) if field.default is MISSING and field.default_factory is MISSING]
     missing = [name for name in needed if name not in values]
     if missing:
-        raise ValueError(f"disturbance {text!r} needs {' and '.join(missing)} too; give instances of it in Python")
+        raise ValueError(
+            f"disturbance {text!r} needs {' and '.join(missing)} too; give it in brackets, as in "
+            f"correlated_noise(std=0.2).time_constant"
+        )
     return kind(**values)
 
 

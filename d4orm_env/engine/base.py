@@ -201,26 +201,47 @@ class Sight(NamedTuple):
 
     Attributes:
         goal: ``(B, K, d)`` [m].
-        states: ``(B, K, n)``.
-        controls: ``(B, K, m)`` executed last.
-        arrived: ``(B, K)`` bool.
+        state: ``(B, K, n)``.
+        control: ``(B, K, m)`` executed last.
+        docked: ``(B, K)`` bool.
         bodies: ``(B, N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves among the robots and is
             none; a radius of zero stands for one that is not seen.
         time_left: ``(B,)`` share of the time left, 1 to 0.
     """
 
     goal: FloatArray
-    states: FloatArray
-    controls: FloatArray
-    arrived: BoolArray
+    state: FloatArray
+    control: FloatArray
+    docked: BoolArray
     bodies: FloatArray
     time_left: FloatArray
 
+    @classmethod
+    def of_team(
+        cls,
+        goal: FloatArray,
+        state: FloatArray,
+        control: FloatArray,
+        docked: BoolArray,
+        time_left: float,
+        bodies: FloatArray | None = None,
+    ) -> Sight:
+        """Of one world, in arrays of its own: kernels are compiled anew for read-only ones."""
+        if bodies is None:
+            bodies = np.empty((0, 2 * goal.shape[1] + 1), np.float32)
+        one = np.newaxis
+        return cls(
+            np.array(goal, np.float32)[one],
+            np.array(state, np.float32)[one],
+            np.array(control, np.float32)[one],
+            np.array(docked, np.bool_)[one],
+            np.array(bodies, np.float32)[one],
+            np.array([time_left], np.float32),
+        )
+
     def of(self, worlds: slice) -> Sight:
         """The same of some of the worlds."""
-        floats = (self.goal, self.states, self.controls, self.bodies, self.time_left)
-        goal, states, controls, bodies, time_left = (part[worlds] for part in floats)
-        return Sight(goal, states, controls, self.arrived[worlds], bodies, time_left)
+        return Sight(*(part[worlds] for part in self))  # type: ignore[arg-type]
 
 
 class WorldEngine(Engine, Protocol):
@@ -228,30 +249,6 @@ class WorldEngine(Engine, Protocol):
 
     def contacts(self, arrays: ProblemArrays, states: FloatArray) -> tuple[BoolArray, BoolArray]:
         """``(collided (K,), margin_violated (K,))`` of a team standing at ``states`` ``(K, n)``."""
-        ...
-
-    def observe(
-        self,
-        arrays: ProblemArrays,
-        layout: ObservationLayout,
-        states: FloatArray,
-        controls: FloatArray,
-        arrived: BoolArray,
-        time_left: float,
-    ) -> FloatArray:
-        """What every robot sees.
-
-        Args:
-            arrays: The problem.
-            layout: Which components there are, and their bounds.
-            states: ``(K, n)``.
-            controls: ``(K, m)`` executed last.
-            arrived: ``(K,)`` bool.
-            time_left: Share of the time left, 1 to 0.
-
-        Returns:
-            ``(K, D)`` observations inside the layout's bounds.
-        """
         ...
 
     def observe_worlds(self, arrays: ProblemArrays, layout: ObservationLayout, sight: Sight, out: FloatArray) -> None:

@@ -17,6 +17,7 @@ from d4orm_env.engine import noise, sampling
 from d4orm_env.engine.base import (
     WATCHED_SAMPLES,
     DenoisingStep,
+    MovingObstacles,
     SamplingResult,
     SamplingRules,
     SamplingTask,
@@ -27,9 +28,9 @@ from d4orm_env.engine.base import (
 )
 from d4orm_env.engine.lanes import TILE
 from d4orm_env.engine.noise import DRAWS, TURNS
-from d4orm_env.engine.proximity import body_boxes, bound_boxes, make_scratch
+from d4orm_env.engine.proximity import bound_boxes, make_bodies
 from d4orm_env.engine.threads import Threads, available_cores
-from d4orm_env.engine.worlds import WorldBatch, WorldKernels, judge_worlds, kernels_of_codes
+from d4orm_env.engine.worlds import View, WorldBatch, WorldKernels, Worlds, kernels_of_codes
 
 
 class CpuEngine:
@@ -42,56 +43,22 @@ class CpuEngine:
 
     def step(self, arrays: ProblemArrays, states: FloatArray, arrived: BoolArray, controls: FloatArray) -> StepResult:
         """See :meth:`d4orm_env.engine.base.Engine.step`."""
-        state, control = np.array(states, np.float32)[None], np.array(controls, np.float32)[None]
-        docked = np.array(arrived, bool)[None]
-        collided, violated, rewards = np.empty_like(docked), np.empty_like(docked), np.empty(docked.shape, np.float32)
-        arrays = _typed(arrays)
-        _kernels(arrays).step_worlds(
-            arrays, *_single(arrays), state, control, docked, collided, violated, rewards, _ONE_TILE
-        )  # fmt: skip
-        return StepResult(state[0], control[0], docked[0], collided[0], violated[0], rewards[0])
+        after = _rolled_out(arrays, states, arrived, np.asarray(controls)[None])
+        return StepResult(
+            after.state[1], after.control[1], after.docked[1], after.collided[1], after.violated[1], after.rewards[1]
+        )
 
     def contacts(self, arrays: ProblemArrays, states: FloatArray) -> tuple[BoolArray, BoolArray]:
         """See :meth:`d4orm_env.engine.base.WorldEngine.contacts`."""
-        state = np.array(states, np.float32)[None]
-        control = np.zeros((1, len(states), 1), np.float32)
-        docked = np.zeros((1, len(states)), bool)
-        collided, violated = np.empty_like(docked), np.empty_like(docked)
-        arrays = _typed(arrays)
-        judge_worlds(arrays, *_single(arrays), state, control, docked, collided, violated)
-        return collided[0], violated[0]
-
-    def observe(
-        self,
-        arrays: ProblemArrays,
-        layout: ObservationLayout,
-        states: FloatArray,
-        controls: FloatArray,
-        arrived: BoolArray,
-        time_left: float,
-    ) -> FloatArray:
-        """See :meth:`d4orm_env.engine.base.WorldEngine.observe`."""
-        sight = Sight(
-            np.array(arrays.goal, np.float32)[None],
-            np.array(states, np.float32)[None],
-            np.array(controls, np.float32)[None],
-            np.array(arrived, bool)[None],
-            np.empty((1, 0, 2 * layout.dimension + 1), np.float32),
-            np.array([time_left], np.float32),
-        )
-        out: FloatArray = np.empty((1, len(states), layout.size), np.float32)
-        self.observe_worlds(arrays, layout, sight, out)
-        seen: FloatArray = out[0]
-        return seen
+        robots = len(states)
+        here = _rolled_out(arrays, states, np.zeros(robots, bool), np.zeros((0, robots, 1), np.float32))
+        return here.collided[0], here.violated[0]
 
     def observe_worlds(self, arrays: ProblemArrays, layout: ObservationLayout, sight: Sight, out: FloatArray) -> None:
         """See :meth:`d4orm_env.engine.base.WorldEngine.observe_worlds`."""
         arrays = _typed(arrays)
-        kernel, shown = _kernels(arrays).observe_worlds, (layout.bounds, layout.num_neighbors, layout.num_obstacles)
-        if len(out) <= TILE:
-            kernel(arrays, *sight, *shown, _ONE_TILE, out)
-        else:
-            self._threads.over(-(-len(out) // TILE), lambda part: kernel(arrays, *sight, *shown, part, out))
+        kernel, view = _kernels(arrays).observe_worlds, _view(layout)
+        self._threads.over(-(-len(out) // TILE), lambda part: kernel(arrays, sight, view, part, out))
 
     def advance(
         self,
@@ -104,12 +71,9 @@ class CpuEngine:
     ) -> None:
         """See :meth:`d4orm_env.engine.base.WorldEngine.advance`."""
         arrays = _typed(arrays)
-        advance_worlds = _kernels(arrays).advance_worlds
+        kernel, view = _kernels(arrays).advance_worlds, _view(layout)
         self._threads.over(
-            -(-len(orders) // TILE),
-            lambda part: advance_worlds(
-                arrays, layout.bounds, layout.num_neighbors, layout.num_obstacles, max_cycles, orders, batch, part, out
-            ),
+            -(-len(orders) // TILE), lambda part: kernel(arrays, view, max_cycles, orders, batch, part, out)
         )
 
     def rollout(self, problem: Problem, controls: ArrayLike) -> Trajectory:
@@ -118,26 +82,16 @@ class CpuEngine:
         Raises:
             ValueError: If the controls have another shape than ``(H, K, m)`` or are not finite.
         """
-        wanted = checked_controls(problem, controls)
-        moments = len(wanted) + 1
-        executed = np.zeros((moments, *wanted.shape[1:]), np.float32)
-        executed[1:] = wanted
-        states = np.empty((moments, *problem.start.shape), np.float32)
-        states[0] = problem.start
-        docked = np.zeros((moments, problem.num_robots), bool)
-        collided, violated = np.empty_like(docked), np.empty_like(docked)
-        rewards = np.empty(docked.shape, np.float32)
-        arrays = _typed(problem.arrays)
-        goal, inverse = (np.repeat(array, moments, axis=0) for array in _single(arrays))
-        _kernels(arrays).roll_out(arrays, goal, inverse, executed, states, docked, collided, violated, rewards)
+        nobody = np.zeros(problem.num_robots, bool)
+        moments = _rolled_out(problem.arrays, problem.start, nobody, checked_controls(problem, controls))
         return Trajectory(
-            states=states,
-            positions=np.ascontiguousarray(states[..., : problem.dimension]),
-            controls=executed[1:],
-            rewards=rewards[1:],
-            arrived=docked,
-            collided=collided,
-            margin_violated=violated,
+            states=moments.state,
+            positions=np.ascontiguousarray(moments.state[..., : problem.dimension]),
+            controls=moments.control[1:],
+            rewards=moments.rewards[1:],
+            arrived=moments.docked,
+            collided=moments.collided,
+            margin_violated=moments.violated,
         )
 
     def prepare(self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int) -> None:
@@ -196,43 +150,41 @@ class Sampling:
         self.task, self.threads = task, threads
         self.arrays = _typed(task.arrays)
         self.kernel = sampling.score_kernel(problem.team.models)
-        self.spaces: dict[int, tuple[Any, Any]] = {}
+        self.spaces: dict[int, sampling.Workspace] = {}
         self.base = np.ascontiguousarray(task.base, np.float32)
         docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
-        self.docked = np.ascontiguousarray(docked, bool)
-        if task.moving is None:
-            self.moving = np.zeros((len(self.base), 0, problem.dimension), np.float32)
-            self.moving_radius = np.zeros(0, np.float32)
-        else:
-            self.moving = np.ascontiguousarray(task.moving.positions, np.float32)
-            self.moving_radius = np.ascontiguousarray(task.moving.radius, np.float32)
-        self.static = bound_boxes(self.arrays)
-        self.body_boxes = body_boxes(self.moving, self.moving_radius, self.arrays.margin)
+        moving = task.moving or MovingObstacles(
+            np.zeros((len(self.base), 0, problem.dimension), np.float32), np.zeros(0, np.float32)
+        )
+        self.scoring = sampling.Scoring(
+            docked=np.ascontiguousarray(docked, bool),
+            collisions=task.collisions,
+            penalty=np.float32(task.penalty),
+            bodies=make_bodies(*moving, self.arrays.margin),
+            bounds=bound_boxes(self.arrays),
+        )
         self.seed = np.array(noise.seed_words(seed), np.uint32)
         self.rewards = np.empty((problem.num_robots, num_samples), np.float32)
         num_tiles, pairs = -(-num_samples // TILE), (problem.control_size + 1) // 2
         self.kept = np.empty((num_tiles, problem.num_robots, len(self.base), pairs, 2, DRAWS), np.float32)
 
-    def space(self, first: int) -> tuple[Any, Any]:
-        """Workspace and scratch of the thread whose tiles begin with this number."""
+    def space(self, first: int) -> sampling.Workspace:
+        """The workspace of the thread whose tiles begin with this number."""
         if first not in self.spaces:
-            (num_steps, num_robots, num_controls), dimension = self.base.shape, self.arrays.goal.shape[1]
-            workspace = sampling.make_workspace(num_steps, num_robots, num_controls, dimension)
-            self.spaces[first] = workspace, make_scratch(num_robots, dimension)
+            self.spaces[first] = sampling.make_workspace(self.base.shape, self.arrays.goal.shape[1])
         return self.spaces[first]
 
     def score(self, step: int, mean: FloatArray, scale: FloatArray) -> FloatArray:
         """Rewards of this step's samples, ``(M,)`` for team credit and ``(K, M)`` for robot credit."""
         num_tiles = -(-self.rewards.shape[1] // TILE)
-        offset, scale = self.base + mean, np.ascontiguousarray(scale, np.float32)
+        scale = np.ascontiguousarray(scale, np.float32)
+        drawing = sampling.Drawing(self.base + mean, scale, self.seed, step)
         self.threads.over(
             num_tiles,
             lambda part: self.kernel(
-                self.arrays, offset, scale, self.docked, self.task.collisions, np.float32(self.task.penalty),
-                self.moving, self.moving_radius, self.body_boxes, self.static, self.seed, step, part,
-                *self.space(part[0]), self.kept, self.rewards,
+                self.arrays, self.scoring, drawing, part, self.space(part[0]), self.kept, self.rewards
             ),
-        )  # fmt: skip
+        )
         return self.rewards.mean(axis=0, keepdims=True) if self.task.credit == "team" else self.rewards
 
     def log_ratio(self, mean: FloatArray, scale: FloatArray) -> FloatArray:
@@ -280,16 +232,26 @@ def _by_counter(weights: FloatArray) -> tuple[FloatArray, FloatArray]:
     return turns[0::2] - turns[1::2], turns[0::2] + turns[1::2]
 
 
-_ONE_TILE = np.array([0, 1])
-
-
 def _kernels(arrays: ProblemArrays) -> WorldKernels:
     return kernels_of_codes(arrays.model_codes.tobytes())
 
 
-def _single(arrays: ProblemArrays) -> tuple[FloatArray, FloatArray]:
-    """Goals and inverse start distances as of one world, of arrays that are :func:`_typed`."""
-    return arrays.goal[None], arrays.inverse_initial_distance[None]
+def _view(layout: ObservationLayout) -> View:
+    return View(layout.bounds, layout.num_neighbors, layout.num_obstacles)
+
+
+def _rolled_out(arrays: ProblemArrays, states: FloatArray, docked: BoolArray, controls: FloatArray) -> Worlds:
+    """The ``H+1`` moments of a team from states ``(K, n)`` on under controls ``(H, K, m)``, clipped here."""
+    arrays, rows = _typed(arrays), len(controls) + 1
+    state = np.empty((rows, *states.shape), np.float32)
+    control = np.zeros((rows, *controls.shape[1:]), np.float32)
+    arrived, collided, violated = np.zeros((3, rows, len(states)), np.bool_)
+    rewards = np.empty(arrived.shape, np.float32)
+    state[0], arrived[0], control[1:] = states, docked, controls
+    goal, inverse = arrays.goal[None], arrays.inverse_initial_distance[None]
+    moments = Worlds(goal, inverse, state, control, arrived, collided, violated, rewards)
+    _kernels(arrays).roll_out(arrays, moments)
+    return moments
 
 
 def _typed(arrays: ProblemArrays) -> ProblemArrays:

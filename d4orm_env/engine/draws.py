@@ -27,15 +27,17 @@ def draw_normals(keys: Any, steps: Any, stream: Any, call: Any, out: Any) -> Non
         call: uint32 number of the call in that step.
         out: float32, output.
     """
+    num_pairs = out.shape[1] // 2
     for b in range(out.shape[0]):
         key = noise.stream_key(
             keys[b, 0], keys[b, 1], np.uint32(steps[b]), np.uint32(stream), np.uint32(call), np.uint32(0), BIT_OPS
         )
-        for i in range(0, out.shape[1], 2):
-            x, y = noise.normal_pair(np.uint32(i), key, BIT_OPS)
-            out[b, i] = x
-            if i + 1 < out.shape[1]:
-                out[b, i + 1] = y
+        for j in range(num_pairs):  # without a branch, so that the compiler takes several at once
+            x, y = noise.normal_pair(np.uint32(2 * j), key, BIT_OPS)
+            out[b, 2 * j] = x
+            out[b, 2 * j + 1] = y
+        if 2 * num_pairs < out.shape[1]:
+            out[b, 2 * num_pairs] = noise.normal_pair(np.uint32(2 * num_pairs), key, BIT_OPS)[0]
 
 
 @cached_kernel(_SOURCES, **OPTIONS)

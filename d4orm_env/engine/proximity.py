@@ -59,6 +59,21 @@ class Scratch(NamedTuple):
     spare: Any
 
 
+class Bodies(NamedTuple):
+    """Bodies that move among the robots.
+
+    Attributes:
+        places: ``(H, O, d)`` after every step.
+        radius: ``(O,)``.
+        boxes: ``(B, O, d, 2)`` ends of the boxes round them in each of the blocks of a horizon, widened by half of the
+            margin.
+    """
+
+    places: Any
+    radius: Any
+    boxes: Any
+
+
 def make_scratch(num_robots: int, dimension: int) -> Scratch:
     """Scratch for one thread."""
     return Scratch(
@@ -80,20 +95,14 @@ def bound_boxes(arrays: Any) -> FloatArray:
     return _widened(low, high, arrays.margin)
 
 
-def body_boxes(moving: FloatArray, radius: FloatArray, margin: Any) -> FloatArray:
-    """``(B, O, d, 2)`` ends of the boxes round moving bodies in each of the blocks of a horizon, widened by half of the
-    margin.
-
-    Args:
-        moving: ``(H, O, d)`` places of the bodies.
-        radius: ``(O,)``.
-        margin: The margin.
-    """
-    num_steps, num_blocks = len(moving), -(-len(moving) // BLOCK)
+def make_bodies(places: FloatArray, radius: FloatArray, margin: Any) -> Bodies:
+    """Bodies of this radius ``(O,)`` at ``places`` ``(H, O, d)``, with their boxes."""
+    num_steps, num_blocks = len(places), -(-len(places) // BLOCK)
     # A last block that is short goes on with its last place.
-    blocks = moving[np.minimum(np.arange(num_blocks * BLOCK), num_steps - 1)]
-    blocks = blocks.reshape(num_blocks, BLOCK, *moving.shape[1:])
-    return _widened(blocks.min(axis=1) - radius[:, None], blocks.max(axis=1) + radius[:, None], margin)
+    blocks = places[np.minimum(np.arange(num_blocks * BLOCK), num_steps - 1)]
+    blocks = blocks.reshape(num_blocks, BLOCK, *places.shape[1:])
+    boxes = _widened(blocks.min(axis=1) - radius[:, None], blocks.max(axis=1) + radius[:, None], margin)
+    return Bodies(np.ascontiguousarray(places, np.float32), np.ascontiguousarray(radius, np.float32), boxes)
 
 
 def _widened(low: Any, high: Any, margin: Any) -> FloatArray:
@@ -185,44 +194,40 @@ def _mark_listed(radius: Any, margin: Any, dimension: Any, places: Any, s: Any) 
 
 
 @compiled
-def _mark_bodies(
-    radius: Any, margin: Any, moving: Any, moving_radius: Any, boxes: Any, first: Any, count: Any, places: Any, s: Any
-) -> None:
+def _mark_bodies(radius: Any, margin: Any, bodies: Any, first: Any, count: Any, places: Any, s: Any) -> None:
     """Flag robots within the margin of moving bodies."""
-    _, num_bodies, dimension = moving.shape
-    limits, before = boxes.reshape(-1), first // BLOCK * num_bodies
+    _, num_bodies, dimension = bodies.places.shape
+    limits, before = bodies.boxes.reshape(-1), first // BLOCK * num_bodies
     for k in range(radius.shape[0]):
         for body in range(num_bodies):
             if _meets(k, before + body, dimension, s.boxes, limits):
-                reach = radius[k] + moving_radius[body] + margin
+                reach = radius[k] + bodies.radius[body] + margin
                 for step in range(count):
                     rows = places[place_of(k, step, dimension) : place_of(k, step + 1, dimension)]
-                    s.near[k, step] |= tiles.near_round(reach, moving[first + step, body], dimension, rows, s.spare)
+                    s.near[k, step] |= tiles.near_round(
+                        reach, bodies.places[first + step, body], dimension, rows, s.spare
+                    )
 
 
 @inlined
-def mark_robots(
-    radius: Any, margin: Any, moving: Any, moving_radius: Any, boxes: Any, first: Any, count: Any, places: Any, s: Any
-) -> None:
+def mark_robots(radius: Any, margin: Any, bodies: Any, first: Any, count: Any, places: Any, s: Any) -> None:
     """Flag in ``s.near`` robots within the margin of each other or of a body in a block.
 
     Args:
         radius: ``(K,)``.
         margin: The margin.
-        moving: ``(H, O, d)`` places of the bodies.
-        moving_radius: ``(O,)``.
-        boxes: ``(B, O, d, 2)`` see :func:`body_boxes`.
+        bodies: The :class:`Bodies`.
         first: Time of the block's first step.
         count: Steps in the block; of later ones the flags mean nothing.
         places: Rows of places, see :func:`place_of`.
         s: Scratch with the boxes of the robots in this block.
     """
     s.near[:] = NOWHERE
-    dimension = moving.shape[2]
+    dimension = bodies.places.shape[2]
     _list_near(dimension, s)
     _mark_listed(radius, margin, dimension, places, s)
-    if moving.shape[1] > 0:
-        _mark_bodies(radius, margin, moving, moving_radius, boxes, first, count, places, s)
+    if bodies.places.shape[1] > 0:
+        _mark_bodies(radius, margin, bodies, first, count, places, s)
 
 
 @inlined

@@ -28,7 +28,7 @@ from d4orm_env.engine.lanes import (
     use_wide_registers,
 )
 from d4orm_env.engine.noise import DRAWS
-from d4orm_env.engine.proximity import enclose, mark_robots, near_static, place_of
+from d4orm_env.engine.proximity import enclose, make_scratch, mark_robots, near_static, place_of
 from d4orm_env.engine.tiles import (
     INLINED,
     NOWHERE,
@@ -63,6 +63,7 @@ class Workspace(NamedTuple):
         controls: ``(BLOCK CONTROL_ROWS TILE,)`` one robot's controls in a block.
         keys: ``(2, K H P)`` keys of the noise streams, ``P`` pairs of components each.
         standing: ``(K,)`` whether a robot has docked in all samples.
+        scratch: What is noted of who is near what.
     """
 
     w: Any
@@ -71,14 +72,51 @@ class Workspace(NamedTuple):
     controls: Any
     keys: Any
     standing: Any
+    scratch: Any
 
 
-def make_workspace(num_steps: int, num_robots: int, num_controls: int, dimension: int) -> Workspace:
-    """A workspace."""
+class Scoring(NamedTuple):
+    """What samples are scored by, in all steps of a run.
+
+    Attributes:
+        docked: ``(K,)`` bool, docked from the beginning.
+        collisions: Whether robots count when near each other or near a moving body.
+        penalty: What a violation costs per step.
+        bodies: What moves, :class:`~d4orm_env.engine.proximity.Bodies`.
+        bounds: ``(S, d, 2)`` boxes beyond them, see :func:`~d4orm_env.engine.proximity.bound_boxes`.
+    """
+
+    docked: Any
+    collisions: Any
+    penalty: Any
+    bodies: Any
+    bounds: Any
+
+
+class Drawing(NamedTuple):
+    """What the samples of a denoising step are drawn from.
+
+    Attributes:
+        offset: ``(H, K, m)`` base controls plus mean deformation.
+        scale: ``(H, K, m)`` standard deviation of the noise.
+        seed: Two uint32 words.
+        step: Number of the denoising step.
+    """
+
+    offset: Any
+    scale: Any
+    seed: Any
+    step: Any
+
+
+def make_workspace(shape: tuple[int, ...], dimension: int) -> Workspace:
+    """A workspace for controls of this shape, ``(H, K, m)``."""
+    num_steps, num_robots, num_controls = shape
     return Workspace(
         tiles.aligned_zeros(num_robots * STRIDE), tiles.aligned_zeros(num_robots * BLOCK * dimension * TILE),
         tiles.aligned_zeros(BLOCK * 4 * DRAWS), tiles.aligned_zeros(BLOCK * CONTROL_ROWS * TILE),
         np.empty((2, num_robots * num_steps * ((num_controls + 1) // 2)), np.uint32), np.empty(num_robots, np.bool_),
+        make_scratch(num_robots, dimension),
     )  # fmt: skip
 
 
@@ -291,13 +329,22 @@ def _stay(dimension: Any, w: Any, places: Any) -> None:
 
 
 @inlined
+def _punish_near(near: Any, count: Any, penalty: Any, w: Any) -> None:
+    """Take the penalty from the robots that are near each other or a body, in the steps of a block."""
+    for k in range(near.shape[0]):
+        for step in range(count):
+            if near[k, step] != NOWHERE:
+                subtract_where(w, k * STRIDE + TOTAL * TILE, near[k, step], penalty)
+
+
+@inlined
 def _score_tile(
-    run_robot: Any, arrays: Any, offset: Any, scale: Any, docked: Any, collisions: Any, penalty: Any, moving: Any,
-    moving_radius: Any, body_boxes: Any, static: Any, counter: Any, kept: Any, space: Any, scratch: Any,
+    run_robot: Any, arrays: Any, scoring: Any, drawing: Any, counter: Any, kept: Any, space: Any
 ) -> None:  # fmt: skip
     """Roll out a tile of samples, noise beginning with this counter; leave summed rewards in rows TOTAL."""
     w, places, draws, controls, standing = space.w, space.places, space.draws, space.controls, space.standing
-    keys = space.keys
+    keys, scratch, offset, scale = space.keys, space.scratch, drawing.offset, drawing.scale
+    penalty, bounds = scoring.penalty, scoring.bounds
     num_steps, num_robots, num_controls = offset.shape
     num_pairs = (num_controls + 1) // 2
     # Taken out of the tuple once: every access counts a reference, which costs as much as several samples.
@@ -307,8 +354,8 @@ def _score_tile(
     docking = (arrays.squared_goal_radius, arrays.squared_goal_speed, docks)
     radius, margin = arrays.radius, arrays.margin
     standing[:] = False
-    _begin_tile(arrays, docked, w)
-    near, boxes = scratch.near, scratch.boxes
+    _begin_tile(arrays, scoring.docked, w)
+    boxes = scratch.boxes
     for first in range(0, num_steps, BLOCK):
         count = min(BLOCK, num_steps - first)
         for k in range(num_robots):
@@ -335,18 +382,15 @@ def _score_tile(
                 rest = num_steps - (first + count)
                 _add_standing(goals[k], inverse[k], np.float32(rest), robot)
             enclose(k, radius[k] + HALF * margin, dimension, places, boxes)
-            if near_static(arrays, k, static, boxes, scratch.spare):
+            if near_static(arrays, k, bounds, boxes, scratch.spare):
                 for step in range(count):
                     rows = own_places[step * dimension * TILE : (step + 1) * dimension * TILE]
                     touch = obstacles.near_obstacles(arrays, radius[k] + margin, rows, scratch.spare)
                     steps = np.float32(1 + rest if step == count - 1 else 1)
                     subtract_where(robot, TOTAL * TILE, touch, steps * penalty)
-        if collisions:
-            mark_robots(radius, margin, moving, moving_radius, body_boxes, first, count, places, scratch)
-            for k in range(num_robots):
-                for step in range(count):
-                    if near[k, step] != NOWHERE:
-                        subtract_where(w, k * STRIDE + TOTAL * TILE, near[k, step], penalty)
+        if scoring.collisions:
+            mark_robots(radius, margin, scoring.bodies, first, count, places, scratch)
+            _punish_near(scratch.near, count, penalty, w)
 
 
 @compiled
@@ -370,18 +414,10 @@ def score_kernel(models: tuple[str, ...]) -> Any:
     arguments:
 
     - ``arrays``: The problem.
-    - ``offset``: ``(H, K, m)`` base controls plus mean deformation.
-    - ``scale``: ``(H, K, m)`` standard deviation of the noise.
-    - ``docked``: ``(K,)`` bool, docked from the beginning.
-    - ``collisions``: Whether robots count when near each other or near a moving body.
-    - ``penalty``: What a violation costs per step.
-    - ``moving``: ``(H, O, d)`` places of moving bodies after every step.
-    - ``moving_radius``: ``(O,)``.
-    - ``body_boxes``, ``static``: Boxes of moving bodies and static things, see :mod:`~d4orm_env.engine.proximity`.
-    - ``seed``: Two uint32 words.
-    - ``step``: Number of the denoising step.
+    - ``scoring``: What samples are scored by, a :class:`Scoring`.
+    - ``drawing``: What they are drawn from, a :class:`Drawing`.
     - ``tile_range``: First tile and the one after the last.
-    - ``space``, ``scratch``: This thread's.
+    - ``space``: This thread's.
     - ``kept``: ``(T, K, H, P, 2, DRAWS)`` the noise of ``T`` tiles, in ``P`` pairs of components, output.
     - ``rewards``: Output.
     """
@@ -394,23 +430,18 @@ def _score_kernel(models: tuple[str, ...]) -> Any:
 
     @cached_kernel(models_key(SOURCES, models), variant="_".join(models), **OPTIONS)
     def score_tiles(
-        arrays: Any, offset: Any, scale: Any, docked: Any, collisions: Any, penalty: Any, moving: Any,
-        moving_radius: Any, body_boxes: Any, static: Any, seed: Any, step: Any, tile_range: Any, space: Any,
-        scratch: Any, kept: Any, rewards: Any,
-    ) -> None:  # fmt: skip
+        arrays: Any, scoring: Any, drawing: Any, tile_range: Any, space: Any, kept: Any, rewards: Any
+    ) -> None:
         use_wide_registers()
         num_robots, num_samples = rewards.shape
-        _fill_keys(seed, step, num_robots, kept.shape[2], kept.shape[3], space.keys)
+        _fill_keys(drawing.seed, drawing.step, num_robots, kept.shape[2], kept.shape[3], space.keys)
         for index in range(tile_range[0], tile_range[1]):
             first = index * TILE
-            _score_tile(
-                run_robot, arrays, offset, scale, docked, collisions, penalty, moving, moving_radius, body_boxes,
-                static, index * DRAWS, kept.reshape(-1), space, scratch,
-            )  # fmt: skip
+            _score_tile(run_robot, arrays, scoring, drawing, index * DRAWS, kept.reshape(-1), space)
             for k in range(num_robots):
                 # The last tile may reach beyond the last sample.
                 for s in range(min(TILE, num_samples - first)):
-                    rewards[k, first + s] = space.w[k * STRIDE + TOTAL * TILE + s] / np.float32(offset.shape[0])
+                    rewards[k, first + s] = space.w[k * STRIDE + TOTAL * TILE + s] / np.float32(kept.shape[2])
 
     return score_tiles
 

@@ -65,10 +65,10 @@ class Threads:
     def over(self, count: int, work: Callable[[Any], None]) -> None:
         """Call ``work(array([first, last]))`` on parts that together make up ``range(count)``, and wait for all."""
         parts = min(self.num_threads, count)
-        edges = np.array([count * part // parts for part in range(parts + 1)])
-        if parts == 1:
-            work(edges)
+        if parts <= 1:
+            work(np.array((0, count)))
             return
+        edges = np.array([count * part // parts for part in range(parts + 1)])
         # Engines that share the cores, each in a thread of its own, share these threads too.
         todo = _queue(max(self.num_threads, available_cores()) - 1, os.getpid())
         done: SimpleQueue[BaseException | None] = SimpleQueue()

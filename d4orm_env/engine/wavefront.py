@@ -215,7 +215,8 @@ def _about_to_obstacles(space: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 @inlined
-def _clearance(space: Any, x: Any, y: Any, z: Any) -> Any:
+def clearance_at(space: Any, x: Any, y: Any, z: Any) -> Any:
+    """Distance of a place from the nearest obstacle or bound, negative inside [m]."""
     return min(_to_obstacles(space, x, y, z), _to_bounds(space, x, y, z))
 
 
@@ -325,13 +326,13 @@ def _settled(space: Any, lattice: Any, reach: Any, place: Any) -> Any:
     """
     half, probe, spare = lattice.step / 2, lattice.step / 64, reach * _SPARE
     x, y, z = place
-    clearance = _clearance(space, x, y, z)
+    clearance = clearance_at(space, x, y, z)
     for _ in range(_PUSHES):
         if clearance > reach or clearance < reach - lattice.step:
             break
-        gx = _clearance(space, x + probe, y, z) - _clearance(space, x - probe, y, z)
-        gy = _clearance(space, x, y + probe, z) - _clearance(space, x, y - probe, z)
-        gz = _clearance(space, x, y, z + probe) - _clearance(space, x, y, z - probe)
+        gx = clearance_at(space, x + probe, y, z) - clearance_at(space, x - probe, y, z)
+        gy = clearance_at(space, x, y + probe, z) - clearance_at(space, x, y - probe, z)
+        gz = clearance_at(space, x, y, z + probe) - clearance_at(space, x, y, z - probe)
         norm = np.sqrt(gx * gx + gy * gy + gz * gz)
         if norm == 0.0:
             break
@@ -340,7 +341,7 @@ def _settled(space: Any, lattice: Any, reach: Any, place: Any) -> Any:
         x = min(max(x + push * gx, place[0] - half), place[0] + half)
         y = min(max(y + push * gy, place[1] - half), place[1] + half)
         z = min(max(z + push * gz, place[2] - half), place[2] + half)
-        clearance = _clearance(space, x, y, z)
+        clearance = clearance_at(space, x, y, z)
     return (x, y, z), clearance > reach
 
 
@@ -465,7 +466,7 @@ def _spread(space: Any, lattice: Any, reach: Any, goal: Any, nodes: Any) -> Any:
     points[0, 0], points[0, 1], points[0, 2] = goal[0], goal[1], goal[2]
     values[0], parents[0], used = 0.0, _NOBODY, 1
     at = _place(points, 0)
-    own_goal = _clearance(space, at[0], at[1], at[2])
+    own_goal = clearance_at(space, at[0], at[1], at[2])
     heap = [(0.0, np.int64(0)) for _ in range(0)]
     around = 2 + np.int64(2 * max(0.0, reach - own_goal) / lattice.step)
     low_i, low_j, low_k = _corner(lattice, at)
@@ -557,11 +558,11 @@ def look(space: Any, lattice: Any, reach: Any, front: Any, places: Any, target: 
     """
     points, values = front.points, front.values
     step, size = lattice.step, lattice.size
-    own_goal = _clearance(space, points[0, 0], points[0, 1], points[0, 2])
+    own_goal = clearance_at(space, points[0, 0], points[0, 1], points[0, 2])
     goal = (points[0, 0], points[0, 1], points[0, 2])
     for b in range(places.shape[0]):
         q = (places[b, 0], places[b, 1], places[b, 2])
-        own = _clearance(space, q[0], q[1], q[2])
+        own = clearance_at(space, q[0], q[1], q[2])
         length[b], anchor[b] = np.inf, _NOBODY
         if _sees(space, reach, goal, own_goal, q, own):
             length[b], anchor[b] = _distance(goal, q), 0
@@ -603,7 +604,7 @@ def is_free_line(space: Any, reach: Any, tail: Any, head: Any) -> Any:
     An end that lies nearer than that to something is left and reached on a line that comes no nearer.
     """
     p, q = (tail[0], tail[1], tail[2]), (head[0], head[1], head[2])
-    return _sees(space, reach, p, _clearance(space, p[0], p[1], p[2]), q, _clearance(space, q[0], q[1], q[2]))
+    return _sees(space, reach, p, clearance_at(space, p[0], p[1], p[2]), q, clearance_at(space, q[0], q[1], q[2]))
 
 
 @cached_kernel(SOURCES, variant="lines", **OPTIONS)

@@ -61,44 +61,65 @@ for _function in (
     register_jitable(**INLINED)(_function)
 
 
-@compiled
-def _load_world(goal: Any, state: Any, control: Any, docked: Any, b: Any, s: Any, w: Any) -> None:
+class Worlds(NamedTuple):
+    """``B`` worlds, or ``B`` moments of one; kernels change them in place.
+
+    Attributes:
+        goal: ``(B, K, d)``, or ``(1, K, d)`` for all.
+        inverse: ``(B, K)`` one over the start distances, or ``(1, K)``.
+        state: ``(B, K, n)``.
+        control: ``(B, K, m)``; what to do goes in, what was executed comes out.
+        docked: ``(B, K)`` bool.
+        collided: ``(B, K)`` bool, hard contact.
+        violated: ``(B, K)`` bool, within the margin.
+        rewards: ``(B, K)`` of each robot where it stands.
+    """
+
+    goal: Any
+    inverse: Any
+    state: Any
+    control: Any
+    docked: Any
+    collided: Any
+    violated: Any
+    rewards: Any
+
+
+# ``worlds`` is a Worlds or has its attributes among others, as a WorldBatch does.
+
+
+@inlined
+def _load_world(worlds: Any, b: Any, s: Any, w: Any) -> None:
     """Put world ``b`` into lane ``s`` of a tile."""
-    for k in range(state.shape[1]):
+    own = min(b, worlds.goal.shape[0] - 1)
+    for k in range(worlds.state.shape[1]):
         o = k * STRIDE + s
-        for i in range(state.shape[2]):
-            w[o + (STATE + i) * TILE] = state[b, k, i]
-        for i in range(control.shape[2]):
-            w[o + (CONTROL + i) * TILE] = control[b, k, i]
-        for axis in range(goal.shape[2]):
-            w[o + (GOAL + axis) * TILE] = goal[b, k, axis]
-        w[o + DOCKED * TILE] = ONE if docked[b, k] else ZERO
+        for i in range(worlds.state.shape[2]):
+            w[o + (STATE + i) * TILE] = worlds.state[b, k, i]
+        for i in range(worlds.control.shape[2]):
+            w[o + (CONTROL + i) * TILE] = worlds.control[b, k, i]
+        for axis in range(worlds.goal.shape[2]):
+            w[o + (GOAL + axis) * TILE] = worlds.goal[own, k, axis]
+        w[o + DOCKED * TILE] = ONE if worlds.docked[b, k] else ZERO
 
 
 @compiled
-def _load(goal: Any, state: Any, control: Any, docked: Any, first: Any, w: Any) -> None:
+def _load(worlds: Any, first: Any, w: Any) -> None:
     """Put worlds from number ``first`` on into the lanes of a tile."""
-    for s in range(min(TILE, state.shape[0] - first)):
-        _load_world(goal, state, control, docked, first + s, s, w)
+    for s in range(min(TILE, worlds.state.shape[0] - first)):
+        _load_world(worlds, first + s, s, w)
 
 
 @compiled
-def _store_world(state: Any, control: Any, docked: Any, b: Any, s: Any, w: Any) -> None:
+def _store_world(worlds: Any, b: Any, s: Any, w: Any) -> None:
     """The reverse of :func:`_load_world`, for what a step changes."""
-    for k in range(state.shape[1]):
+    for k in range(worlds.state.shape[1]):
         o = k * STRIDE + s
-        for i in range(state.shape[2]):
-            state[b, k, i] = w[o + (STATE + i) * TILE]
-        for i in range(control.shape[2]):
-            control[b, k, i] = w[o + (CONTROL + i) * TILE]
-        docked[b, k] = w[o + DOCKED * TILE] > ZERO
-
-
-@compiled
-def _store(state: Any, control: Any, docked: Any, first: Any, w: Any) -> None:
-    """The reverse of :func:`_load`, for what a step changes."""
-    for s in range(min(TILE, state.shape[0] - first)):
-        _store_world(state, control, docked, first + s, s, w)
+        for i in range(worlds.state.shape[2]):
+            worlds.state[b, k, i] = w[o + (STATE + i) * TILE]
+        for i in range(worlds.control.shape[2]):
+            worlds.control[b, k, i] = w[o + (CONTROL + i) * TILE]
+        worlds.docked[b, k] = w[o + DOCKED * TILE] > ZERO
 
 
 @inlined
@@ -107,128 +128,65 @@ def _bit(mask: Any, s: Any) -> Any:
 
 
 @compiled
-def _judge(
-    arrays: Any, inverse: Any, first: Any, w: Any, near: Any, collided: Any, violated: Any, rewards: Any
-) -> None:
-    """Flag contacts and margin violations and compute rewards; all outputs ``(B, K)``."""
+def _judge(arrays: Any, worlds: Any, first: Any, w: Any, near: Any) -> None:
+    """Flag contacts and margin violations of the worlds of a tile, and compute rewards."""
     num_robots = arrays.radius.shape[0]
     for k in range(num_robots):
         near[k, ROBOT] = near[k, OBSTACLE] = NOWHERE
     # Whatever is in contact is within the margin too, so the second level adds to the flags of the first.
     for level in range(2):
         extra = ZERO if level == 0 else arrays.margin
-        flags = collided if level == 0 else violated
+        flags = worlds.collided if level == 0 else worlds.violated
         tiles.mark_pairs(arrays, extra, w, near)
         for k in range(num_robots):
             robot = w[k * STRIDE : (k + 1) * STRIDE]
             places, spare = robot[STATE * TILE : CONTROL * TILE], robot[SPARE * TILE : ROWS * TILE]
             near[k, OBSTACLE] |= obstacles.near_obstacles(arrays, arrays.radius[k] + extra, places, spare)
-        for s in range(min(TILE, collided.shape[0] - first)):
+        for s in range(min(TILE, flags.shape[0] - first)):
             for k in range(num_robots):
                 flags[first + s, k] = _bit(near[k, ROBOT] | near[k, OBSTACLE], s) != NOWHERE
-    for s in range(min(TILE, collided.shape[0] - first)):
+    for s in range(min(TILE, worlds.rewards.shape[0] - first)):
+        own = min(first + s, worlds.inverse.shape[0] - 1)
         for k in range(num_robots):
-            rewards[first + s, k] = reward.step_reward(
-                np.sqrt(w[k * STRIDE + DISTANCE2 * TILE + s]), inverse[first + s, k],
+            worlds.rewards[first + s, k] = reward.step_reward(
+                np.sqrt(w[k * STRIDE + DISTANCE2 * TILE + s]), worlds.inverse[own, k],
                 np.float32(_bit(near[k, ROBOT], s)), np.float32(_bit(near[k, OBSTACLE], s)), ONE,
             )  # fmt: skip
 
 
-@compiled
-def _judge_all(
-    arrays: Any, goal: Any, inverse: Any, state: Any, control: Any, docked: Any, collided: Any, violated: Any,
-    rewards: Any, w: Any, near: Any,
-) -> None:  # fmt: skip
-    for first in range(0, state.shape[0], TILE):
-        _load(goal, state, control, docked, first, w)
-        tiles.measure_goal_distance(arrays.goal.shape[0], arrays.goal.shape[1], w)
-        _judge(arrays, inverse, first, w, near, collided, violated, rewards)
-
-
 @cache
-def step_worlds_kernel(names: tuple[str, ...]) -> Any:
-    """A kernel that steps ``B`` worlds of one problem in place; each has its own goals and start distances.
+def roll_out_kernel(names: tuple[str, ...]) -> Any:
+    """A kernel that steps one world through the rows of ``moments.control``, keeping every moment.
 
-    Args:
-        names: Models that the kernel is for.
-        arrays: The problem.
-        goal: ``(B, K, d)``.
-        inverse: ``(B, K)`` one over the start distances.
-        state: ``(B, K, n)``.
-        control: ``(B, K, m)``; holds the executed controls afterwards.
-        docked: ``(B, K)`` bool.
-        collided: ``(B, K)`` bool, output.
-        violated: ``(B, K)`` bool, output.
-        rewards: ``(B, K)``, output.
-        tile_range: First tile of worlds and the one after the last.
+    ``moments`` is a :class:`Worlds` of ``H+1`` rows, of which the first is the start and has no control. The motion
+    comes first; then 64 moments at a time are judged, as if they were worlds.
     """
     move_robot = robot_mover(names)
 
     @cached_kernel(models_key(SOURCES, names), variant="_".join(names), **OPTIONS)
-    def step_worlds(
-        arrays: Any, goal: Any, inverse: Any, state: Any, control: Any, docked: Any, collided: Any, violated: Any,
-        rewards: Any, tile_range: Any,
-    ) -> None:  # fmt: skip
+    def roll_out(arrays: Any, moments: Any) -> None:
         use_wide_registers()
         num_robots, dimension = arrays.goal.shape
         w = tiles.aligned_zeros(num_robots * STRIDE)
         near = np.empty((num_robots, 2), np.uint64)
-        for index in range(tile_range[0], tile_range[1]):
-            first = index * TILE
-            _load(goal, state, control, docked, first, w)
-            tiles.measure_goal_distance(num_robots, dimension, w)
-            for k in range(num_robots):
-                move_robot(arrays, k, w)
-            _judge(arrays, inverse, first, w, near, collided, violated, rewards)
-            _store(state, control, docked, first, w)
-
-    return step_worlds
-
-
-@cache
-def roll_out_kernel(names: tuple[str, ...]) -> Any:
-    """A kernel that steps a single world through ``controls`` ``(H+1, K, m)``, keeping every step.
-
-    The first row of the controls is unused. Every output has ``H+1`` rows too, the first for the start. The motion
-    comes first; then 64 time steps at a time are judged, as if they were worlds.
-    """
-    move_robot = robot_mover(names)
-
-    @cached_kernel(models_key(SOURCES, names), variant="_".join(names), **OPTIONS)
-    def roll_out(
-        arrays: Any, goal: Any, inverse: Any, controls: Any, states: Any, docked: Any, collided: Any, violated: Any,
-        rewards: Any,
-    ) -> None:  # fmt: skip
-        use_wide_registers()
-        num_robots = arrays.radius.shape[0]
-        w = tiles.aligned_zeros(num_robots * STRIDE)
-        near = np.empty((num_robots, 2), np.uint64)
         lane = np.int64(0)  # a literal zero would compile what it is passed to once more
-        for t in range(1, controls.shape[0]):
+        state, docked = moments.state, moments.docked
+        for t in range(1, state.shape[0]):
             # Loops, because numba takes seconds to compile assignments of slices.
             for k in range(num_robots):
-                for i in range(states.shape[2]):
-                    states[t, k, i] = states[t - 1, k, i]
+                for i in range(state.shape[2]):
+                    state[t, k, i] = state[t - 1, k, i]
                 docked[t, k] = docked[t - 1, k]
-            _load_world(goal, states, controls, docked, t, lane, w)
+            _load_world(moments, t, lane, w)
             for k in range(num_robots):
                 move_robot(arrays, k, w)
-            _store_world(states, controls, docked, t, lane, w)
-        _judge_all(arrays, goal, inverse, states, controls, docked, collided, violated, rewards, w, near)
+            _store_world(moments, t, lane, w)
+        for first in range(0, state.shape[0], TILE):
+            _load(moments, first, w)
+            tiles.measure_goal_distance(num_robots, dimension, w)
+            _judge(arrays, moments, first, w, near)
 
     return roll_out
-
-
-@cached_kernel(SOURCES, **OPTIONS)
-def judge_worlds(
-    arrays: Any, goal: Any, inverse: Any, state: Any, control: Any, docked: Any, collided: Any, violated: Any
-) -> None:
-    """Contacts and margin violations of ``B`` worlds as they stand; arguments as in :func:`step_worlds`."""
-    use_wide_registers()
-    w = tiles.aligned_zeros(arrays.radius.shape[0] * STRIDE)
-    near = np.empty((arrays.radius.shape[0], 2), np.uint64)
-    rewards = np.empty(collided.shape, np.float32)
-    _judge_all(arrays, goal, inverse, state, control, docked, collided, violated, rewards, w, near)
 
 
 @numba.njit(nogil=True, **OPTIONS)
@@ -241,34 +199,50 @@ def _allocate_sensed(num_robots: Any, num_bodies: Any, dimension: Any, num_neigh
     )  # fmt: skip
 
 
-@inlined
-def _observe(
-    read_motion: Any, arrays: Any, goal: Any, docked: Any, bodies: Any, time_left: Any, s: Any, w: Any, bounds: Any,
-    sensed: Any, out: Any,
-) -> None:  # fmt: skip
-    """Fill ``out`` ``(K, D)`` with what the robots of the world in lane ``s`` see, inside ``bounds`` ``(2, D)``.
+class View(NamedTuple):
+    """What an observation is made of, see :class:`~d4orm_env.core.observation_layout.ObservationLayout`.
 
-    Beside robots they see ``bodies`` ``(N, 2 d + 1)``: position, velocity and radius, which is zero for an unseen one.
+    Attributes:
+        bounds: ``(2, D)`` lowest and highest observation.
+        num_neighbors: Robots in it.
+        num_obstacles: Obstacles in it.
     """
-    num_robots, dimension = goal.shape
-    for k in range(num_robots):
-        for axis in range(dimension):
-            sensed.position[k, axis] = w[k * STRIDE + (STATE + axis) * TILE + s]
-        read_motion(arrays, k, s, w, sensed.velocity[k], sensed.heading[k])
-        sensed.arrived[k] = ONE if docked[k] else ZERO
-        for axis in range(dimension):
-            if transition.stands(docked[k], arrays.docks):
-                sensed.velocity[k, axis] = ZERO
-        sensed.radius[k] = arrays.radius[k]
+
+    bounds: Any
+    num_neighbors: Any
+    num_obstacles: Any
+
+
+@compiled
+def _sense_bodies(bodies: Any, num_robots: Any, sensed: Any) -> None:
+    """Put ``bodies`` ``(N, 2 d + 1)``, position, velocity and radius, behind the robots; no radius is an unseen one."""
+    dimension = (bodies.shape[1] - 1) // 2
     for body in range(bodies.shape[0]):
         sensed.radius[num_robots + body] = bodies[body, 2 * dimension]
         for axis in range(dimension):
             unseen = bodies[body, 2 * dimension] <= ZERO
             sensed.position[num_robots + body, axis] = np.float32(np.inf) if unseen else bodies[body, axis]
             sensed.velocity[num_robots + body, axis] = bodies[body, dimension + axis]
+
+
+@inlined
+def _observe(
+    read_motion: Any, arrays: Any, worlds: Any, b: Any, time_left: Any, w: Any, bounds: Any, sensed: Any, out: Any
+) -> None:
+    """Fill ``out`` ``(K, D)`` with what the robots of world ``b`` of a loaded tile see, inside ``bounds``."""
+    (num_robots, dimension), s = arrays.goal.shape, b % TILE
+    for k in range(num_robots):
+        for axis in range(dimension):
+            sensed.position[k, axis] = w[k * STRIDE + (STATE + axis) * TILE + s]
+        read_motion(arrays, k, s, w, sensed.velocity[k], sensed.heading[k])
+        sensed.arrived[k] = ONE if worlds.docked[b, k] else ZERO
+        for axis in range(dimension):
+            if transition.stands(worlds.docked[b, k], arrays.docks):
+                sensed.velocity[k, axis] = ZERO
+        sensed.radius[k] = arrays.radius[k]
     for k in range(num_robots):
         row = out[k]
-        observation.observe_robot(k, arrays, goal, sensed, time_left, row)
+        observation.observe_robot(k, arrays, worlds.goal[b], sensed, time_left, row)
         for i in range(row.shape[0]):
             value = row[i]
             value = value if value > bounds[0, i] else bounds[0, i]
@@ -282,33 +256,23 @@ def observe_worlds_kernel(names: tuple[str, ...]) -> Any:
     Args:
         names: Models that the kernel is for.
         arrays: The problem that the worlds share; its starts and goals are not looked at.
-        goal: ``(B, K, d)``.
-        state: ``(B, K, n)``.
-        control: ``(B, K, m)`` executed last.
-        docked: ``(B, K)`` bool.
-        bodies: ``(B, N, 2 d + 1)`` position, velocity and radius of what is no robot.
-        time_left: ``(B,)`` share of the time left, 1 to 0.
-        bounds: ``(2, D)`` lowest and highest observation.
-        num_neighbors: Robots in an observation.
-        num_obstacles: Obstacles in an observation.
+        sight: What there is to see, a :class:`~d4orm_env.engine.base.Sight`.
+        view: What an observation is made of, a :class:`View`.
         tile_range: First tile of worlds and the one after the last.
     """
     read_motion = motion_reader(names)
 
     @cached_kernel(models_key(SOURCES, names), variant="_".join(names), **OPTIONS)
-    def observe_worlds(
-        arrays: Any, goal: Any, state: Any, control: Any, docked: Any, bodies: Any, time_left: Any, bounds: Any,
-        num_neighbors: Any, num_obstacles: Any, tile_range: Any, out: Any,
-    ) -> None:  # fmt: skip
+    def observe_worlds(arrays: Any, sight: Any, view: Any, tile_range: Any, out: Any) -> None:
         num_robots, dimension = arrays.goal.shape
         w = tiles.aligned_zeros(num_robots * STRIDE)
-        sensed = _allocate_sensed(num_robots, bodies.shape[1], dimension, num_neighbors, num_obstacles)
+        sensed = _allocate_sensed(num_robots, sight.bodies.shape[1], dimension, view.num_neighbors, view.num_obstacles)
         for index in range(tile_range[0], tile_range[1]):
             first = index * TILE
-            _load(goal, state, control, docked, first, w)
-            for s in range(min(TILE, state.shape[0] - first)):
-                b = first + s
-                _observe(read_motion, arrays, goal[b], docked[b], bodies[b], time_left[b], s, w, bounds, sensed, out[b])
+            _load(sight, first, w)
+            for b in range(first, min(first + TILE, sight.state.shape[0])):
+                _sense_bodies(sight.bodies[b], num_robots, sensed)
+                _observe(read_motion, arrays, sight, b, sight.time_left[b], w, view.bounds, sensed, out[b])
 
     return observe_worlds
 
@@ -402,6 +366,18 @@ def _restart(batch: Any, b: Any) -> None:
 
 
 @compiled
+def _restart_tile(batch: Any, orders: Any, first: Any, count: Any) -> Any:
+    """Reset the worlds of a tile that are to be reset, and say whether any is to be stepped, or not to be skipped."""
+    moving, busy = False, False
+    for b in range(first, first + count):
+        moving |= orders[b] == STEP
+        busy |= orders[b] != SKIP
+        if orders[b] == RESET:
+            _restart(batch, b)
+    return moving, busy
+
+
+@compiled
 def _tally(batch: Any, max_cycles: Any, b: Any) -> None:
     """Count the step that world ``b`` has just taken, and see whether its episode has ended."""
     num_robots = batch.docked.shape[1]
@@ -435,9 +411,9 @@ def _move_tile(move_robot: Any, arrays: Any, batch: Any, orders: Any, first: Any
     for s in range(count):
         b = first + s
         if orders[b] == STEP:
-            _store_world(batch.state, batch.control, batch.docked, b, s, w)
+            _store_world(batch, b, s, w)
         else:
-            _load_world(batch.goal, batch.state, batch.control, batch.docked, b, s, w)
+            _load_world(batch, b, s, w)
 
 
 @cache
@@ -447,9 +423,7 @@ def advance_worlds_kernel(names: tuple[str, ...]) -> Any:
     Args:
         names: Models that the kernel is for.
         arrays: The problem that the worlds share; its starts and goals are not looked at.
-        bounds: ``(2, D)`` lowest and highest observation.
-        num_neighbors: Robots in an observation.
-        num_obstacles: Obstacles in an observation.
+        view: What an observation is made of, a :class:`View`.
         max_cycles: Steps in an episode.
         orders: ``(B,)`` uint8, one of ``STEP``, ``RESET``, ``LOOK`` and ``SKIP`` for every world.
         batch: The worlds, a :class:`WorldBatch`.
@@ -462,46 +436,34 @@ def advance_worlds_kernel(names: tuple[str, ...]) -> Any:
 
     @cached_kernel(models_key(SOURCES, names), variant="_".join(names), **OPTIONS)
     def advance_worlds(
-        arrays: Any, bounds: Any, num_neighbors: Any, num_obstacles: Any, max_cycles: Any, orders: Any, batch: Any,
-        tile_range: Any, out: Any,
-    ) -> None:  # fmt: skip
+        arrays: Any, view: Any, max_cycles: Any, orders: Any, batch: Any, tile_range: Any, out: Any
+    ) -> None:
         use_wide_registers()
         num_robots, dimension = arrays.goal.shape
         w = tiles.aligned_zeros(num_robots * STRIDE)
         near = np.empty((num_robots, 2), np.uint64)
-        sensed = _allocate_sensed(num_robots, 0, dimension, num_neighbors, num_obstacles)
-        bodies = np.empty((0, 2 * dimension + 1), np.float32)
+        sensed = _allocate_sensed(num_robots, 0, dimension, view.num_neighbors, view.num_obstacles)
         for index in range(tile_range[0], tile_range[1]):
             first = index * TILE
             count = min(TILE, orders.shape[0] - first)
-            moving, busy = False, False
-            for s in range(count):
-                order = orders[first + s]
-                moving |= order == STEP
-                busy |= order != SKIP
-                if order == RESET:
-                    _restart(batch, first + s)
+            moving, busy = _restart_tile(batch, orders, first, count)
             if not busy:
                 continue
-            _load(batch.goal, batch.state, batch.control, batch.docked, first, w)
+            _load(batch, first, w)
             tiles.measure_goal_distance(num_robots, dimension, w)
             if moving:
                 _move_tile(move_robot, arrays, batch, orders, first, count, w)
-            _judge(arrays, batch.inverse, first, w, near, batch.collided, batch.violated, batch.rewards)
-            for s in range(count):
-                b = first + s
+            _judge(arrays, batch, first, w, near)
+            for b in range(first, first + count):
+                if orders[b] == SKIP:
+                    continue
                 if orders[b] == STEP:
                     _tally(batch, max_cycles, b)
-                if orders[b] != SKIP:
-                    for k in range(num_robots):
-                        batch.distance[b, k] = np.sqrt(w[k * STRIDE + DISTANCE2 * TILE + s])
-                    if out.shape[0] == 0:
-                        continue
+                for k in range(num_robots):
+                    batch.distance[b, k] = np.sqrt(w[k * STRIDE + DISTANCE2 * TILE + b - first])
+                if out.shape[0] > 0:
                     time_left = np.float32(max(0.0, 1.0 - batch.steps[b] / max_cycles))
-                    _observe(
-                        read_motion, arrays, batch.goal[b], batch.docked[b], bodies, time_left, s, w, bounds, sensed,
-                        out[b],
-                    )  # fmt: skip
+                    _observe(read_motion, arrays, batch, b, time_left, w, view.bounds, sensed, out[b])
 
     return advance_worlds
 
@@ -509,7 +471,6 @@ def advance_worlds_kernel(names: tuple[str, ...]) -> Any:
 class WorldKernels(NamedTuple):
     """The kernels that step and observe teams of some models."""
 
-    step_worlds: Any
     roll_out: Any
     observe_worlds: Any
     advance_worlds: Any
@@ -521,9 +482,7 @@ def world_kernels(models: tuple[str, ...]) -> WorldKernels:
     """
     own = models_of_kernel(models)
     names = COMMON if set(own) <= set(COMMON) else own
-    return WorldKernels(
-        step_worlds_kernel(names), roll_out_kernel(own), observe_worlds_kernel(names), advance_worlds_kernel(names)
-    )
+    return WorldKernels(roll_out_kernel(own), observe_worlds_kernel(names), advance_worlds_kernel(names))
 
 
 @lru_cache(maxsize=256)

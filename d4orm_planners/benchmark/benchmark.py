@@ -266,9 +266,7 @@ def _measure_env(settings: BenchmarkSettings, num_boxes: int, disturbances: Sequ
 
     spread = measure(steps, settings.repetitions, settings.time_limit)
     env.close()
-    row: Row = {"environment": "parallel_env", "num_worlds": 1, "num_robots": 8, "obstacles": num_boxes}
-    row["disturbances"] = len(disturbances)
-    return {**row, **_rate(spread, settings.env_steps)}
+    return _rate("parallel_env", 1, num_boxes, disturbances, spread.times(1 / settings.env_steps))
 
 
 def _measure_worlds(settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[Disturbance[Any]] = ()) -> Row:
@@ -297,9 +295,7 @@ def _measure_worlds(settings: BenchmarkSettings, num_boxes: int, disturbances: S
 
     spread = measure(steps, settings.repetitions, settings.time_limit)
     env.close()
-    row: Row = {"environment": "make_vec", "num_worlds": size, "num_robots": 8, "obstacles": num_boxes}
-    row["disturbances"] = len(disturbances)
-    return {**row, **_rate(spread, calls * size)}
+    return _rate("make_vec", size, num_boxes, disturbances, spread.times(1 / (calls * size)))
 
 
 def _measure_functional(settings: BenchmarkSettings) -> Row:
@@ -327,13 +323,22 @@ def _measure_functional(settings: BenchmarkSettings) -> Row:
     spread = measure(
         lambda: jax.block_until_ready(steps(state, jax.random.key(1))), settings.repetitions, settings.time_limit
     )
-    row: Row = {"environment": "FunctionalEnv", "num_worlds": size, "num_robots": 8, "obstacles": 0, "disturbances": 0}
-    return {**row, **_rate(spread, calls * size)}
+    return _rate("FunctionalEnv", size, 0, (), spread.times(1 / (calls * size)))
 
 
-def _rate(seconds: Spread, steps: int) -> Row:
+def _rate(
+    environment: str, num_worlds: int, num_boxes: int, disturbances: Sequence[Disturbance[Any]], seconds: Spread
+) -> Row:
     """Seconds per environment step, and steps per second at the median."""
-    return {"seconds_per_step": seconds.times(1 / steps), "steps_per_second": steps / seconds.median}
+    return {
+        "environment": environment,
+        "num_worlds": num_worlds,
+        "num_robots": 8,
+        "obstacles": num_boxes,
+        "disturbances": len(disturbances),
+        "seconds_per_step": seconds,
+        "steps_per_second": 1 / seconds.median,
+    }
 
 
 def _measure_plans(settings: BenchmarkSettings, preset: str | None, num_robots: int) -> Row:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
+from operator import itemgetter
 from pathlib import Path
 
 from d4orm_env.core.files import replaced_when_done
@@ -101,84 +102,55 @@ def _denoising(rows: list[Row]) -> str:
     return table("Denoising", header, lines)
 
 
-def _environments(rows: list[Row]) -> str:
-    lines = [
-        (
-            row["environment"],
-            str(row["num_worlds"]),
-            str(row["num_robots"]),
-            str(row["obstacles"]),
-            str(row["disturbances"]),
-            f"{row['steps_per_second']:,.0f}",
-        )
-        for row in rows
-    ]
-    header = ("environment", "worlds", "robots", "boxes", "disturbances", "env-steps per second")
-    return table("Environment steps", header, lines)
+def _tabulated(title: str, columns: Mapping[str, Callable[[Row], object]]) -> Callable[[list[Row]], str]:
+    """Draws a table of measurements, with what to write in a column by its name."""
 
+    def draw(rows: list[Row]) -> str:
+        return table(title, tuple(columns), [[str(text(row)) for text in columns.values()] for row in rows])
 
-def _obstacles(rows: list[Row]) -> str:
-    lines = [
-        (
-            f"{row['obstacles']} {row['where']}",
-            milliseconds(row["iteration"]),
-            f"{row['ratio'].median:.2f}",
-            milliseconds(row["verify"]),
-        )
-        for row in rows
-    ]
-    header = ("boxes", "iteration, ms", "times that in the open", "verify(), ms")
-    return table("Obstacles, 8 robots, preset paper", header, lines)
-
-
-def _index(rows: list[Row]) -> str:
-    lines = [
-        (
-            f"{row['cells']} x {row['cells']}",
-            str(row["obstacles"]),
-            f"{row['seconds']:.2f}",
-            f"{row['bytes'] / 2**20:.1f}",
-        )
-        for row in rows
-    ]
-    return table("Index of a map's obstacles", ("cells", "boxes", "s", "MiB"), lines)
-
-
-def _startup(rows: list[Row]) -> str:
-    lines = [(str(row["num_robots"]), f"{row['compiling']:.1f}", f"{row['cold']:.1f}", seconds(row["warm"]))
-             for row in rows]  # fmt: skip
-    header = ("robots", "compiling, s", "process with an empty cache, s", "process with a full cache, s")
-    return table("From the start of a process to its first plan", header, lines)
-
-
-def _memory(rows: list[Row]) -> str:
-    lines = [(str(row["num_robots"]), f"{row['imported'] / 2**20:.0f}", f"{row['peak'] / 2**20:.0f}") for row in rows]
-    return table("Memory", ("robots", "after importing, MiB", "peak while planning, MiB"), lines)
-
-
-def _plans(rows: list[Row]) -> str:
-    lines = [
-        (
-            str(row["num_robots"]),
-            row["rules"],
-            f"{row['solved']} of {row['seeds']}",
-            seconds(row["seconds"]),
-            f"{row['seconds'].largest:.2f}",
-            f"{row['iterations'].median:.1f}",
-            f"{row['travel_time'].median:.2f}",
-        )
-        for row in rows
-    ]
-    header = ("robots", "preset", "solved", "planning, s", "slowest, s", "iterations", "travel time, s")
-    return table("First feasible verified plan, circle of 5 m", header, lines)
+    return draw
 
 
 _SECTIONS: dict[str, Callable[[list[Row]], str]] = {
     "denoising": _denoising,
-    "environments": _environments,
-    "obstacles": _obstacles,
-    "index": _index,
-    "startup": _startup,
-    "memory": _memory,
-    "plans": _plans,
-}
+    "environments": _tabulated("Environment steps", {
+        "environment": itemgetter("environment"),
+        "worlds": itemgetter("num_worlds"),
+        "robots": itemgetter("num_robots"),
+        "boxes": itemgetter("obstacles"),
+        "disturbances": itemgetter("disturbances"),
+        "env-steps per second": lambda row: f"{row['steps_per_second']:,.0f}",
+    }),
+    "obstacles": _tabulated("Obstacles, 8 robots, preset paper", {
+        "boxes": lambda row: f"{row['obstacles']} {row['where']}",
+        "iteration, ms": lambda row: milliseconds(row["iteration"]),
+        "times that in the open": lambda row: f"{row['ratio'].median:.2f}",
+        "verify(), ms": lambda row: milliseconds(row["verify"]),
+    }),
+    "index": _tabulated("Index of a map's obstacles", {
+        "cells": lambda row: f"{row['cells']} x {row['cells']}",
+        "boxes": itemgetter("obstacles"),
+        "s": lambda row: f"{row['seconds']:.2f}",
+        "MiB": lambda row: f"{row['bytes'] / 2**20:.1f}",
+    }),
+    "startup": _tabulated("From the start of a process to its first plan", {
+        "robots": itemgetter("num_robots"),
+        "compiling, s": lambda row: f"{row['compiling']:.1f}",
+        "process with an empty cache, s": lambda row: f"{row['cold']:.1f}",
+        "process with a full cache, s": lambda row: seconds(row["warm"]),
+    }),
+    "memory": _tabulated("Memory", {
+        "robots": itemgetter("num_robots"),
+        "after importing, MiB": lambda row: f"{row['imported'] / 2**20:.0f}",
+        "peak while planning, MiB": lambda row: f"{row['peak'] / 2**20:.0f}",
+    }),
+    "plans": _tabulated("First feasible verified plan, circle of 5 m", {
+        "robots": itemgetter("num_robots"),
+        "preset": itemgetter("rules"),
+        "solved": lambda row: f"{row['solved']} of {row['seeds']}",
+        "planning, s": lambda row: seconds(row["seconds"]),
+        "slowest, s": lambda row: f"{row['seconds'].largest:.2f}",
+        "iterations": lambda row: f"{row['iterations'].median:.1f}",
+        "travel time, s": lambda row: f"{row['travel_time'].median:.2f}",
+    }),
+}  # fmt: skip

@@ -11,7 +11,6 @@ from d4orm_planners.commands.inputs import make_folder
 from d4orm_planners.commands.options import Engine, Seed
 from d4orm_planners.commands.outputs import episode_rows, print_plan, print_table, require_solved
 from d4orm_planners.commands.plan import solving
-from d4orm_planners.commands.run import execute
 
 if TYPE_CHECKING:
     from d4orm_planners.episode import Episode
@@ -31,7 +30,8 @@ def demo(
     if denoising:
         show_denoising(out, num_robots, seed, engine)
         return
-    from d4orm_env import make_problem, verify
+    from d4orm_env import make_problem, navigation_v0, verify
+    from d4orm_planners.episode import run_episode
     from d4orm_planners.policy import OpenLoop
     from d4orm_planners.registry import make_planner
 
@@ -42,7 +42,7 @@ def demo(
         plan = planner.solve(problem, seed, callback=callback)
     print_plan(plan)
     require_solved(plan)
-    episode = execute(problem, OpenLoop(plan=plan), seed)
+    episode = run_episode(navigation_v0.parallel_env(problem=problem), OpenLoop(plan=plan), seed)
     report = verify(problem, plan.controls)
     verdict = "yes" if report.ok else "no: " + "; ".join(map(str, report.violations[:3]))
     rows = [("verified", verdict), ("closest approach", f"{report.min_separation * 100:.1f} cm between surfaces")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -18,7 +19,7 @@ from d4orm_planners.commands.inputs import (
     parse_settings,
     seed_list,
 )
-from d4orm_planners.commands.options import Quiet, ScenarioSettings, TimeLimit
+from d4orm_planners.commands.options import Physics, Quiet, ScenarioSettings, TimeLimit
 
 if TYPE_CHECKING:
     from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup
@@ -29,7 +30,9 @@ NoiseLevels = Annotated[
 ]
 DisturbanceLevels = Annotated[
     list[str] | None,
-    typer.Option("--disturb", help="Levels of a disturbance, as delay=0,1,2 or push.speed=0.2,0.5; repeatable."),
+    typer.Option(
+        "--disturb", help="Levels of a disturbance, as delay=0,1,2 or push(rate=1).speed=0.2,0.5; repeatable."
+    ),
 ]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to, and to go on from.")]
 
@@ -64,6 +67,7 @@ class StudyOptions:
     ] = "50"
     control_noise_std: NoiseLevels = "0"
     disturb: DisturbanceLevels = None
+    physics: Physics = "model"
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="A setting of all policies that have it, or of one, as orca.time_horizon=2."),
@@ -101,6 +105,7 @@ class StudyOptions:
             model=names(self.model),
             scenario_settings=parse_settings(self.scenario_settings, "--scenario-set"),
             time_limit=self.time_limit,
+            physics=self.physics,
         )
         make_folder(self.out)
         with resumable(f"the finished trials are kept in {self.out}", enabled=not self.quiet) as progress:
@@ -112,21 +117,31 @@ class StudyOptions:
 @takes(StudyOptions)
 def evaluate(options: StudyOptions) -> None:
     """Compare policies on scenarios, team sizes, seeds, noise and disturbances; goes on where it was stopped."""
+    from d4orm_planners.evaluation.report import PARQUET_HINT, write_results
+
+    rates, written = report(options, write_results)
+    if options.out / "trials.parquet" not in written:
+        typer.echo(PARQUET_HINT, err=True)
+    require_trials(rates)
+
+
+def report(
+    options: StudyOptions, write: Callable[[Path, list[SuccessRate]], list[Path]]
+) -> tuple[list[SuccessRate], list[Path]]:
+    """Run the trials and write what they came to; the success rates and what was written."""
     from d4orm_planners.commands.progress import tell_results
     from d4orm_planners.evaluation.disturbance_report import write_disturbances
-    from d4orm_planners.evaluation.report import PARQUET_HINT, markdown, write_results
+    from d4orm_planners.evaluation.report import markdown
     from d4orm_planners.evaluation.summary import success_rates
 
     groups = options.run()
     rates = success_rates(groups)
-    written = write_results(options.out, rates)
+    written = write(options.out, rates)
     if options.disturb is not None:
         written += write_disturbances(options.out, groups)
     if not options.quiet:
         tell_results(markdown(rates), written)
-    if options.out / "trials.parquet" not in written:
-        typer.echo(PARQUET_HINT, err=True)
-    require_trials(rates)
+    return rates, written
 
 
 def require_trials(rates: list[SuccessRate]) -> None:

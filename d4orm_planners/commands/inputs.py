@@ -20,19 +20,12 @@ def parse_settings(settings: list[str] | None, option: str = "--set") -> dict[st
     Raises:
         ValueError: If a text has another form, or gives a name again.
     """
-    from d4orm_env.core.yaml_text import parse_yaml
-
-    values = {}
+    values: dict[str, Any] = {}
     for setting in settings or []:
         name, separator, text = setting.partition("=")
         if not separator or not name:
             raise ValueError(f"{option} {setting!r} is not of the form name=value, as num_samples=512")
-        if name in values:
-            raise ValueError(f"{option} gives {name!r} twice; give it once")
-        try:
-            values[name] = parse_yaml(text) if text.strip() else None
-        except ValueError as error:
-            raise ValueError(f"{option} {setting!r}: the value {error}") from None
+        _add(values, name, text if text.strip() else "null", option, f"{setting!r}: the value")
     return values
 
 
@@ -42,22 +35,17 @@ def parse_levels(texts: list[str] | None) -> dict[str, list[Any]] | None:
     Raises:
         ValueError: If a text has another form, or gives a name again.
     """
-    from d4orm_env.core.yaml_text import parse_yaml
-
     if texts is None:
         return None
     levels: dict[str, list[Any]] = {}
     for text in texts:
-        name, separator, listed = (part.strip() for part in text.partition("="))
+        brackets, closed, rest = text.rpartition(")")  # what is in them has equals signs of its own
+        name, separator, listed = (part.strip() for part in rest.partition("="))
+        name = brackets + closed + name
         if not separator or not name or not listed:
             raise ValueError(f"--disturb {text!r} is not of the form name=levels, as delay=0,1,2 or push.speed=0.2,0.5")
-        if name in levels:
-            raise ValueError(f"--disturb gives {name!r} twice; give it once")
-        try:
-            values: Any = parse_yaml(f"[{listed}]")
-        except ValueError as error:
-            raise ValueError(f"--disturb {text!r}: the levels {error}") from None
-        levels[name] = [math.inf if value == "inf" else value for value in values]
+        _add(levels, name, f"[{listed}]", "--disturb", f"{text!r}: the levels")
+        levels[name] = [math.inf if value == "inf" else value for value in levels[name]]
     return levels
 
 
@@ -72,6 +60,18 @@ def single_levels(texts: list[str] | None) -> dict[str, Any]:
         if len(values) != 1:
             raise ValueError(f"--disturb {name}: an episode has one level, not {len(values)}; use d4orm evaluate")
     return {name: values[0] for name, values in levels.items()}
+
+
+def _add(values: dict[str, Any], name: str, text: str, option: str, what: str) -> None:
+    """Add a value read as YAML under a new name."""
+    from d4orm_env.core.yaml_text import parse_yaml
+
+    if name in values:
+        raise ValueError(f"{option} gives {name!r} twice; give it once")
+    try:
+        values[name] = parse_yaml(text)
+    except ValueError as error:
+        raise ValueError(f"{option} {what} {error}") from None
 
 
 def refuse_options(context: typer.Context, options: Iterable[str], reason: str) -> None:

@@ -23,6 +23,9 @@ ScenarioSettings = Annotated[
 Seed = Annotated[int, typer.Option("--seed", help="Seed of the scenario and of the planner.")]
 Engine = Annotated[str, typer.Option("--engine", help="auto, cpu or jax.")]
 TimeLimit = Annotated[float | None, typer.Option("--time-limit", help="Seconds for planning.")]
+Physics = Annotated[
+    str, typer.Option("--physics", help="What moves the robots: model, as planners know them, or mujoco.")
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no tables.")]
 
 

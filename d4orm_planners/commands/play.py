@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from d4orm_planners.commands.dataclass_options import takes
+from d4orm_planners.commands.inputs import names
 from d4orm_planners.commands.options import ProblemOptions
 
 
@@ -18,7 +19,9 @@ from d4orm_planners.commands.options import ProblemOptions
 class PlayOptions(ProblemOptions):
     """What to begin with, and where to be found."""
 
-    policy: Annotated[str, typer.Option("--policy", "-p", help="What drives (see `d4orm planners`).")] = "d4orm-c2f"
+    policy: Annotated[
+        str, typer.Option("--policy", "-p", help="What drives (see `d4orm planners`); several, separated by commas.")
+    ] = "d4orm-c2f"
     host: Annotated[
         str, typer.Option("--host", help="Where to be found; elsewhere than here the address has a token.")
     ] = "127.0.0.1"
@@ -35,7 +38,8 @@ def play(options: PlayOptions) -> None:
         raise ImportError('d4orm play needs viser; install it with pip install "d4orm-env[viz]"') from error
 
     typer.echo("getting ready; the first time this compiles for a while ...")
-    playground = Playground(options.problem(), options.policy, options.seed, options.host, options.port)
+    policies = names(options.policy) or ()
+    playground = Playground(options.problem(), *policies, seed=options.seed, host=options.host, port=options.port)
     try:
         typer.echo(f"open {playground.address}\nCtrl-C ends it")
         if options.open_browser and has_display():

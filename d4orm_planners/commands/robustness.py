@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from d4orm_planners.commands.dataclass_options import takes
-from d4orm_planners.commands.evaluate import NoiseLevels, Out, StudyOptions, require_trials
+from d4orm_planners.commands.evaluate import NoiseLevels, Out, StudyOptions, report, require_trials
 
 STANDARD = (
     "control_noise=0,0.1,0.2,0.3",
@@ -36,18 +36,9 @@ class RobustnessOptions(StudyOptions):
 @takes(RobustnessOptions)
 def robustness(options: RobustnessOptions) -> None:
     """Measure how often policies succeed when something goes wrong: noise, delays, pushes and others."""
-    from d4orm_planners.commands.progress import tell_results
-    from d4orm_planners.evaluation.disturbance_report import write_disturbances
-    from d4orm_planners.evaluation.report import markdown, write_robustness
-    from d4orm_planners.evaluation.summary import success_rates
+    from d4orm_planners.evaluation.report import write_robustness
 
     if options.control_noise_std is None and options.disturb is None:
         options = replace(options, disturb=list(STANDARD))
-    groups = options.run()
-    rates = success_rates(groups)
-    written = write_robustness(options.out, rates)
-    if options.disturb is not None:
-        written += write_disturbances(options.out, groups)
-    if not options.quiet:
-        tell_results(markdown(rates), written)
+    rates, _ = report(options, write_robustness)
     require_trials(rates)

@@ -12,7 +12,7 @@ import typer
 from d4orm_env.core.summary import count
 from d4orm_planners.commands.dataclass_options import takes
 from d4orm_planners.commands.inputs import check_target, names, refuse_options, single_levels
-from d4orm_planners.commands.options import PictureOptions, ProblemOptions
+from d4orm_planners.commands.options import Physics, PictureOptions, ProblemOptions
 from d4orm_planners.commands.outputs import episode_rows, print_table
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ class RunOptions(PictureOptions, ProblemOptions):
     ] = None
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Replay to write, .html.")] = None
 
+    physics: Physics = "model"
     disturb: Annotated[
         list[str] | None,
         typer.Option("--disturb", help="A disturbance at a level, as delay=2 or push.speed=0.3; repeatable."),
@@ -51,6 +52,15 @@ class RunOptions(PictureOptions, ProblemOptions):
         from d4orm_env.disturbances.registry import disturbances_at
 
         return disturbances_at(single_levels(self.disturb))
+
+    def execute(self, problem: Problem, policy: Policy, disturbances: Sequence[Disturbance[Any]]) -> Episode:
+        """An episode of a policy on a problem."""
+        from d4orm_planners.episode import open_env, run_episode
+
+        env = open_env(problem, self.physics, control_noise_std=self.control_noise_std, disturbances=disturbances)
+        episode = run_episode(env, policy, seed=self.seed)
+        env.close()
+        return episode
 
     def chosen(self) -> tuple[Problem, Policy]:
         """The problem, and what acts in it.
@@ -83,7 +93,7 @@ def run(options: RunOptions) -> None:
         return
     disturbances = options.disturbances()
     problem, policy = options.chosen()
-    episode = execute(problem, policy, options.seed, options.control_noise_std, disturbances)
+    episode = options.execute(problem, policy, disturbances)
     options.draw(problem, episode.trajectory, episode.marks)
     if options.out is not None:
         episode.to_html(options.out)
@@ -111,27 +121,10 @@ def compare(options: RunOptions, policies: Sequence[str]) -> None:
     problem, makers = options.problem(), {name: make_policy(name) for name in policies}
     episodes = {}
     for name, policy in makers.items():
-        episodes[name] = execute(problem, policy, options.seed, options.control_noise_std, options.disturbances())
+        episodes[name] = options.execute(problem, policy, options.disturbances())
         if not options.quiet:
             print_table(name, episode_rows(episodes[name]))
     title = f"{problem.name}, {count(problem.num_robots, 'robot')}"
     Replay(title, tuple(episode.motion(name) for name, episode in episodes.items())).save(options.out)
     if not options.quiet:
         typer.echo(f"wrote {options.out}")
-
-
-def execute(
-    problem: Problem,
-    policy: Policy,
-    seed: int,
-    control_noise_std: float = 0.0,
-    disturbances: Sequence[Disturbance[Any]] = (),
-) -> Episode:
-    """An episode of a policy on a problem."""
-    from d4orm_env import navigation_v0
-    from d4orm_planners.episode import run_episode
-
-    env = navigation_v0.parallel_env(problem=problem, control_noise_std=control_noise_std, disturbances=disturbances)
-    episode = run_episode(env, policy, seed=seed)
-    env.close()
-    return episode

@@ -8,26 +8,34 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.trajectory import Trajectory
 
 
-@dataclass(frozen=True, eq=False)
-class Guidance:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Waypoints:
+    """What a team follows.
+
+    Attributes:
+        path: ``(H+1, K, d)`` waypoints, one per time step of the control loop [m].
+        ordered: Whether the ways were found on a roadmap, where who waits for whom decides.
+    """
+
+    path: FloatArray
+    ordered: bool
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Guidance(Waypoints):
     """A coarse plan and the path made from it.
 
     Attributes:
         problem: The coarse problem: larger time steps from where the plan begins.
         controls: ``(H_c, K, m)`` of the coarse plan.
         states: ``(H_c+1, K, n)``.
-        path: ``(H+1, K, d)`` waypoints, one per time step of the control loop [m].
-        ordered: Whether the ways were found on a roadmap, where who waits for whom decides.
     """
 
     problem: Problem
     controls: FloatArray
     states: FloatArray
-    path: FloatArray
-    ordered: bool = False
 
 
 def coarse_problem(problem: Problem, factor: int) -> Problem:
@@ -50,12 +58,6 @@ def interpolate(path: FloatArray, factor: int) -> FloatArray:
     share = (np.arange(factor, dtype=path.dtype) / factor)[None, :, None, None]
     between = path[:-1, None] * (1 - share) + path[1:, None] * share
     return np.concatenate([between.reshape(-1, *path.shape[1:]), path[-1:]])
-
-
-def passes_checks(trajectory: Trajectory, interval: int) -> bool:
-    """Whether everyone arrives, and nobody violates the margin at any ``interval``-th step (paper, section VI-A)."""
-    arrives = bool(trajectory.arrived[-1].all())
-    return arrives and not trajectory.margin_violated[interval::interval].any()
 
 
 def nearest_indices(path: FloatArray, positions: FloatArray, last: IntArray, window: int) -> IntArray:

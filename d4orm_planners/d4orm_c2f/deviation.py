@@ -1,4 +1,4 @@
-"""Where robots are expected, how far they come from there, and what room that calls for."""
+"""Where robots are and are expected, how far they come from there, and what room that calls for."""
 
 from __future__ import annotations
 
@@ -8,6 +8,11 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.base import Engine
 from d4orm_env.joint_state import JointState
+from d4orm_planners.d4orm_c2f.filtering import StateFilter
+from d4orm_planners.d4orm_c2f.lateness import Lateness
+from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
+from d4orm_planners.d4orm_c2f.standing import Standing
+from d4orm_planners.d4orm_c2f.weakness import Weakness
 
 DECAY = 0.98
 """What is left after a time step of the largest deviation seen."""
@@ -22,43 +27,76 @@ class Deviation:
     Args:
         problem: The robots.
         engine: What knows how they should move.
-        delay: Steps late that commands are executed.
+        config: What is to be found out: how late commands are, how noisy states are, who is weak or does not obey.
 
     Attributes:
         speed: The largest deviation of a robot in a time step, over its length, of late [m/s].
+        problem: The robots with the limits that they are believed to have now.
+        lateness: How late commands are executed.
+        standing: Who has stalled.
     """
 
-    def __init__(self, problem: Problem, engine: Engine, delay: int) -> None:
-        self._problem, self._engine = problem, engine
-        nothing = np.zeros((problem.num_robots, problem.control_size), np.float32)
-        self._under_way = [nothing] * delay
+    def __init__(self, problem: Problem, engine: Engine, config: D4ormC2FConfig) -> None:
+        self.problem, self._engine = problem, engine
+        self.lateness = Lateness(problem.num_robots, problem.control_size, config.delay)
+        self._weakness = Weakness(problem) if config.learn_limits else None
+        self.standing = Standing(problem) if config.stalls else None
+        self._filter = StateFilter(problem) if config.filter_states else None
+        self._measured: JointState | None = None
+        self._estimated: JointState | None = None
         self._expected: FloatArray | None = None
         self.speed = 0.0
 
     def observe(self, joint: JointState) -> JointState:
         """Compare where the robots are with where they were expected; where they will be once commands arrive."""
+        told = self.lateness.observe(joint.controls, ~joint.arrived)
+        joint = self._filtered(joint)
+        if self._weakness is not None:
+            going = ~joint.arrived if self.standing is None else ~joint.arrived & ~self.standing.robots
+            self._weakness.observe(told, joint.controls, going)
+            self.problem = self._weakness.problem
+        if self.standing is not None:
+            joint = self.standing.observe(joint, told)
         self.speed *= DECAY
         if self._expected is not None:
-            d = self._problem.dimension
+            d = self.problem.dimension
             away = np.linalg.norm(joint.states[:, :d] - self._expected[:, :d], axis=1)[~joint.arrived]
-            self.speed = max(self.speed, float(away.max(initial=0.0)) / self._problem.dt)
+            self.speed = max(self.speed, float(away.max(initial=0.0)) / self.problem.dt)
         self._seen = joint
-        for controls in self._under_way:
+        for controls in self.lateness.under_way:
             joint = self._moved(joint, controls)
         return joint
 
+    def _filtered(self, joint: JointState) -> JointState:
+        """The joint state with less noise on it, where measurements are noisy."""
+        if self._filter is None:
+            return joint
+        estimated = joint
+        if self._measured is not None and self._estimated is not None:
+            # What was executed is known, so that noise on controls is not taken for noise on states.
+            led_to = self._moved(self._measured, joint.controls).states
+            same = self._estimated.states is self._measured.states
+            expected = led_to if same else self._moved(self._estimated, joint.controls).states
+            states = self._filter.update(joint.states, led_to, expected, ~joint.arrived)
+            if states is not joint.states:
+                estimated = joint._replace(states=states)
+        self._measured, self._estimated = joint, estimated
+        return estimated
+
     def expect(self, controls: FloatArray) -> None:
         """Remember where the robots should be in a time step, now that these controls ``(K, m)`` are sent."""
-        self._under_way = [*self._under_way, controls]
-        self._expected = self._moved(self._seen, self._under_way.pop(0)).states
+        arrays = self.problem.resumed_at(self._seen.states, self._seen.goals).arrays
+        step = self._engine.step(arrays, self._seen.states, self._seen.arrived, controls)
+        now = self.lateness.send(step.controls)
+        self._expected = step.states if now is step.controls else self._moved(self._seen, now).states
 
     def _moved(self, joint: JointState, controls: FloatArray) -> JointState:
-        arrays, d = self._problem.resumed_at(joint.states, joint.goals).arrays, self._problem.dimension
+        arrays, d = self.problem.resumed_at(joint.states, joint.goals).arrays, self.problem.dimension
         step = self._engine.step(arrays, joint.states, joint.arrived, controls)
         bodies = joint.bodies.copy()
         if len(bodies):
-            bodies[:, :d] += self._problem.dt * bodies[:, d : 2 * d]
-        return joint._replace(states=step.states, arrived=step.arrived & self._problem.docks, bodies=bodies)
+            bodies[:, :d] += self.problem.dt * bodies[:, d : 2 * d]
+        return joint._replace(states=step.states, arrived=step.arrived & self.problem.docks, bodies=bodies)
 
     def room(self, reaction_time: float) -> float:
         """How far robots get from where they are expected within so many seconds [m]."""

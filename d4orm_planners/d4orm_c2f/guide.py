@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -14,10 +15,10 @@ from d4orm_env.joint_state import JointState
 from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.coarse import (
     Guidance,
+    Waypoints,
     coarse_problem,
     interpolate,
     nearest_indices,
-    passes_checks,
     rest_of,
     subgoal_indices,
 )
@@ -27,11 +28,9 @@ from d4orm_planners.d4orm_c2f.sight import within_sight
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
 from d4orm_planners.guidance.planner import Guide as Ways
+from d4orm_planners.guidance.relay import relay_ways
 from d4orm_planners.search import Search
 from d4orm_planners.steering import straight_drives
-
-LAG = 5
-"""Waypoints that a robot may be behind the others without its subgoal staying behind too."""
 
 NEARER = 0.05
 """What counts as coming nearer to the goals, all robots together [m]."""
@@ -46,48 +45,44 @@ class Guide:
         seed: Of the episode.
         refiner: What refinements roll out and sample with.
         background: Where they are made, if not between control loops.
+        lifelong: Whether robots that arrive get new goals.
 
     Attributes:
+        problem: The problem, with the limits that the robots are believed to have now.
         guidance: What is followed at present.
         index: Waypoint at which the team is.
         anew: ``(K,)`` robots that are sent another way than before, until :meth:`fresh_start` has reported it.
         stuck: ``(K,)`` robots that do not get on, or did not until a short while ago.
     """
 
-    guidance: Guidance
+    guidance: Waypoints
     index: int
     anew: BoolArray
     stuck: BoolArray
 
     def __init__(
-        self, problem: Problem, config: D4ormC2FConfig, seed: int, refiner: Engine, background: Background[Guidance]
+        self,
+        problem: Problem,
+        config: D4ormC2FConfig,
+        seed: int,
+        refiner: Engine,
+        background: Background[Guidance],
+        lifelong: bool,
     ) -> None:
-        self._problem, self._config, self._seed = problem, config, seed
+        self.problem, self._config, self._seed, self._lifelong = problem, config, seed, lifelong
         self._refiner, self._background = refiner, background
         # Ways that fit between others to the centimetre are no guidance: fine plans cannot keep to them. But where
         # the team does not get on there may be no other ways.
-        self._planner, self._thorough = (
-            D4ormD(
-                D4ormDConfig(
-                    engine=config.engine,
-                    num_samples=config.coarse_samples,
-                    num_steps=config.coarse_steps,
-                    repair_steps=config.coarse_repair_steps,
-                    improve=True,
-                    reroute=reroute,
-                    shorten=False,
-                )
-            )
-            for reroute in (False, True)
-        )
+        self._planner, self._thorough = (_coarse_planner(config, reroute=reroute) for reroute in (False, True))
 
     def begin(self, joint: JointState) -> None:
         """Plan for the episode."""
-        self._patience = Patience(joint)
-        guidance = self.plan(joint, None, self._config.coarse_iterations)
-        self._follow(joint, guidance, np.ones(self._problem.num_robots, bool))
+        everybody = np.ones(self.problem.num_robots, bool)
+        self._patience, self.stuck = Patience(joint), ~everybody
+        self.guidance, self.index = self.plan(joint, None, self._config.coarse_iterations), 0
+        self._follow(joint, self._relayed(joint, everybody) or self.guidance, everybody)
 
-    def _follow(self, joint: JointState, guidance: Guidance, anew: BoolArray) -> None:
+    def _follow(self, joint: JointState, guidance: Waypoints, anew: BoolArray) -> None:
         """Begin at the beginning of a guidance, which sends the robots ``anew`` ``(K,)`` another way than before."""
         self.anew = anew
         self.guidance = guidance
@@ -98,47 +93,53 @@ class Guide:
     def plan(self, joint: JointState, initial: FloatArray | None, iterations: int, thorough: bool = False) -> Guidance:
         """Plan for the whole team from where it is, until a plan passes the checks (Algorithm 4, lines 1 to 3)."""
         planner = self._thorough if thorough else self._planner
-        present = self._problem.resumed_at(joint.states, joint.goals)
+        present = self.problem.resumed_at(joint.states, joint.goals)
         coarse = coarse_problem(present, self._config.coarse_factor)
-        search = Search(planner, coarse, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps), initial)
+        seed, interval = derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps), self._config.check_interval
+        search = Search(planner, coarse, seed, initial, check_interval=interval)
         chosen, ordered = search.current, False
         for number in range(iterations):
-            if passes_checks(chosen.trajectory, self._config.check_interval):
+            if not chosen.failed.any():
                 break
             search.advance()
             if number == 0:
                 ordered = isinstance(search.state, Ways)
             chosen = search.current if search.current.rank >= search.best.rank else search.best
-            if passes_checks(search.current.trajectory, self._config.check_interval):
+            if not search.current.failed.any():
                 chosen = search.current
         plan = chosen.trajectory
         path = interpolate(plan.positions, self._config.coarse_factor)
-        return Guidance(coarse, plan.controls, plan.states, path, ordered)
+        return Guidance(problem=coarse, controls=plan.controls, states=plan.states, path=path, ordered=ordered)
 
     def subgoals(self, joint: JointState, docked: BoolArray) -> IntArray:
         """``(K,)`` waypoints that the robots head for; finds out where on the path they are (Algorithm 4, line 6)."""
         path, offset = self.guidance.path, self._config.subgoal_offset
-        positions = joint.states[:, : self._problem.dimension]
+        positions = joint.states[:, : self.problem.dimension]
         self._indices = nearest_indices(path, positions, self._indices, offset)
         going = ~docked & ~self.stuck
         if going.any():
             self.index = round(float(self._indices[going].mean()))
-        targets = subgoal_indices(self._indices, self.index, offset, LAG, len(path) - 1)
+        lag = len(path) if self._config.max_lag is None else self._config.max_lag
+        targets = subgoal_indices(self._indices, self.index, offset, lag, len(path) - 1)
+        if not self._config.sight:
+            return targets
         walls = self.guidance.ordered
-        return within_sight(self._problem, positions, path, self._indices, targets, docked, walls)
+        return within_sight(self.problem, positions, path, self._indices, targets, docked, walls)
 
     def followed(self, joint: JointState, engine: Engine, horizon: int) -> FloatArray:
         """``(horizon, K, m)`` controls that take every robot slowly along its path."""
-        return follow_slowly(self._problem, engine, joint, self.guidance.path, self._indices, horizon)
+        return follow_slowly(self.problem, engine, joint, self.guidance.path, self._indices, horizon)
 
     def timed(self, joint: JointState, engine: Engine, horizon: int) -> FloatArray:
         """``(horizon, K, m)`` controls that take every robot along its path in the team's time."""
-        clock = np.minimum(self.index, self._indices + LAG)
-        return keep_time(self._problem, engine, joint, self.guidance.path, clock, horizon)
+        clock = np.full_like(self._indices, self.index)
+        if self._config.max_lag is not None:
+            clock = np.minimum(clock, self._indices + self._config.max_lag)
+        return keep_time(self.problem, engine, joint, self.guidance.path, clock, horizon)
 
     def fresh_start(self, base: FloatArray) -> None:
         """Have those that are sent another way begin ``base`` ``(H_predict, K, m)`` with the coarse plan's controls."""
-        if self.anew.any():
+        if self.anew.any() and isinstance(self.guidance, Guidance):
             # Each is held for as long as it stands for.
             held = np.repeat(self.guidance.controls, self._config.coarse_factor, axis=0)[: len(base)]
             base[:, self.anew] = 0
@@ -149,27 +150,48 @@ class Guide:
         """Plan anew for robots with new goals or stuck, for a team that lost the guidance or has come to its end."""
         changed = (joint.goals != self._goals).any(axis=1)
         moving = ~docked
-        stuck, self.stuck = self._patience.observe(joint, self._due(joint))
+        stuck, lost = np.zeros_like(docked), False
+        if self._config.replan:
+            stuck, self.stuck = self._patience.observe(joint, self._due(joint))
+            lost = bool(moving.any()) and self._is_lost(joint, moving)
         if not moving.any():
             return False
-        lost = self._is_lost(joint, moving)
+        if self._config.replan:
+            changed |= moving & (self._away(joint) > self._config.replan_distance)
         held_up = moving & stuck & (joint.steps - self._began > STUCK_AFTER)
         if not (changed | held_up).any() and not lost:
             return False
         changed |= held_up
         keep = moving & ~changed
+        relayed = self._relayed(joint, ~keep | lost) or self._relayed(joint, np.ones_like(keep))
+        if relayed is not None:
+            self._follow(joint, relayed, changed)
+            return True
         thorough = lost or bool(held_up.any())
         iterations = self._config.coarse_iterations if thorough else self._config.replan_iterations
-        # A way straight through walls is no beginning: there the whole team's ways are found anew on the roadmap.
-        initial = None if self.guidance.ordered else self._beginning(joint, keep & (not lost))
+        initial = self._beginning(joint, keep & (not lost))
         guidance = self.plan(joint, initial, iterations, thorough)
         self._follow(joint, guidance, ~keep | lost)
         return True
 
-    def _beginning(self, joint: JointState, keep: BoolArray) -> FloatArray:
-        """``(H_c, K, m)`` straight drives, but for those that ``keep`` ``(K,)`` what is left of their ways."""
+    def _relayed(self, joint: JointState, changed: BoolArray) -> Waypoints | None:
+        """New ways on the roadmap for those ``changed`` ``(K,)``, around all others on theirs, where goals are many."""
+        if not (self._lifelong and self.guidance.ordered):
+            return None
+        factor, seed = self._config.coarse_factor, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps)
+        present = coarse_problem(self.problem.resumed_at(joint.states, joint.goals), factor)
+        ways = relay_ways(present, self.guidance.path[self.index :: factor], changed, seed)
+        return None if ways is None else Waypoints(path=interpolate(ways, factor), ordered=True)
+
+    def _beginning(self, joint: JointState, keep: BoolArray) -> FloatArray | None:
+        """``(H_c, K, m)`` straight drives, but for those that ``keep`` ``(K,)`` what is left of their ways.
+
+        ``None`` among walls: there the whole team's ways are found anew on the roadmap.
+        """
+        if self.guidance.ordered or not isinstance(self.guidance, Guidance):
+            return None
         factor = self._config.coarse_factor
-        present = coarse_problem(self._problem.resumed_at(joint.states, joint.goals), factor)
+        present = coarse_problem(self.problem.resumed_at(joint.states, joint.goals), factor)
         initial = straight_drives(present).controls[:, :, 0]
         if keep.any():
             rest = self.guidance.controls[self.index // factor :]
@@ -184,22 +206,30 @@ class Guide:
 
     def _is_lost(self, joint: JointState, moving: BoolArray) -> bool:
         """Whether the robots under way are far from their waypoints, at the end of the path, or get no nearer."""
-        positions = joint.states[:, : self._problem.dimension]
+        positions = joint.states[:, : self.problem.dimension]
         distance = float(np.linalg.norm((joint.goals - positions)[moving], axis=1).sum())
         if distance < self._nearest - NEARER:
             self._nearest, self._nearest_at = distance, joint.steps
-        waypoints = self.guidance.path[self._indices, np.arange(len(moving))]
-        away = np.linalg.norm(positions - waypoints, axis=1)[moving].mean()
         return bool(
-            away > self._config.replan_distance
+            self._away(joint)[moving].mean() > self._config.replan_distance
             or self.index >= len(self.guidance.path) - 1
             or joint.steps - self._nearest_at > self._config.patience
         )
+
+    def _away(self, joint: JointState) -> FloatArray:
+        """``(K,)`` how far the robots are from their waypoints [m]."""
+        positions = joint.states[:, : self.problem.dimension]
+        away: FloatArray = np.linalg.norm(
+            positions - self.guidance.path[self._indices, np.arange(len(positions))], axis=1
+        )
+        return away
 
     def refine(self, step: int, due: bool) -> bool:
         """Take over what the refinement has done meanwhile, and give it more to do if that is ``due``."""
         index = self.index + self._config.subgoal_offset
         if self._config.refine == "off" or index >= len(self.guidance.path) - 1:
+            return False
+        if not isinstance(self.guidance, Guidance):
             return False
         guidance, seed = self.guidance, derived_seed(self._seed, Stream.REFINEMENT, step)
         if self._config.refine == "sync":
@@ -226,3 +256,18 @@ class Guide:
         all_controls = np.concatenate([guidance.controls[:done], after.controls])
         path = interpolate(positions, self._config.coarse_factor)
         return replace(guidance, controls=all_controls, states=states, path=path)
+
+
+def _coarse_planner(config: D4ormC2FConfig, reroute: bool) -> D4ormD:
+    """D4orm-D as it plans coarsely, with or without looking for ways around all others."""
+    given: dict[str, Any] = {} if config.coarse_preset is None else {**D4ormD.presets[config.coarse_preset]}
+    given |= {
+        "engine": config.engine,
+        "num_samples": config.coarse_samples,
+        "num_steps": config.coarse_steps,
+        "repair_steps": config.coarse_repair_steps,
+        "improve": True,
+        "reroute": reroute,
+        "shorten": False,
+    }
+    return D4ormD(D4ormDConfig(**given))

@@ -13,16 +13,25 @@ from d4orm_env.core.seeds import Stream, derived_seed, generator
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_planners.d4orm_c2f.background import Background
-from d4orm_planners.d4orm_c2f.coarse import Guidance
+from d4orm_planners.d4orm_c2f.barrier import safe_velocities
+from d4orm_planners.d4orm_c2f.coarse import Guidance, Waypoints
 from d4orm_planners.d4orm_c2f.deviation import Deviation
 from d4orm_planners.d4orm_c2f.guide import Guide
-from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
+from d4orm_planners.d4orm_c2f.settings import PAPER_CONTROL, D4ormC2FConfig
+from d4orm_planners.d4orm_c2f.standing import PROBE
 from d4orm_planners.d4orm_c2f.window import Prediction, Situation, Window
 from d4orm_planners.policy import StatePolicy
 from d4orm_planners.settings import CheckedSettings
+from d4orm_planners.steering import drive_to_goal, present_velocities, track_velocities
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
+
+GAP = 0.4
+"""Share of the margin that is kept in the last resort."""
+
+NEARLY = 1e-3
+"""Velocities that differ by no more are the same [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +70,7 @@ class D4ormC2F(StatePolicy):
 
     name = "d4orm-c2f"
     config_class: ClassVar[type[CheckedSettings] | None] = D4ormC2FConfig
+    presets: ClassVar = {"paper": PAPER_CONTROL}
 
     def __init__(self, config: D4ormC2FConfig | None = None) -> None:
         self.config = config or D4ormC2FConfig()
@@ -76,7 +86,7 @@ class D4ormC2F(StatePolicy):
         return sum(loop.missed for loop in self.loops)
 
     @property
-    def guidance(self) -> Guidance:
+    def guidance(self) -> Waypoints:
         """What is followed at present."""
         return self._guide.guidance
 
@@ -87,28 +97,52 @@ class D4ormC2F(StatePolicy):
         self._control.forget()
         self.loops: list[LoopRecord] = []
         joint = split_state(self.problem, env.state())
-        self._window = Window(self.problem, self.config, self._engine, docks=not env.unwrapped.lifelong)
+        lifelong = env.unwrapped.lifelong
+        self._window = Window(self.problem, self.config, self._engine, docks=not lifelong)
         self._window.prepare(joint)
         self._plan, self._next = self._window.no_controls(), 0
         self.subgoals: FloatArray = joint.states[:, : self.problem.dimension]
         begin = time.perf_counter()
-        self._guide = Guide(self.problem, self.config, seed, self._refiner, self._refinement)
+        self._guide = Guide(self.problem, self.config, seed, self._refiner, self._refinement, lifelong)
         self._guide.begin(joint)
-        self._deviation = Deviation(self.problem, self._engine, self.config.delay)
+        self._deviation = Deviation(self.problem, self._engine, self.config)
         self.coarse_time = time.perf_counter() - begin
 
     def _controls(self, joint: JointState) -> FloatArray:
+        goals = joint.goals
         joint = self._deviation.observe(joint)
+        believed = self._window.problem = self._guide.problem = self._deviation.problem
         if not self.loops or self._next >= self.config.execute_horizon:
             self._loop(joint)
         controls = self._plan[min(self._next, len(self._plan) - 1)]
+        if self.config.last_resort:
+            controls = self._evading(joint, controls)
         self._next += 1
+        if (standing := self._deviation.standing) is not None and standing.robots.any():
+            probe = PROBE * drive_to_goal(believed, joint.states, goals)
+            controls = np.where(standing.robots[:, None], probe, controls)
         if self.config.control_noise_std:
             noise = self._random.normal(0, self.config.control_noise_std, controls.shape)
             limit = self.problem.team.control_limits
             controls = np.clip(controls + noise, -limit, limit).astype(np.float32)
         self._deviation.expect(controls)
         return controls
+
+    def _evading(self, joint: JointState, controls: FloatArray) -> FloatArray:
+        """The controls ``(K, m)``, but for robots that would come to touch something: these brake, or evade."""
+        problem, docked = self._deviation.problem, joint.arrived & self._at_goal(joint)
+        gap, left = GAP * problem.margin, self._plan[min(self._next, len(self._plan) - 1) :]
+        touching = self._window.touching(joint, docked, left, gap)
+        if not touching.any():
+            return controls
+        left[:, touching] = self._window.stop(joint, docked)[: len(left), touching]
+        controls = np.where(touching[:, None], left[0], controls)
+        ahead = self._engine.step(problem.resumed_at(joint.states, joint.goals).arrays, joint.states, docked, controls)
+        wanted = present_velocities(problem, ahead.states, ahead.controls)
+        # Other velocities are reached by the next step, by which everybody will be elsewhere.
+        safe = safe_velocities(problem, joint._replace(states=ahead.states), wanted, ~docked, gap)
+        evading = np.abs(safe - wanted).max(axis=1) > NEARLY
+        return np.where(evading[:, None], track_velocities(problem, joint.states, safe), controls)
 
     def _loop(self, joint: JointState) -> None:
         """One control loop (Algorithm 4, lines 6 to 9)."""

@@ -7,11 +7,35 @@ from typing import Annotated
 
 from pydantic import Field
 
-from d4orm_planners.sampling.settings import DiffusionSettings, SoftmaxSettings
+from d4orm_planners.sampling.settings import PAPER, DiffusionSettings, SoftmaxSettings
 from d4orm_planners.settings import Count, EngineName, NotNegative, Positive, Samples, Steps, Whole, one_of
 
 Credit = Annotated[str, one_of(("robot", "team"))]
+CoarsePreset = Annotated[str, one_of(("paper",))] | None
 Refinement = Annotated[str, one_of(("background", "sync", "off"))]
+
+PAPER_CONTROL = {
+    "coarse_samples": PAPER["num_samples"],
+    "coarse_steps": PAPER["num_steps"],
+    "coarse_preset": "paper",
+    "num_samples": PAPER["num_samples"],
+    "num_steps": PAPER["num_steps"],
+    "weight_cutoff": PAPER["weight_cutoff"],
+    "max_lag": None,
+    "sight": False,
+    "credit": "team",
+    "penalty": 1.0,
+    "relative_distance": True,
+    "safe_mix": False,
+    "reaction_time": 0.0,
+    "delay": 0,
+    "filter_states": False,
+    "learn_limits": False,
+    "stalls": False,
+    "last_resort": False,
+    "replan": False,
+}
+"""Algorithm 4 (paper, section VI), with the samples and steps of the paper's experiments (section IV-B)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,23 +49,38 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
         coarse_samples: ``M`` of the coarse plan.
         coarse_steps: ``N`` of the coarse plan.
         coarse_repair_steps: The same of repairs of the coarse plan.
+        coarse_preset: Preset of D4orm-D that plans coarsely: ``"paper"`` or, by default, ``None``.
         coarse_iterations: Iterations after which the coarse plan is taken as it is.
         replan_iterations: The same when only some robots have new goals.
         predict_horizon: ``H_predict``, steps that a control loop looks ahead.
         execute_horizon: ``H_execute``, steps executed before the next control loop.
         subgoal_offset: ``m``, waypoints from where the team is to its subgoal.
+        max_lag: Waypoints that a robot may be behind the others without its subgoal staying behind too. ``None`` for any
+            number: the subgoals of all are always those of one moment, as in the paper.
+        sight: Whether a subgoal behind what stands is exchanged for the furthest waypoint before it that is in sight.
         num_samples: ``M`` of a control loop.
         num_steps: ``N`` of a control loop.
         credit: ``"robot"`` or ``"team"``: whose reward weights the samples of a control loop.
         penalty: What a violation costs per step in a control loop, against the paper's one.
+        relative_distance: Whether distances to subgoals count relative to the initial one, as in the paper, rather than
+            to how far robots get in ``m`` steps: then a robot next to its subgoal has no more to lose than others.
+        safe_mix: Whether robots follow a fine plan only as far as nobody comes within the margin of anything in it.
         extra_margin: Added to the problem's margin in control loops, as room for disturbances [m].
         reaction_time: The margin in control loops grows by how far robots come within so many seconds from where they
             were expected, by the largest deviation of late: nothing while they do as they are told [s].
-        delay: Steps late that commands are executed: control loops begin where those under way lead.
+        delay: Steps late that commands are executed: control loops begin where those under way lead. ``None`` finds out
+            from what the robots report to have executed.
+        filter_states: Whether states that are seen to be noisy are filtered.
+        learn_limits: Whether robots that never do as much as they are asked to are taken to be that much weaker.
+        stalls: Whether a robot that stands whatever it is told is taken for an obstacle, which the others drive around.
+        last_resort: Whether robots whose plan would end in contact are told to brake or to evade instead.
         refine: Whether the guidance is refined while it is followed: in a ``"background"`` thread, ``"sync"`` between
             control loops, which gives the same controls every time, or ``"off"``.
         refine_every: At most every so-manyth control loop a refinement begins: it takes time from control loops.
-        replan_distance: The guidance is planned anew when the robots are this far from it on average [m].
+        replan: Whether the guidance is planned anew for robots that are stuck or astray, and for a team that has lost
+            it or has come to its end; for robots with new goals it always is.
+        replan_distance: The guidance is planned anew for robots this far from it, and for all if they are so on average
+            [m].
         patience: Or when they have come no nearer to their goals for so many steps.
         deadline: Seconds that a control loop may take; one that takes longer is left behind, and the last plan goes on.
             ``None`` waits for every loop.
@@ -57,20 +96,30 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
     coarse_samples: Samples = 256
     coarse_steps: Steps = 50
     coarse_repair_steps: Steps = 20
+    coarse_preset: CoarsePreset = None
     coarse_iterations: Count = 20
     replan_iterations: Count = 2
     predict_horizon: Steps = 20
     execute_horizon: Steps = 1
     subgoal_offset: Steps = 15
+    max_lag: Annotated[Whole, Field(ge=0)] | None = 5
+    sight: bool = True
     num_samples: Samples = 128
     num_steps: Steps = 20
     credit: Credit = "robot"
     penalty: Positive = 10.0
+    relative_distance: bool = False
+    safe_mix: bool = True
     extra_margin: NotNegative = 0.0
     reaction_time: NotNegative = 0.4
-    delay: Annotated[Whole, Field(ge=0, le=100)] = 0
+    delay: Annotated[Whole, Field(ge=0, le=100)] | None = None
+    filter_states: bool = True
+    learn_limits: bool = True
+    stalls: bool = True
+    last_resort: bool = True
     refine: Refinement = "background"
     refine_every: Count = 5
+    replan: bool = True
     replan_distance: Positive = 1.0
     patience: Count = 15
     deadline: Positive | None = None

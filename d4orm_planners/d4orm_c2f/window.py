@@ -69,10 +69,13 @@ class Window:
         config: The settings.
         engine: What rolls out and samples.
         docks: Whether robots dock at their goals, rather than drive through them to others.
+
+    Attributes:
+        problem: The problem, with the limits that the robots are believed to have now.
     """
 
     def __init__(self, problem: Problem, config: D4ormC2FConfig, engine: Engine, docks: bool) -> None:
-        self._problem, self._config, self._engine, self._docks = problem, config, engine, docks
+        self.problem, self._config, self._engine, self._docks = problem, config, engine, docks
         self._rules = SamplingRules(config.weights)
         self._noise_scale = config.noise_scale(config.num_steps)
         limits = problem.team.limits
@@ -80,18 +83,18 @@ class Window:
 
     def prepare(self, joint: JointState) -> None:
         """Compile, so that the first control loop is as quick as the others."""
-        window = self._problem.resumed_at(joint.states, joint.goals, horizon=self._config.predict_horizon)
+        window = self.problem.resumed_at(joint.states, joint.goals, horizon=self._config.predict_horizon)
         task = SamplingTask(window, self.no_controls(), arrived=joint.arrived)
         self._engine.prepare(task, self._rules, self._noise_scale, self._config.num_samples)
 
     def no_controls(self) -> FloatArray:
         """``(H_predict, K, m)`` zeros."""
-        shape = (self._config.predict_horizon, self._problem.num_robots, self._problem.control_size)
+        shape = (self._config.predict_horizon, self.problem.num_robots, self.problem.control_size)
         return np.zeros(shape, np.float32)
 
     def predict(self, now: Situation, seed: int) -> Prediction:
         """Fine controls towards the subgoals."""
-        problem, config = self._problem, self._config
+        problem, config = self.problem, self._config
         result = self._engine.denoise(
             self._task(now), self._rules, np.zeros_like(now.base), self._noise_scale, config.num_samples, seed
         )
@@ -102,11 +105,14 @@ class Window:
         radius = problem.goal_radius if self._docks else NOT_AT_SUBGOALS
         joint, horizon = now.joint, config.predict_horizon
         truth = problem.resumed_at(joint.states, joint.goals, horizon=horizon, goal_radius=radius)
+        if not config.safe_mix:
+            positions = self._engine.rollout(truth, controls).positions
+            return Prediction(controls, least_gap(truth, positions[1:]))
         return self._safe_mix(truth, controls, now)
 
     def _task(self, now: Situation) -> SamplingTask:
         """Deform the base so that everybody heads for its subgoal, or its goal where that is near."""
-        problem, config, goals = self._problem, self._config, now.joint.goals
+        problem, config, goals = self.problem, self._config, now.joint.goals
         near = np.linalg.norm(now.subgoals - goals, axis=1) <= problem.goal_radius
         window = problem.resumed_at(
             now.joint.states,
@@ -115,23 +121,24 @@ class Window:
             margin=problem.margin + config.extra_margin + now.room,
             goal_radius=problem.goal_radius if near.any() and self._docks else NOT_AT_SUBGOALS,
         )
+        reach = problem.dt * config.subgoal_offset * float(np.max(np.asarray(problem.team.max_speed)))
         return SamplingTask(
             window,
             now.base,
             credit=config.credit,
-            moving=self._bodies(now, config.predict_horizon),
+            moving=self._bodies(now.joint, config.predict_horizon),
             arrived=now.docked,
             penalty=config.penalty,
-            reference_distance=problem.dt * config.subgoal_offset * float(np.max(np.asarray(problem.team.max_speed))),
+            reference_distance=None if config.relative_distance else reach,
         )
 
-    def _bodies(self, now: Situation, horizon: int) -> MovingObstacles | None:
+    def _bodies(self, joint: JointState, horizon: int) -> MovingObstacles | None:
         """Where bodies that are no robots will be, going on as they do; ``None`` if none is seen."""
-        d, bodies = self._problem.dimension, now.joint.bodies
+        d, bodies = self.problem.dimension, joint.bodies
         seen = bodies[bodies[:, -1] > 0] if len(bodies) else bodies
         if not len(seen):
             return None
-        times = self._problem.dt * np.arange(1, horizon + 1, dtype=np.float32)[:, None, None]
+        times = self.problem.dt * np.arange(1, horizon + 1, dtype=np.float32)[:, None, None]
         return MovingObstacles(seen[:, :d] + times * seen[:, d : 2 * d], seen[:, -1])
 
     def _with_stop(self, window: Problem, controls: FloatArray, steps: int, docked: BoolArray) -> FloatArray:
@@ -148,6 +155,12 @@ class Window:
             stopping[t] = track_velocities(window, states, still)
             states = self._engine.step(window.arrays, states, docked, stopping[t]).states
         return stopping
+
+    def stop(self, joint: JointState, docked: BoolArray) -> FloatArray:
+        """``(H_predict + S, K, m)`` controls that bring everyone to rest now."""
+        nothing = self.no_controls()
+        present = self.problem.resumed_at(joint.states, joint.goals, horizon=len(nothing))
+        return self._with_stop(present, nothing, 0, docked)
 
     def _safe_mix(self, window: Problem, fresh: FloatArray, now: Situation) -> Prediction:
         """Fresh controls where they keep everyone apart; where not, robots stop earlier, or do as they had in mind.
@@ -187,10 +200,27 @@ class Window:
             allowed = min(gap - ROUNDING, window.margin / 2 if now.stuck.any() else window.margin)
             nearer = window.resumed_at(window.start, window.goal, margin=max(allowed, 0.0))
             violated[lenient] = self._engine.rollout(nearer, controls).margin_violated[1:, lenient].any(axis=0)
-        if (bodies := self._bodies(now, len(controls))) is not None:
-            away = np.linalg.norm(trajectory.positions[1:, :, None] - bodies.positions[:, None], axis=3)
-            violated |= (away <= radius[:, None] + bodies.radius + window.margin).any(axis=(0, 2))
-        return trajectory, violated
+        return trajectory, violated | self._meets_bodies(now.joint, trajectory, window.margin)
+
+    def _meets_bodies(self, joint: JointState, trajectory: Trajectory, margin: float) -> BoolArray:
+        """``(K,)`` who comes within a margin of a body that is no robot."""
+        bodies = self._bodies(joint, len(trajectory.controls))
+        if bodies is None:
+            return np.zeros(self.problem.num_robots, bool)
+        away = np.linalg.norm(trajectory.positions[1:, :, None] - bodies.positions[:, None], axis=3)
+        reach = np.asarray(self.problem.team.radius)[:, None] + bodies.radius + margin
+        meets: BoolArray = (away <= reach).any(axis=(0, 2))
+        return meets
+
+    def touching(self, joint: JointState, docked: BoolArray, controls: FloatArray, gap: float) -> BoolArray:
+        """``(K,)`` who comes within a gap [m] of anything if all execute ``controls`` ``(T, K, m)``, and a stop."""
+        radius = self.problem.goal_radius if self._docks else NOT_AT_SUBGOALS
+        present = self.problem.resumed_at(
+            joint.states, joint.goals, horizon=len(controls), margin=gap, goal_radius=radius
+        )
+        trajectory = self._engine.rollout(present, controls)
+        touches: BoolArray = trajectory.margin_violated[1:].any(axis=0) & ~docked
+        return touches | self._meets_bodies(joint, trajectory, gap) & ~docked
 
 
 def least_gap(problem: Problem, positions: FloatArray) -> float:

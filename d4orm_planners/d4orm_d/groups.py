@@ -21,7 +21,8 @@ class Groups:
     def replan(self, team: DeformedTeam) -> Groups:
         """Replan every group with a failed robot in turn, the robots outside it as moving obstacles."""
         planner, search, problem = team.planner, team.search, team.problem
-        graph = conflicts(search.current.trajectory.positions, problem.team.radius, problem.margin)
+        checked = search.current.trajectory.positions[:: search.check_interval]
+        graph = conflicts(checked, problem.team.radius, problem.margin)
         team.controls = planner.config.continued(search.current).copy()
         for group in failure_groups(search.current.failed, reconnected(graph, self.graph)):
             if search.should_stop():

@@ -21,10 +21,11 @@ from d4orm_planners.guidance.planner import (
     GuidedConfig,
     better_ways,
     first_ways,
+    going_on_from_best,
     guided_iteration,
 )
 from d4orm_planners.planner import Iteration
-from d4orm_planners.refinement.iteration import refined_iteration, shorten_first_ways
+from d4orm_planners.refinement.iteration import FIRST_ROUNDS, GUIDED_ROUNDS, refined_iteration, shorten_first_ways
 from d4orm_planners.refinement.team import TeamPaths
 from d4orm_planners.search import Search
 from d4orm_planners.steering import prepare_drives, straight_drives
@@ -35,6 +36,8 @@ State = Groups | Repairs | Guide
 GUIDED = GuidedConfig()
 GUIDED_AFTER = 6
 """Iterations without a solution after which ways are looked for on a roadmap."""
+GUIDED_TURNS = 5
+"""Of so many iterations after guided ways one refines the motions, the others replan on the roadmap."""
 
 
 class D4ormD(D4orm):
@@ -72,12 +75,11 @@ class D4ormD(D4orm):
     def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
         """See :meth:`Planner.iterate`: the whole team at first and once nobody fails, the failed robots in between."""
         if isinstance(state, Guide):
-            state = better_ways(search, state, GUIDED.neighbours, GUIDED.replannings)
-            return state, guided_iteration(search, state)
+            return self.go_on_guided(search, state)
         if self.is_guided(search):
             guide = first_ways(search)
             if isinstance(guide, Guide):
-                return guide, guided_iteration(search, guide)
+                return guide, self.guided(search, guide)
         if search.iteration == 0 and not search.current.controls.any():
             drives = self.straight_start(search.problem)
             return self.whole_team(search, state) if drives is None else (state, Iteration(drives))
@@ -91,6 +93,27 @@ class D4ormD(D4orm):
         state = state.repair(team, self.config)
         self.shorten_first(team)
         return state, team.iteration()
+
+    def guided(self, search: Search, guide: Guide) -> Iteration:
+        """What a team does that has ways; they become a little shorter if that is all that is left to do."""
+        iteration = guided_iteration(search, guide)
+        if not self.config.shorten:
+            return iteration
+        team = DeformedTeam(self, search, search.engine.rollout(search.problem, iteration.controls))
+        self.shorten_first(team, GUIDED_ROUNDS)
+        return replace(iteration, controls=team.controls)
+
+    def go_on_guided(self, search: Search, guide: Guide) -> tuple[Guide, Iteration]:
+        """Better ways for a team that has some: mostly on the roadmap, and by turns by search among its motions.
+
+        The first finds other ways round, the second cuts corners and leaves out stops.
+        """
+        if search.best.solved and self.config.shorten:
+            if search.iteration % GUIDED_TURNS == 1:
+                return guide, refined_iteration(search)
+            guide = going_on_from_best(search, guide)
+        guide = better_ways(search, guide, GUIDED.neighbours, GUIDED.replannings)
+        return guide, guided_iteration(search, guide)
 
     def is_guided(self, search: Search) -> bool:
         """Whether this iteration is to find ways on a roadmap: the first, or one after some without a solution."""
@@ -109,10 +132,10 @@ class D4ormD(D4orm):
         self.shorten_first(team)
         return state, replace(iteration, controls=team.controls)
 
-    def shorten_first(self, team: DeformedTeam) -> None:
+    def shorten_first(self, team: DeformedTeam, rounds: int = FIRST_ROUNDS) -> None:
         """Let the ways of a team in which nobody fails any more become shorter."""
         if self.config.shorten and not team.faults(np.arange(team.problem.num_robots))[0].any():
-            shorten_first_ways(team)
+            shorten_first_ways(team, rounds)
 
     def is_patient(self, search: Search) -> bool:
         """See :meth:`D4orm.is_patient`: repairs are what helps here."""

@@ -68,7 +68,7 @@ def paired(first: Sequence[Trial], second: Sequence[Trial], cost: Callable[[Tria
 
 
 def in_common(first: Sequence[Trial], second: Sequence[Trial]) -> list[tuple[Trial, Trial]]:
-    """Pairs of trials of two policies with the same problem, seed, noise and disturbances."""
+    """Pairs of trials of two policies with the same problem, seed, noise, disturbances and physics."""
     others = {_circumstances(trial): trial for trial in second}
     return [(trial, others[_circumstances(trial)]) for trial in first if _circumstances(trial) in others]
 
@@ -89,8 +89,8 @@ def mcnemar(only_first: int, only_second: int) -> float:
     return float(stats.binomtest(only_first, apart).pvalue) if apart else 1.0
 
 
-def _circumstances(trial: Trial) -> tuple[str, float, int, str]:
-    return trial.problem, trial.control_noise_std, trial.seed, trial.disturbances
+def _circumstances(trial: Trial) -> tuple[str, float, int, str, str]:
+    return trial.problem, trial.control_noise_std, trial.seed, trial.disturbances, trial.physics
 
 
 def steps_to_solution(trial: Trial) -> int | None:

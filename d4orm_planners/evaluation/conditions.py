@@ -29,12 +29,14 @@ class Condition:
         disturbances: What else goes wrong.
         name: What is varied, such as ``"push.speed"``; empty for nothing.
         level: How much of it; of disturbances that differ in more than a number, their place among the levels.
+        physics: What moves the robots, one of :data:`d4orm_planners.episode.PHYSICS`.
     """
 
     control_noise_std: float = 0.0
     disturbances: tuple[Disturbance[Any], ...] = ()
     name: str = ""
     level: float | None = None
+    physics: str = "model"
 
     @property
     def text(self) -> str:
@@ -55,7 +57,7 @@ class Condition:
     @property
     def replayable(self) -> bool:
         """Whether the executed controls alone tell how the robots have moved."""
-        return all(one.negligible or one.replayable for one in self.disturbances)
+        return self.physics == "model" and all(one.negligible or one.replayable for one in self.disturbances)
 
 
 def conditions(

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from d4orm_planners.evaluation.disturbance_figures import draw_disturbance, draw_map
+from d4orm_planners.evaluation.figures import draw_disturbance, draw_map
 from d4orm_planners.evaluation.pairs import PairedPolicies, compare_pairs
 from d4orm_planners.evaluation.report import markdown, panels, table, target, write_csv
 from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_rates

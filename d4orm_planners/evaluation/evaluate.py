@@ -38,6 +38,7 @@ def evaluate(
     model: str | Iterable[str | None] | None = None,
     scenario_settings: Mapping[str, object] | None = None,
     time_limit: float | None = None,
+    physics: str = "model",
     trial_timeout: float | None = None,
     workers: int | None = None,
     ray: str | None = None,
@@ -69,6 +70,8 @@ def evaluate(
         scenario_settings: Further arguments of the scenarios by name, as ``{"corridor_width": 0.8}``; every one of them
             must take all of these. The results name them behind the scenario.
         time_limit: Seconds for planning, for planners without a ``time_limit`` of their own.
+        physics: What moves the robots: ``"model"``, the equations that planners know, or ``"mujoco"``, see
+            :mod:`d4orm_env.mujoco`. Executed controls are not judged by :func:`d4orm_env.verify` then.
         trial_timeout: Seconds after which a trial is ended with an error; ``None`` waits.
         workers: Processes of one thread each, by default as many as there are cores; with 1, and without
             ``trial_timeout``, trials run in this process on all its cores. On a cluster: jobs under way at most.
@@ -94,6 +97,7 @@ def evaluate(
         model=model,
         scenario_settings=scenario_settings or {},
         time_limit=time_limit,
+        physics=physics,
     )
     trials = run_study(study, out, trial_timeout=trial_timeout, workers=workers, ray=ray, progress=progress)
     rates = success_rates(trials)

@@ -58,17 +58,16 @@ def _groups(trials: Sequence[Trial]) -> dict[Key, list[Trial]]:
     groups: dict[Key, list[Trial]] = {}
     for trial in trials:
         label = labels[trial.label, trial.config]
-        key = (label, trial.scenario, trial.num_robots, trial.model, trial.control_noise_std, told(trial.disturbances))
+        key = (label, trial.scenario, trial.num_robots, trial.model, trial.control_noise_std, told(trial))
         groups.setdefault(key, []).append(trial)
     return {key: groups[key] for key in sorted(groups, key=lambda key: (*key[1:], key[0]))}
 
 
-def told(disturbances: str) -> str:
-    """Disturbances as they are stored, in words: ``"push rate=0.2, speed=0.5; delay steps=2"``."""
-    listed = json.loads(disturbances)
-    return "; ".join(
-        f"{name} " + ", ".join(f"{key}={value}" for key, value in values.items()) for name, values in listed
-    )
+def told(trial: Trial) -> str:
+    """Disturbances and another physics, in words: ``"push rate=0.2, speed=0.5; delay steps=2; in mujoco"``."""
+    listed = json.loads(trial.disturbances)
+    words = [f"{name} " + ", ".join(f"{key}={value}" for key, value in values.items()) for name, values in listed]
+    return "; ".join([*words, *([f"in {trial.physics}"] if trial.physics != "model" else [])])
 
 
 def _condition(rate: SuccessRate) -> tuple[float, str]:

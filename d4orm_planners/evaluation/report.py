@@ -1,4 +1,4 @@
-"""What a study came to as tables, files and a picture: Markdown, CSV, Parquet, and success against noise."""
+"""What a study came to as tables and files: Markdown, CSV and Parquet."""
 
 from __future__ import annotations
 
@@ -54,6 +54,8 @@ def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate
     Raises:
         OSError: If the folder does not exist or cannot be written to.
     """
+    from d4orm_planners.evaluation.figures import draw_noise  # which needs this module
+
     paths = [Path(folder, f"robustness.{kind}") for kind in ("csv", "md", "png")]
     _write_rates(paths[0], rates)
     with target(paths[1]) as path:
@@ -61,7 +63,7 @@ def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate
     if any(rate.disturbance for rate in rates):
         return paths[:2]
     with target(paths[2]) as path:
-        _draw(path, rates)
+        draw_noise(path, rates)
     return paths
 
 
@@ -208,28 +210,3 @@ def errors(found: Iterable[tuple[str, str]]) -> list[str]:
     """Labels with their errors, listed as the only block; no block where all errors are empty."""
     lines = dict.fromkeys(f"- `{label}`: {error}" for label, error in found if error)
     return ["\n".join(["### Errors", "", *lines])] if lines else []
-
-
-def _draw(path: Path, rates: Sequence[SuccessRate]) -> None:
-    """Success against noise with confidence bands: one line per policy, one panel per scenario and team."""
-    # The figure is made without pyplot, which would keep state and want a display.
-    from matplotlib.figure import Figure
-
-    groups = panels(rates)
-    columns = min(len(groups), 3)
-    rows = -(-len(groups) // columns)
-    figure = Figure(figsize=(4.8 * columns, 3.6 * rows), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
-    for ax in axes[len(groups) :]:
-        ax.set_visible(False)
-    for ax, (title, group) in zip(axes, groups.items()):
-        for policy in dict.fromkeys(rate.label for rate in group):
-            line = sorted((rate for rate in group if rate.label == policy), key=lambda rate: rate.control_noise_std)
-            noise = [rate.control_noise_std for rate in line]
-            (drawn,) = ax.plot(noise, [rate.rate for rate in line], marker="o", label=policy, clip_on=False)
-            lower, upper = [rate.lower for rate in line], [rate.upper for rate in line]
-            ax.fill_between(noise, lower, upper, color=drawn.get_color(), alpha=0.15, linewidth=0)
-        ax.set(title=title, xlabel="standard deviation of the control noise", ylabel="success rate", ylim=(0, 1))
-        ax.grid(alpha=0.3)
-    axes[0].legend(loc="best")
-    figure.savefig(path, dpi=150)

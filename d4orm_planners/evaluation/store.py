@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 APPLICATION_ID = 0x64346F72
 """Marks the file as one of ours, in its header ("d4or")."""
-VERSION = 6
-READABLE = (4, 5, VERSION)
+VERSION = 7
+READABLE = (4, 5, 6, VERSION)
 """Of versions before some columns have other names, and some are missing."""
 STORE = "trials.sqlite"
 """Name of the file in a folder of results."""
@@ -36,6 +36,7 @@ class TrialKey(NamedTuple):
         control_noise_std: Standard deviation of the execution noise, in the controls' units.
         seed: Seed of the episode: of the policy and of the noise.
         disturbances: What else goes wrong, as JSON: a list of ``[name, attributes]``.
+        physics: What moved the robots, one of :data:`d4orm_planners.episode.PHYSICS`.
     """
 
     policy: str
@@ -44,13 +45,14 @@ class TrialKey(NamedTuple):
     control_noise_std: float
     seed: int
     disturbances: str = "[]"
+    physics: str = "model"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
     """One episode of one policy and how it ended: a row of the store, with a column per field, in this order.
 
-    The first six fields are its :class:`TrialKey`.
+    The first seven fields are its :class:`TrialKey`.
 
     Attributes:
         label: What the policy with these settings was called.
@@ -93,6 +95,7 @@ class Trial:
     control_noise_std: float
     seed: int
     disturbances: str = "[]"
+    physics: str = "model"
     label: str
     scenario: str
     num_robots: int
@@ -125,15 +128,14 @@ class Trial:
 
     @property
     def key(self) -> TrialKey:
-        key = (self.policy, self.config, self.problem, self.control_noise_std, self.seed, self.disturbances)
-        return TrialKey(*key)
+        return TrialKey(*(getattr(self, name) for name in TrialKey._fields))
 
 
 _NAMES = tuple(field.name for field in fields(Trial))
 _KEY = ", ".join(TrialKey._fields)
 _FORMER = {"num_robots": "robots", "control_noise_std": "noise"}
 """Columns that had other names in version 4."""
-_FORMERLY = {"disturbances": "'[]'"}
+_FORMERLY = {"disturbances": "'[]'", "physics": "'model'"}
 """What columns that were missing stand for; others are empty."""
 _TRUTHS = ("success", "verified")
 _JSON: Mapping[str, type | int] = {"config": dict, "versions": dict, "machine": dict, "history": 3, "disturbances": 2}

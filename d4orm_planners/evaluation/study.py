@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -14,6 +14,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.selection import at_work
 from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_env.scenarios.problems import is_scenario_file
+from d4orm_planners.episode import check_physics
 from d4orm_planners.evaluation.conditions import DisturbanceLevels, conditions
 from d4orm_planners.evaluation.store import LARGEST_NUMBER
 from d4orm_planners.evaluation.trials import Configuration, Job
@@ -43,20 +44,25 @@ class Study:
     model: str | Iterable[str | None] | None = None
     scenario_settings: Mapping[str, object] = field(default_factory=dict)
     time_limit: float | None = None
+    physics: str = "model"
 
     def groups(self) -> list[list[Job]]:
         """A list of jobs per scenario, model, team size and policy, in that order, with one for every seed.
 
         Raises:
             ValueError: For an unknown name or setting, a number that makes no sense, or nothing to do.
-            ImportError: If a policy needs a library that is not installed.
+            ImportError: If a policy, or the physics, needs a library that is not installed.
         """
-        under = conditions(self.control_noise_std, self.disturbances)
+        under = tuple(
+            replace(condition, physics=self.physics)
+            for condition in conditions(self.control_noise_std, self.disturbances)
+        )
         policies, seeds = self.configurations(), _checked_seeds(self.seeds)
         cells = self._problems(seeds)
         for problem in (problems[0] for _, problems in cells):
             for condition in under:
                 at_work(condition.disturbances, problem)
+            check_physics(problem, self.physics)
         return [
             [Job(policy, problem, scenario, seed, under) for seed, problem in zip(seeds, problems)]
             for scenario, problems in cells

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from d4orm_env import navigation_v0, verify
+from d4orm_env import verify
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.errors import UnknownKeywordError, describe
 from d4orm_env.core.problem import Problem
 from d4orm_planners._machine import commit, describe_machine, versions
-from d4orm_planners.episode import Episode, run_episode
+from d4orm_planners.episode import Episode, open_env, run_episode
 from d4orm_planners.evaluation.conditions import Condition
 from d4orm_planners.evaluation.store import Trial, TrialKey
 from d4orm_planners.plan import IterationRecord, Plan
@@ -28,7 +28,7 @@ from d4orm_planners.registry import is_planned, make_policy, policy_settings
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
 
-LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "pyrvo", "casadi")
+LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "pyrvo", "casadi", "mujoco")
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,8 @@ class Job:
     def key(self, condition: Condition) -> TrialKey:
         """Of the trial under one condition."""
         policy, noise = self.policy, condition.control_noise_std
-        return TrialKey(policy.policy, policy.config, self.problem.digest, noise, self.seed, condition.text)
+        key = (policy.policy, policy.config, self.problem.digest, noise, self.seed, condition.text, condition.physics)
+        return TrialKey(*key)
 
     def failed(self, condition: Condition, error: str) -> Trial:
         """The trial under one condition, which has no outcome."""
@@ -138,7 +139,7 @@ def _outcome(policy: _TimedPolicy, job: Job, condition: Condition) -> dict[str, 
     """Columns of a trial that runs to its end."""
     problem = job.problem
     noise, disturbances = condition.control_noise_std, condition.disturbances
-    env = navigation_v0.parallel_env(problem=problem, control_noise_std=noise, disturbances=disturbances)
+    env = open_env(problem, condition.physics, control_noise_std=noise, disturbances=disturbances)
     episode = run_episode(env, policy, seed=job.seed)
     env.close()
     metrics, plan = episode.metrics, policy.plan

@@ -94,6 +94,14 @@ def guided_iteration(search: Search, guide: Guide) -> Iteration:
     return Iteration(guide.driven.until(search.problem.horizon))
 
 
+def going_on_from_best(search: Search, guide: Guide) -> Guide:
+    """The guide of a team that drives as in the best plan so far, whoever found it."""
+    # Here, because importing numba takes long.
+    from d4orm_planners.guidance.team import Driven
+
+    return replace(guide, driven=Driven.of(search.best.trajectory))
+
+
 def better_ways(search: Search, guide: Guide, neighbours: int, replannings: int) -> Guide:
     """Replan so many groups of at most so many robots; what is no better for all together is left."""
     random, driven = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE)), guide.driven

@@ -211,6 +211,7 @@ def find_way(
     stride: Any,
     launch: Any,
     latest: Any,
+    linger: Any,
 ) -> Any:
     """The soonest way of a robot to its goal among all others: safe interval path planning.
 
@@ -226,13 +227,14 @@ def find_way(
         stride: How far it drives in a step [m].
         launch: Steps that it loses whenever it sets out.
         latest: Step by which it must have arrived.
+        linger: Steps for which it stays at its goal; negative for ever.
 
     Returns:
         ``(n, 3)`` int64 nodes, the steps at which it sets out for each and comes to each; none where there is no way.
     """
     goal, start, nodes = bodies.goals[k], np.int64(roadmap.starts[k]), roadmap.nodes
-    # Nobody may come near its goal once it stands there.
-    dock = others.positions.shape[0] - 1
+    # Nobody may come near its goal once it stands there for good.
+    dock = others.positions.shape[0] - 1 if linger < 0 else -1
     while dock >= 0 and _is_clear(others, k, dock, nodes[goal, 0], nodes[goal, 1], nodes[goal, 2]):
         dock -= 1
     boxes = np.empty((latest // BLOCK + 2, others.positions.shape[1], 6))
@@ -294,6 +296,9 @@ def find_way(
                     continue
                 depart += 1
                 if head == goal and bodies.docks and until <= dock:
+                    continue
+                if head == goal and ends[head, safe] < min(until + linger, latest):
+                    depart += ends[head, safe] - until
                     continue
                 if not _is_line_free(others, boxes, k, tail, nodes[head], depart - 1, until):
                     # Whoever stands in the way often does so for long.

@@ -9,7 +9,9 @@ import numpy as np
 from numba import types
 
 from d4orm_env.core.arrays import FloatArray, IntArray
+from d4orm_env.core.metrics import arrival_steps
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.wavefront import make_space
 from d4orm_planners.guidance.execution import drive_along
 from d4orm_planners.guidance.lacam import Team
@@ -54,6 +56,13 @@ class Driven:
     places: Floats
     arrivals: IntArray
 
+    @classmethod
+    def of(cls, trajectory: Trajectory) -> Driven:
+        """How a team drives that docks."""
+        places = np.zeros((*trajectory.positions.shape[:2], 3))
+        places[..., : trajectory.positions.shape[2]] = trajectory.positions
+        return cls(trajectory.controls, places, arrival_steps(trajectory.arrived))
+
     def cost(self, horizon: int) -> tuple[int, int]:
         """Less is better: robots that come too late, and the sum of all arrival steps."""
         return int((self.arrivals > horizon).sum()), int(self.arrivals.sum())
@@ -80,13 +89,15 @@ class Replanning:
     Args:
         problem: The team.
         roadmap: The roadmap of its world.
+        linger: Steps after which a robot that has arrived is nobody's obstacle any more, for it goes on to another
+            goal; ``None`` if it stays.
 
     Attributes:
         alone: ``(K,)`` about how many steps each robot takes by itself.
     """
 
-    def __init__(self, problem: Problem, roadmap: Roadmap) -> None:
-        self.problem, self.roadmap = problem, roadmap
+    def __init__(self, problem: Problem, roadmap: Roadmap, linger: int | None = None) -> None:
+        self.problem, self.roadmap, self.linger = problem, roadmap, linger
         self.cells = sort_into_cells(roadmap.nodes, float(2 * np.asarray(problem.team.radius).max() + problem.margin))
         self.space = make_space(problem) if problem.world.num_obstacles else None
         self.bodies = Team(problem, roadmap).bodies
@@ -141,8 +152,16 @@ class Replanning:
         places = np.full((steps + 1, num_robots, 3), FAR)
         controls = np.zeros((steps, num_robots, problem.control_size), np.float32)
         driven = Driven(controls, places, np.full(num_robots, steps + 1))
-        waiting = list(np.argsort(self.alone + random.random(num_robots)))
-        settled = np.zeros(num_robots, bool)
+        waiting = np.argsort(self.alone + random.random(num_robots))
+        return self.settle(driven, waiting, random, should_stop, most)
+
+    def settle(
+        self, driven: Driven, robots: IntArray, random: np.random.Generator, should_stop: Callable[[], bool], most: int
+    ) -> Driven | None:
+        """The same for those ``robots``, the last of them first, among all others in ``driven``, which is changed."""
+        steps, waiting, num_robots = len(driven.controls), robots.tolist(), self.problem.num_robots
+        settled = np.ones(num_robots, bool)
+        settled[robots] = False
         while waiting and not should_stop():
             most -= 1
             if most < 0:
@@ -158,14 +177,19 @@ class Replanning:
                 return None
             driven.places[:, robot] = around[:, robot]
             apart = self.bodies.radius[robot] + self.bodies.radius + self.bodies.margin + TOUCH
-            gaps = np.sqrt(((driven.places - driven.places[:, robot, None]) ** 2).sum(axis=2))
-            displaced = settled & (gaps[1:] < np.minimum(apart, self.ends_apart[robot])).any(axis=0)
+            there = driven.places[1 : self.leaves(int(driven.arrivals[robot]))]
+            gaps = np.sqrt(((there - there[:, robot, None]) ** 2).sum(axis=2))
+            displaced = settled & (gaps < np.minimum(apart, self.ends_apart[robot])).any(axis=0)
             displaced[robot] = False
             driven.places[:, displaced] = FAR
             settled &= ~displaced
             settled[robot] = True
             waiting[:0] = random.permutation(np.flatnonzero(displaced)).tolist()
         return None if waiting else driven
+
+    def leaves(self, arrival: int) -> int | None:
+        """The step from which on a robot that arrives at a step is nobody's obstacle any more, if any."""
+        return None if self.linger is None else arrival + self.linger + 1
 
     def replan_one(self, driven: Driven, robot: int, latest: int, random: np.random.Generator) -> bool:
         """Plan a robot's way around all others in ``driven``, which is changed; whether that succeeds."""
@@ -189,6 +213,7 @@ class Replanning:
                 cruise * self.strides[robot],
                 self.launch[robot],
                 bound,
+                -1 if self.linger is None else self.linger,
             )
             if len(way):
                 break
@@ -206,13 +231,15 @@ class Replanning:
             drive = drive_by_clock(self.problem, robot, route, stops, steps, hurrying=hurrying)
             if self.fits(Others(driven.places, np.minimum(apart + TOUCH, others.need)), robot, drive, latest):
                 driven.controls[:, robot], driven.places[:, robot], driven.arrivals[robot] = drive
+                if self.linger is not None:
+                    driven.places[self.leaves(drive[2]) :, robot] = FAR
                 return True
         return False
 
     def fits(self, others: Others, robot: int, drive: tuple[FloatArray, Floats, int], latest: int) -> bool:
         """Whether a drive of a robot ends in time, and comes near to nobody and nothing."""
         _, places, arrival = drive
-        if arrival > latest or touches(others, robot, places):
+        if arrival > latest or touches(others, robot, places[: self.leaves(arrival)]):
             return False
         if self.space is None:
             return True

@@ -23,7 +23,7 @@ MOST_ROBOTS, MOST_OBSTACLES = 200, 500
 """A slip of the finger must not fill the page."""
 
 _ATTEMPTS = 500
-_KINDS = ("circles", "spheres", "cylinders", "boxes", "polygons")
+KINDS = ("circles", "spheres", "cylinders", "boxes", "polygons")
 
 
 def move_goal(problem: Problem, robot: int, place: ArrayLike) -> Problem:
@@ -85,7 +85,7 @@ def add_obstacle(problem: Problem, kind: str, random: np.random.Generator) -> Pr
 
 def remove_obstacle(problem: Problem) -> Problem:
     """One obstacle fewer: the last one of its kind."""
-    for kind in reversed(_KINDS):
+    for kind in reversed(KINDS):
         shapes = getattr(problem.world, kind)
         if len(shapes):
             return _with_world(problem, **{kind: shapes[:-1]})
@@ -113,16 +113,54 @@ def move_obstacle(problem: Problem, kind: str, index: int, shift: ArrayLike) -> 
     return _with_world(problem, **{kind: shapes})
 
 
+def followed(before: Problem, after: Problem, other: Problem, who: str) -> Problem:
+    """Another team's scene changed as this one was: what was moved, added or removed is, all else stays.
+
+    Args:
+        before: This scene.
+        after: What has become of it.
+        other: Another with the same team and world, whose robots are elsewhere.
+        who: Whose that is, for messages.
+    """
+    kept = min(before.num_robots, after.num_robots)
+    places, moved = [], []
+    for here, there, elsewhere in zip(_places(before), _places(after), _places(other)):
+        same = (there[:kept] == here[:kept]).all(axis=1)
+        there[:kept][same] = elsewhere[:kept][same]
+        places.append(there)
+        moved.append([*np.flatnonzero(~same), *range(kept, len(there))])
+    changed = after.resumed_at(*places)
+    try:
+        for what, rows, robots in zip(("the robot", "the goal"), places, moved):
+            for robot in robots:
+                _check_place(changed, what, int(robot), rows[:, : changed.dimension])
+        if after.world is not before.world:
+            _check_world(changed)
+    except ValueError as error:
+        raise ValueError(f"{who}: {error}") from None
+    return changed
+
+
+def _places(problem: Problem) -> tuple[FloatArray, FloatArray]:
+    """Copies of starts and goals."""
+    return np.array(problem.start), np.array(problem.goal)
+
+
 def _with_world(problem: Problem, **changes: Any) -> Problem:
     world = problem.world
-    parts: dict[str, Any] = {name: getattr(world, name) for name in ("dimension", *_KINDS, "lower", "upper")}
-    changed = World(**parts | changes)
+    parts: dict[str, Any] = {name: getattr(world, name) for name in ("dimension", *KINDS, "lower", "upper")}
+    changed = problem.resumed_at(problem.start, problem.goal, world=World(**parts | changes))
+    _check_world(changed)
+    return changed
+
+
+def _check_world(problem: Problem) -> None:
+    """Refuse obstacles on robots and goals."""
     radius = np.asarray(problem.team.radius, np.float64)
     for what, places in (("robot", problem.start[:, : problem.dimension]), ("goal of robot", problem.goal)):
-        touched = np.flatnonzero(changed.clearance(places) <= radius)
+        touched = np.flatnonzero(problem.world.clearance(places) <= radius)
         if len(touched):
             raise ValueError(f"the obstacle would touch the {what}_{touched[0]}; put it elsewhere")
-    return problem.resumed_at(problem.start, problem.goal, world=changed)
 
 
 def _check_place(problem: Problem, what: str, robot: int, places: FloatArray) -> None:

@@ -10,54 +10,80 @@ from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
 
 
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """A moment of a session.
+@dataclass(frozen=True)
+class Moment:
+    """What all that drive side by side have in common.
 
     Attributes:
+        generation: Counts changes of team, world and policies.
+        number: Counts moments.
+        time: Simulated seconds since the scene was made.
+        since: ``time.perf_counter()`` when this moment began.
+        pace: Seconds from one step to the next at this speed.
+        state: ``"running"``, ``"paused"``, ``"planning"`` or ``"arrived"``.
+        message: What went wrong last, for people.
+    """
+
+    generation: int
+    number: int
+    time: float
+    since: float
+    pace: float
+    state: str
+    message: str
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A moment of a team that a policy drives.
+
+    Attributes:
+        moment: When that is.
+        policy: Name of what drives.
         problem: Team and world; its start and goals are those of the last change.
-        generation: Counts changes of team and world.
-        number: Counts frames.
         states: ``(K, n)`` now.
         before: ``(K, d)`` positions a step ago [m].
         goals: ``(K, d)`` [m].
         arrived: ``(K,)``.
         collided: ``(K,)``.
-        time: Simulated seconds since the scene was made.
-        since: ``time.perf_counter()`` when this moment began.
-        pace: Seconds from one step to the next at this speed.
+        finished: Whether all have arrived.
         loop: Seconds that the policy took for this step.
         replanned: Seconds that it took to plan after the last change.
         closest: Least distance between surfaces [m], negative in contact.
         guidance: ``(P, K, d)`` where the policy leads the team from here, if it says so.
         subgoals: ``(K, d)`` what it heads for next, likewise.
-        state: ``"running"``, ``"paused"``, ``"planning"`` or ``"arrived"``.
-        message: What went wrong last, for people.
+        bodies: ``(N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves about and is no robot.
     """
 
+    moment: Moment
+    policy: str
     problem: Problem
-    generation: int
-    number: int
     states: FloatArray
     before: FloatArray
     goals: FloatArray
     arrived: BoolArray
     collided: BoolArray
-    time: float
-    since: float
-    pace: float
+    finished: bool
     loop: float
     replanned: float
     closest: float
     guidance: FloatArray | None
     subgoals: FloatArray | None
-    state: str
-    message: str
+    bodies: FloatArray
 
     def positions(self, now: float) -> FloatArray:
         """``(K, d)`` where to draw the robots at a time of ``time.perf_counter()``: on their way here."""
-        share = np.float32(min(max((now - self.since) / max(self.pace, 1e-3), 0.0), 1.0))
-        return self.before + share * (self.states[:, : self.problem.dimension] - self.before)
+        return self.before + self._share(now) * (self.states[:, : self.problem.dimension] - self.before)
+
+    def body_positions(self, now: float) -> FloatArray:
+        """``(N, d)`` likewise for what is no robot."""
+        d = self.problem.dimension
+        return self.bodies[:, :d] - (1 - self._share(now)) * np.float32(self.problem.dt) * self.bodies[:, d : 2 * d]
+
+    def _share(self, now: float) -> np.float32:
+        """How much of the step before this moment has been shown."""
+        moment = self.moment
+        return np.float32(min(max((now - moment.since) / max(moment.pace, 1e-3), 0.0), 1.0))
 
 
 def closest_approach(problem: Problem, states: FloatArray) -> float:

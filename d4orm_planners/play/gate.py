@@ -10,6 +10,9 @@ import threading
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs, urlsplit
 
+GATE_HEADER = "X-D4orm-Gate"
+"""What the gate writes its token into, so that what is behind it can tell who has come through the gate."""
+
 _HEAD = 16_384
 _PATIENCE = 10.0
 
@@ -70,7 +73,7 @@ class Gate:
             behind, ahead = await asyncio.open_connection("127.0.0.1", self._target)
             pumps = [asyncio.create_task(_pump(reader, ahead)), asyncio.create_task(_pump(behind, writer))]
             try:
-                ahead.write(head)
+                ahead.write(head[:-2] + f"{GATE_HEADER}: {self.token}\r\n\r\n".encode())
                 await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
             finally:
                 for pump in pumps:

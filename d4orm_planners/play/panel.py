@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -16,13 +16,22 @@ from d4orm_env.scenarios import list_scenarios, make_problem
 from d4orm_env.scenarios.files import scenario_text
 from d4orm_env.scenarios.schema import parse
 from d4orm_planners.play import edits
+from d4orm_planners.play.dials import Dials
 from d4orm_planners.play.frame import Frame
 from d4orm_planners.play.session import Session
 from d4orm_planners.play.view import View
 
-POLICIES = ("d4orm-c2f", "orca", "ppo", "sac", "goal", "d4orm-d", "guided")
-COMPARED = ("d4orm-c2f", "d4orm-d", "goal")
-"""Policies that need no extra, and no model of their own."""
+POLICIES = {
+    "d4orm-c2f": "D4orm-C2F",
+    "orca": "ORCA",
+    "ppo": "PPO",
+    "sac": "SAC",
+    "goal": "straight",
+    "d4orm-d": "open loop: D4orm-D",
+    "guided": "open loop: guided",
+}
+"""Policies that the page offers, and what it calls them."""
+
 MODELS = ("scenario's own", "holonomic2d", "velocity2d", "differential_drive", "unicycle", "car", "holonomic3d")
 OWN_MODEL = MODELS[0]
 STATUS_EVERY = 0.2
@@ -44,10 +53,14 @@ class Panel:
         self._gui, self._session, self._view = server.gui, session, view
         self._random = np.random.default_rng(0)
         self._status_at = 0.0
-        self._text = ""
+        self._text = self._told = ""
         self._status = self._gui.add_markdown("")
         with self._gui.add_folder("Clock"):
             self._add_clock()
+        with self._gui.add_folder("Who drives", expand_by_default=False):
+            self._add_policies()
+        with self._gui.add_folder("What goes wrong", expand_by_default=False):
+            self._dials = Dials(server.gui, session)
         with self._gui.add_folder("Change the scene"):
             self._add_edits()
         with self._gui.add_folder("Another scene", expand_by_default=False):
@@ -57,35 +70,57 @@ class Panel:
         with self._gui.add_folder("Files", expand_by_default=False):
             self._add_files()
 
-    def update(self, frame: Frame) -> None:
+    def update(self) -> None:
         """Say how the team is doing."""
         now = time.perf_counter()
         if now - self._status_at < STATUS_EVERY:
             return
         self._status_at = now
-        text = status_text(frame, self._session.policy)
+        frames = self._session.frames
+        text = status_text(frames)
         if text != self._text:
             self._text = self._status.content = text
+        message = frames[0].moment.message
+        if message != self._told:
+            self._told = message
+            if message:  # something was refused, and the controls say what is
+                self._dials.follow()
+                self._follow_policies()
 
     def _add_clock(self) -> None:
-        paused: Any = self._gui.add_checkbox("Paused", False)
-        paused.on_update(lambda _: self._session.pause(paused.value))
+        self.paused: Any = self._gui.add_checkbox("Paused", False)
+        self.paused.on_update(lambda _: self._session.pause(self.paused.value))
         step, reset = self._gui.add_button("Step"), self._gui.add_button("Reset")
 
         def one_step(_: Any) -> None:
-            paused.value = True
+            self.paused.value = True
             self._session.step()
 
         step.on_click(one_step)
         reset.on_click(lambda _: self._session.reset())
         speed = self._gui.add_slider("Speed", 0.1, 8.0, 0.1, 1.0)
         speed.on_update(lambda _: self._session.set_speed(speed.value))
-        policy = self._gui.add_dropdown("Policy", tuple(dict.fromkeys((self._session.policy, *POLICIES))))
-        policy.on_update(lambda _: self._session.choose(policy.value))
-        horizon = self._gui.add_slider("Look ahead", 5, 50, 1, 20, hint="Steps that D4orm-C2F predicts.")
-        horizon.on_update(lambda _: self._session.set_horizon(int(horizon.value)))
         lifelong = self._gui.add_checkbox("Lifelong goals", False)
         lifelong.on_update(lambda _: self._session.set_lifelong(lifelong.value))
+
+    def _add_policies(self) -> None:
+        self._gui.add_markdown("Several drive side by side. To begin with the same start: Reset.")
+        offered = dict.fromkeys((*self._session.policies, *POLICIES))
+        self._drivers: dict[str, Any] = {
+            name: self._gui.add_checkbox(POLICIES.get(name, name), name in self._session.policies) for name in offered
+        }
+        for box in self._drivers.values():
+            box.on_update(self._choose)
+        horizon = self._gui.add_slider("Look ahead", 5, 50, 1, 20, hint="Steps that D4orm-C2F predicts.")
+        horizon.on_update(lambda _: self._session.set_horizon(int(horizon.value)))
+
+    def _choose(self, event: Any) -> None:
+        if event.client is not None:  # somebody's hand, not this program's
+            self._session.choose(*(name for name, box in self._drivers.items() if box.value))
+
+    def _follow_policies(self) -> None:
+        for name, box in self._drivers.items():
+            box.value = name in self._session.policies
 
     def _add_edits(self) -> None:
         self._gui.add_markdown("Drag robots, goals and obstacles.")
@@ -104,7 +139,7 @@ class Panel:
         self._gui.add_button(name).on_click(lambda _: self._session.edit(change))
 
     def _drawn(self, change: Callable[[Problem, np.random.Generator], Problem]) -> edits.Edit:
-        """A change that draws at random."""
+        """A change that draws at random, with other numbers each time."""
         return lambda scene: change(scene, self._random)
 
     def _add_scenes(self) -> None:
@@ -124,8 +159,8 @@ class Panel:
     def _add_views(self, server: viser.ViserServer) -> None:
         for name in self._view.shown:
             self._add_choice(name)
-        dark = self._gui.add_checkbox("Dark", False)
-        dark.on_update(lambda _: server.gui.configure_theme(dark_mode=dark.value, **THEME))
+        self.dark: Any = self._gui.add_checkbox("Dark", False)
+        self.dark.on_update(lambda _: server.gui.configure_theme(dark_mode=self.dark.value, **THEME))
 
     def _add_choice(self, name: str) -> None:
         box = self._gui.add_checkbox(name.capitalize(), self._view.shown[name])
@@ -133,20 +168,14 @@ class Panel:
 
     def _add_files(self) -> None:
         scene, replay = self._gui.add_button("Save scene"), self._gui.add_button("Save replay")
-        compare = self._gui.add_button("Compare policies", hint="From the beginning, with the same seed, as a replay.")
         load = self._gui.add_upload_button("Load scene", mime_type=".yaml,.yml")
 
         def save_scene(event: Any) -> None:
             _send(event.client, "scene.yaml", scenario_text(at_rest(self._session.scene)))
 
         def save_replay(event: Any) -> None:
-            _send(event.client, "replay.html", self._session.recording.replay(self._session.policy).html)
+            _send(event.client, "replay.html", self._session.replay().html)
 
-        def save_comparison(event: Any) -> None:
-            client = event.client
-            self._session.compare(COMPARED, lambda replay: _send(client, "compare.html", replay.html))
-
-        compare.on_click(save_comparison)
         scene.on_click(save_scene)
         replay.on_click(save_replay)
         load.on_upload(lambda _: self._session.load(partial(read_scene, load.value.content)))
@@ -160,18 +189,29 @@ def _send(client: viser.ClientHandle, name: str, text: str) -> None:
     client.send_file_download(name, text.encode(), save_immediately=True)
 
 
-def status_text(frame: Frame, policy: str) -> str:
+def status_text(frames: Sequence[Frame]) -> str:
     """What the page says of a moment."""
-    team = frame.problem.num_robots
-    contacts = int(frame.collided.sum())
-    lines = [
-        f"**{frame.problem.name}, {team} robots, {policy}: {frame.state}**",
-        f"time {frame.time:.1f} s, arrived {int(frame.arrived.sum())} of {team}",
-        f"closest approach {100 * frame.closest:.1f} cm" + (f", **{contacts} in contact**" if contacts else ""),
-        f"control loop {1e3 * frame.loop:.0f} ms, last replanning {frame.replanned:.2f} s",
-    ]
-    if frame.message:
-        lines.append(f"**{plain(frame.message)}**")
+    first, moment = frames[0], frames[0].moment
+    team = first.problem.num_robots
+    who = ", ".join(frame.policy for frame in frames)
+    lines = [f"**{first.problem.name}, {team} robots, {plain(who)}: {moment.state}**", f"time {moment.time:.1f} s"]
+    for frame in frames:
+        contacts = int(frame.collided.sum())
+        touching = f", **{contacts} in contact**" if contacts else ""
+        arrived = f"arrived {int(frame.arrived.sum())} of {team}"
+        loop, planning = f"{1e3 * frame.loop:.0f} ms", f"{frame.replanned:.2f} s"
+        if len(frames) == 1:
+            lines += [
+                arrived,
+                f"closest approach {100 * frame.closest:.1f} cm{touching}",
+                f"control loop {loop}, last replanning {planning}",
+            ]
+        else:
+            lines.append(
+                f"**{plain(frame.policy)}**: {arrived}, {100 * frame.closest:.1f} cm{touching}, {loop}, {planning}"
+            )
+    if moment.message:
+        lines.append(f"**{plain(moment.message)}**")
     return "  \n".join(lines)
 
 

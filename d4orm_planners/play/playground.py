@@ -11,13 +11,13 @@ import time
 import viser
 
 from d4orm_env.core.problem import Problem
+from d4orm_planners.play.admission import LOOPBACK, Admission
 from d4orm_planners.play.gate import Gate
 from d4orm_planners.play.panel import THEME, Panel
 from d4orm_planners.play.session import Session
-from d4orm_planners.play.view import View, look_at
+from d4orm_planners.play.view import View
 
 FRAMES_PER_SECOND = 33
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
 class _Server(viser.ViserServer):
@@ -32,8 +32,8 @@ class Playground:
 
     Args:
         problem: The scene to begin with.
-        policy: Name of what drives.
-        seed: Of the policy.
+        policies: Names of what drives, side by side; D4orm-C2F by default.
+        seed: Of the policies, of what goes wrong, and of new goals.
         host: Where to be found; by default on this machine only. Elsewhere the address has a token.
         port: Where to be found; 0 for any free port.
 
@@ -45,17 +45,16 @@ class Playground:
         ValueError: If it cannot be found there, or there is no such policy.
     """
 
-    def __init__(
-        self, problem: Problem, policy: str = "d4orm-c2f", seed: int = 0, host: str = LOOPBACK[0], port: int = 0
-    ) -> None:
+    def __init__(self, problem: Problem, *policies: str, seed: int = 0, host: str = LOOPBACK[0], port: int = 0) -> None:
         local = host in LOOPBACK
         chosen = _free_port(host, port)
-        self.session = Session(problem, policy, seed)
+        self.session = Session(problem, *policies, seed=seed)
         with contextlib.redirect_stdout(io.StringIO()):  # its own words on where it is
             self._server = _Server(
                 host="127.0.0.1", port=chosen if local else _free_port("127.0.0.1", 0), verbose=False
             )
         self._gate = None if local else Gate(host, chosen, self._server.get_port())
+        Admission(self._server, None if self._gate is None else self._gate.token)
         if self._gate is None:
             self.address = f"http://127.0.0.1:{self._server.get_port()}/"
         else:
@@ -68,7 +67,6 @@ class Playground:
         self._server.gui.set_panel_label("d4orm play")
         self._view = View(self._server, self.session)
         self._panel = Panel(self._server, self.session, self._view)
-        self._looked_at: object = None
         self._stopping = threading.Event()
 
     def run(self, seconds: float | None = None) -> None:
@@ -98,13 +96,8 @@ class Playground:
 
     def show(self) -> None:
         """Bring the page up to date."""
-        frame = self.session.frame
-        scene = (frame.problem.name, frame.problem.num_robots, frame.problem.dimension)
-        if scene != self._looked_at:
-            self._looked_at = scene
-            look_at(self._server, frame.problem)
-        self._view.update(frame)
-        self._panel.update(frame)
+        self._view.update()
+        self._panel.update()
 
     def close(self) -> None:
         """Leave no thread and no port."""

@@ -1,22 +1,17 @@
-"""Replays of a session: its last minutes, and how several policies do its scene."""
+"""The last minutes of a team, for replays."""
 
 from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.summary import count
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.render.replay import Replay, motion
-from d4orm_planners.episode import run_episode
-from d4orm_planners.registry import make_policy
+from d4orm_env.render.replay import ReplayMotion, motion
 
 MOST_STEPS = 6000
 """Ten minutes at the usual time step; what is older is forgotten."""
@@ -31,7 +26,7 @@ class _Moment(NamedTuple):
 
 
 class Recording:
-    """What happened since team or world last changed; one thread may add while others make replays."""
+    """What happened since team, world or policies last changed; one thread may add while others make replays."""
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
@@ -46,8 +41,8 @@ class Recording:
         with self._lock:
             self._moments.append(_Moment(*moment))
 
-    def replay(self, policy: str) -> Replay:
-        """A page that plays it."""
+    def motion(self, policy: str) -> ReplayMotion:
+        """What happened, for a replay."""
         with self._lock:
             problem, moments = self._problem, list(self._moments)
         states = np.stack([moment.states for moment in moments])
@@ -61,15 +56,5 @@ class Recording:
             collided=np.stack([moment.collided for moment in moments]),
             margin_violated=np.stack([moment.violated for moment in moments]),
         )
-        title = f"{problem.name}, {count(problem.num_robots, 'robot')} by {policy}, {steps * problem.dt:.1f} s"
         goals = np.stack([moment.goals for moment in moments])
-        return Replay(title, (motion(problem, trajectory, title, goals=goals),))
-
-
-def compared(scene: Problem, policies: Sequence[str], seed: int) -> Replay:
-    """Several policies side by side, from the same start with the same seed."""
-    motions = []
-    for name in policies:
-        env = navigation_v0.parallel_env(problem=scene)
-        motions.append(run_episode(env, make_policy(name), seed=seed).motion(name))
-    return Replay(f"{scene.name}, {count(scene.num_robots, 'robot')}", tuple(motions))
+        return motion(problem, trajectory, f"{policy}, {steps * problem.dt:.1f} s", goals=goals)

@@ -1,7 +1,8 @@
 """A simulation that goes on by a clock in a thread of its own, and that others may look at and change meanwhile.
 
 The thread plans and steps; nobody waits for it but the simulated clock. Changes are put into a queue and made between
-two steps: the team then goes on from where it is, and the policy plans anew.
+two steps: the team then goes on from where it is, and the policy plans anew. Where several policies drive side by side,
+each has a team of its own in the same world, and whatever is changed is changed for all.
 """
 
 from __future__ import annotations
@@ -9,79 +10,96 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
-
-from d4orm_env import navigation_v0
-from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.errors import first_line
 from d4orm_env.core.problem import Problem
-from d4orm_env.joint_state import JointState, split_state
+from d4orm_env.core.summary import count
+from d4orm_env.disturbances.registry import disturbances_at
 from d4orm_env.render.replay import Replay
-from d4orm_planners.play.edits import Edit
-from d4orm_planners.play.frame import Frame, closest_approach, guidance
-from d4orm_planners.play.recording import Recording, compared
+from d4orm_planners.play.edits import Edit, followed
+from d4orm_planners.play.frame import Frame, Moment
+from d4orm_planners.play.lane import Lane, Terms
 from d4orm_planners.policy import Policy
 from d4orm_planners.registry import make_policy, setting_names
 
-MOST_CYCLES = 10_000_000
 _IDLE = 0.1
 
 HORIZON = "predict_horizon"
 """Setting of policies that look ahead."""
 
+MOST_LANES = 6
+
 
 class Session:
-    """A team in its world, driven by a policy.
+    """A team in its world, driven by a policy, or by several side by side.
 
     Args:
         problem: The scene to begin with.
-        policy: Name of what drives; one of :func:`~d4orm_planners.list_policies`.
-        seed: Of the policy, and of new goals.
+        policies: Names of what drives; of :func:`~d4orm_planners.list_policies`.
+        seed: Of the policies, of what goes wrong, and of new goals.
         lifelong: Whether robots go on to new goals.
 
     Attributes:
         failure: What ended the thread, if it was not :meth:`close`.
+
+    Raises:
+        ValueError: If there is no such policy, or it cannot drive there.
     """
 
-    def __init__(self, problem: Problem, policy: str = "d4orm-c2f", seed: int = 0, lifelong: bool = False) -> None:
-        self._scene, self._policy_name, self._seed, self._lifelong = problem, policy, seed, lifelong
+    def __init__(self, problem: Problem, *policies: str, seed: int = 0, lifelong: bool = False) -> None:
+        self._loaded, self._names = problem, policies or ("d4orm-c2f",)
+        self._terms, self._levels = Terms(seed, lifelong), dict[str, float]()
         self._policies: dict[tuple[str, int | None], Policy] = {}
         self._horizon: int | None = None
         self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._wake, self._closing = threading.Event(), threading.Event()
         self._paused, self._steps_wanted, self._speed = False, 0, 1.0
-        self._generation = self._number = 0
-        self._frame: Frame
-        self._env: navigation_v0.parallel_env
-        self._policy: Policy
-        self._message = ""
+        self._moment = Moment(0, 0, 0.0, 0.0, problem.dt, "planning", "")
+        self._frames: tuple[Frame, ...] = ()
+        self._lanes: tuple[Lane, ...] = ()
         self.failure: BaseException | None = None
         self._thread = threading.Thread(target=self._live, name="d4orm-play", daemon=True)
-        self._begin(problem, new_scene=True)
+        self._begin([problem] * len(self._names), afresh=True)
+
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        """The present moment of all that drive, in their order."""
+        return self._frames
 
     @property
     def frame(self) -> Frame:
-        """The present moment."""
-        return self._frame
+        """The present moment of the first that drives."""
+        return self._frames[0]
 
     @property
-    def policy(self) -> str:
-        """Name of what drives."""
-        return self._policy_name
+    def policies(self) -> tuple[str, ...]:
+        """Names of what drives."""
+        return self._names
+
+    @property
+    def levels(self) -> Mapping[str, float]:
+        """What goes wrong, by name and level."""
+        return self._levels
 
     @property
     def scene(self) -> Problem:
-        """The scene as it is now, for a file: where the robots are is where they start, at rest or under way."""
-        frame = self._frame
+        """The scene as the first that drives has it now, for a file: where the robots are is where they start."""
+        frame = self.frame
         return frame.problem.resumed_at(frame.states, frame.goals)
 
     @property
-    def recording(self) -> Recording:
-        """What happened since team or world last changed."""
-        return self._recording
+    def recorded_steps(self) -> int:
+        """How much has happened since team, world or policies last changed."""
+        return len(self._lanes[0].recording) - 1
+
+    def replay(self) -> Replay:
+        """What happened since team, world or policies last changed, side by side."""
+        lanes = self._lanes
+        scene = lanes[0].scene
+        motions = [lane.recording.motion(lane.name) for lane in lanes]
+        return Replay(f"{scene.name}, {count(scene.num_robots, 'robot')} by {', '.join(self._names)}", tuple(motions))
 
     def start(self) -> None:
         """Let the clock run."""
@@ -94,13 +112,23 @@ class Session:
         if self._thread.is_alive():
             self._thread.join()
 
-    def edit(self, edit: Edit) -> None:
-        """Change the scene between two steps; what cannot be is left, and the next frame's message says why."""
+    def edit(self, edit: Edit, lane: int = 0) -> None:
+        """Change the scene between two steps; what cannot be is left, and the next frame's message says why.
+
+        Args:
+            edit: The change.
+            lane: Whose robots it goes by, where several drive side by side; all others follow.
+        """
 
         def make() -> None:
-            scene = edit(self.scene)
-            old = self._frame.problem
-            self._begin(scene, new_scene=scene.team is not old.team or scene.world is not old.world)
+            before = [lane.scene for lane in self._lanes]
+            leader = min(lane, len(before) - 1)
+            after = edit(before[leader])
+            scenes = [
+                after if index == leader else followed(before[leader], after, other, self._names[index])
+                for index, other in enumerate(before)
+            ]
+            self._begin(scenes, afresh=after.team is not before[0].team or after.world is not before[0].world)
 
         self._post(make)
 
@@ -108,31 +136,26 @@ class Session:
         """Begin anew with another scene."""
 
         def make() -> None:
-            scene, former = make_scene(), self._seed
-            self._seed = seed
-            try:
-                self._begin(scene, new_scene=True)
-            except Exception:
-                self._seed = former
-                raise
-            self._scene = scene
+            scene = make_scene()
+            self._begin([scene] * len(self._names), terms=replace(self._terms, seed=seed), afresh=True)
+            self._loaded = scene
 
         self._post(make)
 
     def reset(self) -> None:
         """Begin the scene anew that was loaded last."""
-        self._post(lambda: self._begin(self._scene, new_scene=True))
+        self._post(lambda: self._begin([self._loaded] * len(self._names), afresh=True))
 
-    def choose(self, policy: str) -> None:
-        """Let another policy drive on from here."""
+    def choose(self, *policies: str) -> None:
+        """Let other policies drive on from here, side by side; one that comes in begins where the first is."""
 
         def make() -> None:
-            former, self._policy_name = self._policy_name, policy
-            try:
-                self._begin(self.scene, new_scene=False)
-            except Exception:
-                self._policy_name = former
-                raise
+            if policies == self._names:
+                return
+            if not 1 <= len(set(policies)) == len(policies) <= MOST_LANES:
+                raise ValueError(f"{len(policies)} policies are chosen; choose 1 to {MOST_LANES}, each once")
+            scenes = {lane.name: lane.scene for lane in self._lanes}
+            self._begin([scenes.get(name, self._lanes[0].scene) for name in policies], names=policies, afresh=True)
 
         self._post(make)
 
@@ -142,35 +165,28 @@ class Session:
         def make() -> None:
             former, self._horizon = self._horizon, steps
             try:
-                self._begin(self.scene, new_scene=False)
+                self._begin_here()
             except Exception:
                 self._horizon = former
                 raise
 
         self._post(make)
 
-    def compare(self, policies: Sequence[str], done: Callable[[Replay], object]) -> None:
-        """Let several policies do the scene that was loaded last, with the same seed; the clock waits meanwhile.
+    def set_lifelong(self, lifelong: bool) -> None:
+        """Whether robots that arrive go on to new goals."""
+        self._post(lambda: self._begin_here(replace(self._terms, lifelong=lifelong)))
+
+    def disturb(self, levels: Mapping[str, float]) -> None:
+        """What goes wrong from the next step on.
 
         Args:
-            policies: Names.
-            done: What is called with them side by side.
+            levels: Names and levels of :func:`~d4orm_env.disturbances.registry.disturbances_at`.
         """
 
         def make() -> None:
-            self._frame = replace(self._frame, state="planning")
-            replay = compared(self._scene, policies, self._seed)
-            self._show(self._frame.before, state=self._state)
-            done(replay)
-
-        self._post(make)
-
-    def set_lifelong(self, lifelong: bool) -> None:
-        """Whether robots that arrive go on to new goals."""
-
-        def make() -> None:
-            self._lifelong = lifelong
-            self._begin(self.scene, new_scene=False)
+            if levels != self._levels:
+                self._begin_here(replace(self._terms, disturbances=disturbances_at(levels)))
+                self._levels = dict(levels)
 
         self._post(make)
 
@@ -179,7 +195,7 @@ class Session:
 
         def make() -> None:
             self._paused, self._steps_wanted = paused, 0
-            self._show(self._frame.before, state=self._state)
+            self._show(self._state)
 
         self._post(make)
 
@@ -224,109 +240,87 @@ class Session:
     def _advance_or_pause(self) -> None:
         """One step; where there is none, such as without room for a lifelong goal, a pause that says why."""
         try:
-            self._advance()
+            if any(not lane.finished for lane in self._lanes):
+                for lane in self._lanes:
+                    lane.advance()
+                self._moment = replace(self._moment, time=self._moment.time + self._lanes[0].scene.dt)
+                self._show(self._state, moved=True)
         except (ValueError, RuntimeError) as error:
-            self._message, self._paused = first_line(error), True
-            self._show(self._frame.before, state=self._state)
+            self._paused = True
+            self._show(self._state, first_line(error))
 
     def _obey(self) -> bool:
         """Do what was asked for meanwhile; whether there was anything."""
         obeyed = False
         while not self._commands.empty():
-            obeyed, self._message = True, ""
+            obeyed = True
+            self._moment = replace(self._moment, message="")
             try:
                 self._commands.get()()
             except (ValueError, RuntimeError, ImportError) as error:
-                self._message = first_line(error)
-                self._show(self._frame.before, state=self._state)
+                self._show(self._state, first_line(error))
         return obeyed
 
     @property
     def _pace(self) -> float:
-        return self._frame.problem.dt / self._speed
+        return self.frame.problem.dt / self._speed
 
     @property
     def _state(self) -> str:
         if self._paused:
             return "paused"
-        return "running" if self._env.agents else "arrived"
+        return "arrived" if all(lane.finished for lane in self._lanes) else "running"
 
-    def _begin(self, scene: Problem, new_scene: bool) -> None:
-        """Go on from a scene: an episode of its own, which the policy plans for."""
-        env = navigation_v0.parallel_env(problem=scene, lifelong=self._lifelong, max_cycles=MOST_CYCLES)
-        observations, _ = env.reset(seed=self._seed)
-        if self._number:
-            self._frame = replace(self._frame, state="planning")
-        begin = time.perf_counter()
-        policy = self._driver()
+    def _begin_here(self, terms: Terms | None = None) -> None:
+        """Go on from where everybody is."""
+        self._begin([lane.scene for lane in self._lanes], terms=terms)
+
+    def _begin(
+        self,
+        scenes: Sequence[Problem],
+        names: tuple[str, ...] | None = None,
+        terms: Terms | None = None,
+        afresh: bool = False,
+    ) -> None:
+        """Go on from scenes, one for each policy: episodes of their own, which the policies plan for.
+
+        What fails leaves everything as it was.
+        """
+        names, terms = names or self._names, terms or self._terms
+        recordings = [None] * len(names) if afresh else [lane.recording for lane in self._lanes]
+        if self._frames:
+            self._show("planning")
         try:
-            policy.reset(env, seed=self._seed)
+            lanes = tuple(
+                Lane(name, self._driver(name), scene, terms, recording)
+                for name, scene, recording in zip(names, scenes, recordings, strict=True)
+            )
         except Exception:
-            if self._number:  # what drove until now may have forgotten where it was
-                self._policy.reset(self._env, seed=self._seed)
+            for lane in self._lanes:  # what drove until now may have forgotten where it was
+                lane.regain()
             raise
-        self._replanned, self._loop = time.perf_counter() - begin, 0.0
-        self._env, self._observations, self._policy = env, observations, policy
-        if new_scene:
-            self._generation += 1
-            self._time = 0.0
-            self._recording = Recording(scene)
-        self._problem = scene
-        self._remember()
-        self._show(scene.start[:, : scene.dimension], state=self._state)
+        self._lanes, self._names, self._terms = lanes, names, terms
+        if afresh:
+            self._moment = replace(self._moment, generation=self._moment.generation + 1, time=0.0)
+        self._show(self._state, moved=True)
 
-    def _driver(self) -> Policy:
-        """The policy that drives, made when it is first needed: some hold threads, so there is one of each."""
-        name = self._policy_name
+    def _driver(self, name: str) -> Policy:
+        """The policy of a name, made when it is first needed: some hold threads, so there is one of each."""
         horizon = self._horizon if HORIZON in setting_names(name) else None
         if (name, horizon) not in self._policies:
             settings = {} if horizon is None else {HORIZON: horizon}
             self._policies[name, horizon] = make_policy(name, **settings)
         return self._policies[name, horizon]
 
-    def _advance(self) -> None:
-        """One step of the policy and of the world."""
-        if not self._env.agents:
-            return
-        before = self._frame.states[:, : self._problem.dimension]
-        acting = {agent: self._observations[agent] for agent in self._env.agents}
-        begin = time.perf_counter()
-        actions = self._policy.act(acting, self._env.state())
-        self._loop = time.perf_counter() - begin
-        self._observations, *_ = self._env.step(actions)
-        self._time += self._problem.dt
-        self._remember()
-        self._show(before, state=self._state)
-
-    @property
-    def _joint(self) -> JointState:
-        return split_state(self._problem, self._env.state())
-
-    def _remember(self) -> None:
-        joint, last = self._joint, self._env.last_step
-        self._recording.add(joint.states, joint.goals, joint.arrived, last.collided, last.margin_violated)
-
-    def _show(self, before: FloatArray, state: str) -> None:
-        """Make a frame of the present."""
-        joint, last = self._joint, self._env.last_step
-        self._number += 1
-        self._frame = Frame(
-            problem=self._problem,
-            generation=self._generation,
-            number=self._number,
-            states=joint.states,
-            before=before,
-            goals=joint.goals,
-            arrived=joint.arrived,
-            collided=np.array(last.collided),
-            time=self._time,
-            since=time.perf_counter(),
-            pace=self._problem.dt / self._speed,
-            loop=self._loop,
-            replanned=self._replanned,
-            closest=closest_approach(self._problem, joint.states),
-            guidance=guidance(self._policy, joint.steps),
-            subgoals=getattr(self._policy, "subgoals", None),
+    def _show(self, state: str, message: str | None = None, moved: bool = False) -> None:
+        """Make frames of the present; without another message the last one stays."""
+        dt = self._lanes[0].scene.dt
+        self._moment = replace(
+            self._moment,
+            number=self._moment.number + 1,
+            since=time.perf_counter() if moved else self._moment.since,
+            pace=dt / self._speed,
             state=state,
-            message=self._message,
+            message=self._moment.message if message is None else message,
         )
+        self._frames = tuple(lane.frame(self._moment) for lane in self._lanes)

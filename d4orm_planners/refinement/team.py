@@ -43,6 +43,11 @@ class TeamPaths:
         self.arrived: BoolArray = trajectory.arrived[-1].copy()
         margin = self.problem.margin + ROUNDING
         self.index = PathIndex(trajectory.positions, self.problem.team.radius, margin)
+        self._interval = search.check_interval
+        # Who fails is looked for at some steps only, ways around others are at all of them.
+        self._checked = self.index
+        if self._interval > 1:
+            self._checked = PathIndex(trajectory.positions[:: self._interval], self.problem.team.radius, margin)
 
     @property
     def positions(self) -> FloatArray:
@@ -50,8 +55,8 @@ class TeamPaths:
         return self.index.positions
 
     def conflicts(self) -> Graph:
-        """Who comes within the margin of whom after the start."""
-        return graph_of(self.problem.num_robots, self.index.pairs())
+        """Who comes within the margin of whom after the start, at the steps that are checked."""
+        return graph_of(self.problem.num_robots, self._checked.pairs())
 
     def move(self, robots: ArrayLike, controls: FloatArray, states: FloatArray, arrived: ArrayLike) -> None:
         """Let robots ``(R,)`` do otherwise: ``(H, R, m)``, ``(H+1, R, n)`` and ``(R,)``."""
@@ -62,9 +67,11 @@ class TeamPaths:
         self.states[:, index, : states.shape[2]] = states
         self.arrived[index] = arrived
         self.index.move(index, states[..., : self.problem.dimension])
+        if self._checked is not self.index:
+            self._checked.move(index, states[:: self._interval, :, : self.problem.dimension])
 
     def faults(self, robots: ArrayLike) -> tuple[Costs, IntArray]:
-        """What robots ``(R,)`` do wrong at present.
+        """What robots ``(R,)`` do wrong at present, at the steps that are checked.
 
         Returns:
             ``(R,)`` counted in robots met: a missed goal and contact with an obstacle amount to several, docking where
@@ -97,7 +104,12 @@ class TeamPaths:
         from d4orm_env.engine.path_index import judge_alone
 
         paths, horizon = np.ascontiguousarray(np.moveaxis(states, 0, 2)), self.problem.horizon
-        met, meeting = self.index.count_met(robots, paths)
+        checked = paths[:, :, :: self._interval]
+        met, meeting = self._checked.count_met(robots, checked)
         touching, moves, unsure = judge_alone(self.problem.arrays, robots, paths)
+        if self._interval > 1:
+            touching = judge_alone(self.problem.arrays, robots, checked)[0] * self._interval
+            # What there is none of comes after the last step.
+            meeting = np.minimum(meeting * self._interval, horizon + 1)
         faults = met + (unsure <= horizon) + MISSING * (~arrived | (touching <= horizon))
         return faults + moves / (horizon + 1), np.minimum(np.minimum(meeting, touching), unsure)

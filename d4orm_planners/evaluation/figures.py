@@ -1,8 +1,8 @@
-"""Pictures of a study of disturbances, with matplotlib."""
+"""Pictures of what went wrong and how often policies succeeded all the same, with matplotlib."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,17 @@ import numpy as np
 from d4orm_planners.evaluation.report import panels
 from d4orm_planners.evaluation.summary import SuccessRate
 from d4orm_planners.evaluation.tolerance import THRESHOLD
+
+
+def draw_noise(path: Path, rates: Sequence[SuccessRate]) -> None:
+    """Success against the execution noise: one line per policy, one panel per scenario and team."""
+    groups = panels(rates)
+    figure, axes = _figure(len(groups), 4.8, 3.6)
+    for ax, (title, group) in zip(axes, groups.items()):
+        _draw_lines(ax, sorted(group, key=lambda rate: rate.control_noise_std), lambda rate: rate.control_noise_std)
+        ax.set(title=title, xlabel="standard deviation of the control noise")
+    axes[0].legend(loc="best")
+    figure.savefig(path, dpi=150)
 
 
 def draw_disturbance(path: Path, name: str, rates: Sequence[SuccessRate]) -> None:
@@ -29,21 +40,27 @@ def draw_disturbance(path: Path, name: str, rates: Sequence[SuccessRate]) -> Non
         # Levels that are no quantities, or lie apart by orders of magnitude, are places in a row.
         levels = [level for level in places if level is not None and np.isfinite(level)]
         even = len(levels) < len(places) or _uneven(levels)
-        for policy in dict.fromkeys(rate.label for rate in group):
-            line = [rate for rate in group if rate.label == policy]
-            x = [places[rate.level] if even else rate.level for rate in line]
-            (drawn,) = ax.plot(x, [rate.rate for rate in line], marker="o", label=policy, clip_on=False)
-            lower, upper = [rate.lower for rate in line], [rate.upper for rate in line]
-            ax.fill_between(x, lower, upper, color=drawn.get_color(), alpha=0.15, linewidth=0)
+        _draw_lines(ax, group, lambda rate: places[rate.level] if even else rate.level)  # noqa: B023 - called at once
         if even:
             ax.set_xticks(range(len(places)), [_shown(level) for level in places])
         elif levels[0] > levels[-1]:
             ax.invert_xaxis()
         ax.axhline(THRESHOLD, color="0.6", linewidth=0.8, linestyle=":")
-        ax.set(title=title, xlabel=name, ylabel="success rate", ylim=(0, 1))
-        ax.grid(alpha=0.3)
+        ax.set(title=title, xlabel=name)
     axes[0].legend(loc="best")
     figure.savefig(path, dpi=150)
+
+
+def _draw_lines(ax: Any, rates: Sequence[SuccessRate], place: Callable[[SuccessRate], float | None]) -> None:
+    """A line with a confidence band per policy."""
+    for policy in dict.fromkeys(rate.label for rate in rates):
+        line = [rate for rate in rates if rate.label == policy]
+        x = [place(rate) for rate in line]
+        (drawn,) = ax.plot(x, [rate.rate for rate in line], marker="o", label=policy, clip_on=False)
+        lower, upper = [rate.lower for rate in line], [rate.upper for rate in line]
+        ax.fill_between(x, lower, upper, color=drawn.get_color(), alpha=0.15, linewidth=0)
+    ax.set(ylabel="success rate", ylim=(0, 1))
+    ax.grid(alpha=0.3)
 
 
 def draw_map(path: Path, rates: Sequence[SuccessRate]) -> None:

@@ -1,0 +1,215 @@
+"""A team as rigid bodies in motion: put somewhere, moved by commands, looked at."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.portable import NUMPY_OPS
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.robot_model import ACCELERATION, SPEED, TimeStep
+from d4orm_env.mujoco.physics import Physics
+from d4orm_env.mujoco.scene import DRIVES, HALF_TRACK, NOT_SOLID, OBSTACLE, PUCKS, WHEEL_RADIUS, build_scene
+from d4orm_env.mujoco.wheels import GRAVITY, Commands, WheelControl
+
+Floats = NDArray[np.float64]
+Robots = NDArray[np.intp]
+
+_HELD = 1e6
+"""What a docked robot weighs more, per degree of freedom [kg]: nothing moves it."""
+_SPIN, _FREE_DOFS, _FREE_PLACE = 2, 6, 7
+
+
+class Moved(NamedTuple):
+    """What a step came to.
+
+    Attributes:
+        states: ``(K, n)`` as the problem's models have them.
+        touched: ``(K,)`` bool: was in contact with a robot, an obstacle or an intruder at any moment of it.
+    """
+
+    states: FloatArray
+    touched: BoolArray
+
+
+class TeamBodies:
+    """The bodies of a problem's team.
+
+    Args:
+        problem: The problem; every robot has a body, see :func:`~d4orm_env.mujoco.scene.check_problem`.
+        physics: What they are made of.
+        intruder_radius: ``(N,)`` of bodies that are no robots [m].
+    """
+
+    def __init__(self, problem: Problem, physics: Physics, intruder_radius: FloatArray) -> None:
+        self.problem, self.intruder_radius = problem, intruder_radius
+        self._substeps = math.ceil(problem.dt / physics.time_step - 1e-9)
+        self._step = problem.dt / self._substeps
+        self.scene = build_scene(problem, physics, intruder_radius, self._step)
+        self.data = mujoco.MjData(self.scene.model)
+        self._settling_time = physics.settling_time
+        self._grip = physics.wheel_friction * GRAVITY
+        names = np.array(problem.team.models)
+        self._pucks, self._drives = np.flatnonzero(np.isin(names, PUCKS)), np.flatnonzero(np.isin(names, DRIVES))
+        self._servos = np.flatnonzero(names == "velocity2d")
+        radius = np.asarray(problem.team.radius, np.float64)[self._drives]
+        mass = self.scene.mass[self._drives]
+        self._wheels = WheelControl(WHEEL_RADIUS * radius, HALF_TRACK * radius, mass, physics.settling_time)
+        dofs = self.scene.dofs
+        self._push_dofs = dofs[self._pucks][:, None] + np.arange(2)
+        self._servo_dofs = dofs[self._servos][:, None] + np.arange(2)
+        self._wheel_dofs = dofs[self._drives][:, None] + _FREE_DOFS + np.arange(2)
+        self._headings: Floats = np.zeros(problem.num_robots)
+        self._wanted: Floats = np.zeros(problem.num_robots)
+        self._held: BoolArray = np.zeros(problem.num_robots, np.bool_)
+        self.begin()
+
+    def begin(self) -> None:
+        """Put everybody at the start, at whatever speed the problem says, and let go of those that were held."""
+        mujoco.mj_resetData(self.scene.model, self.data)
+        self._held[:] = False
+        self.scene.model.dof_armature[:] = 0
+        self.put(np.arange(self.problem.num_robots), self.problem.start)
+
+    def put(self, robots: Robots, states: FloatArray) -> None:
+        """Put some robots into the states in the rows of ``states`` ``(K, n)``."""
+        for robot in robots.tolist():
+            self._put(robot, states[robot].astype(np.float64))
+        self._wheels.reset(np.isin(self._drives, robots))
+
+    def hold(self, robots: Robots) -> None:
+        """Stop some robots where they are, so that nothing moves them any more."""
+        for robot in robots.tolist():
+            dofs = self._dofs(robot)
+            self.data.qvel[dofs] = self.data.qfrc_applied[dofs] = 0
+            self.scene.model.dof_armature[dofs] = _HELD
+        self._held[robots] = True
+
+    def advance(self, controls: FloatArray, limits: FloatArray, intruders: FloatArray) -> Moved:
+        """One time step of the problem.
+
+        Args:
+            controls: ``(K, m)`` within the robots' limits.
+            limits: ``(K, L)`` of the robots.
+            intruders: ``(N, 5)`` where bodies that are no robots are at the end of the step, and their velocities.
+
+        Raises:
+            RuntimeError: If the simulation has become unstable.
+        """
+        states = self.states()
+        self._push(controls, states, limits)
+        commands = self._commands(controls, states, limits)
+        touched = np.zeros(self.problem.num_robots, np.bool_)
+        for number in range(1, self._substeps + 1):
+            left = self.problem.dt - number * self._step
+            for place, body in zip(self.data.mocap_pos, intruders):
+                place[:2] = body[:2] - left * body[2:4]
+            self._serve(controls)
+            torque = self._wheels.torque(commands, number * self._step, self._step, self.data.qvel[self._wheel_dofs])
+            torque[self._held[self._drives]] = 0
+            self.data.qfrc_applied[self._wheel_dofs] = torque
+            mujoco.mj_step(self.scene.model, self.data)
+            self._note_contacts(touched)
+        if self.data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
+            raise RuntimeError("MuJoCo's simulation has become unstable; use a smaller Physics time_step")
+        return Moved(self.states(), touched)
+
+    def states(self) -> FloatArray:
+        """``(K, n)`` the robots' states, headings wound up as the models' are."""
+        states: FloatArray = np.zeros(self.problem.start.shape, np.float32)
+        qpos, qvel = self.data.qpos, self.data.qvel
+        for robot, model in enumerate(self.problem.team.robot_models):
+            joint, dof = self.scene.joints[robot], self.scene.dofs[robot]
+            states[robot, :2] = qpos[joint : joint + 2]
+            if model.heading_index is None:
+                velocity = qvel[dof : dof + 2]
+            else:
+                states[robot, model.heading_index] = heading = self._heading(robot)
+                velocity = qvel[dof] * math.cos(heading) + qvel[dof + 1] * math.sin(heading)
+            if model.speed_indices:
+                states[robot, list(model.speed_indices)] = velocity
+        return states
+
+    def _put(self, robot: int, state: Floats) -> None:
+        model, data = self.problem.team.robot_models[robot], self.data
+        joint, dof = int(self.scene.joints[robot]), int(self.scene.dofs[robot])
+        data.qpos[joint : joint + 2] = state[:2]
+        data.qvel[self._dofs(robot)] = 0
+        data.qfrc_applied[self._dofs(robot)] = 0
+        if model.heading_index is None:
+            data.qpos[joint + _SPIN] = 0
+            if model.speed_indices:
+                data.qvel[dof : dof + 2] = state[list(model.speed_indices)]
+            return
+        self._headings[robot] = heading = state[model.heading_index]
+        data.qpos[joint + 2 : joint + _FREE_PLACE] = [0, math.cos(heading / 2), 0, 0, math.sin(heading / 2)]
+        data.qpos[joint + _FREE_PLACE : joint + _FREE_PLACE + 2] = 0
+        self._wanted[robot] = speed = float(sum(state[index] for index in model.speed_indices))
+        data.qvel[dof : dof + 2] = speed * math.cos(heading), speed * math.sin(heading)
+        data.qvel[dof + _FREE_DOFS : dof + _FREE_DOFS + 2] = speed / (
+            WHEEL_RADIUS * float(self.problem.team.radius[robot])
+        )
+
+    def _dofs(self, robot: int) -> slice:
+        first = int(self.scene.dofs[robot])
+        return slice(first, first + (_FREE_DOFS + 2 if robot in self._drives else _SPIN + 1))
+
+    def _heading(self, robot: int) -> float:
+        """The angle of a drive over the floor, wound on from where it was last seen [rad]."""
+        joint = self.scene.joints[robot] + 3
+        w, x, y, z = self.data.qpos[joint : joint + 4].tolist()
+        angle = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        self._headings[robot] += math.remainder(angle - self._headings[robot], 2 * math.pi)
+        return float(self._headings[robot])
+
+    def _push(self, controls: FloatArray, states: FloatArray, limits: FloatArray) -> None:
+        """Push the pucks that are controlled by acceleration, no faster than they may be, for a whole step."""
+        h = TimeStep(*self.problem.arrays.time_step)
+        for robot, dofs in zip(self._pucks.tolist(), self._push_dofs):
+            model = self.problem.team.robot_models[robot]
+            if not model.speed_indices or self._held[robot]:
+                continue
+            x, u, limit = tuple(states[robot]), tuple(controls[robot]), tuple(limits[robot])
+            wanted = model.functions.limit_state(model.functions.integrate(x, u, limit, h, NUMPY_OPS), limit, NUMPY_OPS)
+            change = [wanted[index] - states[robot, index] for index in model.speed_indices]
+            self.data.qfrc_applied[dofs] = self.scene.mass[robot] / self.problem.dt * np.array(change, np.float64)
+
+    def _serve(self, controls: FloatArray) -> None:
+        """Push the pucks that are controlled by velocity, as hard as tyres would hold, until they have it."""
+        if not len(self._servos):
+            return
+        pull = (controls[self._servos, :2] - self.data.qvel[self._servo_dofs]) / self._settling_time
+        size = np.sqrt((pull * pull).sum(axis=1, keepdims=True))
+        pull *= self._grip / np.maximum(size, self._grip)
+        pull[self._held[self._servos]] = 0
+        self.data.qfrc_applied[self._servo_dofs] = self.scene.mass[self._servos, None] * pull
+
+    def _commands(self, controls: FloatArray, states: FloatArray, limits: FloatArray) -> Commands:
+        """What the drives are told: a turn rate, and a speed, or an acceleration from the speed wanted last."""
+        rows = []
+        for robot in self._drives.tolist():
+            first, second = controls[robot, :2].tolist()
+            speeds = states[robot, list(self.problem.team.robot_models[robot].speed_indices)].tolist()
+            if not speeds:
+                rows.append((first, 0.0, second))
+                continue
+            # From the speed that it was to have, which it nearly has unless something holds it up.
+            behind = self._wanted[robot] - speeds[0]
+            most = float(limits[robot, ACCELERATION]) * self.problem.dt
+            begin = speeds[0] + min(max(behind, -most), most)
+            end = begin + self.problem.dt * second
+            self._wanted[robot] = min(max(end, -float(limits[robot, SPEED])), float(limits[robot, SPEED]))
+            rows.append((begin, second, first))
+        speed, acceleration, turn_rate = np.array(rows, np.float64).reshape(-1, 3).T
+        return Commands(speed, acceleration, turn_rate, limits[self._drives, SPEED].astype(np.float64))
+
+    def _note_contacts(self, touched: BoolArray) -> None:
+        contact = self.data.contact
+        owners = self.scene.owner[contact.geom]
+        meeting = owners[(owners != NOT_SOLID).all(axis=1) & (contact.dist <= 0)].ravel()
+        touched[meeting[meeting != OBSTACLE]] = True

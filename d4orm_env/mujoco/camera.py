@@ -1,0 +1,90 @@
+"""Pictures of a scene by MuJoCo's own renderer, without a screen."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.core.problem import Problem
+
+PLATFORMS = ("egl", "osmesa")
+"""OpenGL without a screen, as MuJoCo calls it."""
+SIZE = 480
+"""Height and width of a picture [pixels]."""
+_VIEW_ANGLE = 45.0
+
+
+class NoCameraError(RuntimeError):
+    """OpenGL cannot draw without a screen here."""
+
+
+def open_context(size: int) -> Any:
+    """A context of OpenGL.
+
+    Raises:
+        NoCameraError: If none can be had.
+    """
+    complaints = []
+    for platform in PLATFORMS:
+        try:
+            context = importlib.import_module(f"mujoco.{platform}").GLContext(size, size)
+            context.make_current()
+        except Exception as error:  # every driver and loader fails in its own way
+            complaints.append(f"{platform}: {' '.join(str(error).split()) or type(error).__name__}")
+        else:
+            return context
+    raise NoCameraError(
+        f"OpenGL cannot draw without a screen here ({'; '.join(complaints)}); install EGL or OSMesa, or use "
+        "renderer='pictures'"
+    )
+
+
+class Camera:
+    """Looks down on a scene at a slant.
+
+    Args:
+        model: The scene.
+        problem: What is to be in view: starts, goals and bounds.
+
+    Raises:
+        NoCameraError: If OpenGL cannot draw here.
+    """
+
+    def __init__(self, model: mujoco.MjModel, problem: Problem) -> None:
+        self._gl = open_context(SIZE)
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._model = model
+        self._scene = mujoco.MjvScene(model, maxgeom=10_000)
+        self._view = mujoco.MjvCamera()
+        places = np.concatenate([problem.start[:, :2], problem.goal])
+        if problem.world.lower is not None:
+            places = np.concatenate([places, problem.world.bounds])
+        low, high = places.min(axis=0), places.max(axis=0)
+        reach = float(np.linalg.norm(high - low)) / 2 + 2 * float(problem.team.radius.max())
+        self._view.lookat[:] = [*((low + high) / 2), 0]
+        self._view.distance = reach / math.tan(math.radians(_VIEW_ANGLE / 2))
+        self._view.elevation, self._view.azimuth = -60, 90
+
+    def draw(self, data: mujoco.MjData) -> NDArray[np.uint8]:
+        """``(480, 480, 3)`` uint8 picture of the bodies as they are."""
+        # What is drawn follows from positions; after a step these are ahead of it.
+        mujoco.mj_kinematics(self._model, data)
+        self._gl.make_current()
+        frame = np.empty((SIZE, SIZE, 3), np.uint8)
+        view, whole = mujoco.MjvOption(), mujoco.MjrRect(0, 0, SIZE, SIZE)
+        mujoco.mjv_updateScene(self._model, data, view, None, self._view, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene)
+        mujoco.mjr_render(whole, self._scene, self._context)
+        mujoco.mjr_readPixels(frame, None, whole, self._context)
+        return frame[::-1].copy()
+
+    def close(self) -> None:
+        """Give back what OpenGL holds."""
+        self._gl.make_current()
+        self._context.free()
+        self._gl.free()

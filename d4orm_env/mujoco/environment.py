@@ -1,0 +1,84 @@
+"""Multi-robot navigation among rigid bodies: the PettingZoo environment, moved by MuJoCo."""
+
+from __future__ import annotations
+
+from pettingzoo import AECEnv
+from pettingzoo.utils import OrderEnforcingWrapper
+
+from d4orm_env import navigation_v0
+from d4orm_env._viewer import RENDER_MODES
+from d4orm_env.core.arrays import FloatArray, shown
+from d4orm_env.mujoco.physics import Physics
+from d4orm_env.mujoco.simulation import MujocoSimulation
+from d4orm_env.mujoco.viewer import RENDERERS, MujocoViewer
+from d4orm_env.navigation_v0 import TurnByTurn
+from d4orm_env.options import EnvOptions
+from d4orm_env.scenarios.problems import ScenarioLike
+from d4orm_env.simulation import Simulation
+
+__all__ = ["env", "parallel_env", "raw_env"]
+
+
+class parallel_env(navigation_v0.parallel_env):
+    """:class:`d4orm_env.navigation_v0.parallel_env` with the team as rigid bodies in MuJoCo.
+
+    Observations, actions, infos, docking, rewards and metrics are the same; what differs is how robots move. Planar
+    problems of ``holonomic2d`` and ``velocity2d``, which are pushed pucks, and of ``differential_drive`` and
+    ``unicycle``, which stand on two wheels and a caster. ``collided`` is contact at any moment of a step.
+
+    Args:
+        scenario: As in :class:`~d4orm_env.options.EnvOptions`, like all arguments not named here.
+        num_robots: Size of the team.
+        physics: What the bodies are made of.
+        renderer: Who draws ``"rgb_array"`` frames: ``"mujoco"``; ``"pictures"``, which are those of the other
+            environments; or by default ``"auto"``, MuJoCo where EGL or OSMesa is there, else pictures. A window is
+            always of pictures.
+        **options: Further attributes of :class:`~d4orm_env.options.EnvOptions`, and arguments of the scenario.
+
+    Raises:
+        TypeError: For an argument that neither the environment nor the scenario has.
+        ValueError: For a bad argument, or a robot that has no body in MuJoCo.
+    """
+
+    metadata: dict[str, object] = {  # noqa: RUF012 - declared mutable by PettingZoo
+        "name": "d4orm_mujoco",
+        "render_modes": list(RENDER_MODES),
+        "render_fps": 10,
+        "is_parallelizable": True,
+    }
+
+    def __init__(
+        self,
+        scenario: ScenarioLike | None = None,
+        num_robots: int | None = None,
+        *,
+        physics: Physics | None = None,
+        renderer: str = "auto",
+        **options: object,
+    ) -> None:
+        if not isinstance(physics, Physics | None):
+            raise ValueError(f"physics is {shown(physics)}; give d4orm_env.mujoco.Physics(...), or leave it out")
+        if renderer not in RENDERERS:
+            raise ValueError(f"renderer is {shown(renderer)}; choose one of {', '.join(RENDERERS)}")
+        self._physics, self._renderer = physics or Physics(), renderer
+        super().__init__(scenario, num_robots, **options)
+
+    def _make_simulation(self, options: EnvOptions) -> Simulation:
+        return MujocoSimulation(options, self._physics)
+
+    def _make_viewer(self, options: EnvOptions) -> MujocoViewer:
+        return MujocoViewer(options.render_mode, self._renderer)
+
+
+def raw_env(
+    scenario: ScenarioLike | None = None, num_robots: int | None = None, **options: object
+) -> AECEnv[str, FloatArray, FloatArray | None]:
+    """The robots act in turn and move together when the last has chosen; arguments of :class:`parallel_env`."""
+    return TurnByTurn(parallel_env(scenario, num_robots, **options))  # type: ignore[arg-type] # checked there
+
+
+def env(
+    scenario: ScenarioLike | None = None, num_robots: int | None = None, **options: object
+) -> AECEnv[str, FloatArray, FloatArray | None]:
+    """:func:`raw_env`, with calls in the wrong order caught; arguments of :class:`parallel_env`."""
+    return OrderEnforcingWrapper(raw_env(scenario, num_robots, **options))

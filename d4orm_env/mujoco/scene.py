@@ -1,0 +1,216 @@
+"""A problem as a scene of MuJoCo: a floor, static obstacles, and a body for every robot."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.world import World
+from d4orm_env.mujoco.physics import Physics
+from d4orm_env.mujoco.wheels import GRAVITY
+
+PUCKS, DRIVES = ("holonomic2d", "velocity2d"), ("differential_drive", "unicycle")
+"""Models of robots that are pushed, and of those on two wheels."""
+
+WHEEL_RADIUS, HALF_TRACK, WHEEL_HALF_WIDTH, CASTER_RADIUS, CASTER_PLACE = 0.3, 0.65, 0.08, 0.1, 0.75
+CLEARANCE, HEIGHT, FRONT_GAP = 0.25, 0.85, 0.02
+"""Measures of a robot, over its radius. The caster is behind; one in front, off the floor, keeps the nose up."""
+WHEEL_SHARE, BATTERY_SHARE, BATTERY_PLACE = 0.1, 0.5, (-0.15, 0.0, 0.2)
+"""Shares of the mass: of each wheel, and of what lies low and behind the axle."""
+_WALL = 1.0
+_ROLLING, _SOLID = 1, 2
+"""Kinds of contact: of what rolls on the floor, and of what bodies must not touch."""
+_PALETTE = ((0.12, 0.47, 0.71), (1.0, 0.5, 0.05), (0.17, 0.63, 0.17), (0.84, 0.15, 0.16), (0.58, 0.4, 0.74),
+            (0.55, 0.34, 0.29), (0.89, 0.47, 0.76), (0.74, 0.74, 0.13))  # fmt: skip
+
+
+class Scene(NamedTuple):
+    """A compiled scene and where things are in it.
+
+    Attributes:
+        model: The scene.
+        joints: ``(K,)`` first address of every robot's positions; a puck has ``x, y, angle`` there, a drive place and
+            quaternion, and then two wheels.
+        dofs: ``(K,)`` first address of its velocities.
+        owner: ``(geoms,)`` the robot that a solid geom belongs to, :data:`OBSTACLE`, or :data:`NOT_SOLID`.
+        mass: ``(K,)`` [kg].
+    """
+
+    model: mujoco.MjModel
+    joints: NDArray[np.int64]
+    dofs: NDArray[np.int64]
+    owner: NDArray[np.int64]
+    mass: NDArray[np.float64]
+
+
+OBSTACLE, NOT_SOLID = -1, -2
+
+
+def check_problem(problem: Problem) -> None:
+    """Refuse what has no bodies here.
+
+    Raises:
+        ValueError: For a problem in space, or a robot whose model has none.
+    """
+    for robot, name in enumerate(problem.team.models):
+        if name not in PUCKS + DRIVES:
+            raise ValueError(
+                f"robot_{robot} is a {name}, which has no body in MuJoCo; use one of {', '.join(PUCKS + DRIVES)}"
+            )
+
+
+def build_scene(problem: Problem, physics: Physics, body_radius: FloatArray, step: float) -> Scene:
+    """The scene of a problem, all robots at their starts.
+
+    Args:
+        problem: The problem.
+        physics: What bodies are made of.
+        body_radius: ``(N,)`` of bodies that are no robots and move as they like [m].
+        step: Of MuJoCo [s].
+    """
+    spec = mujoco.MjSpec()
+    spec.option.timestep = step
+    spec.option.gravity = [0, 0, -GRAVITY]
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    # Wheels creep sideways on the default, pyramidal friction cones.
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10
+    spec.visual.global_.offwidth = spec.visual.global_.offheight = 640
+    radius = np.asarray(problem.team.radius, np.float64)
+    top = max(HEIGHT * float(radius.max()), 2 * CLEARANCE * float(radius.max()))
+    _add_surroundings(spec, problem.world, top, physics)
+    for number, size in enumerate(body_radius.tolist()):
+        body = spec.worldbody.add_body(name=f"intruder_{number}", mocap=True)
+        _cylinder(body, size, 0.0, top, physics, rgba=[0.2, 0.2, 0.2, 1])
+    for robot, name in enumerate(problem.team.models):
+        add = _add_puck if name in PUCKS else _add_drive
+        add(spec, robot, float(radius[robot]), top, physics)
+    return _addresses(spec.compile(), problem, physics)
+
+
+def _addresses(model: mujoco.MjModel, problem: Problem, physics: Physics) -> Scene:
+    names = [f"robot_{robot}" for robot in range(problem.num_robots)]
+    first = [int(model.body(name).jntadr[0]) for name in names]
+    owner = np.full(model.ngeom, NOT_SOLID)
+    solid = model.geom_contype == _SOLID
+    owner[solid] = OBSTACLE
+    for robot, name in enumerate(names):
+        owner[solid & (model.geom_bodyid == model.body(name).id)] = robot
+    radius = np.asarray(problem.team.radius, np.float64)
+    return Scene(
+        model,
+        np.array(model.jnt_qposadr[first], np.int64),
+        np.array(model.jnt_dofadr[first], np.int64),
+        owner,
+        physics.surface_density * radius * radius,
+    )
+
+
+def _solid(physics: Physics) -> dict[str, object]:
+    return {"contype": _SOLID, "conaffinity": _SOLID, "friction": [physics.body_friction, 0.005, 0.0001]}
+
+
+def _cylinder(
+    body: mujoco.MjsBody,
+    radius: float,
+    low: float,
+    high: float,
+    physics: Physics,
+    place: tuple[float, float] = (0.0, 0.0),
+    **attributes: object,
+) -> None:
+    """A solid upright cylinder between two heights [m]."""
+    size, middle = [radius, (high - low) / 2, 0], [*place, (high + low) / 2]
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=size, pos=middle, **_solid(physics), **attributes)
+
+
+def _add_surroundings(spec: mujoco.MjSpec, world: World, top: float, physics: Physics) -> None:
+    """Floor, light, obstacles and the walls round a bounded world, all of them ``top`` high [m]."""
+    ground, grey = spec.worldbody, [0.45, 0.47, 0.5, 1]
+    ground.add_light(pos=[0, 0, 50], dir=[0, 0, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+    # It has a side of the contact only, so that nothing but what rolls meets it.
+    ground.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_PLANE, size=[100, 100, 1], contype=0, conaffinity=_ROLLING, rgba=[0.8, 0.8, 0.8, 1]
+    )  # fmt: skip
+    for x, y, radius in world.circles.tolist():
+        _cylinder(ground, radius, 0.0, top, physics, place=(x, y), rgba=grey)
+    boxes = world.boxes.tolist()
+    if world.lower is not None and world.upper is not None:
+        boxes += _walls(world.lower.tolist(), world.upper.tolist())
+    for left, low, right, high in boxes:
+        ground.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=[(right - left) / 2, (high - low) / 2, top / 2],
+            pos=[(right + left) / 2, (high + low) / 2, top / 2],
+            rgba=grey,
+            **_solid(physics),
+        )
+    for number, corners in enumerate(world.shapes.triangles.reshape(-1, 3, 2).astype(np.float64)):
+        prism = [[*corner, height] for corner in corners.tolist() for height in (0.0, top)]
+        # A shell, because a sliver has no volume to speak of; what never moves needs no inertia.
+        spec.add_mesh(
+            name=f"prism_{number}", uservert=np.ravel(prism), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        )
+        ground.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"prism_{number}", rgba=grey, **_solid(physics))
+
+
+def _walls(lower: list[float], upper: list[float]) -> list[list[float]]:
+    (left, low), (right, high) = lower, upper
+    return [
+        [left - _WALL, low - _WALL, left, high + _WALL],
+        [right, low - _WALL, right + _WALL, high + _WALL],
+        [left, low - _WALL, right, low],
+        [left, high, right, high + _WALL],
+    ]
+
+
+def _colour(robot: int) -> list[float]:
+    return [*_PALETTE[robot % len(_PALETTE)], 1.0]
+
+
+def _add_puck(spec: mujoco.MjSpec, robot: int, radius: float, top: float, physics: Physics) -> None:
+    """A disc that glides over the floor against a drag, and turns when it is touched."""
+    body = spec.worldbody.add_body(name=f"robot_{robot}")
+    mass = physics.surface_density * radius * radius
+    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+    body.add_joint(type=slide, axis=[1, 0, 0], damping=physics.drag * mass)
+    body.add_joint(type=slide, axis=[0, 1, 0], damping=physics.drag * mass)
+    body.add_joint(type=hinge, axis=[0, 0, 1], damping=physics.drag * mass * radius * radius / 2)
+    _cylinder(body, radius, CLEARANCE * radius, top, physics, mass=mass, rgba=_colour(robot))
+
+
+def _add_drive(spec: mujoco.MjSpec, robot: int, radius: float, top: float, physics: Physics) -> None:
+    """A round robot on two wheels and a caster; its frame is on the floor, under the middle of the axle."""
+    body = spec.worldbody.add_body(name=f"robot_{robot}")
+    body.add_freejoint()
+    mass, shell = physics.surface_density * radius * radius, 1 - 2 * WHEEL_SHARE - BATTERY_SHARE
+    _cylinder(body, radius, CLEARANCE * radius, top, physics, mass=shell * mass, rgba=_colour(robot))
+    body.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[0.3 * radius, 0.3 * radius, 0.05 * radius],
+        pos=[radius * part for part in BATTERY_PLACE],
+        mass=BATTERY_SHARE * mass,
+        contype=0,
+        conaffinity=0,
+    )
+    size = CASTER_RADIUS * radius
+    for place, gap in ((-CASTER_PLACE, 0.0), (CASTER_PLACE, FRONT_GAP)):
+        # Without friction: it turns and rolls as it likes. Its priority has the floor's own friction not count.
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[size, 0, 0], pos=[place * radius, 0, size + gap * radius], mass=0,
+            contype=_ROLLING, conaffinity=0, condim=1, priority=1,
+        )  # fmt: skip
+    for side in (1, -1):
+        wheel = body.add_body(pos=[0, side * HALF_TRACK * radius, WHEEL_RADIUS * radius])
+        wheel.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0])
+        # Round across too, as a tyre is: it meets the floor in one point, and turning does not scrub.
+        wheel.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_ELLIPSOID, mass=WHEEL_SHARE * mass, contype=_ROLLING, conaffinity=0,
+            size=[WHEEL_RADIUS * radius, WHEEL_HALF_WIDTH * radius, WHEEL_RADIUS * radius],
+            friction=[physics.wheel_friction, 0.005, 0.0001], priority=1, rgba=[0.1, 0.1, 0.1, 1],
+        )  # fmt: skip

@@ -1,0 +1,61 @@
+"""How late commands are executed: which of those sent before is it that the robots report to have executed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from d4orm_env.core.arrays import BoolArray, FloatArray
+
+MOST = 10
+"""Steps late that commands may be and still be recognised."""
+
+DECAY = 0.98
+"""What is left of a difference after a time step."""
+
+BETTER = 0.5
+"""A lateness is believed once commands that late differ less than this share from those executed."""
+
+
+class Lateness:
+    """Remembers the commands that were sent, and compares them with those executed.
+
+    Args:
+        num_robots: ``K``.
+        control_size: ``m``.
+        known: Steps late that commands are known to be, or ``None`` to find out.
+
+    Attributes:
+        steps: How late they are.
+    """
+
+    def __init__(self, num_robots: int, control_size: int, known: int | None) -> None:
+        self._known = known is not None
+        self.steps = known or 0
+        # Before the first there were none, which is as if they were zero.
+        self._sent = [np.zeros((num_robots, control_size), np.float32)] * (max(MOST, self.steps) + 1)
+        self._apart = np.zeros(MOST + 1)
+
+    @property
+    def under_way(self) -> list[FloatArray]:
+        """Commands ``(K, m)`` each that are still to be executed, the next one first."""
+        return self._sent[-self.steps :] if self.steps else []
+
+    def observe(self, executed: FloatArray, going: BoolArray) -> FloatArray:
+        """``(K, m)`` the commands that should have been executed in the last step.
+
+        Args:
+            executed: ``(K, m)`` those that were.
+            going: ``(K,)`` whose tell anything: docked robots execute none.
+        """
+        if not self._known:
+            sent = np.stack(self._sent[: -MOST - 2 : -1])
+            self._apart = DECAY * self._apart + ((sent - executed)[:, going] ** 2).sum(axis=(1, 2))
+            best = int(self._apart.argmin())
+            if self._apart[best] < BETTER * self._apart[self.steps]:
+                self.steps = best
+        return self._sent[-1 - self.steps]
+
+    def send(self, controls: FloatArray) -> FloatArray:
+        """Remember commands ``(K, m)``, inside the limits; those ``(K, m)`` that are executed now."""
+        self._sent = [*self._sent[1:], controls]
+        return self._sent[-1 - self.steps]

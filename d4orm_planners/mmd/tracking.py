@@ -1,0 +1,134 @@
+"""Driving along motions by the clock under a robot's own dynamics, compiled with numba."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from d4orm_env.core import robot_model, transition
+from d4orm_env.core.dynamics import MODELS
+from d4orm_env.core.problem import Problem
+from d4orm_env.engine import lanes, tiles, wavefront
+from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.tiles import OPS, OPTIONS, inlined, make_stepper, models_key, to_fixed_tuple
+from d4orm_env.engine.wavefront import clearance_at
+from d4orm_planners.mmd import clock, way_frame
+from d4orm_planners.mmd.clock import fill_clock
+from d4orm_planners.mmd.way_frame import WayFrame, locate
+
+SOURCES = fingerprint((robot_model, transition, lanes, tiles, wavefront, clock, way_frame))
+
+GAIN = np.float32(1.5)
+"""Share of its distance from the motion that a robot makes up for in a second [1/s]."""
+
+
+class Driven(NamedTuple):
+    """What came of driving along ``B`` motions.
+
+    Attributes:
+        controls: ``(B, H, m)`` float32, zero once docked.
+        places: ``(B, H+1, 3)`` [m].
+        arrivals: ``(B,)`` int64 the step of arrival; ``H + 1`` for none.
+        clearances: ``(B,)`` least distance of the centre from obstacles and bounds [m].
+    """
+
+    controls: Any
+    places: Any
+    arrivals: Any
+    clearances: Any
+
+
+@cache
+def tracking_kernel(name: str) -> Any:
+    """The compiled drives of a robot of the model with this name; see :func:`drive_along`."""
+    robot = MODELS[name]
+    move, dock = make_stepper(robot)
+    approach, track = inlined(robot.functions.approach), inlined(robot.functions.track)
+    limit_control = inlined(robot.functions.limit_control)
+    n, m, d, num_limits = robot.state_size, robot.control_size, robot.dimension, len(robot.limit_names)
+
+    @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
+    def drive(
+        rules: Any, frame: Any, sines: Any, deviation: Any, space: Any, durations: Any, motions: Any, driven: Any
+    ) -> None:
+        dt, docking, docks, limits, goal_place, start = rules
+        h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])
+        docking_rules = (docking[0], docking[1], docks)
+        own, goal = to_fixed_tuple(limits, num_limits), to_fixed_tuple(goal_place, d)
+        last, horizon = sines.shape[0] - 1, driven.controls.shape[1]
+        points, wanted = np.empty((last + 1, 3)), np.zeros(d, np.float32)
+        paces, times, spot = np.empty(last + 1), np.empty(last + 1), np.empty((4, 3))
+        for b in range(motions.shape[0]):
+            axis_aside = frame.axes[b % frame.axes.shape[0]]
+            for i in range(last + 1):
+                locate(frame, axis_aside, sines[i], deviation, motions[b], i, spot)
+                points[i] = spot[0]
+            fill_clock(points, durations[b], frame.speed, frame.acceleration, paces, times)
+            i = 0
+            x, there, arrival, least = to_fixed_tuple(start, n), False, horizon + 1, np.inf
+            driven.places[b] = 0.0
+            for axis in range(d):
+                driven.places[b, 0, axis] = x[axis]
+            for step in range(horizon):
+                time = (step + 1) * dt[0]
+                while i < last and times[i + 1] <= time:
+                    i += 1
+                standing = transition.stands(there, docks)
+                if i < last:
+                    for axis in range(d):
+                        pace = (points[i + 1, axis] - points[i, axis]) / (times[i + 1] - times[i])
+                        error = points[i, axis] + (time - times[i]) * pace - driven.places[b, step, axis]
+                        # By the next step the motion has gone on as well.
+                        wanted[axis] = pace + GAIN * (error - pace * dt[0])
+                    control = track(x, to_fixed_tuple(wanted, d), own, h, OPS)
+                else:
+                    control = track(x, approach(x, goal, own, h, OPS), own, h, OPS)
+                control = limit_control(control, own, OPS)
+                if standing:
+                    driven.controls[b, step] = 0.0
+                else:
+                    for axis in range(m):
+                        driven.controls[b, step, axis] = control[axis]
+                x, _, there = dock(standing, move(standing, x, control, own, h), control, own, goal, docking_rules)
+                for axis in range(d):
+                    driven.places[b, step + 1, axis] = x[axis]
+                place = driven.places[b, step + 1]
+                least = min(least, clearance_at(space, place[0], place[1], place[2]))
+                if not there:
+                    arrival = horizon + 1
+                elif arrival > horizon:
+                    arrival = step + 1
+            driven.arrivals[b], driven.clearances[b] = arrival, least
+
+    return drive
+
+
+def drive_along(
+    problem: Problem, robot: int, frame: WayFrame, sines: Any, deviation: Any, space: Any, durations: Any, motions: Any
+) -> Driven:
+    """Drive a robot along each of some motions, as if it were alone: by the clock, and then straight to its goal.
+
+    Args:
+        problem: The team.
+        robot: The robot's number.
+        frame: Its way.
+        sines: ``(POINTS + 1, MODES)``.
+        deviation: ``(2 MODES,)`` of the modes.
+        space: The world, of :func:`~d4orm_planners.mmd.way_frame.world_space`.
+        durations: ``(B,)`` how long the motions take [s].
+        motions: ``(B, 2 MODES)`` float32 whitened modes.
+    """
+    arrays, count, horizon = problem.arrays, len(motions), problem.horizon
+    driven = Driven(
+        np.zeros((count, horizon, problem.control_size), np.float32),
+        np.empty((count, horizon + 1, 3)),
+        np.empty(count, np.int64),
+        np.empty(count),
+    )
+    docking = np.array([arrays.squared_goal_radius, arrays.squared_goal_speed])
+    rules = (arrays.time_step, docking, arrays.docks, arrays.limits[robot], problem.goal[robot], problem.start[robot])
+    kernel = tracking_kernel(problem.team.models[robot])
+    kernel(rules, frame, sines, deviation, space, durations, motions, driven)
+    return driven

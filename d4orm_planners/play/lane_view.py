@@ -1,0 +1,244 @@
+"""The shapes of one team and its world on the page, and what dragging them does."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import viser
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.render.panels import robot_colors, view_limits
+from d4orm_planners.play import edits
+from d4orm_planners.play.frame import Frame
+from d4orm_planners.play.session import Session
+from d4orm_planners.play.shapes import NO_LINES, Points, ball, edges, in_space, linear, polylines, puck, solid
+
+CONTACT, OBSTACLE, BOUND, MARGIN = (208, 2, 27), (150, 156, 166), (90, 98, 110), (200, 60, 60)
+INK, BODY = (20, 24, 30), (120, 124, 134)
+TRAIL_STEPS = 30
+"""Steps that a robot's trail goes back."""
+
+TRAIL_SEGMENTS, PLAN_SEGMENTS = 8, 12
+"""Most of a trail, and of a way ahead."""
+
+LINES_EVERY = 0.1
+"""Seconds between new trails and plans."""
+
+
+class LaneView:
+    """What the page shows of one that drives.
+
+    Args:
+        server: The page.
+        session: What is shown, and changed by dragging.
+        index: Which of those that drive.
+        frame: What it shows at first.
+        place: ``(3,)`` where its origin is on the page [m].
+        shown: Which of ``"plans"``, ``"trails"``, ``"subgoals"`` and ``"margins"`` are shown.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        session: Session,
+        index: int,
+        frame: Frame,
+        place: Points,
+        shown: Mapping[str, bool],
+    ) -> None:
+        self._scene, self._session, self._index, self._shown = server.scene, session, index, shown
+        self._root = f"/lane_{index}"
+        self._number, self._lines_at = -1, 0.0
+        self._held: dict[tuple[str, int], Points] = {}
+        self._trail: list[FloatArray] = []
+        self._colors = 255 * robot_colors(frame.problem.num_robots)
+        self._nodes: dict[str, Any] = {"": self._scene.add_frame(self._root, show_axes=False, position=place)}
+        self._add_team(frame)
+        self._add_world(frame.problem)
+        self._add_bodies(frame)
+        for name in ("heading", "plans", "trails"):
+            self._nodes[name] = self._scene.add_line_segments(
+                f"{self._root}/{name}", NO_LINES[0], INK if name == "heading" else NO_LINES[1],
+                thickness=2.0, thickness_units="screen",
+            )  # fmt: skip
+
+    def name(self, text: str, place: Points) -> None:
+        """Write who drives at a place of this scene."""
+        self._nodes["name"] = self._scene.add_label(
+            f"{self._root}/name", text, position=place, anchor="bottom-center", font_screen_scale=1.3
+        )
+
+    def remove(self) -> None:
+        """Take everything off the page."""
+        self._nodes[""].remove()
+
+    def update(self, frame: Frame, now: float) -> None:
+        """Show a frame, where the robots are by a time of ``time.perf_counter()``."""
+        nodes = self._nodes  # what has not changed is not sent
+        if frame.moment.number != self._number:
+            self._number = frame.moment.number
+            self._trail = [*self._trail[-TRAIL_STEPS:], frame.states[:, : frame.problem.dimension]]
+            self._color(frame)
+        places = self._with_held("robot", in_space(frame.positions(now)))
+        nodes["robots"].batched_positions = places
+        nodes["heading"].points = self._headings(frame, places)
+        nodes["goals"].batched_positions = self._with_held("goal", in_space(frame.goals))
+        if len(frame.bodies):
+            nodes["bodies"].batched_positions = in_space(frame.body_positions(now))
+        nodes["margins"].visible = self._shown["margins"]
+        if self._shown["margins"]:
+            nodes["margins"].batched_positions = places
+        nodes["subgoals"].visible = self._shown["subgoals"] and frame.subgoals is not None
+        if nodes["subgoals"].visible:
+            nodes["subgoals"].batched_positions = in_space(frame.subgoals)
+        if now - self._lines_at > LINES_EVERY:
+            self._lines_at = now
+            self._draw_lines(frame)
+
+    def _with_held(self, kind: str, places: Points) -> Points:
+        """Places with those that somebody drags at the pointer."""
+        for (what, index), place in list(self._held.items()):
+            if what == kind and index < len(places):
+                places[index] = place
+        return places
+
+    def _add_team(self, frame: Frame) -> None:
+        problem, radius = frame.problem, np.asarray(frame.problem.team.radius, np.float32)
+        flat = problem.dimension == 2
+        body, diamond = (puck(24), puck(4, 0.2)) if flat else (ball(2), ball(0))
+        high = 0.5 * radius if flat else radius
+        mark = 1.5 * radius if flat else 1.4 * radius
+        margin, dot = radius + np.float32(problem.margin), 0.35 * radius
+        shapes = {
+            "robots": (body, radius, high, self._colors, 1.0),
+            "goals": (diamond, mark, mark, self._colors, 0.6 if flat else 0.35),
+            "margins": (body, margin, 0.2 * high if flat else margin, np.array(MARGIN), 0.25),
+            "subgoals": (ball(0), dot, dot, self._colors, 0.9),
+        }
+        places, goals = in_space(frame.positions(time.perf_counter())), in_space(frame.goals)
+        for name, (mesh, wide, tall, colors, opacity) in shapes.items():
+            scales = np.stack([wide, wide, tall], axis=1)
+            self._add_many(name, mesh, goals if name == "goals" else places, scales, colors, opacity)
+        self._drag("robots", "robot", lambda index, place, _: lambda problem: edits.move_robot(problem, index, place))
+        self._drag("goals", "goal", lambda index, place, _: lambda problem: edits.move_goal(problem, index, place))
+
+    def _add_bodies(self, frame: Frame) -> None:
+        """What moves about and is no robot."""
+        if len(frame.bodies):
+            radius = frame.bodies[:, -1]
+            mesh, high = (puck(24), 0.5 * radius) if frame.problem.dimension == 2 else (ball(2), radius)
+            places = in_space(frame.bodies[:, : frame.problem.dimension])
+            self._add_many("bodies", mesh, places, np.stack([radius, radius, high], axis=1), np.array(BODY), 1.0)
+
+    def _add_many(
+        self, name: str, mesh: Any, places: Points, scales: FloatArray, colors: FloatArray, opacity: float
+    ) -> None:
+        self._nodes[name] = self._scene.add_batched_meshes_simple(
+            f"{self._root}/{name}", np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32),
+            np.tile(np.array([1, 0, 0, 0], np.float32), (len(places), 1)), places, batched_scales=scales,
+            batched_colors=linear(colors), opacity=opacity, material="toon5", lod="off", cast_shadow=False,
+            receive_shadow=False,
+        )  # fmt: skip
+
+    def _add_world(self, problem: Problem) -> None:
+        low = view_limits(problem)
+        floor, top = (low[0, 2], low[1, 2]) if problem.dimension == 3 else (0.0, 0.3)
+        for kind in edits.KINDS:
+            for index, shape in enumerate(getattr(problem.world, kind)):
+                mesh, centre = solid(kind, np.asarray(shape, np.float64), problem.dimension, float(floor), float(top))
+                name = f"{kind}_{index}"
+                self._nodes[name] = self._scene.add_mesh_simple(
+                    f"{self._root}/{name}", np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32),
+                    color=OBSTACLE, opacity=None if problem.dimension == 2 else 0.6, flat_shading=True,
+                    position=centre, cast_shadow=False, receive_shadow=False, side="double",
+                )  # fmt: skip
+                self._drag(name, name, _mover(kind, index))
+        if problem.world.lower is not None:
+            self._nodes["bounds"] = self._scene.add_line_segments(
+                f"{self._root}/bounds", edges(in_space(problem.world.bounds)), BOUND,
+                thickness=2.0, thickness_units="screen",
+            )  # fmt: skip
+
+    def _drag(self, name: str, kind: str, edit: Callable[[int, FloatArray, FloatArray], edits.Edit]) -> None:
+        """Let a shape be dragged: it follows the pointer, and where it is let go the scene is changed."""
+        node = self._nodes[name]
+        grips: dict[int, tuple[Points, Points]] = {}
+
+        @node.on_drag("left")
+        def _(event: Any) -> None:
+            index, frame = event.instance_index or 0, self._frame
+            if event.phase == "start":
+                at = self._place_of(kind, index, frame)
+                grips[index] = (at, self._pointed(event, at))
+            if index not in grips:
+                return
+            at, grip = grips[index]
+            moved = at + self._pointed(event, at) - grip
+            if event.phase != "end":
+                self._held[kind, index] = moved
+                if kind not in ("robot", "goal"):
+                    node.position = moved
+                return
+            del grips[index]
+            self._held.pop((kind, index), None)
+            if kind not in ("robot", "goal"):
+                node.position = at  # until the session has agreed
+            d = frame.problem.dimension
+            self._session.edit(edit(index, moved[:d], (moved - at)[:d]), self._index)
+
+    @property
+    def _frame(self) -> Frame:
+        frames = self._session.frames
+        return frames[min(self._index, len(frames) - 1)]
+
+    def _place_of(self, kind: str, index: int, frame: Frame) -> Points:
+        if kind == "robot":
+            return in_space(frame.positions(time.perf_counter()))[index]
+        if kind == "goal":
+            return in_space(frame.goals)[index]
+        return np.asarray(self._nodes[kind].position, np.float32)
+
+    def _pointed(self, event: Any, at: Points) -> Points:
+        """Where the pointer is: on the plane that planar robots drive on, or as far from the camera as the shape."""
+        end = np.asarray(event.end_position, np.float64)
+        if self._frame.problem.dimension == 3:
+            return end.astype(np.float32)
+        eye = np.asarray(event.client.camera.position, np.float64)
+        ray = end - eye
+        if abs(ray[2]) < 1e-9:
+            return end.astype(np.float32)
+        return (eye + (at[2] - eye[2]) / ray[2] * ray).astype(np.float32)
+
+    def _color(self, frame: Frame) -> None:
+        """Red in contact, paler when arrived."""
+        colors = np.where(frame.arrived[:, None], 255 - 0.5 * (255 - self._colors), self._colors)
+        colors = np.where(frame.collided[:, None], np.array(CONTACT), colors)
+        self._nodes["robots"].batched_colors = linear(colors)
+
+    def _draw_lines(self, frame: Frame) -> None:
+        trails = plans = NO_LINES
+        if len(self._trail) > 1 and self._shown["trails"]:
+            trails = polylines(np.stack(self._trail), self._colors, (0.2, 1.0), TRAIL_SEGMENTS)
+        if frame.guidance is not None and len(frame.guidance) > 1 and self._shown["plans"]:
+            plans = polylines(frame.guidance, self._colors, (0.8, 0.25), PLAN_SEGMENTS)
+        for name, (points, colors) in {"trails": trails, "plans": plans}.items():
+            self._nodes[name].points, self._nodes[name].colors = points, colors
+
+    def _headings(self, frame: Frame, places: Points) -> Points:
+        """``(N, 2, 3)`` lines from the centre to the front of robots that have one."""
+        models, radius = frame.problem.team.robot_models, np.asarray(frame.problem.team.radius)
+        drives = [(robot, model.heading_index) for robot, model in enumerate(models) if model.heading_index is not None]
+        points = np.zeros((len(drives), 2, 3), np.float32)
+        for row, (robot, index) in enumerate(drives):
+            angle = frame.states[robot, index]
+            points[row] = places[robot] + np.array([0, 0, 0.3 * radius[robot]])
+            points[row, 1, :2] += radius[robot] * np.array([np.cos(angle), np.sin(angle)])
+        return points
+
+
+def _mover(kind: str, index: int) -> Callable[[int, FloatArray, FloatArray], edits.Edit]:
+    return lambda _, place, shift: lambda problem: edits.move_obstacle(problem, kind, index, shift)

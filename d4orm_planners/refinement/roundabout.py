@@ -1,0 +1,116 @@
+"""A roundabout: everybody drives round the place where most ways cross, on the same side.
+
+The oldest rule for many who cross at one place, as in L. Pallottino, V. G. Scordio, A. Bicchi and E. Frazzoli,
+*Decentralized cooperative policy for conflict resolution in multivehicle systems* (IEEE Transactions on Robotics,
+2007).
+Search among single robots' ways does not find it, because nobody gains by beginning alone.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.robot_model import ACCELERATION, SPEED
+from d4orm_env.engine.base import Engine
+from d4orm_planners.steering import track_velocities
+
+Floats = NDArray[np.float64]
+
+SLACK = 0.002
+"""Added to the distance that robots keep from each other in it [m]."""
+CORRECTION = 1.0
+"""What of its distance from where it should be a robot makes good in a second [1/s]."""
+
+
+class Bends(NamedTuple):
+    """Ways of a line, an arc and a line.
+
+    Attributes:
+        begin: ``(K, 2)`` where they begin [m].
+        centre: ``(K, 2)`` of the arcs [m].
+        radius: ``(K,)`` of the arcs [m].
+        first: ``(K,)`` length of the lines up to the arcs [m].
+        angles: ``(K, 2)`` at which the arcs begin and how far they go round, positive to the left [rad].
+    """
+
+    begin: Floats
+    centre: Floats
+    radius: Floats
+    first: Floats
+    angles: Floats
+
+    def at(self, lengths: Floats) -> tuple[Floats, Floats]:
+        """``(K, 2)`` places and unit directions so far along the ways ``(K,)``."""
+        round_ = np.clip((lengths - self.first) / self.radius, 0, np.abs(self.angles[:, 1]))
+        side = np.sign(self.angles[:, 1])
+        angle = self.angles[:, 0] + side * round_
+        spoke = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        direction = side[:, None] * np.stack([-spoke[:, 1], spoke[:, 0]], axis=1)
+        rest = lengths - self.first - self.radius * round_
+        return self.centre + self.radius[:, None] * spoke + rest[:, None] * direction, direction
+
+
+def drive_roundabout(problem: Problem, engine: Engine, side: int) -> FloatArray | None:
+    """Controls ``(H, K, m)`` of a team in a roundabout; whether robots keep clear of all else is not looked at.
+
+    Args:
+        problem: The team.
+        engine: What moves it.
+        side: 1 to pass the middle to the left of it, -1 to the right.
+
+    Returns:
+        ``None`` in space, or where somebody begins or ends within the roundabout.
+    """
+    if problem.dimension != 2 or problem.num_robots < 2:
+        return None
+    bends = _bends(problem, side)
+    if bends is None:
+        return None
+    speed, acceleration = (problem.team.limits[:, column].astype(np.float64) for column in (SPEED, ACCELERATION))
+    states, nobody = problem.start, np.zeros(problem.num_robots, bool)
+    controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
+    for t in range(problem.horizon):
+        now, after = problem.dt * t, problem.dt * (t + 1)
+        due, _ = bends.at(_driven(now, speed, acceleration))
+        _, direction = bends.at(_driven(after, speed, acceleration))
+        wanted = direction * np.minimum(speed, acceleration * after)[:, None] + CORRECTION * (due - states[:, :2])
+        controls[t] = track_velocities(problem, states, wanted.astype(np.float32))
+        states = engine.step(problem.arrays, states, nobody, controls[t]).states
+    return controls
+
+
+def _driven(time: float, speed: Floats, acceleration: Floats) -> Floats:
+    """How far robots have driven that set out at time zero, as fast as they can."""
+    gaining = np.minimum(time, speed / acceleration)
+    driven: Floats = 0.5 * acceleration * gaining**2 + speed * (time - gaining)
+    return driven
+
+
+def _bends(problem: Problem, side: int) -> Bends | None:
+    begin, end = problem.start[:, :2].astype(np.float64), problem.goal.astype(np.float64)
+    along = end - begin
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    across = side * np.stack([-along[:, 1], along[:, 0]], axis=1)
+    # The place that is nearest to all straight ways.
+    middle = np.linalg.lstsq(across, (across * begin).sum(axis=1), rcond=None)[0]
+    limits, radius = problem.team.limits.astype(np.float64), np.asarray(problem.team.radius, np.float64)
+    apart = 2 * radius.max() + problem.margin + SLACK
+    least = apart / (2 * np.sin(np.pi / problem.num_robots))
+    bend = np.maximum(limits[:, SPEED] ** 2 / limits[:, ACCELERATION], least)
+    # Where robots cannot turn that sharply the arc reaches round the middle on the far side too.
+    centre = middle - (bend - least)[:, None] * across
+    before, behind = begin - centre, end - centre
+    away = np.linalg.norm([before, behind], axis=2)
+    if (away <= bend).any():
+        return None
+    spread = np.arccos(bend / away)
+    turns = np.arctan2([before[:, 1], behind[:, 1]], [before[:, 0], behind[:, 0]])
+    # To the left of the middle is clockwise round it.
+    first, last = turns[0] - side * spread[0], turns[1] + side * spread[1]
+    angle = -side * np.mod(-side * (last - first), 2 * np.pi)
+    return Bends(begin, centre, bend, np.sqrt(away[0] ** 2 - bend**2), np.stack([first, angle], axis=1))
