@@ -3,8 +3,8 @@
     python examples/clone_expert.py
 
 Demonstrations are recorded as a Minari dataset, an episode per robot; broken off, the same command goes on. The network
-sees what a robot sees, in the robot's own frame, and says what the expert would do. On its own it comes into places where
-the expert never was, so that it succeeds less often: more demonstrations help.
+sees what a robot sees, in the robot's own frame, and says what the expert would do. On its own it comes into places
+where the expert never was, so that it succeeds less often.
 """
 
 from __future__ import annotations
