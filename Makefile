@@ -44,6 +44,7 @@ bench: $(CORE_STAMP) ## Measure the engines on this machine, write bench/
 results: $(DEV_STAMP) ## Make the tables and figures in docs/tables from the trials in data/
 	$(BIN)/python examples/tune_rivals.py --trials data/tuning.parquet --out docs/tables
 	$(BIN)/python examples/credit_by_update.py --trials data/credit_by_update.parquet --out docs/tables
+	$(BIN)/python examples/disturbance_study.py --trials data/disturbance_study.parquet --out docs/tables
 
 format: $(DEV_STAMP) ## Format the code and mend what ruff can
 	$(BIN)/ruff check --fix .

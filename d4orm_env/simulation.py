@@ -71,6 +71,7 @@ class Simulation:
             observed_way=options.observed_way,
             spare=self._spare,
         )
+        self._disturbed: DisturbedWorlds | None = None
         self._disturb(0)  # to know what bodies there are
         # In an open world the two are the same.
         self.along_ways = options.progress == "way" and problem.world.num_obstacles > 0
@@ -280,13 +281,14 @@ class Simulation:
 
     def _disturb(self, seed: int) -> None:
         """Begin the disturbances of an episode."""
-        self._disturbed: DisturbedWorlds | None = None
         self._seen: Seen | None = None
-        if self.disturbances:
-            problem = self.problem
-            self._disturbed = DisturbedWorlds(self.disturbances, problem, 1, self.max_cycles)
-            self._disturbed.begin(np.arange(1), [seed], problem.start[None], problem.goal[None])
-            self._true_limits = self._disturbed.true_limits(problem.arrays.limits)
+        if not self.disturbances:
+            return
+        problem, disturbed = self.problem, self._disturbed
+        if disturbed is None or disturbed.problem is not problem or disturbed.max_cycles != self.max_cycles:
+            self._disturbed = disturbed = DisturbedWorlds(self.disturbances, problem, 1, self.max_cycles)
+            self._true_limits = disturbed.true_limits(problem.arrays.limits)
+        disturbed.begin(np.arange(1), [seed], problem.start[None], problem.goal[None])
 
     def _scene(self) -> Scene:
         assert self._disturbed is not None

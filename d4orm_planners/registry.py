@@ -80,8 +80,8 @@ def make_policy(name: PolicyLike, **config: Any) -> Policy:
             that makes one, its keywords.
 
     Raises:
-        ValueError: For an unknown name or preset, an import path that leads nowhere, something that does not act, or a setting
-            that makes no sense.
+        ValueError: For an unknown name or preset, an import path that leads nowhere, something that does not act, or a
+            setting that makes no sense.
         TypeError: For an unknown setting.
     """
     kind, owner = find_policy(name), f"policy {_called(name)!r}"

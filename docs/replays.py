@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from d4orm_env import make_problem, navigation_v0
+from d4orm_env.disturbances import Delay, Intruder, Push, StateNoise
 from d4orm_env.render import Replay
 from d4orm_planners import make_planner, make_policy, run_episode
 from d4orm_planners.denoising import DenoisingFilm
@@ -34,6 +35,21 @@ def compared(title: str, policies: dict[str, str], **options: object) -> Replay:
     return Replay(title, tuple(motions))
 
 
+def planned_by(title: str, planners: Sequence[str], scenario: str, **arguments: object) -> Replay:
+    """The same problem by several planners, each with what it takes."""
+    problem = make_problem(scenario, **arguments)
+    return Replay(title, tuple(make_planner(name).solve(problem, seed=0).motion(name) for name in planners))
+
+
+def drawn(title: str, labels: dict[str, dict[str, object]], **options: object) -> Replay:
+    """An environment with other arguments each, driven alike."""
+    motions = []
+    for label, others in labels.items():
+        env = navigation_v0.parallel_env(**options, **others)
+        motions.append(run_episode(env, make_policy("d4orm-c2f"), seed=0).motion(label))
+    return Replay(title, tuple(motions))
+
+
 REPLAYS: dict[str, Callable[[], Replay]] = {
     "denoising": denoised,
     "warehouse": lambda: planned("warehouse", num_robots=16),
@@ -56,6 +72,31 @@ REPLAYS: dict[str, Callable[[], Replay]] = {
         scenario="circle",
         num_robots=8,
         control_noise_std=0.4,
+    ),
+    "disturbances": lambda: compared(
+        "Pushes, intruders, delays and noise in what is seen",
+        {"d4orm, open loop": "d4orm", "d4orm-c2f": "d4orm-c2f", "orca": "orca"},
+        scenario="circle",
+        num_robots=8,
+        disturbances=[Delay(1), Push(0.2, 0.3), Intruder(2), StateNoise(0.02, 0.02)],
+    ),
+    "rivals": lambda: planned_by(
+        "The same eight robots by the rivals", ("d4orm", "mppi", "cem", "mbd", "i-mbd"), "circle", num_robots=8
+    ),
+    "nodes": lambda: planned_by("Nodes that exchange candidates", ("d-d4orm",), "circle", num_robots=16),
+    "amswarm": lambda: planned_by("AMSwarm", ("amswarm", "d4orm-d"), "amswarm_3"),
+    "ipopt": lambda: planned_by("Direct collocation", ("ipopt",), "circle", num_robots=4),
+    "instances": lambda: drawn(
+        "Other instances of one scenario",
+        {"seed 1": {"seed": 1}, "seed 2": {"seed": 2}, "seed 3": {"seed": 3}},
+        scenario="random",
+        num_robots=8,
+    ),
+    "models": lambda: drawn(
+        "Other robots in one scenario",
+        {name: {"model": name} for name in ("holonomic2d", "velocity2d", "differential_drive", "car")},
+        scenario="circle",
+        num_robots=6,
     ),
     "lifelong": lambda: compared(
         "Lifelong goals",

@@ -15,6 +15,12 @@ from hypothesis import settings
 os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
 os.environ["MPLBACKEND"] = "Agg"
 
+# Processes of pytest-xdist that each start as many threads as there are cores get in each other's way.
+_processes = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+if _processes > 1:
+    for _name in ("D4ORM_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(_name, str(max((os.cpu_count() or 1) // _processes, 1)))
+
 # No deadline: the first example pays for compilation. In CI the examples are the same in every run.
 settings.register_profile("local", deadline=None)
 settings.register_profile("ci", deadline=None, derandomize=True, print_blob=True)

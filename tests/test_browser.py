@@ -15,7 +15,8 @@ import pytest
 from browser_support import PATIENCE, Page, browser, missing
 
 from d4orm_env import Problem, World, load_problem, make_problem
-from d4orm_planners import make_planner
+from d4orm_planners import make_planner, register_policy
+from d4orm_planners.policy import DriveToGoal
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(missing()), reason=missing())]
 
@@ -126,11 +127,12 @@ viser_leaves_loops = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisable
 
 
 def pixel(playground: Any, place: Sequence[float]) -> tuple[float, float]:
-    """Where on the page a place of the plane is."""
+    """Where on the page a place of the plane, or of space, is."""
     from viser import transforms
 
     camera = next(iter(playground.clients.values())).camera
-    x, y, z = transforms.SO3(np.asarray(camera.wxyz)).inverse() @ (np.array([*place, 0.0]) - camera.position)
+    point = np.array([*place, 0.0])[:3]
+    x, y, z = transforms.SO3(np.asarray(camera.wxyz)).inverse() @ (point - camera.position)
     scale = 0.5 * camera.image_height / np.tan(camera.fov / 2)
     return camera.image_width / 2 + scale * x / z, camera.image_height / 2 + scale * y / z
 
@@ -140,6 +142,7 @@ def tick(page: Page, label: str) -> None:
     place = f"""(() => {{
       let row = [...document.querySelectorAll('label')].find((part) => part.textContent === {label!r});
       while (!row.querySelector('input[type=checkbox]')) row = row.parentElement;
+      row.scrollIntoView({{block: 'nearest'}});
       const box = row.querySelector('input[type=checkbox]').getBoundingClientRect();
       return [box.x + box.width / 2, box.y + box.height / 2];
     }})()"""
@@ -226,6 +229,117 @@ def test_obstacles_are_dragged_and_scenes_and_replays_saved(page: Page, tmp_path
         saved = load_problem(tmp_path / "scene.yaml")
         np.testing.assert_array_equal(saved.world.boxes, session.frame.problem.world.boxes)
         assert "circle, 2 robots by goal" in (tmp_path / "replay.html").read_text(encoding="utf-8")
+
+
+@viser_leaves_loops
+def test_goals_are_dragged_in_space(page: Page) -> None:
+    with running(make_problem("sphere", num_robots=3, seed=0), "goal") as playground:
+        session = playground.session
+        session.pause(True)
+        page.look()
+        page.offline(False)
+        page.open(playground.address)
+        page.until("document.body.textContent.includes('sphere, 3 robots, goal: paused')")
+        wait_for(lambda: len(playground.clients) == 1)
+        page.frames(8)
+        goal, wanted = session.frame.goals[0], pixel(playground, np.zeros(3))
+        page.drag(pixel(playground, goal), wanted)
+        wait_for(lambda: not np.array_equal(session.frame.goals[0], goal))
+        moved = session.frame.goals[0]
+        assert np.abs(np.array(pixel(playground, moved)) - wanted).max() < 30, "it is where it was let go"
+        eye = next(iter(playground.clients.values())).camera.position
+        assert np.linalg.norm(moved - eye) == pytest.approx(np.linalg.norm(goal - eye), rel=0.2), "and as far away"
+        np.testing.assert_array_equal(session.frame.goals[1:], session.frame.problem.goal[1:])
+
+
+@viser_leaves_loops
+def test_policies_are_ticked_and_drive_side_by_side(page: Page, tmp_path: Path) -> None:
+    with running(make_problem("circle", num_robots=3, seed=0), "goal") as playground:
+        session = playground.session
+        page.look()
+        page.offline(False)
+        page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+        page.open(playground.address)
+        page.until("document.body.textContent.includes('circle, 3 robots, goal')")
+        wait_for(lambda: len(playground.clients) == 1)
+        click(page, "Who drives")
+        tick(page, "D4orm-C2F")
+        wait_for(lambda: session.policies == ("goal", "d4orm-c2f"))
+        page.until("document.body.textContent.includes('circle, 3 robots, goal, d4orm-c2f')")
+        session.pause(True)
+        wait_for(lambda: session.frame.moment.state == "paused")
+        offset = playground._view._lanes[1]._nodes[""].position[:2]
+        goal = session.frames[1].goals[0]
+        wait_for(lambda: abs(pixel(playground, goal + offset)[0]) < 1200)
+        page.frames(8)
+        page.drag(
+            pixel(playground, goal + offset + np.array([0.0, 0.19])), pixel(playground, offset + np.array([0.3, 0.5]))
+        )
+        wait_for(lambda: not np.array_equal(session.frame.goals[0], goal))
+        np.testing.assert_array_equal(session.frame.goals, session.frames[1].goals)
+        click(page, "Files")
+        click(page, "Save replay")
+        wait_for((tmp_path / "replay.html").exists)
+        text = (tmp_path / "replay.html").read_text(encoding="utf-8")
+        assert "by goal, d4orm-c2f" in text
+
+
+@viser_leaves_loops
+def test_a_slow_planner_does_not_freeze_the_page(page: Page) -> None:
+    with running(make_problem("circle", num_robots=3, seed=0), "goal") as playground:
+        session = playground.session
+        page.look()
+        page.offline(False)
+        page.open(playground.address)
+        page.until("document.body.textContent.includes('circle, 3 robots, goal')")
+        ended = threading.Event()
+        register_policy("slow", lambda: Slow(ended))
+        session.choose("slow")
+        page.until("document.body.textContent.includes('planning')")
+        page.frames(5)
+        click(page, "Show")
+        tick(page, "Margins")
+        wait_for(lambda: playground._view.shown["margins"])
+        assert session.frame.moment.state == "planning"
+        ended.set()
+        page.until("document.body.textContent.includes('circle, 3 robots, slow')")
+
+
+class Slow(DriveToGoal):
+    """A policy that plans until it is told that it has found something, in compiled code as it were."""
+
+    def __init__(self, ended: threading.Event) -> None:
+        self._ended = ended
+
+    def _begin(self, env: object, seed: int) -> None:
+        self._ended.wait(PATIENCE)
+
+
+@viser_leaves_loops
+def test_a_slider_disturbs_from_the_next_step_on(page: Page) -> None:
+    with running(make_problem("circle", num_robots=3, seed=0), "goal") as playground:
+        session = playground.session
+        page.look()
+        page.offline(False)
+        page.open(playground.address)
+        page.until("document.body.textContent.includes('circle, 3 robots, goal')")
+        session.set_lifelong(True)
+        click(page, "What goes wrong")
+        time.sleep(1.0)
+        x, y = page.evaluate("""(() => {
+          let row = [...document.querySelectorAll('label')].find((part) => part.textContent === 'Intruders');
+          while (!row.querySelector('[role=slider]')) row = row.parentElement;
+          row.scrollIntoView({block: 'center'});
+          const bar = row.querySelector('.mantine-Slider-track').getBoundingClientRect();
+          return [bar.x + bar.width / 2, bar.y + bar.height / 2];
+        })()""")
+        for kind in ("Moved", "Pressed", "Released"):
+            page.mouse(kind, x, y)
+        wait_for(lambda: session.levels.get("intruder"))
+        wait_for(lambda: len(session.frame.bodies) == session.levels["intruder"])
+        wait_for(lambda: "bodies" in playground._view._lanes[0]._nodes)
+        click(page, "Nothing")
+        wait_for(lambda: not session.levels)
 
 
 @viser_leaves_loops

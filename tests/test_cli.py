@@ -201,6 +201,8 @@ BAD = [
     (("bench", "--num-robots", "4,99999"), "num_robots is 99999; it must be at most 10000"),
     (("run", "--control-noise-std", "-1"), "control_noise_std is -1"),
     (("run", "--policy", "nope"), "policy 'nope' is unknown"),
+    (("run", "--policy", "d4orm-c2f", "--preset", "nope"), "preset 'nope' of policy 'd4orm-c2f' is unknown"),
+    (("run", "--policy", "orca", "--preset", "paper"), "'preset' is no setting of policy 'orca'"),
     (("demo", "--out", "good.yaml"), "good.yaml"),
     (("demo", "--num-robots", "0"), "num_robots"),
     (("nonsense",), "nonsense"),

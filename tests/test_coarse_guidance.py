@@ -85,7 +85,7 @@ def trajectory(arrived: Any, violated: Any) -> Trajectory:
     ],
 )
 def test_coarse_plans_are_checked_at_intervals(arrived: bool, violated: list[int], interval: int, passes: bool) -> None:
-    assert not failed_robots(trajectory(arrived, violated), interval).any() is passes
+    assert failed_robots(trajectory(arrived, violated), interval).any() != passes
 
 
 @pytest.mark.parametrize(("interval", "meets"), [(1, True), (2, True), (3, False), (7, False)])

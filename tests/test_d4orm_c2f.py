@@ -354,7 +354,7 @@ def test_commands_under_way_are_counted() -> None:
     policy = controller(delay=2)
     assert episode(policy, circle(4), disturbances=[Delay(2)]).metrics["success"]
     assert policy._deviation.speed < 1e-4
-    policy = controller()
+    policy = controller(delay=0)
     episode(policy, circle(4), disturbances=[Delay(2)])
     assert policy._deviation.speed > 0.01
 
@@ -385,8 +385,9 @@ def test_who_lost_the_guidance_begins_anew_straight_to_the_goals(monkeypatch: py
     calls = replanned(monkeypatch, policy, pushed, problem=problem)
     assert calls[0][0].steps < 30
     for joint, initial, iterations, *_ in calls:
-        assert iterations == 3
-        np.testing.assert_array_equal(initial, straight(problem, joint, policy.config.coarse_factor))
+        anew = (initial == straight(problem, joint, policy.config.coarse_factor)).all(axis=(0, 2))
+        # All of them once the team has lost it, before that those that are astray.
+        assert anew.all() if iterations == 3 else anew.any()
 
 
 def test_with_new_goals_for_some_the_others_keep_what_is_left_of_the_guidance(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -258,7 +258,7 @@ def test_float32_stays_close_to_float64_over_a_whole_horizon(model: str) -> None
 
 class TestThreads:
     @pytest.mark.parametrize("num_threads", [1, 2, 3, 7])
-    @pytest.mark.parametrize("count", [1, 2, 3, 5, 16, 33])
+    @pytest.mark.parametrize("count", [0, 1, 2, 3, 5, 16, 33])
     def test_parts_make_up_the_range(self, num_threads: int, count: int) -> None:
         seen, lock = np.zeros(count, int), threading.Lock()
 

@@ -176,9 +176,32 @@ def test_credit_and_update_are_crossed(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("program", "name"), [("tune_rivals", "tuning"), ("credit_by_update", "credit_by_update")])
+def test_policies_meet_every_disturbance(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("disturbance_study", out)
+    rows = table(out / "disturbance_study.csv")
+    assert len({row["disturbance"] for row in rows}) == len(rows) == 11
+    assert {(row["scenario"], row["policy"], row["trials"], row["errors"]) for row in rows} == {
+        ("circle", "orca", "1", "0")
+    }
+    assert (out / "disturbance_study.png").read_bytes().startswith(PNG)
+    completed("disturbance_study", tmp_path / "again", "--trials", str(out / "disturbance_study.parquet"))
+    assert table(tmp_path / "again" / "disturbance_study.csv") == rows
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("program", "name"),
+    [
+        ("tune_rivals", "tuning"),
+        ("credit_by_update", "credit_by_update"),
+        ("disturbance_study", "disturbance_study"),
+        ("disturbance_study", "disturbance_overview"),
+    ],
+)
 def test_the_tables_of_the_docs_are_those_of_the_data(tmp_path: Path, program: str, name: str) -> None:
-    completed(program, tmp_path / "out", "--trials", str(ROOT / "data" / f"{name}.parquet"))
+    data = "disturbance_study" if program == "disturbance_study" else name
+    completed(program, tmp_path / "out", "--trials", str(ROOT / "data" / f"{data}.parquet"))
     for kind in ("csv", "md"):
         committed = ROOT / "docs" / "tables" / f"{name}.{kind}"
         assert (tmp_path / "out" / f"{name}.{kind}").read_bytes() == committed.read_bytes()

@@ -13,7 +13,7 @@ import pytest
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances import Push
+from d4orm_env.disturbances import LimitMismatch, Push, Stall, StateNoise
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import Search, make_planner, make_policy, run_episode
@@ -185,7 +185,17 @@ POLICY_CHANGES: dict[str, dict[str, tuple[Any, dict[str, Any]]]] = {
         "coarse_samples": (24, {}),
         "coarse_steps": (6, {}),
         "coarse_repair_steps": (6, {}),
+        "coarse_preset": ("paper", {}),
         "coarse_iterations": (1, {}),
+        "max_lag": (0, {}),
+        "sight": (False, {"scenario": "maze", "max_cycles": 60}),
+        "relative_distance": (True, {}),
+        "safe_mix": (False, {"scenario": "circle", "max_cycles": 60, "disturbances": [Push(3.0, 0.5)]}),
+        "filter_states": (False, {"disturbances": [StateNoise(0.05, 0.05)], "max_cycles": 60}),
+        "learn_limits": (False, {"disturbances": [LimitMismatch(0.6)]}),
+        "stalls": (False, {"scenario": "circle", "max_cycles": 60, "disturbances": [Stall(1.0)]}),
+        "last_resort": (False, {"disturbances": [Push(3.0, 0.5)], "max_cycles": 80}),
+        "replan": (False, {"disturbances": [Push(3.0, 0.5)], "max_cycles": 80, "replan_distance": 0.1}),
         "replan_iterations": (1, {"replan_iterations": 5, "lifelong": True, "max_cycles": 80}),
         "predict_horizon": (9, {}),
         "execute_horizon": (2, {}),

@@ -180,7 +180,7 @@ class Problem(Frozen):
         goal_speed = np.inf if self.goal_speed is None else self.goal_speed
         arrays = ProblemArrays(
             model_codes=np.array([MODEL_CODES[name] for name in self.team.models], np.int32),
-            limits=self.team.limits,
+            limits=self.team.limits.copy(),
             radius=self.team.radius,
             start=self.start,
             goal=self.goal,

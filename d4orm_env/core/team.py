@@ -92,17 +92,17 @@ class Team(Frozen):
         """Position dimensions ``d``."""
         return self.robot_models[0].dimension
 
-    @property
+    @cached_property
     def state_size(self) -> int:
         """``n``: the largest state size of the team; smaller states are padded with zeros."""
         return max(model.state_size for model in self.robot_models)
 
-    @property
+    @cached_property
     def control_size(self) -> int:
         """``m``: the largest control size of the team; smaller controls are padded with zeros."""
         return max(model.control_size for model in self.robot_models)
 
-    @property
+    @cached_property
     def limits(self) -> FloatArray:
         """``(K, L)`` limits in the order of :attr:`Model.limit_names`; one on padding."""
         models = self.robot_models
@@ -112,14 +112,16 @@ class Team(Frozen):
         for robot, model in enumerate(models):
             for column, limit in enumerate(model.own_limits, len(STANDARD_LIMITS)):
                 limits[robot, column] = self.own_limits[limit.name][robot]
+        limits.setflags(write=False)
         return limits
 
-    @property
+    @cached_property
     def control_limits(self) -> FloatArray:
         """``(K, m)`` largest magnitude of each control component; zero on padding."""
         bound = np.zeros((self.num_robots, self.control_size), np.float32)
         for robot, (model, limits) in enumerate(zip(self.robot_models, self.limits, strict=True)):
             bound[robot, : model.control_size] = limits[list(model.control_limits)]
+        bound.setflags(write=False)
         return bound
 
     def select(self, robots: Sequence[int]) -> Team:

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import pairwise, product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.shapes import Shapes
@@ -320,24 +320,16 @@ def _split(cells: _Cells, size: Floats) -> _Cells:
     return _Cells(np.concatenate(places), np.concatenate(owners), np.concatenate(items))
 
 
-def _frozen(
-    low: Floats,
-    scale: float,
-    ends: Floats,
-    size: Floats | NDArray[np.int64],
-    slack: float,
-    clearance: Floats,
-    first: Floats | NDArray[np.int64],
-    items: Floats | Ints,
-    longest: int,
-    nearest: int,
-    levels: int,
-) -> WorldIndex:
-    index = WorldIndex(
-        low.astype(np.float32), np.float32(scale), ends.astype(np.float32), size.astype(np.int32),
-        np.float32(slack), clearance.astype(np.float32), first.astype(np.int32), items.astype(np.int32),
-        np.int32(longest), np.int32(nearest), np.int32(levels),
-    )  # fmt: skip
+_KINDS: dict[str, Any] = {
+    "low": np.float32, "scale": np.float32, "ends": np.float32, "size": np.int32, "slack": np.float32,
+    "clearance": np.float32, "first": np.int32, "items": np.int32, "longest": np.int32, "nearest": np.int32,
+    "levels": np.int32,
+}  # fmt: skip
+
+
+def _frozen(*parts: ArrayLike) -> WorldIndex:
+    """The index of these parts, as engines read it."""
+    index = WorldIndex(*(kind(part) for kind, part in zip(_KINDS.values(), parts, strict=True)))
     for array in index:
         if isinstance(array, np.ndarray):
             array.setflags(write=False)

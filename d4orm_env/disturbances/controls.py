@@ -223,7 +223,7 @@ class Dropout(Disturbance[Drawn]):
 
     def command(self, controls: FloatArray, memory: Drawn, scene: Scene, draws: Draws) -> FloatArray:
         lost = draws.uniform(controls.shape[1]) < self.probability
-        instead = memory.values if self.hold else brake(scene, scene.states, lost)
-        received: FloatArray = np.where(lost[..., None], instead, controls)
-        memory.values[:] = received
-        return received
+        np.copyto(memory.values, controls, where=~lost[..., None])
+        if not self.hold:
+            np.copyto(memory.values, brake(scene, scene.states, lost), where=lost[..., None])
+        return memory.values.copy()

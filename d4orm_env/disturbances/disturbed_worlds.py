@@ -21,6 +21,8 @@ from d4orm_env.disturbances.draws import Ahead, Draws, Keys, Steps, episode_keys
 
 Worlds = NDArray[np.intp]
 
+_FLOAT32 = np.dtype(np.float32)
+
 
 class _Purpose(IntEnum):
     """What a disturbance draws for; the numbers are part of what a seed means, so append."""
@@ -33,10 +35,11 @@ class _Purpose(IntEnum):
 
 @dataclass(eq=False)
 class _Running:
-    """A disturbance at work: its stream of random numbers, and what it remembers."""
+    """A disturbance at work: its stream of random numbers, what it draws by purpose, and what it remembers."""
 
     disturbance: Disturbance[Any]
     stream: int
+    draws: dict[_Purpose, Draws] = field(default_factory=dict)
     memory: Memory = field(default=())
 
     def remember(self, memory: Memory, worlds: Worlds, first: bool = False) -> None:
@@ -230,7 +233,11 @@ class DisturbedWorlds:
         return observations
 
     def _draws(self, one: _Running, scene: Scene, purpose: _Purpose) -> Draws:
-        return Draws(self._keys, scene.steps, one.stream, purpose, self._ahead)
+        draws = one.draws.get(purpose)
+        if draws is None:
+            one.draws[purpose] = draws = Draws(self._keys, scene.steps, one.stream, purpose, self._ahead)
+        draws.turn_to(scene.steps)
+        return draws
 
 
 @cache
@@ -250,7 +257,7 @@ def _together(join: Any, parts: Sequence[Any]) -> Any:
 
 def _checked(values: ArrayLike, shape: tuple[int, ...], one: _Running, method: str) -> FloatArray:
     """What a disturbance returned, as float32."""
-    array = values if isinstance(values, np.ndarray) and values.dtype == np.float32 else as_float32(values)
+    array = values if isinstance(values, np.ndarray) and values.dtype == _FLOAT32 else as_float32(values)
     if array.shape != shape:
         name = type(one.disturbance).__name__
         raise ValueError(f"disturbance {name}: {method} returned shape {array.shape}; expected {shape}")

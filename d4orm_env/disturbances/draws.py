@@ -14,9 +14,12 @@ from d4orm_env.core.arrays import FloatArray
 Keys = NDArray[np.uint32]
 Steps = NDArray[np.int64]
 Kernel = Callable[..., Any]
-Ahead = dict[tuple[Kernel, int, int, tuple[int, ...]], tuple[int, FloatArray]]
-"""What a single world has drawn ahead in its episode: by kernel, stream, call and shape the first step, and rows of
-numbers, one for each step from there on."""
+Ahead = dict[tuple[int, int, int, tuple[int, ...]], tuple[int, FloatArray]]
+"""What a single world has drawn ahead in its episode: by kind of number, stream, call and shape the first step, and
+rows of numbers, one for each step from there on."""
+
+_NORMAL, _UNIFORM = range(2)
+"""Kinds of number."""
 
 _AHEAD = 16
 """Steps that a single world draws for at once: calling a kernel takes longer than what it does there."""
@@ -54,8 +57,12 @@ class Draws:
     """
 
     def __init__(self, keys: Keys, steps: Steps, stream: int, purpose: int, ahead: Ahead | None = None) -> None:
-        self._keys, self._steps, self._stream, self._ahead = keys, steps, stream, ahead
-        self._call = purpose << 16
+        self._keys, self._stream, self._first, self._ahead = keys, stream, purpose << 16, ahead
+        self.turn_to(steps)
+
+    def turn_to(self, steps: Steps) -> None:
+        """Begin anew at another moment, ``(B,)`` steps."""
+        self._steps, self._call = steps, self._first
 
     def of(self, worlds: NDArray[np.intp]) -> Draws:
         """The same for some of the worlds: they draw what they would draw here."""
@@ -65,11 +72,11 @@ class Draws:
 
     def normal(self, *shape: int) -> FloatArray:
         """``(B, *shape)`` independent standard normals."""
-        return self._filled(_kernels()[0], shape)
+        return self._filled(_NORMAL, shape)
 
     def uniform(self, *shape: int) -> FloatArray:
         """``(B, *shape)`` independent numbers, uniform between 0 and 1, neither of which occurs."""
-        return self._filled(_kernels()[1], shape)
+        return self._filled(_UNIFORM, shape)
 
     def whole(self, low: int, high: int, *shape: int) -> NDArray[np.int64]:
         """``(B, *shape)`` independent whole numbers, uniform from ``low`` to ``high``, both included."""
@@ -83,27 +90,27 @@ class Draws:
         directions: FloatArray = vectors / np.maximum(length, np.float32(1e-12))
         return directions
 
-    def _filled(self, kernel: Kernel, shape: tuple[int, ...]) -> FloatArray:
+    def _filled(self, kind: int, shape: tuple[int, ...]) -> FloatArray:
         if self._ahead is None:
-            out = self._drawn(kernel, self._keys, self._steps, shape)
+            out = self._drawn(kind, self._keys, self._steps, shape)
         else:
-            out = self._taken(kernel, shape, self._ahead)
+            out = self._taken(kind, shape, self._ahead)
         self._call += 1
         return out
 
-    def _drawn(self, kernel: Kernel, keys: Keys, steps: Steps, shape: tuple[int, ...]) -> FloatArray:
+    def _drawn(self, kind: int, keys: Keys, steps: Steps, shape: tuple[int, ...]) -> FloatArray:
         """``(R, *shape)`` numbers, a row for each of the keys ``(R, 2)`` at its step ``(R,)``."""
         rows = len(keys)
         out: FloatArray = np.empty((rows, *shape), np.float32)
-        kernel(keys, steps, np.uint32(self._stream), np.uint32(self._call), out.reshape(rows, -1))
+        _kernels()[kind](keys, steps, np.uint32(self._stream), np.uint32(self._call), out.reshape(rows, -1))
         return out
 
-    def _taken(self, kernel: Kernel, shape: tuple[int, ...], ahead: Ahead) -> FloatArray:
+    def _taken(self, kind: int, shape: tuple[int, ...], ahead: Ahead) -> FloatArray:
         """``(1, *shape)`` numbers of a single world, drawn ahead if they are not yet."""
-        step, place = int(self._steps[0]), (kernel, self._stream, self._call, shape)
+        step, place = int(self._steps[0]), (kind, self._stream, self._call, shape)
         first, rows = ahead.get(place, (0, _NOTHING))
         if not first <= step < first + len(rows):
             first, steps = step, np.arange(step, step + _AHEAD)
-            rows = self._drawn(kernel, self._keys.repeat(_AHEAD, axis=0), steps, shape)
+            rows = self._drawn(kind, self._keys.repeat(_AHEAD, axis=0), steps, shape)
             ahead[place] = first, rows
         return rows[step - first : step - first + 1].copy()  # the caller's to change

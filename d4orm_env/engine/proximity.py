@@ -97,12 +97,13 @@ def bound_boxes(arrays: Any) -> FloatArray:
 
 def make_bodies(places: FloatArray, radius: FloatArray, margin: Any) -> Bodies:
     """Bodies of this radius ``(O,)`` at ``places`` ``(H, O, d)``, with their boxes."""
+    places, radius = np.ascontiguousarray(places, np.float32), np.ascontiguousarray(radius, np.float32)
     num_steps, num_blocks = len(places), -(-len(places) // BLOCK)
     # A last block that is short goes on with its last place.
     blocks = places[np.minimum(np.arange(num_blocks * BLOCK), num_steps - 1)]
     blocks = blocks.reshape(num_blocks, BLOCK, *places.shape[1:])
     boxes = _widened(blocks.min(axis=1) - radius[:, None], blocks.max(axis=1) + radius[:, None], margin)
-    return Bodies(np.ascontiguousarray(places, np.float32), np.ascontiguousarray(radius, np.float32), boxes)
+    return Bodies(places, radius, boxes)
 
 
 def _widened(low: Any, high: Any, margin: Any) -> FloatArray:

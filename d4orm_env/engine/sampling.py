@@ -338,9 +338,7 @@ def _punish_near(near: Any, count: Any, penalty: Any, w: Any) -> None:
 
 
 @inlined
-def _score_tile(
-    run_robot: Any, arrays: Any, scoring: Any, drawing: Any, counter: Any, kept: Any, space: Any
-) -> None:  # fmt: skip
+def _score_tile(run_robot: Any, arrays: Any, scoring: Any, drawing: Any, counter: Any, kept: Any, space: Any) -> None:
     """Roll out a tile of samples, noise beginning with this counter; leave summed rewards in rows TOTAL."""
     w, places, draws, controls, standing = space.w, space.places, space.draws, space.controls, space.standing
     keys, scratch, offset, scale = space.keys, space.scratch, drawing.offset, drawing.scale

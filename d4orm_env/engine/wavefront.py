@@ -391,19 +391,10 @@ def _kept(anchor: Any, own_goal: Any, reach: Any) -> Any:
 
 @compiled
 def _seen_anchor(
-    space: Any,
-    lattice: Any,
-    reach: Any,
-    own_goal: Any,
-    nodes: Any,
-    points: Any,
-    values: Any,
-    n: Any,
-    q: Any,
-    tried: Any,
+    space: Any, lattice: Any, reach: Any, own_goal: Any, nodes: Any, points: Any, values: Any, n: Any
 ) -> Any:
     """The best anchor of the neighbours of a node that it sees, and the way by it; -1 for none."""
-    i, j, k = _indices(lattice, n)
+    (i, j, k), q, tried = _indices(lattice, n), _place(lattice.places, n), nodes.tried
     best, chosen, count = np.inf, _NOBODY, 0
     for move in range(lattice.moves.shape[0]):
         p = _neighbour(lattice, move, i, j, k)
@@ -461,7 +452,7 @@ def _add_anchor(points: Any, values: Any, parents: Any, number: Any, place: Any,
 def _spread(space: Any, lattice: Any, reach: Any, goal: Any, nodes: Any) -> Any:
     """See :func:`spread`; anchors, their values and their parents."""
     count, size = lattice.free.shape[0], lattice.size
-    value, anchor, hidden, tried = nodes.value, nodes.anchor, nodes.hidden, nodes.tried
+    value, anchor, hidden = nodes.value, nodes.anchor, nodes.hidden
     points, values, parents = np.empty((256, 3)), np.empty(256), np.empty(256, np.int32)
     points[0, 0], points[0, 1], points[0, 2] = goal[0], goal[1], goal[2]
     values[0], parents[0], used = 0.0, _NOBODY, 1
@@ -484,7 +475,7 @@ def _spread(space: Any, lattice: Any, reach: Any, goal: Any, nodes: Any) -> Any:
         q, a = _place(lattice.places, n), anchor[n]
         if not nodes.tested[n] and not _sees(space, reach, _place(points, a), _kept(a, own_goal, reach), q, reach):
             hidden[n] = a
-            a, value[n] = _seen_anchor(space, lattice, reach, own_goal, nodes, points, values, n, q, tried)
+            a, value[n] = _seen_anchor(space, lattice, reach, own_goal, nodes, points, values, n)
             p, via, bend = _way_round(space, lattice, reach, nodes, n, q)
             if via < value[n]:
                 b, c, parent = _place(lattice.places, p), bend, anchor[p]

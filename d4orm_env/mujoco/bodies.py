@@ -110,9 +110,7 @@ class TeamBodies:
             for place, body in zip(self.data.mocap_pos, intruders):
                 place[:2] = body[:2] - left * body[2:4]
             self._serve(controls)
-            torque = self._wheels.torque(commands, number * self._step, self._step, self.data.qvel[self._wheel_dofs])
-            torque[self._held[self._drives]] = 0
-            self.data.qfrc_applied[self._wheel_dofs] = torque
+            self._turn_wheels(commands, number * self._step)
             mujoco.mj_step(self.scene.model, self.data)
             self._note_contacts(touched)
         if self.data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
@@ -188,6 +186,14 @@ class TeamBodies:
         pull *= self._grip / np.maximum(size, self._grip)
         pull[self._held[self._servos]] = 0
         self.data.qfrc_applied[self._servo_dofs] = self.scene.mass[self._servos, None] * pull
+
+    def _turn_wheels(self, commands: Commands, time: float) -> None:
+        """Have the wheels follow commands that were given so long before the end of MuJoCo's next step [s]."""
+        if not len(self._drives):
+            return
+        torque = self._wheels.torque(commands, time, self._step, self.data.qvel[self._wheel_dofs])
+        torque[self._held[self._drives]] = 0
+        self.data.qfrc_applied[self._wheel_dofs] = torque
 
     def _commands(self, controls: FloatArray, states: FloatArray, limits: FloatArray) -> Commands:
         """What the drives are told: a turn rate, and a speed, or an acceleration from the speed wanted last."""

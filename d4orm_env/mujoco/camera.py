@@ -10,7 +10,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
+from d4orm_env.mujoco.scene import colour
 
 PLATFORMS = ("egl", "osmesa")
 """OpenGL without a screen, as MuJoCo calls it."""
@@ -59,7 +61,7 @@ class Camera:
         self._gl = open_context(SIZE)
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
-        self._model = model
+        self._model, self._goal_radius = model, problem.goal_radius
         self._scene = mujoco.MjvScene(model, maxgeom=10_000)
         self._view = mujoco.MjvCamera()
         places = np.concatenate([problem.start[:, :2], problem.goal])
@@ -71,17 +73,28 @@ class Camera:
         self._view.distance = reach / math.tan(math.radians(_VIEW_ANGLE / 2))
         self._view.elevation, self._view.azimuth = -60, 90
 
-    def draw(self, data: mujoco.MjData) -> NDArray[np.uint8]:
-        """``(480, 480, 3)`` uint8 picture of the bodies as they are."""
+    def draw(self, data: mujoco.MjData, goals: FloatArray) -> NDArray[np.uint8]:
+        """``(480, 480, 3)`` uint8 picture of the bodies as they are, and of goals ``(K, 2)`` [m] on the floor."""
         # What is drawn follows from positions; after a step these are ahead of it.
         mujoco.mj_kinematics(self._model, data)
         self._gl.make_current()
         frame = np.empty((SIZE, SIZE, 3), np.uint8)
         view, whole = mujoco.MjvOption(), mujoco.MjrRect(0, 0, SIZE, SIZE)
         mujoco.mjv_updateScene(self._model, data, view, None, self._view, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene)
+        self._add_goals(goals)
         mujoco.mjr_render(whole, self._scene, self._context)
         mujoco.mjr_readPixels(frame, None, whole, self._context)
         return frame[::-1].copy()
+
+    def _add_goals(self, goals: FloatArray) -> None:
+        size = [self._goal_radius, 1e-3, 0]
+        for robot, goal in enumerate(goals.tolist()):
+            if self._scene.ngeom == self._scene.maxgeom:
+                return
+            disc = self._scene.geoms[self._scene.ngeom]
+            paint = np.array(colour(robot), np.float32)
+            mujoco.mjv_initGeom(disc, mujoco.mjtGeom.mjGEOM_CYLINDER, size, [*goal, 2e-3], np.eye(3).ravel(), paint)
+            self._scene.ngeom += 1
 
     def close(self) -> None:
         """Give back what OpenGL holds."""

@@ -22,7 +22,8 @@ CLEARANCE, HEIGHT, FRONT_GAP = 0.25, 0.85, 0.02
 """Measures of a robot, over its radius. The caster is behind; one in front, off the floor, keeps the nose up."""
 WHEEL_SHARE, BATTERY_SHARE, BATTERY_PLACE = 0.1, 0.5, (-0.15, 0.0, 0.2)
 """Shares of the mass: of each wheel, and of what lies low and behind the axle."""
-_WALL = 1.0
+_WALL = 0.2
+"""Thickness of the walls round a bounded world [m]."""
 _ROLLING, _SOLID = 1, 2
 """Kinds of contact: of what rolls on the floor, and of what bodies must not touch."""
 _PALETTE = ((0.12, 0.47, 0.71), (1.0, 0.5, 0.05), (0.17, 0.63, 0.17), (0.84, 0.15, 0.16), (0.58, 0.4, 0.74),
@@ -81,6 +82,9 @@ def build_scene(problem: Problem, physics: Physics, body_radius: FloatArray, ste
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10
     spec.visual.global_.offwidth = spec.visual.global_.offheight = 640
+    # The only light comes from where one looks from, as far as one is.
+    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.5] * 3, [0.5] * 3
+    spec.visual.headlight.specular = [0.0] * 3
     radius = np.asarray(problem.team.radius, np.float64)
     top = max(HEIGHT * float(radius.max()), 2 * CLEARANCE * float(radius.max()))
     _add_surroundings(spec, problem.world, top, physics)
@@ -130,9 +134,8 @@ def _cylinder(
 
 
 def _add_surroundings(spec: mujoco.MjSpec, world: World, top: float, physics: Physics) -> None:
-    """Floor, light, obstacles and the walls round a bounded world, all of them ``top`` high [m]."""
+    """Floor, obstacles and the walls round a bounded world, all of them ``top`` high [m]."""
     ground, grey = spec.worldbody, [0.45, 0.47, 0.5, 1]
-    ground.add_light(pos=[0, 0, 50], dir=[0, 0, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     # It has a side of the contact only, so that nothing but what rolls meets it.
     ground.add_geom(
         type=mujoco.mjtGeom.mjGEOM_PLANE, size=[100, 100, 1], contype=0, conaffinity=_ROLLING, rgba=[0.8, 0.8, 0.8, 1]
@@ -169,7 +172,8 @@ def _walls(lower: list[float], upper: list[float]) -> list[list[float]]:
     ]
 
 
-def _colour(robot: int) -> list[float]:
+def colour(robot: int) -> list[float]:
+    """Of a robot and its goal: red, green, blue and opacity, from 0 to 1."""
     return [*_PALETTE[robot % len(_PALETTE)], 1.0]
 
 
@@ -181,7 +185,7 @@ def _add_puck(spec: mujoco.MjSpec, robot: int, radius: float, top: float, physic
     body.add_joint(type=slide, axis=[1, 0, 0], damping=physics.drag * mass)
     body.add_joint(type=slide, axis=[0, 1, 0], damping=physics.drag * mass)
     body.add_joint(type=hinge, axis=[0, 0, 1], damping=physics.drag * mass * radius * radius / 2)
-    _cylinder(body, radius, CLEARANCE * radius, top, physics, mass=mass, rgba=_colour(robot))
+    _cylinder(body, radius, CLEARANCE * radius, top, physics, mass=mass, rgba=colour(robot))
 
 
 def _add_drive(spec: mujoco.MjSpec, robot: int, radius: float, top: float, physics: Physics) -> None:
@@ -189,7 +193,7 @@ def _add_drive(spec: mujoco.MjSpec, robot: int, radius: float, top: float, physi
     body = spec.worldbody.add_body(name=f"robot_{robot}")
     body.add_freejoint()
     mass, shell = physics.surface_density * radius * radius, 1 - 2 * WHEEL_SHARE - BATTERY_SHARE
-    _cylinder(body, radius, CLEARANCE * radius, top, physics, mass=shell * mass, rgba=_colour(robot))
+    _cylinder(body, radius, CLEARANCE * radius, top, physics, mass=shell * mass, rgba=colour(robot))
     body.add_geom(
         type=mujoco.mjtGeom.mjGEOM_BOX,
         size=[0.3 * radius, 0.3 * radius, 0.05 * radius],

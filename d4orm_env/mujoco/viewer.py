@@ -49,7 +49,7 @@ class MujocoViewer(Viewer):
                 self.renderer = "pictures"
             else:
                 self.renderer = "mujoco"
-                return self._camera.draw(bodies.data)
+                return self._camera.draw(bodies.data, simulation.arrays.goal)
         return super().render(simulation)
 
     def close(self) -> None:

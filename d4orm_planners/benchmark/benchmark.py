@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, TypeAlias
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import numpy as np
 from pydantic import Field
@@ -21,8 +22,12 @@ from d4orm_planners.benchmark.probes import measure_memory, measure_startup
 from d4orm_planners.benchmark.timing import Row, Spread, measure
 from d4orm_planners.benchmark.walls import Where, boxed_problem, measure_index, measure_obstacles
 from d4orm_planners.d4orm import D4orm
+from d4orm_planners.episode import open_env
 from d4orm_planners.registry import make_planner
 from d4orm_planners.settings import CheckedSettings, Count, Positive, Samples, Steps, Whole
+
+if TYPE_CHECKING:
+    from pettingzoo import ParallelEnv
 
 ENGINES = ("cpu", "jax", "plain")
 MODELS = (*COMMON, "unicycle", "car")
@@ -115,6 +120,9 @@ FIRST_STEPS = 5
 DISTURBANCES: tuple[Disturbance[Any], ...] = (Delay(2), Dropout(0.3), StateNoise(0.02, 0.05))
 """With what environments are stepped beside those that nothing disturbs."""
 
+RIGID = ("holonomic2d", "differential_drive")
+"""Models that are stepped as rigid bodies, where MuJoCo is installed."""
+
 Run: TypeAlias = Callable[[FloatArray, bool], object]
 """``(noise_scale, collisions)`` to what is timed."""
 
@@ -151,6 +159,8 @@ def parts(settings: BenchmarkSettings) -> Iterator[Part]:
         disturbed = partial(measurement, settings, 0, DISTURBANCES)
         yield "environments", f"{what} with {len(DISTURBANCES)} disturbances", disturbed
     yield "environments", f"{settings.num_worlds} worlds in JAX", partial(_measure_functional, settings)
+    for model in RIGID if find_spec("mujoco") else ():
+        yield "environments", f"one environment of {model} in MuJoCo", partial(_measure_rigid, settings, model)
     surroundings: dict[Where, tuple[int, ...]] = {"near": settings.obstacles, "far": settings.far_obstacles}
     for where, counts in surroundings.items():
         for count in counts:
@@ -250,6 +260,18 @@ def _measure_env(settings: BenchmarkSettings, num_boxes: int, disturbances: Sequ
     from d4orm_env import navigation_v0
 
     env = navigation_v0.parallel_env(problem=boxed_problem(num_boxes, "near"), disturbances=disturbances)
+    return _rate("parallel_env", 1, num_boxes, disturbances, _measure_steps(settings, env, settings.env_steps))
+
+
+def _measure_rigid(settings: BenchmarkSettings, model: str) -> Row:
+    """The same of rigid bodies in MuJoCo."""
+    env = open_env(circle(8, model, settings.horizon), "mujoco")
+    seconds = _measure_steps(settings, env, max(1, settings.env_steps // 10))
+    return _rate(f"mujoco, {model}", 1, 0, (), seconds)
+
+
+def _measure_steps(settings: BenchmarkSettings, env: ParallelEnv, count: int) -> Spread:
+    """Seconds per step of an environment, ``count`` of them with each repetition."""
     env.reset(seed=0)
     space = env.action_space(env.possible_agents[0])
     random = np.random.default_rng(0)
@@ -259,14 +281,14 @@ def _measure_env(settings: BenchmarkSettings, num_boxes: int, disturbances: Sequ
     ]
 
     def steps() -> None:
-        for index in range(settings.env_steps):
+        for index in range(count):
             if not env.agents:
                 env.reset()
             env.step(table[index % len(table)])
 
     spread = measure(steps, settings.repetitions, settings.time_limit)
     env.close()
-    return _rate("parallel_env", 1, num_boxes, disturbances, spread.times(1 / settings.env_steps))
+    return spread.times(1 / count)
 
 
 def _measure_worlds(settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[Disturbance[Any]] = ()) -> Row:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import typer
+
+N = TypeVar("N", int, float)
 
 MOST_SEEDS = 1_000_000
 """Trials of one policy at most: a slip of the finger must not fill the memory."""
@@ -102,12 +104,7 @@ def numbers(option: str, text: str | None) -> tuple[int, ...] | None:
     Raises:
         ValueError: If it is something else; the message names the option.
     """
-    if text is None:
-        return None
-    try:
-        return tuple(int(number) for number in text.split(","))
-    except ValueError:
-        raise ValueError(f"{option} {text!r} is not a list of whole numbers, as 4,8,16") from None
+    return None if text is None else _listed(option, text, int, "whole numbers, as 4,8,16")
 
 
 def decimals(option: str, text: str) -> tuple[float, ...]:
@@ -116,10 +113,14 @@ def decimals(option: str, text: str) -> tuple[float, ...]:
     Raises:
         ValueError: If it is something else; the message names the option.
     """
+    return _listed(option, text, float, "numbers, as 0,0.05,0.1")
+
+
+def _listed(option: str, text: str, kind: Callable[[str], N], what: str) -> tuple[N, ...]:
     try:
-        return tuple(float(number) for number in text.split(","))
+        return tuple(kind(number) for number in text.split(","))
     except ValueError:
-        raise ValueError(f"{option} {text!r} is not a list of numbers, as 0,0.05,0.1") from None
+        raise ValueError(f"{option} {text!r} is not a list of {what}") from None
 
 
 def seed_list(text: str) -> list[int]:

@@ -28,6 +28,7 @@ class RunOptions(PictureOptions, ProblemOptions):
 
     plan_file: Annotated[Path | None, typer.Argument(help="Plan to execute; plans anew without one.")] = None
     policy: Annotated[str, typer.Option("--policy", "-p", help="Planner, policy or package.module:Name.")] = "d4orm"
+    preset: Annotated[str | None, typer.Option("--preset", help="Preset of the policy, as `paper`.")] = None
     control_noise_std: Annotated[
         float, typer.Option("--control-noise-std", "--noise", help="Standard deviation of the execution noise.")
     ] = 0.0
@@ -73,10 +74,11 @@ class RunOptions(PictureOptions, ProblemOptions):
         from d4orm_planners.registry import make_policy
 
         if self.plan_file is None:
-            return self.problem(), make_policy(self.policy)
+            chosen = {} if self.preset is None else {"preset": self.preset}
+            return self.problem(), make_policy(self.policy, **chosen)
         refuse_options(
             self.context,
-            {"policy", "compare", *(field.name for field in fields(ProblemOptions) if field.name != "seed")},
+            {"policy", "preset", "compare", *(field.name for field in fields(ProblemOptions) if field.name != "seed")},
             f"does not go with a plan file; {self.plan_file} has a problem and controls of its own",
         )
         plan = Plan.load(self.plan_file)
@@ -116,7 +118,7 @@ def compare(options: RunOptions, policies: Sequence[str]) -> None:
 
     if options.out is None:
         raise ValueError("--compare needs --out, the replay to write, as --out compare.html")
-    alone = {"policy", "picture", "animation", "plan_file"}
+    alone = {"policy", "preset", "picture", "animation", "plan_file"}
     refuse_options(options.context, alone, f"does not go with --compare {','.join(policies)}; run that policy alone")
     problem, makers = options.problem(), {name: make_policy(name) for name in policies}
     episodes = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import combinations
 
 import numpy as np
@@ -28,11 +29,11 @@ def safe_velocities(problem: Problem, joint: JointState, wanted: FloatArray, fre
     """Velocities near those wanted, at which everybody can still brake before it touches anything.
 
     Two robots may close in on each other no faster than both together can brake within what is left between them,
-    ``n (v_i - v_j) >= -sqrt(2 (a_i + a_j) (d - gap))``: the braking-distance barrier of Wang, Ames and Egerstedt (Safety
-    barrier certificates for collisions-free multirobot systems, IEEE Trans. Robotics 33, 2017, eq. 4), here for the
-    velocities of the next step; on an obstacle, or a body that obeys nobody, one of them does all the braking. The
-    nearest velocities to those wanted are a least-distance problem, solved by non-negative least squares (Lawson and
-    Hanson, Solving Least Squares Problems, chapter 23).
+    ``n (v_i - v_j) >= -sqrt(2 (a_i + a_j) (d - gap))``: the braking-distance barrier of Wang, Ames and Egerstedt
+    (Safety barrier certificates for collisions-free multirobot systems, IEEE Trans. Robotics 33, 2017), here for the
+    velocities of the next step. On a body that obeys nobody, a side of the bounds, or the nearest obstacle, the robot
+    does all the braking. The nearest velocities to those wanted are a least-distance problem, solved by non-negative
+    least squares (Lawson and Hanson, Solving Least Squares Problems, chapter 23).
 
     Args:
         problem: The robots and obstacles.
@@ -104,11 +105,23 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float) 
                 normal = offset / away
                 room = away - radius[i] - float(body[-1]) - gap
                 add({i: normal}, room, braking[i], float(normal @ body[d : 2 * d]))
-    clearance = problem.world.clearance(places)
-    for i in (robot for robot in able if clearance[robot] < NEAR):
-        around = places[i] + _STEP * np.vstack([np.eye(d), -np.eye(d)])
-        slope = problem.world.clearance(around)
-        normal = slope[:d] - slope[d:]
-        if (length := np.linalg.norm(normal)) > 0:
-            add({i: normal / length}, float(clearance[i] - radius[i] - gap), braking[i])
+    for i, normal, room in _walls(problem, places[able], able):
+        add({i: normal}, room - radius[i] - gap, braking[i])
     return np.array(rows).reshape(-1, count * d), np.array(least)
+
+
+def _walls(problem: Problem, places: Array, robots: list[int]) -> Iterator[tuple[int, Array, float]]:
+    """What stands near robots at ``places`` ``(R, d)``: of which one, the direction away from it, and how far it is."""
+    d, (lower, upper) = problem.dimension, problem.world.bounds.astype(np.float64)
+    axes, nearest = np.eye(d), problem.world.clearance(places)
+    for robot, place, clearance in zip(robots, places, nearest):
+        if clearance >= NEAR:
+            continue
+        sides = np.concatenate([place - lower, upper - place])
+        for side in np.flatnonzero(sides < NEAR):
+            yield robot, axes[side] if side < d else -axes[side - d], float(sides[side])
+        if clearance < sides.min():
+            around = problem.world.clearance(place + _STEP * np.concatenate([axes, -axes]))
+            slope = around[:d] - around[d:]
+            if (length := np.linalg.norm(slope)) > 0:
+                yield robot, slope / length, float(clearance)

@@ -131,12 +131,14 @@ class D4ormC2F(StatePolicy):
     def _evading(self, joint: JointState, controls: FloatArray) -> FloatArray:
         """The controls ``(K, m)``, but for robots that would come to touch something: these brake, or evade."""
         problem, docked = self._deviation.problem, joint.arrived & self._at_goal(joint)
-        gap, left = GAP * problem.margin, self._plan[min(self._next, len(self._plan) - 1) :]
-        touching = self._window.touching(joint, docked, left, gap)
+        gap, now = GAP * problem.margin, min(self._next, len(self._plan) - 1)
+        touching = self._window.touching(joint, docked, self._plan[now:], gap)
         if not touching.any():
             return controls
-        left[:, touching] = self._window.stop(joint, docked)[: len(left), touching]
-        controls = np.where(touching[:, None], left[0], controls)
+        # A late loop may still be reading the plan.
+        self._plan = self._plan.copy()
+        self._plan[now:, touching] = self._window.stop(joint, docked)[: len(self._plan) - now, touching]
+        controls = np.where(touching[:, None], self._plan[now], controls)
         ahead = self._engine.step(problem.resumed_at(joint.states, joint.goals).arrays, joint.states, docked, controls)
         wanted = present_velocities(problem, ahead.states, ahead.controls)
         # Other velocities are reached by the next step, by which everybody will be elsewhere.

@@ -55,8 +55,8 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
         predict_horizon: ``H_predict``, steps that a control loop looks ahead.
         execute_horizon: ``H_execute``, steps executed before the next control loop.
         subgoal_offset: ``m``, waypoints from where the team is to its subgoal.
-        max_lag: Waypoints that a robot may be behind the others without its subgoal staying behind too. ``None`` for any
-            number: the subgoals of all are always those of one moment, as in the paper.
+        max_lag: Waypoints that a robot may be behind the others without its subgoal staying behind too. ``None`` for
+            any number: the subgoals of all are always those of one moment, as in the paper.
         sight: Whether a subgoal behind what stands is exchanged for the furthest waypoint before it that is in sight.
         num_samples: ``M`` of a control loop.
         num_steps: ``N`` of a control loop.

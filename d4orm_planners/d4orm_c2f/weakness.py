@@ -32,7 +32,7 @@ STEP = 0.05
 """Shares of the limits that are told apart."""
 
 
-def effort(problem: Problem, controls: FloatArray) -> NDArray[np.float64]:
+def effort(problem: Problem, controls: FloatArray | NDArray[np.float64]) -> NDArray[np.float64]:
     """``(K,)`` how large controls ``(K, m)`` are, in shares of the robots' limits."""
     limits = np.asarray(problem.team.control_limits, np.float64)
     shares = np.divide(controls, limits, out=np.zeros_like(limits), where=limits > 0)

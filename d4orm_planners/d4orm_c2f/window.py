@@ -229,5 +229,7 @@ def least_gap(problem: Problem, positions: FloatArray) -> float:
     first, second = np.triu_indices(problem.num_robots, 1)
     if not len(first):
         return float("inf")
-    gap2 = ((positions[:, first] - positions[:, second]) ** 2).sum(axis=2)
+    gap2 = np.zeros((len(positions), len(first)), positions.dtype)
+    for axis in range(positions.shape[2]):
+        gap2 += (positions[:, first, axis] - positions[:, second, axis]) ** 2
     return float((np.sqrt(gap2.min(axis=0)) - radius[first] - radius[second]).min())

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
@@ -15,15 +16,30 @@ from d4orm_env.render.panels import robot_colors, view_limits
 from d4orm_planners.play import edits
 from d4orm_planners.play.frame import Frame
 from d4orm_planners.play.session import Session
-from d4orm_planners.play.shapes import NO_LINES, Points, ball, edges, in_space, linear, polylines, puck, solid
+from d4orm_planners.play.shapes import (
+    NO_LINES,
+    Colors,
+    Points,
+    ball,
+    bends,
+    edges,
+    in_space,
+    linear,
+    polylines,
+    puck,
+    solid,
+)
 
 CONTACT, OBSTACLE, BOUND, MARGIN = (208, 2, 27), (150, 156, 166), (90, 98, 110), (200, 60, 60)
 INK, BODY = (20, 24, 30), (120, 124, 134)
 TRAIL_STEPS = 30
 """Steps that a robot's trail goes back."""
 
-TRAIL_SEGMENTS, PLAN_SEGMENTS = 8, 12
-"""Most of a trail, and of a way ahead."""
+TRAIL_SEGMENTS = 8
+"""Lines that a trail consists of."""
+
+PLAN_TOLERANCE = 0.1
+"""How far the line of a way ahead may be off, in radii of a robot."""
 
 LINES_EVERY = 0.1
 """Seconds between new trails and plans."""
@@ -38,7 +54,7 @@ class LaneView:
         index: Which of those that drive.
         frame: What it shows at first.
         place: ``(3,)`` where its origin is on the page [m].
-        shown: Which of ``"plans"``, ``"trails"``, ``"subgoals"`` and ``"margins"`` are shown.
+        shown: What is shown, see :class:`~d4orm_planners.play.view.View`.
     """
 
     def __init__(
@@ -52,10 +68,11 @@ class LaneView:
     ) -> None:
         self._scene, self._session, self._index, self._shown = server.scene, session, index, shown
         self._root = f"/lane_{index}"
-        self._number, self._lines_at = -1, 0.0
+        self._seen, self._lines_at = (-1, False), 0.0
         self._held: dict[tuple[str, int], Points] = {}
         self._trail: list[FloatArray] = []
-        self._colors = 255 * robot_colors(frame.problem.num_robots)
+        self._plan: tuple[FloatArray, list[NDArray[np.intp]]] | None = None
+        self._colors = self._own_colors = 255 * robot_colors(frame.problem.num_robots)
         self._nodes: dict[str, Any] = {"": self._scene.add_frame(self._root, show_axes=False, position=place)}
         self._add_team(frame)
         self._add_world(frame.problem)
@@ -79,9 +96,11 @@ class LaneView:
     def update(self, frame: Frame, now: float) -> None:
         """Show a frame, where the robots are by a time of ``time.perf_counter()``."""
         nodes = self._nodes  # what has not changed is not sent
-        if frame.moment.number != self._number:
-            self._number = frame.moment.number
-            self._trail = [*self._trail[-TRAIL_STEPS:], frame.states[:, : frame.problem.dimension]]
+        seen = (frame.moment.number, self._shown["dark"])
+        if seen != self._seen:
+            if seen[0] != self._seen[0]:
+                self._trail = [*self._trail[-TRAIL_STEPS:], frame.states[:, : frame.problem.dimension]]
+            self._seen = seen
             self._color(frame)
         places = self._with_held("robot", in_space(frame.positions(now)))
         nodes["robots"].batched_positions = places
@@ -214,19 +233,37 @@ class LaneView:
         return (eye + (at[2] - eye[2]) / ray[2] * ray).astype(np.float32)
 
     def _color(self, frame: Frame) -> None:
-        """Red in contact, paler when arrived."""
-        colors = np.where(frame.arrived[:, None], 255 - 0.5 * (255 - self._colors), self._colors)
+        """Red in contact, paler when arrived, all lighter where it is dark."""
+        self._colors = self._own_colors + (0.4 * (255 - self._own_colors) if self._shown["dark"] else 0)
+        colors = np.where(frame.arrived[:, None], 0.5 * (self._paper + self._colors), self._colors)
         colors = np.where(frame.collided[:, None], np.array(CONTACT), colors)
         self._nodes["robots"].batched_colors = linear(colors)
+        self._nodes["goals"].batched_colors = self._nodes["subgoals"].batched_colors = linear(self._colors)
+
+    @property
+    def _paper(self) -> int:
+        """Brightness of what everything is drawn on."""
+        return 20 if self._shown["dark"] else 255
 
     def _draw_lines(self, frame: Frame) -> None:
-        trails = plans = NO_LINES
+        lines = {"trails": NO_LINES, "plans": NO_LINES}
         if len(self._trail) > 1 and self._shown["trails"]:
-            trails = polylines(np.stack(self._trail), self._colors, (0.2, 1.0), TRAIL_SEGMENTS)
+            trail = np.stack(self._trail)
+            taken = np.linspace(0, len(trail) - 1, TRAIL_SEGMENTS + 1).round().astype(np.intp)
+            knots = [np.unique(taken)] * trail.shape[1]
+            lines["trails"] = polylines(trail, self._colors, self._paper, (0.2, 1.0), knots)
         if frame.guidance is not None and len(frame.guidance) > 1 and self._shown["plans"]:
-            plans = polylines(frame.guidance, self._colors, (0.8, 0.25), PLAN_SEGMENTS)
-        for name, (points, colors) in {"trails": trails, "plans": plans}.items():
+            lines["plans"] = self._plan_lines(frame.guidance, frame.problem)
+        for name, (points, colors) in lines.items():
             self._nodes[name].points, self._nodes[name].colors = points, colors
+
+    def _plan_lines(self, path: FloatArray, problem: Problem) -> tuple[Points, Colors]:
+        """Lines of the ways ahead, looked for only when these are others."""
+        if self._plan is None or not np.array_equal(self._plan[0], path):
+            tolerance = PLAN_TOLERANCE * np.asarray(problem.team.radius)
+            knots = [bends(path[:, robot], float(tolerance[robot])) for robot in range(path.shape[1])]
+            self._plan = (path, knots)
+        return polylines(path, self._colors, self._paper, (0.8, 0.25), self._plan[1])
 
     def _headings(self, frame: Frame, places: Points) -> Points:
         """``(N, 2, 3)`` lines from the centre to the front of robots that have one."""

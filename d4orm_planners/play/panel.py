@@ -66,7 +66,7 @@ class Panel:
         with self._gui.add_folder("Another scene", expand_by_default=False):
             self._add_scenes()
         with self._gui.add_folder("Show", expand_by_default=False):
-            self._add_views(server)
+            self._add_views()
         with self._gui.add_folder("Files", expand_by_default=False):
             self._add_files()
 
@@ -156,15 +156,18 @@ class Panel:
 
         self._gui.add_button("Begin").on_click(load)
 
-    def _add_views(self, server: viser.ViserServer) -> None:
+    def _add_views(self) -> None:
         for name in self._view.shown:
             self._add_choice(name)
-        self.dark: Any = self._gui.add_checkbox("Dark", False)
-        self.dark.on_update(lambda _: server.gui.configure_theme(dark_mode=self.dark.value, **THEME))
 
     def _add_choice(self, name: str) -> None:
-        box = self._gui.add_checkbox(name.capitalize(), self._view.shown[name])
-        box.on_update(lambda _: self._view.shown.update({name: box.value}))
+        box: Any = self._gui.add_checkbox(name.capitalize(), self._view.shown[name])
+
+        def choose(_: Any) -> None:
+            self._view.shown[name] = box.value
+            self._gui.configure_theme(dark_mode=self._view.shown["dark"], **THEME)
+
+        box.on_update(choose)
 
     def _add_files(self) -> None:
         scene, replay = self._gui.add_button("Save scene"), self._gui.add_button("Save replay")

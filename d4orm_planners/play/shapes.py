@@ -5,6 +5,7 @@ Few triangles and cheap materials: where a browser has no graphics processor, th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -83,23 +84,42 @@ def edges(bounds: Points) -> Points:
 
 
 def polylines(
-    path: NDArray[Any], colors: NDArray[Any], shares: tuple[float, float], most: int
+    path: NDArray[Any], colors: NDArray[Any], paper: int, shares: tuple[float, float], knots: Sequence[NDArray[np.intp]]
 ) -> tuple[Points, Colors]:
     """Segments along the ways of a team.
 
     Args:
-        path: ``(T, K, d)`` positions, at least two.
+        path: ``(T, K, d)`` positions.
         colors: ``(K, 3)`` up to 255.
-        shares: How much of its colour a way has at its beginning and its end; the rest is white.
-        most: Segments of a way.
+        paper: Brightness of what they are drawn on, up to 255.
+        shares: How much of its colour a way has at its beginning and its end; the rest is paper.
+        knots: Which points of its way each robot's line goes through.
 
     Returns:
         ``(N, 2, 3)`` ends and their colours.
     """
-    taken = np.unique(np.linspace(0, len(path) - 1, most + 1).round().astype(np.intp))
-    places = in_space(path[taken])
-    points = np.stack([places[:-1], places[1:]], axis=2)
-    share = np.linspace(shares[0], shares[1], len(points))
-    faded = 255 - share[:, None, None] * (255 - colors)
-    both = np.repeat(np.broadcast_to(faded, (*points.shape[:2], 3))[:, :, None], 2, axis=2)
-    return points.reshape(-1, 2, 3), linear(both.reshape(-1, 2, 3))
+    places, share = in_space(path), np.linspace(shares[0], shares[1], len(path))[:, None]
+    points, tones = [NO_LINES[0]], [NO_LINES[1].astype(np.float64)]
+    for robot, taken in enumerate(knots):
+        way, tone = places[taken, robot], paper + share[taken] * (colors[robot] - paper)
+        points.append(np.stack([way[:-1], way[1:]], axis=1))
+        tones.append(np.stack([tone[:-1], tone[1:]], axis=1))
+    return np.concatenate(points), linear(np.concatenate(tones))
+
+
+def bends(way: NDArray[Any], tolerance: float) -> NDArray[np.intp]:
+    """Indices of a few points that tell a way ``(T, d)`` to within a tolerance [m] (Ramer, Douglas and Peucker)."""
+    kept, open_parts = {0, len(way) - 1}, [(0, len(way) - 1)]
+    while open_parts:
+        first, last = open_parts.pop()
+        if last - first < 2:
+            continue
+        along, off = way[last] - way[first], way[first + 1 : last] - way[first]
+        share = np.clip(off @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
+        distance = np.linalg.norm(off - share[:, None] * along, axis=1)
+        farthest = int(distance.argmax())
+        if distance[farthest] > tolerance:
+            middle = first + 1 + farthest
+            kept.add(middle)
+            open_parts += [(first, middle), (middle, last)]
+    return np.array(sorted(kept), np.intp)

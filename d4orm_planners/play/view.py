@@ -9,6 +9,7 @@ import numpy as np
 import viser
 
 from d4orm_env.render.panels import view_limits
+from d4orm_planners.play.camera import Camera
 from d4orm_planners.play.frame import Frame
 from d4orm_planners.play.lane_view import LaneView
 from d4orm_planners.play.session import Session
@@ -26,12 +27,13 @@ class View:
         session: What is shown, and changed by dragging.
 
     Attributes:
-        shown: Which of ``"plans"``, ``"trails"``, ``"subgoals"`` and ``"margins"`` are shown.
+        shown: Which of ``"plans"``, ``"trails"``, ``"subgoals"`` and ``"margins"`` are, and whether on ``"dark"``.
     """
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._server, self._session = server, session
-        self.shown = {"plans": True, "trails": True, "subgoals": False, "margins": False}
+        self.shown = {"plans": True, "trails": True, "subgoals": False, "margins": False, "dark": False}
+        self._camera = Camera(server)
         self._lanes: list[LaneView] = []
         self._built: object = None
         self._looked_at: object = None
@@ -68,7 +70,7 @@ class View:
         if scene != self._looked_at:
             self._looked_at = scene
             corners = limits + places[:, None]
-            _look_at(self._server, np.stack([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))]), problem.dimension)
+            self._camera.show(np.stack([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))]), problem.dimension)
 
 
 def _places(number: int, limits: Points) -> Points:
@@ -77,19 +79,3 @@ def _places(number: int, limits: Points) -> Points:
     row, column = np.divmod(np.arange(number), columns)
     size = (1 + GAP) * np.ptp(limits, axis=0)
     return np.stack([column * size[0], -row * size[1], 0.0 * row], axis=1).astype(np.float32)
-
-
-def _look_at(server: viser.ViserServer, limits: Points, dimension: int) -> None:
-    """Show all between two corners: from above in the plane, from the side in space."""
-    centre, size = limits.mean(axis=0), float(np.ptp(limits, axis=0).max())
-    flat = dimension == 2
-    # The controls lie on the right.
-    centre += 0.15 * size * (np.array([1, 0, 0]) if flat else np.array([0.79, 0.61, 0]))
-    eye = centre + size * (np.array([0, 0, 1.9]) if flat else np.array([1.0, -1.3, 0.9]))
-    up = (0.0, 1.0, 0.0) if flat else (0.0, 0.0, 1.0)
-    server.scene.set_up_direction(up)
-    camera = server.initial_camera
-    camera.position, camera.look_at, camera.up, camera.fov = eye, centre, up, np.deg2rad(35)
-    for client in server.get_clients().values():
-        client.camera.up_direction = up
-        client.camera.position, client.camera.look_at = eye, centre

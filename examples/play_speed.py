@@ -1,0 +1,176 @@
+"""How fast `d4orm play` is: control loops, frames that are sent and drawn, and from a drop to the new plan.
+
+    python examples/play_speed.py --seconds 30
+    python examples/play_speed.py --seconds 30 --browser
+    python examples/play_speed.py --minutes 20 --browser
+
+A team with lifelong goals is driven live, and somebody looks at it: a client that draws nothing, or with `--browser`
+headless Chromium, which without a graphics processor draws on the processor that plans. Where Chromium runs, the time
+that it takes is part of the measurement.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from outputs import require
+
+require("viz", "viser")
+
+import viser
+import zstandard
+from websockets.sync.client import connect
+
+from d4orm_env import make_problem
+from d4orm_planners.play import edits
+from d4orm_planners.play.playground import Playground
+from d4orm_planners.play.session import Session
+
+
+class Client:
+    """Somebody who receives what is sent, and draws nothing."""
+
+    def __init__(self, address: str) -> None:
+        protocols: Any = [f"viser-v{viser.__version__}"]
+        self._socket = connect(address.replace("http", "ws"), subprotocols=protocols, max_size=None)
+        self._ended = threading.Event()
+        self._received = 0
+        self._thread = threading.Thread(target=self._receive, daemon=True)
+        self._thread.start()
+
+    def _receive(self) -> None:
+        while not self._ended.is_set():
+            data = self._socket.recv()
+            assert isinstance(data, bytes)
+            size = int.from_bytes(data[8:16], "little")
+            self._received += b"/robots" in zstandard.decompress(data[16 : 16 + size])
+
+    def frames(self) -> dict[str, float]:
+        """How many there were up to now."""
+        return {"frames received": self._received}
+
+    def close(self) -> None:
+        self._ended.set()
+        self._thread.join()  # more is sent all the time
+        self._socket.close()
+
+
+class Browser:
+    """A browser that draws."""
+
+    def __init__(self, page: Any, address: str) -> None:
+        self._page = page
+        page.look(1200, 800)
+        page.open(address)
+        page.until("document.body.textContent.includes(' robots, ') && window.__viserTestpoints !== undefined")
+        page.evaluate("window.drawn = 0; (function count() { drawn++; requestAnimationFrame(count); })()")
+
+    def frames(self) -> dict[str, float]:
+        """How many there were up to now: chances to draw, and scenes drawn."""
+        chances, scenes = self._page.evaluate("[drawn, __viserTestpoints.rendererInfo.render.frame]")
+        return {"animation frames": chances, "scenes drawn": scenes}
+
+
+@contextmanager
+def looking(address: str, in_browser: bool) -> Iterator[Client | Browser]:
+    """Somebody who looks."""
+    if not in_browser:
+        client = Client(address)
+        yield client
+        client.close()
+        return
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+    import browser_support
+
+    if browser_support.missing():
+        sys.exit(f"--browser {browser_support.missing()}")
+    with TemporaryDirectory(ignore_cleanup_errors=True) as folder, browser_support.browser(Path(folder)) as page:
+        yield Browser(page, address)
+
+
+def watch(session: Session, seconds: float) -> list[float]:
+    """The control loops of so many seconds [s]."""
+    loops, last, end = [], session.frame.moment.time, time.perf_counter() + seconds
+    while time.perf_counter() < end:
+        if (moment := session.frame.moment).time != last:
+            last = moment.time
+            loops.append(session.frame.loop)
+        time.sleep(0.005)
+    return loops
+
+
+def drop(session: Session, random: np.random.Generator) -> float:
+    """Seconds from a goal's being dropped to the first frame with the new plan."""
+    goals = session.frame.goals
+    begin = time.perf_counter()
+    session.edit(lambda scene: edits.move_goal(scene, 0, random.uniform(-1.2, 1.2, scene.dimension)))
+    while np.array_equal(session.frame.goals[0], goals[0]):
+        if session.frame.moment.message or time.perf_counter() - begin > 60:
+            return drop(session, random)  # somebody is there already
+        time.sleep(0.001)
+    return time.perf_counter() - begin
+
+
+def memory() -> float:
+    """What this process holds [MB], on Linux."""
+    pages = Path("/proc/self/statm")
+    return int(pages.read_text().split()[1]) * 4096 / 1e6 if pages.exists() else float("nan")
+
+
+def measure(arguments: argparse.Namespace) -> None:
+    """Play, and print what was measured."""
+    problem = make_problem(arguments.scenario, num_robots=arguments.num_robots, seed=0)
+    playground = Playground(problem, *arguments.policy.split(","))
+    session = playground.session
+    session.set_lifelong(True)
+    thread = threading.Thread(target=playground.run)
+    thread.start()
+    try:
+        with looking(playground.address, arguments.browser) as somebody:
+            watch(session, arguments.warmup)
+            seconds = 60 * arguments.minutes or arguments.seconds
+            before, held, begin = somebody.frames(), memory(), time.perf_counter()
+            loops = 1e3 * np.array(watch(session, seconds))
+            passed, after = time.perf_counter() - begin, somebody.frames()
+            drops = [drop(session, np.random.default_rng(seed)) for seed in range(arguments.drops)]
+            print(f"{problem.name}, {problem.num_robots} robots, {', '.join(session.policies)}: {passed:.0f} s")
+            for name, number in after.items():
+                print(f"{name}: {(number - before[name]) / passed:.1f} per second")
+            print(f"steps: {len(loops) / passed:.1f} of {1 / problem.dt:.0f} per second")
+            middle, late, most, step = np.median(loops), np.percentile(loops, 95), loops.max(), 1e3 * problem.dt
+            print(
+                f"control loop: median {middle:.0f} ms, 95% {late:.0f} ms, most {most:.0f} ms, "
+                f"{100 * np.mean(loops > step):.1f}% over {step:.0f} ms"
+            )
+            print(f"from a drop to the new plan: median {np.median(drops):.2f} s, most {max(drops):.2f} s")
+            print(f"memory: {held:.0f} to {memory():.0f} MB; contacts now: {int(session.frame.collided.sum())}")
+    finally:
+        playground.stop()
+        thread.join()
+        playground.close()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenario", default="circle")
+    parser.add_argument("--num-robots", type=int, default=16)
+    parser.add_argument("--policy", default="d4orm-c2f", help="several, separated by commas, drive side by side")
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--minutes", type=float, default=0.0, help="instead of seconds")
+    parser.add_argument("--warmup", type=float, default=5.0, help="seconds before")
+    parser.add_argument("--drops", type=int, default=5)
+    parser.add_argument("--browser", action="store_true", help="measure in headless Chromium")
+    measure(parser.parse_args())
+
+
+if __name__ == "__main__":
+    main()

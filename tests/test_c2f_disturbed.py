@@ -1,0 +1,246 @@
+"""What D4orm-C2F finds out while things go wrong: lateness, noise, weakness, who stands; and its last resort."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from planner_support import hop_problem
+
+from d4orm_env import navigation_v0
+from d4orm_env.core.problem import Problem
+from d4orm_env.disturbances import Bias, Delay, LimitMismatch, Push, Stall, StateDelay
+from d4orm_env.engine.choice import get_engine
+from d4orm_env.joint_state import JointState
+from d4orm_env.scenarios import make_problem
+from d4orm_planners import make_policy, run_episode
+from d4orm_planners.d4orm_c2f.barrier import safe_velocities
+from d4orm_planners.d4orm_c2f.filtering import StateFilter
+from d4orm_planners.d4orm_c2f.lateness import MOST, Lateness
+from d4orm_planners.d4orm_c2f.policy import D4ormC2F
+from d4orm_planners.d4orm_c2f.standing import AFTER, Standing
+from d4orm_planners.d4orm_c2f.weakness import Weakness
+from d4orm_planners.steering import track_velocities
+
+ALL = np.ones(3, bool)
+
+
+def controller(**config: Any) -> D4ormC2F:
+    policy = make_policy("d4orm-c2f", **{"engine": "cpu", "refine": "off", **config})
+    assert isinstance(policy, D4ormC2F)
+    return policy
+
+
+def joint(problem: Any, states: Any, **parts: Any) -> JointState:
+    nothing = np.zeros((problem.num_robots, problem.control_size), np.float32)
+    given = {"controls": nothing, "arrived": np.zeros(problem.num_robots, bool), "steps": 0}
+    return JointState(**{"states": np.asarray(states, np.float32), "goals": problem.goal, **given, **parts})
+
+
+@given(late=st.integers(0, MOST), noise=st.floats(0, 0.3), seed=st.integers(0, 1000))
+@settings(max_examples=25, deadline=None)
+def test_how_late_commands_are_is_found_out(late: int, noise: float, seed: int) -> None:
+    random, lateness = np.random.default_rng(seed), Lateness(3, 2, None)
+    sent = [np.zeros((3, 2), np.float32)] * (late + 1)
+    for _ in range(60):
+        executed = sent[-1 - late] + random.normal(0, noise, (3, 2)) * (len(sent) > late + 1)
+        lateness.observe(executed.astype(np.float32), ALL)
+        sent.append(random.normal(size=(3, 2)).astype(np.float32))
+        np.testing.assert_array_equal(lateness.send(sent[-1]), sent[-1 - lateness.steps])
+    assert lateness.steps == late
+    assert len(lateness.under_way) == late
+    under_way = np.reshape(lateness.under_way, (late, 3, 2))
+    np.testing.assert_array_equal(under_way, np.reshape(sent[len(sent) - late :], (late, 3, 2)))
+
+
+def test_a_lateness_that_is_known_stays() -> None:
+    lateness = Lateness(3, 2, 2)
+    for number in range(5):
+        lateness.observe(np.full((3, 2), number - 1, np.float32), ALL)
+        lateness.send(np.full((3, 2), number, np.float32))
+    assert lateness.steps == 2
+
+
+def drifting(walk: float, noise: float, steps: int = 300) -> tuple[Any, Any, StateFilter]:
+    """True places, estimated ones of one coordinate, and the filter, of robots that drift and are measured."""
+    random, filter_ = np.random.default_rng(3), StateFilter(hop_problem(3))
+    truth = np.cumsum(random.normal(0, walk, (steps, 3, 4)), axis=0)
+    seen = (truth + random.normal(0, noise, truth.shape)).astype(np.float32)
+    estimates = [seen[0]]
+    for before, now in pairwise(seen):
+        estimates.append(filter_.update(now, before, estimates[-1], ALL))
+    return truth, np.array(estimates), filter_
+
+
+@pytest.mark.parametrize(("walk", "noise"), [(0.001, 0.02), (0.01, 0.02), (0.02, 0.02)])
+def test_noise_on_states_is_told_from_motion_and_filtered(walk: float, noise: float) -> None:
+    truth, estimates, filter_ = drifting(walk, noise)
+    # The gain of the steady state, from the variances themselves (Bar-Shalom et al., section 5.2.5).
+    ahead = (walk**2 + np.sqrt(walk**4 + 4 * walk**2 * noise**2)) / 2
+    expected = max(ahead / (ahead + noise**2), 0.1)
+    np.testing.assert_allclose(filter_.gains().mean(), expected, atol=0.15)
+    error = np.sqrt(((estimates - truth)[50:] ** 2).mean())
+    assert error < 0.95 * noise
+
+
+def test_states_that_are_known_are_taken_as_they_are() -> None:
+    """But for some that chance has look like noisy ones, of which nearly all is believed."""
+    truth, estimates, filter_ = drifting(0.02, 0.0)
+    assert np.median(filter_.gains()) == 1
+    assert filter_.gains().min() > 0.8
+    assert np.abs(estimates - truth).max() < 0.02
+
+
+@pytest.mark.parametrize("share", [1.0, 0.8, 0.5])
+def test_robots_that_do_less_than_asked_are_believed_to_be_weaker(share: float) -> None:
+    problem, random = hop_problem(3), np.random.default_rng(0)
+    weakness = Weakness(problem)
+    for _ in range(30):
+        angle = random.uniform(0, 2 * np.pi, 3)
+        told = np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
+        weakness.observe(told, share * told, ALL)
+    for name in ("max_speed", "max_acceleration", "max_turn_rate"):
+        believed = getattr(weakness.problem.team, name) / getattr(problem.team, name)
+        np.testing.assert_allclose(believed, share, rtol=1e-5)
+
+
+def test_what_is_added_to_commands_is_kept_back() -> None:
+    problem, random = hop_problem(3), np.random.default_rng(0)
+    weakness = Weakness(problem)
+    for _ in range(60):
+        told = random.uniform(-0.5, 0.5, (3, 2)).astype(np.float32)
+        weakness.observe(told, told + np.array([[0, 0], [0.12, 0], [0, -0.22]], np.float32), ALL)
+    np.testing.assert_allclose(weakness.problem.team.max_acceleration, [1, 0.9, 0.8], rtol=1e-5)
+
+
+def test_who_stands_whatever_it_is_told_is_taken_for_docked_until_it_moves() -> None:
+    problem = hop_problem(3)
+    standing, states = Standing(problem), problem.start.copy()
+    told = np.array([[0.8, 0], [0.8, 0], [0.0, 0]], np.float32)
+    executed = np.array([[0.8, 0], [0.0, 0], [0.0, 0]], np.float32)
+    for step in range(AFTER + 1):
+        assert standing.robots.tolist() == [False, step >= AFTER, False]
+        seen = standing.observe(joint(problem, states, controls=executed), told)
+    np.testing.assert_array_equal(seen.arrived, [False, True, False])
+    np.testing.assert_array_equal(seen.goals[1], states[1, :2])
+    np.testing.assert_array_equal(seen.goals[[0, 2]], problem.goal[[0, 2]])
+    states[1, 0] += 0.2
+    assert not standing.observe(joint(problem, states, controls=executed), told).arrived.any()
+
+
+@given(seed=st.integers(0, 10**6))
+@settings(max_examples=40, deadline=None)
+def test_two_robots_that_follow_safe_velocities_never_touch(seed: int) -> None:
+    """They want to go anywhere, mostly through each other."""
+    random = np.random.default_rng(seed)
+    start = np.zeros((2, 4), np.float32)
+    start[:, :2] = np.array([[1, 0], [-1, 0]]) + random.uniform(-0.4, 0.4, (2, 2))
+    problem = Problem(hop_problem(2).team, start, -start[:, :2], horizon=60)
+    engine, states, free = get_engine("cpu"), problem.start, np.ones(2, bool)
+    for step in range(60):
+        if step % 15 == 0:
+            towards = states[::-1, :2] - states[:, :2] + random.uniform(-0.5, 0.5, (2, 2))
+            wanted = (towards / np.linalg.norm(towards, axis=1, keepdims=True)).astype(np.float32)
+        present = joint(problem, states)
+        ahead = engine.step(problem.arrays, states, ~free, track_velocities(problem, states, wanted))
+        safe = safe_velocities(problem, present._replace(states=ahead.states), ahead.states[:, 2:], free, 0.05)
+        result = engine.step(problem.arrays, states, ~free, track_velocities(problem, states, safe))
+        states = result.states
+        assert not result.collided.any()
+
+
+def test_velocities_that_are_safe_are_left_alone() -> None:
+    problem = hop_problem(3)
+    wanted = np.array([[0.5, 0], [0.5, 0], [0.5, 0]], np.float32)
+    np.testing.assert_array_equal(safe_velocities(problem, joint(problem, problem.start), wanted, ALL, 0.02), wanted)
+
+
+def test_who_cannot_be_told_anything_is_driven_around() -> None:
+    """Two robots face each other 4 cm apart; one of them stands."""
+    problem, states = hop_problem(2), np.zeros((2, 4), np.float32)
+    states[1, 0] = 0.34
+    wanted = np.array([[0.5, 0], [0, 0]], np.float32)
+    safe = safe_velocities(problem, joint(problem, states), wanted, np.array([True, False]), 0.02)
+    np.testing.assert_allclose(safe, np.array([[np.sqrt(2 * 0.02), 0], [0, 0]]), atol=1e-4)
+    states[1, 0] = 0.31
+    parting = safe_velocities(problem, joint(problem, states), wanted, np.array([True, False]), 0.02)
+    np.testing.assert_allclose(parting, [[-2 * 0.01, 0], [0, 0]], atol=1e-4)
+
+
+def test_an_intruder_is_made_way_for() -> None:
+    problem = hop_problem(1)
+    body = np.array([[0.32, 0, -0.5, 0, 0.15]], np.float32)
+    present = joint(problem, problem.start, bodies=body)
+    safe = safe_velocities(problem, present, np.zeros((1, 2), np.float32), np.ones(1, bool), 0.02)
+    np.testing.assert_allclose(safe, [[-0.5, 0]], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("disturbance", "late"), [(Delay(2), 2), (Delay(0), 0), (StateDelay(1), 1)], ids=["delay", "none", "seen late"]
+)
+def test_an_episode_tells_how_late_commands_are(disturbance: Any, late: int) -> None:
+    policy = controller()
+    env = navigation_v0.parallel_env(problem=make_problem("circle", num_robots=4), disturbances=[disturbance])
+    executed = run_episode(env, policy, seed=0)
+    assert executed.metrics["success"], executed.metrics
+    assert policy._deviation.lateness.steps == late
+
+
+@pytest.mark.parametrize("scenario", ["circle", "random"])
+@pytest.mark.parametrize(
+    "disturbance", [Push(0.4, 0.3), LimitMismatch(0.7), Bias(0.15)], ids=lambda one: type(one).__name__
+)
+def test_robots_come_home_disturbed(scenario: str, disturbance: Any) -> None:
+    problem = make_problem(scenario, num_robots=6, seed=2)
+    executed = run_episode(
+        navigation_v0.parallel_env(problem=problem, disturbances=[disturbance]), controller(), seed=1
+    )
+    assert executed.metrics["success"], executed.metrics
+
+
+def test_a_robot_that_has_stalled_is_driven_around() -> None:
+    problem = make_problem("circle", num_robots=6)
+    env = navigation_v0.parallel_env(problem=problem, disturbances=[Stall(1.0, robots=1)])
+    policy = controller()
+    executed = run_episode(env, policy, seed=2)
+    assert policy._deviation.standing is not None
+    assert policy._deviation.standing.robots.sum() == 1
+    assert not executed.trajectory.collided.any()
+    np.testing.assert_array_equal(executed.trajectory.arrived[-1], ~policy._deviation.standing.robots)
+
+
+@pytest.mark.parametrize("model", ["holonomic2d", "differential_drive", "velocity2d"])
+def test_finding_out_changes_nothing_while_all_is_as_believed(model: str) -> None:
+    problem = make_problem("circle", num_robots=4, model=model)
+    known = {"delay": 0, "filter_states": False, "learn_limits": False, "stalls": False, "last_resort": False}
+    plain, watchful = (
+        run_episode(navigation_v0.parallel_env(problem=problem), controller(**config), seed=0) for config in (known, {})
+    )
+    np.testing.assert_array_equal(watchful.trajectory.states, plain.trajectory.states)
+
+
+def test_the_paper_preset_is_algorithm_4() -> None:
+    policy = make_policy("d4orm-c2f", preset="paper", engine="cpu", refine="sync", num_steps=10, coarse_steps=30)
+    assert isinstance(policy, D4ormC2F)
+    executed = run_episode(navigation_v0.parallel_env(problem=make_problem("circle", num_robots=3)), policy, seed=0)
+    assert executed.metrics["success"], executed.metrics
+    config = policy.config
+    assert (config.num_samples, config.coarse_samples, config.credit, config.penalty) == (1024, 1024, "team", 1.0)
+    planner = policy._guide._planner.config
+    assert (planner.decoupling, planner.start, planner.credit, planner.weight_cutoff) == ("groups", "team", "team", 0.0)
+    assert not any(loop.replanned for loop in policy.loops)
+    # Line 7: one waypoint for the whole team.
+    np.testing.assert_array_equal(policy.subgoals, policy.guidance.path[policy.loops[-1].subgoal_index])
+
+
+def test_a_preset_of_a_policy_may_be_changed_and_must_exist() -> None:
+    policy = make_policy("d4orm-c2f", preset="paper", penalty=3.0)
+    assert (policy.config.penalty, policy.config.safe_mix) == (3.0, False)  # type: ignore[attr-defined]
+    with pytest.raises(ValueError, match="preset 'nope' of policy 'd4orm-c2f' is unknown; choose one of paper"):
+        make_policy("d4orm-c2f", preset="nope")
+    with pytest.raises(TypeError, match="preset"):
+        make_policy("orca", preset="paper")
