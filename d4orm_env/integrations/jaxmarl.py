@@ -21,7 +21,8 @@ try:
     from jaxmarl.environments.multi_agent_env import MultiAgentEnv
     from jaxmarl.environments.spaces import Box
 except ModuleNotFoundError as error:
-    raise ImportError(f"this integration needs {error.name}; install it with: pip install jaxmarl") from None
+    missing = (error.name or "jaxmarl").partition(".")[0]
+    raise ImportError(f"this integration needs {missing}; install it with: pip install jaxmarl") from None
 
 __all__ = ["JaxMARLNavigation"]
 
