@@ -5,6 +5,7 @@
 >>> problem = make_problem("circle", num_robots=8)
 >>> state = functional.reset(problem, jax.random.key(0))
 >>> state, step = jax.jit(functional.step)(problem, state, controls)
+>>> observations = functional.observe(problem, state, ObservationLayout.for_problem(problem))
 
 Importing this module registers :class:`~d4orm_env.core.problem.Problem` as a JAX pytree: a problem is an ordinary
 traced argument, whose starts, goals, limits and obstacles may be mapped over or differentiated. Models, shapes and the
@@ -21,14 +22,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.robot_model import STANDARD_LIMITS
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.engine.jax import Worlds, advance_worlds, judge
+from d4orm_env.engine.jax import Worlds, advance_worlds, goal_distance, judge
+from d4orm_env.engine.jax_observation import observe_team
+from d4orm_env.rewards import RewardFunction, RewardInput, find_reward
 
-__all__ = ["State", "Step", "reset", "step"]
+__all__ = ["State", "Step", "observe", "reset", "step"]
 
 
 class State(NamedTuple):
@@ -38,11 +42,13 @@ class State(NamedTuple):
         states: ``(K, n)``.
         arrived: ``(K,)`` bool, docked.
         steps: ``()`` int32, steps taken.
+        controls: ``(K, m)`` executed last, zero after a reset: what the speed of first-order robots is read from.
     """
 
     states: jax.Array
     arrived: jax.Array
     steps: jax.Array
+    controls: jax.Array
 
 
 class Step(NamedTuple):
@@ -55,6 +61,7 @@ class Step(NamedTuple):
         margin_violated: ``(K,)`` bool.
         truncated: ``()`` bool, the horizon is reached.
         controls: ``(K, m)`` as executed.
+        distances: ``(K,)`` to the goals [m].
     """
 
     rewards: jax.Array
@@ -63,6 +70,7 @@ class Step(NamedTuple):
     margin_violated: jax.Array
     truncated: jax.Array
     controls: jax.Array
+    distances: jax.Array
 
 
 def reset(problem: Problem, key: jax.Array) -> State:
@@ -77,33 +85,90 @@ def reset(problem: Problem, key: jax.Array) -> State:
     """
     del key
     num_robots = len(problem.team.models)
-    return State(jnp.asarray(problem.start), jnp.zeros(num_robots, bool), jnp.int32(0))
+    idle = jnp.zeros((num_robots, problem.control_size))
+    return State(jnp.asarray(problem.start), jnp.zeros(num_robots, bool), jnp.int32(0), idle)
 
 
-def step(problem: Problem, state: State, controls: ArrayLike) -> tuple[State, Step]:
+def step(
+    problem: Problem, state: State, controls: ArrayLike, reward: str | RewardFunction = "paper"
+) -> tuple[State, Step]:
     """One time step, as every engine takes it.
 
     Args:
         problem: The problem.
         state: Where the team is.
         controls: ``(K, m)``, clipped here.
+        reward: ``"paper"``, ``"training"``, or a function of a :class:`~d4orm_env.rewards.RewardInput` that JAX can
+            trace; static.
 
     Returns:
         The next state and what happened.
+
+    Raises:
+        ValueError: If there is no such reward.
     """
+    function = find_reward(reward)
     arrays = _arrays(problem)
+    d = arrays.goal.shape[1]
     worlds = Worlds(state.states[..., None], state.arrived[..., None], jnp.zeros_like(controls)[..., None])
     worlds = advance_worlds(problem.team.models, arrays, worlds, jnp.asarray(controls)[..., None])
-    collided, margin_violated, rewards = judge(arrays, worlds.state[:, : arrays.goal.shape[1]])
+    collided, margin_violated, rewards = judge(arrays, worlds.state[:, :d])
+    before, after = (goal_distance(arrays, states[:, :d])[:, 0] for states in (state.states[..., None], worlds.state))
     steps = state.steps + 1
-    return State(worlds.state[..., 0], worlds.docked[..., 0], steps), Step(
+    happened = Step(
         rewards[:, 0],
         worlds.docked[:, 0],
         collided[:, 0],
         margin_violated[:, 0],
         steps >= problem.horizon,
         worlds.control[..., 0],
+        after,
     )
+    following = State(worlds.state[..., 0], worlds.docked[..., 0], steps, happened.controls)
+    if function is None:
+        return following, happened
+    traced: dict[str, Any] = {
+        "previous_states": state.states,
+        "states": following.states,
+        "controls": happened.controls,
+        "goals": arrays.goal,
+        "previous_distances": before,
+        "distances": after,
+        "initial_distances": 1 / arrays.inverse_initial_distance,
+        "previously_arrived": state.arrived,
+        "arrived": following.arrived,
+        "collided": happened.collided,
+        "margin_violated": happened.margin_violated,
+        "paper": happened.rewards,
+    }
+    transition = RewardInput(**traced, team=problem.team, dt=problem.dt)
+    return following, happened._replace(rewards=jnp.asarray(function(transition)))
+
+
+def observe(problem: Problem, state: State, layout: ObservationLayout, max_cycles: int | None = None) -> jax.Array:
+    """What every robot sees, as in the environments.
+
+    Args:
+        problem: The problem.
+        state: Where the team is.
+        layout: What observations are made of, as ``ObservationLayout.for_problem(problem)``; static.
+        max_cycles: Steps until truncation; the problem's horizon unless given.
+
+    Returns:
+        ``(K, D)``.
+
+    Raises:
+        ValueError: If the layout has the shortest free way, which is not known here.
+    """
+    if layout.observed_way:
+        raise ValueError("the functional API does not know the shortest free ways; leave observed_way out")
+    cycles = problem.horizon if max_cycles is None else max_cycles
+    time_left = jnp.maximum(0, 1 - state.steps / cycles)
+    world = Worlds(state.states, state.arrived, state.controls)
+    arrays = _arrays(problem)
+    if problem.world.lower is None:
+        arrays = arrays._replace(bounds=None)  # type: ignore[arg-type] # there is nothing to see of them
+    return observe_team(problem.team.models, arrays, world, layout, time_left)
 
 
 def _arrays(problem: Problem) -> ProblemArrays:

@@ -81,10 +81,11 @@ class EnvOptions:
         own = [attribute.name for attribute in fields(cls) if attribute.name != "scenario_settings"]
         given = {name: arguments.pop(name) for name in own if name in arguments}
         options = cls(**given, scenario_settings=arguments)
-        if arguments:
-            complaint = unknown_argument(None if options.problem is not None else options._scenario, arguments, own)
+        for name in arguments:
+            complaint = unknown_argument(None if options.problem is not None else options._scenario, (name,), own)
             if complaint:
-                raise UnknownKeywordError(complaint)
+                # In Python's words first, by which TorchRL knows that it can do without an argument of its own.
+                raise UnknownKeywordError(f"unexpected keyword argument {name!r}: {complaint}")
         options._check()
         return options
 

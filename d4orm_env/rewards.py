@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -93,6 +94,8 @@ class TrainingReward:
         margin: Taken off in every step within the margin of anything.
         contact: Taken off in every step in contact with anything.
         time: Taken off in every step.
+
+    The infos of the environments have each term as it was paid, ``reward_progress`` and so on.
     """
 
     progress: float = 0.3
@@ -100,18 +103,22 @@ class TrainingReward:
     margin: float = 1.0
     contact: float = 3.0
     time: float = 0.05
+    term_names: ClassVar[tuple[str, ...]] = ("progress", "arrival", "margin", "contact", "time")
 
     def __call__(self, step: RewardInput) -> FloatArray:
-        """``(..., K)``."""
-        longest = step.team.max_speed * step.dt
-        rewards: FloatArray = (
-            self.progress * (step.previous_distances - step.distances) / longest
-            + self.arrival * step.arrived
-            - self.margin * step.margin_violated
-            - self.contact * step.collided
-            - self.time
-        ) * ~step.previously_arrived
-        return rewards
+        """``(..., K)``, the sum of :meth:`terms`."""
+        return sum(self.terms(step).values())  # type: ignore[return-value] # there are some
+
+    def terms(self, step: RewardInput) -> dict[str, FloatArray]:
+        """``(..., K)`` each, by the names of the weights."""
+        longest, acting = step.team.max_speed * step.dt, ~step.previously_arrived
+        return {
+            "progress": self.progress * (step.previous_distances - step.distances) / longest * acting,
+            "arrival": self.arrival * step.arrived * acting,
+            "margin": -self.margin * step.margin_violated * acting,
+            "contact": -self.contact * step.collided * acting,
+            "time": -self.time * acting,
+        }
 
 
 def paper_reward(step: RewardInput) -> FloatArray:
@@ -164,6 +171,28 @@ def find_reward(reward: str | RewardFunction) -> RewardFunction | None:
             f"reward {shown(reward)} is unknown; choose one of {', '.join(REWARDS)}, or a function of a RewardInput"
         )
     return REWARDS[reward]
+
+
+def term_names(function: RewardFunction | None) -> tuple[str, ...]:
+    """What a reward that has ``terms`` calls them; others have none."""
+    return tuple(getattr(function, "term_names", ()))
+
+
+def no_terms(function: RewardFunction | None, shape: tuple[int, ...]) -> dict[str, FloatArray]:
+    """The terms of a reward where nothing was paid, each of a shape."""
+    return {name: np.zeros(shape, np.float32) for name in term_names(function)}
+
+
+def compute_terms(function: RewardFunction | None, step: RewardInput) -> dict[str, FloatArray]:
+    """``(..., K)`` float32 each: what a reward was made of, if it says so.
+
+    Raises:
+        ValueError: If a term has another shape, or a value that is not finite.
+    """
+    if not term_names(function):
+        return {}
+    terms = function.terms(step)  # type: ignore[union-attr] # it has names for them
+    return {name: compute_rewards(lambda _, name=name: terms[name], step) for name in term_names(function)}  # type: ignore[misc]
 
 
 def compute_rewards(function: RewardFunction, step: RewardInput) -> FloatArray:

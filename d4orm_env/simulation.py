@@ -27,7 +27,16 @@ from d4orm_env.episode_record import EpisodeRecord
 from d4orm_env.joint_state import JointState, join_state, state_bounds
 from d4orm_env.lifelong import fresh_goal, goal_region, reached_goals
 from d4orm_env.options import EnvOptions
-from d4orm_env.rewards import RewardFunction, RewardInput, along_ways, compute_rewards, find_reward, paper_reward
+from d4orm_env.rewards import (
+    RewardFunction,
+    RewardInput,
+    along_ways,
+    compute_rewards,
+    compute_terms,
+    find_reward,
+    no_terms,
+    paper_reward,
+)
 from d4orm_env.team_step import TeamStep
 from d4orm_env.ways import observe_ways
 
@@ -164,6 +173,7 @@ class Simulation:
         self._disturb(seed)
         self.collided, margin_violated = self._contacts()
         self.record = EpisodeRecord(problem.num_robots, problem.dt, self.lifelong)
+        self._terms = no_terms(self.reward, (problem.num_robots,))
         self._trail: deque[FloatArray] = deque([self.states[:, : self._dimension]], _TRAIL_LENGTH)
         self._running = True
         return self._report(np.zeros(problem.num_robots, np.float32), self.arrived.copy(), margin_violated)
@@ -225,6 +235,7 @@ class Simulation:
         shape = self.problem.start.shape
         self.states = checked_states(self.problem, states, self.arrived & self.problem.docks, self.state_bounds, shape)
         self.collided, margin_violated = self._contacts()
+        self._terms = no_terms(self.reward, self.arrived.shape)
         self._trail.append(self.states[:, : self._dimension])
         return self._report(np.zeros(len(self.states), np.float32), self.arrived.copy(), margin_violated)
 
@@ -321,7 +332,9 @@ class Simulation:
             team=self.problem.team,
             dt=self.problem.dt,
         )
-        return compute_rewards(reward, along_ways(step, self.problem.ways) if self.along_ways else step)
+        step = along_ways(step, self.problem.ways) if self.along_ways else step
+        self._terms = compute_terms(reward, step)
+        return compute_rewards(reward, step)
 
     def _distances(self, states: FloatArray) -> FloatArray:
         """``(K,)`` to the present goals [m]."""
@@ -331,7 +344,7 @@ class Simulation:
 
     def _report(self, rewards: FloatArray, arrived: BoolArray, margin_violated: BoolArray) -> TeamStep:
         observations, distances = self._observe(), self._distances(self.states)
-        self.last = TeamStep(observations, rewards, arrived, self.collided, margin_violated, distances)
+        self.last = TeamStep(observations, rewards, arrived, self.collided, margin_violated, distances, self._terms)
         return self.last
 
     def _observe(self) -> FloatArray:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
@@ -23,6 +24,7 @@ class TeamStep(NamedTuple):
         collided: ``(K,)`` bool, hard contact.
         margin_violated: ``(K,)`` bool.
         distances: ``(K,)`` to the present goals [m].
+        terms: ``(K,)`` each, what the rewards were made of, where the reward says so.
     """
 
     observations: FloatArray
@@ -31,18 +33,21 @@ class TeamStep(NamedTuple):
     collided: BoolArray
     margin_violated: BoolArray
     distances: FloatArray
+    terms: Mapping[str, FloatArray] = MappingProxyType({})
 
 
 def agent_infos(names: Iterable[str], robots: Iterable[int], step: TeamStep) -> AgentInfos:
     """Fresh info dictionaries of some robots, in plain Python values."""
     arrived, collided = step.arrived.tolist(), step.collided.tolist()
     margin_violated, distances = step.margin_violated.tolist(), step.distances.tolist()
+    terms = {f"reward_{name}": values.tolist() for name, values in step.terms.items()}
     return {
         name: {
             "arrived": arrived[robot],
             "collided": collided[robot],
             "margin_violated": margin_violated[robot],
             "distance_to_goal": distances[robot],
+            **{name: values[robot] for name, values in terms.items()},
         }
         for name, robot in zip(names, robots)
     }

@@ -22,7 +22,7 @@ from d4orm_env.env_inputs import checked_states, joint_controls
 from d4orm_env.episode_record import EpisodeCounts, episode_metrics
 from d4orm_env.joint_env import joint_spaces
 from d4orm_env.options import EnvOptions
-from d4orm_env.rewards import RewardInput, along_ways, compute_rewards
+from d4orm_env.rewards import RewardInput, along_ways, compute_rewards, compute_terms, no_terms
 from d4orm_env.scenarios.problems import ScenarioLike
 from d4orm_env.simulation import Simulation
 from d4orm_env.team_step import Info
@@ -126,9 +126,15 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         self._problems = [problem] * count
         self._apart = False
         self.robot_rewards = np.zeros((count, problem.num_robots), np.float32)
+        self._terms = no_terms(self._template.reward, self.robot_rewards.shape)
         shape = (count, problem.num_robots, self._template.layout.size)
         self._observations = np.empty(shape, np.float32)
         self._running = np.zeros(count, np.bool_)
+
+    @property
+    def autoreset_mode(self) -> AutoresetMode:
+        """When a world whose episode has ended is reset; also in ``metadata``."""
+        return self._mode
 
     @property
     def max_cycles(self) -> int:
@@ -169,6 +175,8 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             if own_seed is not None:
                 self._draws.seed(world, own_seed)
         self._begin(np.flatnonzero(mask))
+        for term in self._terms.values():
+            term[mask] = 0
         observations = self._advance(np.where(mask, RESET, LOOK))
         self._running[mask] = True
         return observations, self._infos(mask)
@@ -229,6 +237,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         docked = worlds.docked & ~self._ended[:, None]
         np.copyto(worlds.state, checked_states(self.problem, states, docked, bounds, worlds.state.shape))
         observations = self._advance(np.full(self.num_envs, LOOK))
+        self._terms = no_terms(self._template.reward, worlds.docked.shape)
         return observations, self._infos()
 
     def state(self) -> FloatArray:
@@ -353,6 +362,9 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             drawn = [problem.ways for problem in self._problems] if self._template.redraws else None
             step = along_ways(step, drawn or self.problem.ways)
         self.robot_rewards = np.where(moved[:, None], compute_rewards(reward, step), np.float32(0))
+        self._terms = {
+            name: np.where(moved[:, None], term, np.float32(0)) for name, term in compute_terms(reward, step).items()
+        }
         worlds.reward[:] = self.robot_rewards.mean(axis=1)
         # Where a world was reset both are zero.
         worlds.total_reward[moved] = before.total_reward[moved] + self.robot_rewards[moved].sum(axis=1)
@@ -380,6 +392,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             "collided": worlds.collided,
             "margin_violated": worlds.violated,
             "distance_to_goal": worlds.distance,
+            **{f"reward_{name}": term for name, term in self._terms.items()},
             "is_success": there.all(axis=1) & ~worlds.contacts.any(axis=1),
         }
         return masked(values, np.ones(self.num_envs, np.bool_) if mask is None else mask)

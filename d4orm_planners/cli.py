@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import typer
 
 from d4orm_planners.commands.bench import bench
+from d4orm_planners.commands.dataset import dataset
 from d4orm_planners.commands.demo import demo
 from d4orm_planners.commands.evaluate import evaluate
 from d4orm_planners.commands.leaderboard import leaderboard
@@ -38,7 +39,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-for command in (demo, plan, run, play, evaluate, robustness, reproduce, leaderboard, train, bench, node):
+for command in (demo, plan, run, play, evaluate, robustness, reproduce, leaderboard, dataset, train, bench, node):
     app.command()(command)
 
 

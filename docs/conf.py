@@ -41,7 +41,19 @@ autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
 # Optional extras that a build of the documentation does without.
-autodoc_mock_imports = ["casadi", "msgpack", "pyarrow", "pyrvo", "ray", "trimesh", "viser", "zenoh"]
+autodoc_mock_imports = [
+    "casadi",
+    "h5py",
+    "jaxmarl",
+    "minari",
+    "msgpack",
+    "pyarrow",
+    "pyrvo",
+    "ray",
+    "trimesh",
+    "viser",
+    "zenoh",
+]
 # As fields of the class and not as entries of their own: autodoc lists the documented attributes itself.
 napoleon_use_ivar = True
 napoleon_google_docstring = True

@@ -99,8 +99,9 @@ def test_the_numbers_hang_together(results: dict[str, list[Any]]) -> None:
     for row in results["obstacles"]:
         assert row["ratio"].count == row["iteration"].count >= 1
     assert [(row["obstacles"], row["disturbances"]) for row in results["environments"]] == [
-        (0, 0), (0, 0), (5, 0), (5, 0), (0, 3), (0, 3), (0, 0), (0, 0)
+        (0, 0), (0, 0), (5, 0), (5, 0), (0, 3), (0, 3), (0, 0), (0, 0), (0, 0)
     ]  # fmt: skip
+    assert "FunctionalEnv" in {row["environment"] for row in results["environments"]}
     assert [(row["obstacles"], row["where"]) for row in results["obstacles"]] == [(3, "near"), (5, "far")]
     (index,) = results["index"]
     assert 0 < index["bytes"] < 2**20

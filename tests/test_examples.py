@@ -56,6 +56,8 @@ def completed(name: str, out: Path, *arguments: str) -> None:
         ("supersuit_ppo", "supersuit", "rl"),
         ("train_and_compare", "stable_baselines3", "rl"),
         ("train_and_compare", "pyrvo", "orca"),
+        ("jax_ppo", "optax", "jaxrl"),
+        ("clone_expert", "minari", "dataset"),
         ("read_results", "pandas", "dev"),
         ("read_results", "pyarrow", "evaluate"),
         ("onboard_lifelong", "zenoh", "zenoh"),
@@ -210,6 +212,27 @@ def test_gradient_ascent_through_the_dynamics_raises_the_reward(tmp_path: Path) 
     completed("jax_functional", out)
     rewards = [float(row["reward"]) for row in table(out / "jax_functional.csv")]
     assert rewards[-1] > rewards[0] + 0.05
+
+
+@pytest.mark.slow
+def test_a_network_learns_from_demonstrations(tmp_path: Path) -> None:
+    for module in ("minari", "torch", "stable_baselines3"):
+        pytest.importorskip(module)
+    out = tmp_path / "out"
+    completed("clone_expert", out)
+    rows = {row["policy"]: float(row["success"].removesuffix("%")) for row in table(out / "clone_expert.csv")}
+    assert rows["clone of 160 episodes"] >= 40
+    assert rows["d4orm-c2f"] >= 80
+
+
+@pytest.mark.slow
+def test_ppo_in_one_jit_learns_to_arrive(tmp_path: Path) -> None:
+    pytest.importorskip("optax")
+    out = tmp_path / "out"
+    completed("jax_ppo", out)
+    success = [float(row["success"].removesuffix("%")) for row in table(out / "jax_ppo.csv")]
+    assert success[0] < 20
+    assert success[-1] > 50
 
 
 @pytest.mark.slow

@@ -111,3 +111,9 @@ def test_unknown_names_are_attribute_errors() -> None:
 def test_the_planners_are_not_loaded_by_the_environment() -> None:
     code = "import sys, d4orm_env\nprint(any(name.startswith('d4orm_planners') for name in sys.modules))"
     assert run_python(code) == "False"
+
+
+def test_an_integration_says_which_library_is_missing() -> None:
+    code = "import sys; sys.modules['jaxmarl'] = None\nimport d4orm_env.integrations.jaxmarl"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "ImportError: this integration needs jaxmarl; install it with: pip install jaxmarl" in result.stderr

@@ -110,6 +110,33 @@ def test_the_training_reward_in_numbers() -> None:
     assert env.last_step.rewards[0] == 0
 
 
+def test_infos_say_what_the_training_reward_is_made_of() -> None:
+    problem = line_problem([0.15, 2.0])
+    options: dict[str, Any] = {"problem": problem, "reward": "training"}
+    env, joint, batched = navigation_v0.parallel_env(**options), joint_env(**options), NavigationVectorEnv(2, **options)
+    names = [f"reward_{name}" for name in TrainingReward.term_names]
+    _, infos = env.reset(seed=0)
+    joint.reset(seed=0)
+    _, many = batched.reset(seed=0)
+    assert all(infos[agent][name] == 0 and not many[name].any() for name in names for agent in infos)
+    ahead = np.float32([[1, 0], [1, 0]])
+    for count in range(3):
+        _, rewards, _, _, infos = env.step(act(env, ahead))
+        whole = joint.step(ahead.ravel())[4]["agents"]
+        _, _, _, _, many = batched.step(np.stack([ahead.ravel()] * 2))
+        for agent, reward in rewards.items():
+            assert sum(infos[agent][name] for name in names) == pytest.approx(reward, abs=1e-6)
+            robot = int(agent[-1])
+            for name in names:
+                assert whole[agent][name] == infos[agent][name] == pytest.approx(many[name][1, robot], abs=1e-6)
+        assert (whole["robot_0"]["reward_arrival"] > 0) == (count == 0)
+        assert infos["robot_1"]["reward_time"] == pytest.approx(-TrainingReward().time)
+    _, many = batched.reset(options={"reset_mask": np.array([True, False])})
+    assert (many["reward_time"] != 0).any(axis=1).tolist() == [False, False]
+    plain = navigation_v0.parallel_env(problem=problem)
+    assert not [name for name in plain.reset(seed=0)[1]["robot_0"] if name.startswith("reward_")]
+
+
 def test_the_paper_is_the_default() -> None:
     one, other = (navigation_v0.parallel_env("circle", 3, **given) for given in ({}, {"reward": "paper"}))
     one.reset(seed=0), other.reset(seed=0)

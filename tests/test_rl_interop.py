@@ -119,3 +119,39 @@ def test_torchrl_sees_the_same_episode() -> None:
         observations, rewards, *_ = base.step(actions)
         np.testing.assert_array_equal(data["robot", "observation"].numpy(), np.stack(list(observations.values())))
         np.testing.assert_allclose(data["robot", "reward"].numpy().ravel(), list(rewards.values()), rtol=1e-6)
+
+
+@ignore_torchrl_version
+def test_torchrl_makes_the_joint_env_by_name() -> None:
+    pytest.importorskip("torchrl")
+    from torchrl.envs.libs.gym import GymEnv
+
+    register_environments()
+    env = GymEnv(ENV_ID, num_robots=2, max_cycles=15, device="cpu")
+    env.set_seed(0)
+    rollout = env.rollout(30)
+    assert len(rollout) == 15
+    assert bool(rollout["next", "truncated"][-1])
+    assert rollout["observation"].shape[-1] == env.observation_spec["observation"].shape[-1]
+    with pytest.raises(TypeError, match="unexpected keyword argument 'colour': scenario 'circle' takes no argument"):
+        GymEnv(ENV_ID, num_robots=2, colour="red")
+
+
+@ignore_torchrl_version
+@pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
+def test_torchrl_wraps_the_batched_env(mode: str) -> None:
+    pytest.importorskip("torchrl")
+    from torchrl.envs.libs.gym import GymWrapper
+
+    register_environments()
+    base = gymnasium.make_vec(
+        ENV_ID, num_envs=3, vectorization_mode="vector_entry_point", num_robots=2, max_cycles=15, autoreset_mode=mode
+    )
+    assert base.unwrapped.autoreset_mode.value == mode
+    env = GymWrapper(base, device="cpu")
+    assert env.batch_size == (3,)
+    rollout = env.rollout(40, break_when_any_done=False)
+    done = rollout["next", "done"][..., 0]
+    assert done.shape == (3, 40)
+    assert done[:, [14, 29]].all()
+    assert int(done.sum()) == 6

@@ -158,6 +158,7 @@ def parts(settings: BenchmarkSettings) -> Iterator[Part]:
     for what, measurement in (("one environment", _measure_env), (f"{settings.num_worlds} worlds", _measure_worlds)):
         disturbed = partial(measurement, settings, 0, DISTURBANCES)
         yield "environments", f"{what} with {len(DISTURBANCES)} disturbances", disturbed
+    yield "environments", f"{settings.num_worlds} worlds in JAX", partial(_measure_functional, settings)
     for model in RIGID if find_spec("mujoco") else ():
         yield "environments", f"one environment of {model} in MuJoCo", partial(_measure_rigid, settings, model)
     surroundings: dict[Where, tuple[int, ...]] = {"near": settings.obstacles, "far": settings.far_obstacles}
@@ -317,6 +318,34 @@ def _measure_worlds(settings: BenchmarkSettings, num_boxes: int, disturbances: S
     spread = measure(steps, settings.repetitions, settings.time_limit)
     env.close()
     return _rate("make_vec", size, num_boxes, disturbances, spread.times(1 / (calls * size)))
+
+
+def _measure_functional(settings: BenchmarkSettings) -> Row:
+    """Worlds of 8 robots as pure functions of JAX, all in one program: random controls, observations, auto-reset."""
+    import jax
+
+    from d4orm_env.functional_env import EnvState, FunctionalEnv
+
+    size, calls = settings.num_worlds, max(1, settings.env_steps // 10)
+    env = FunctionalEnv(problem=boxed_problem(0, "near"))
+    limits, begin = env.action_limits, jax.jit(jax.vmap(env.reset))
+
+    def move(carry: tuple[EnvState, Any], key: Any) -> Any:
+        (state, total), keys = carry, jax.random.split(key, 1 + size)
+        controls = jax.random.uniform(keys[0], (size, *limits.shape), minval=-limits, maxval=limits)
+        state, moment = jax.vmap(env.step)(keys[1:], state, controls)
+        # What nobody reads would not be computed.
+        return (state, total + moment.rewards.sum() + moment.observations.sum()), None
+
+    @jax.jit
+    def steps(state: EnvState, key: Any) -> Any:
+        return jax.lax.scan(move, (state, 0.0), jax.random.split(key, calls))[0]
+
+    state, _ = begin(jax.random.split(jax.random.key(0), size))
+    spread = measure(
+        lambda: jax.block_until_ready(steps(state, jax.random.key(1))), settings.repetitions, settings.time_limit
+    )
+    return _rate("FunctionalEnv", size, 0, (), spread.times(1 / (calls * size)))
 
 
 def _rate(

@@ -11,13 +11,13 @@ import typer
 
 from d4orm_planners.commands.dataclass_options import takes
 from d4orm_planners.commands.inputs import (
-    MOST_SEEDS,
     decimals,
     make_folder,
     names,
     numbers,
     parse_levels,
     parse_settings,
+    seed_list,
 )
 from d4orm_planners.commands.options import Physics, Quiet, ScenarioSettings, TimeLimit
 
@@ -96,7 +96,7 @@ class StudyOptions:
         study = Study(
             policies=_with_settings(_policies(self.policies or ["d4orm,goal"]), parse_settings(self.settings)),
             scenarios=names(self.scenario) or (),
-            seeds=_seeds(self.seeds),
+            seeds=seed_list(self.seeds),
             control_noise_std=decimals(
                 "--control-noise-std", "0" if self.control_noise_std is None else self.control_noise_std
             ),
@@ -191,15 +191,3 @@ def _with_settings(chosen: dict[str, dict[str, object]], settings: dict[str, obj
         for label in owners:
             chosen[label].setdefault(setting, value)
     return chosen
-
-
-def _seeds(text: str) -> list[int]:
-    try:
-        if "," in text:
-            return [int(number) for number in text.split(",")]
-        first, last = (int(number) for number in text.split("-")) if "-" in text.strip()[1:] else (0, int(text) - 1)
-    except ValueError:
-        raise ValueError(f"--seeds {text!r} is neither a number, as 50, nor a range, as 10-19, nor a list") from None
-    if last - first >= MOST_SEEDS:
-        raise ValueError(f"--seeds {text!r} asks for more than {MOST_SEEDS} seeds; give fewer")
-    return list(range(first, last + 1))

@@ -51,6 +51,19 @@ def parse_levels(texts: list[str] | None) -> dict[str, list[Any]] | None:
     return levels
 
 
+def single_levels(texts: list[str] | None) -> dict[str, Any]:
+    """The same where every name has one level.
+
+    Raises:
+        ValueError: As :func:`parse_levels`; also if a name has several.
+    """
+    levels = parse_levels(texts) or {}
+    for name, values in levels.items():
+        if len(values) != 1:
+            raise ValueError(f"--disturb {name}: an episode has one level, not {len(values)}; use d4orm evaluate")
+    return {name: values[0] for name, values in levels.items()}
+
+
 def _add(values: dict[str, Any], name: str, text: str, option: str, what: str) -> None:
     """Add a value read as YAML under a new name."""
     from d4orm_env.core.yaml_text import parse_yaml
@@ -108,6 +121,23 @@ def _listed(option: str, text: str, kind: Callable[[str], N], what: str) -> tupl
         return tuple(kind(number) for number in text.split(","))
     except ValueError:
         raise ValueError(f"{option} {text!r} is not a list of {what}") from None
+
+
+def seed_list(text: str) -> list[int]:
+    """Seeds of ``--seeds``: how many, a range or a list.
+
+    Raises:
+        ValueError: If it is something else, or asks for too many.
+    """
+    try:
+        if "," in text:
+            return [int(number) for number in text.split(",")]
+        first, last = (int(number) for number in text.split("-")) if "-" in text.strip()[1:] else (0, int(text) - 1)
+    except ValueError:
+        raise ValueError(f"--seeds {text!r} is neither a number, as 50, nor a range, as 10-19, nor a list") from None
+    if last - first >= MOST_SEEDS:
+        raise ValueError(f"--seeds {text!r} asks for more than {MOST_SEEDS} seeds; give fewer")
+    return list(range(first, last + 1))
 
 
 def make_folder(folder: Path) -> None:

@@ -11,7 +11,7 @@ import typer
 
 from d4orm_env.core.summary import count
 from d4orm_planners.commands.dataclass_options import takes
-from d4orm_planners.commands.inputs import check_target, names, parse_levels, refuse_options
+from d4orm_planners.commands.inputs import check_target, names, refuse_options, single_levels
 from d4orm_planners.commands.options import Physics, PictureOptions, ProblemOptions
 from d4orm_planners.commands.outputs import episode_rows, print_table
 
@@ -52,11 +52,7 @@ class RunOptions(PictureOptions, ProblemOptions):
         """
         from d4orm_env.disturbances.registry import disturbances_at
 
-        levels = parse_levels(self.disturb) or {}
-        for name, values in levels.items():
-            if len(values) != 1:
-                raise ValueError(f"--disturb {name}: an episode has one level, not {len(values)}; use d4orm evaluate")
-        return disturbances_at({name: values[0] for name, values in levels.items()})
+        return disturbances_at(single_levels(self.disturb))
 
     def execute(self, problem: Problem, policy: Policy, disturbances: Sequence[Disturbance[Any]]) -> Episode:
         """An episode of a policy on a problem."""

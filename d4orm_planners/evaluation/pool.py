@@ -8,14 +8,14 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from itertools import count
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.trials import Job, run_job
@@ -177,10 +177,11 @@ class ProcessPool:
     Args:
         size: Processes.
         threads: Threads of each.
+        run: What they do with a job; by default they run its trials.
     """
 
-    def __init__(self, size: int, threads: int = 1) -> None:
-        self._size, self._threads = size, threads
+    def __init__(self, size: int, threads: int = 1, run: Callable[[Any], Iterator[Any]] = run_job) -> None:
+        self._size, self._threads, self._run = size, threads, run
         self._context = multiprocessing.get_context("spawn")
         # Nobody else holds the sending end: when this process dies, the workers notice.
         self._receiver, self._sender = self._context.Pipe(duplex=False)
@@ -190,7 +191,7 @@ class ProcessPool:
     def free(self) -> bool:
         return len(self._workers) < self._size or any(worker.ticket is None for worker in self._workers)
 
-    def start(self, job: Job) -> int:
+    def start(self, job: Any) -> int:
         idle = (worker for worker in self._workers if worker.ticket is None)
         worker = next(idle, None) or self._new()
         worker.ticket = next(self._tickets)
@@ -226,7 +227,8 @@ class ProcessPool:
 
     def _new(self) -> _Worker:
         ours, theirs = self._context.Pipe()
-        process = self._context.Process(target=_work, args=(theirs, self._receiver, self._threads), daemon=True)
+        work = (theirs, self._receiver, self._threads, self._run)
+        process = self._context.Process(target=_work, args=work, daemon=True)
         process.start()
         theirs.close()  # or a dead worker would not close the pipe
         worker = _Worker(process, ours)
@@ -257,7 +259,7 @@ class ProcessPool:
         return Lost(f"ChildProcessError: the worker process died ({how})")
 
 
-def _work(pipe: Connection, parent: Connection, threads: int) -> None:
+def _work(pipe: Connection, parent: Connection, threads: int, run: Callable[[Any], Iterator[Any]]) -> None:
     """Run jobs until the parent is gone; Ctrl-C is for the parent, who decides."""
     os.environ.update(D4ORM_NUM_THREADS=str(threads), OMP_NUM_THREADS=str(threads))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -271,6 +273,6 @@ def _work(pipe: Connection, parent: Connection, threads: int) -> None:
         while True:
             job = pipe.recv()
             pipe.send(Sign.BEGUN)
-            for trial in run_job(job):
-                pipe.send(trial)
+            for result in run(job):
+                pipe.send(result)
             pipe.send(Sign.ENDED)

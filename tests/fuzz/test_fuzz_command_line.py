@@ -56,10 +56,11 @@ SMALL: dict[str, list[str]] = {
     "robustness": ["--out", "taken"],
     "bench": ["--out", "taken"],
     "train": ["ppo", "--out", "taken"],
+    "dataset": ["--out", "taken"],
 }
 """What keeps a call from taking long, whatever else it is told."""
 
-FOLDER = ("demo", "evaluate", "robustness", "bench", "train")
+FOLDER = ("demo", "evaluate", "robustness", "bench", "train", "dataset")
 
 
 def options_of(command: str) -> list[Any]:
