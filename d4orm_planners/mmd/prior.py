@@ -73,8 +73,8 @@ def load_prior(path: Path = WEIGHTS) -> Prior:
         prior = Prior(*(np.ascontiguousarray(file[name], np.float32) for name in Prior._fields))
     if prior.into.shape[0] != SIZE + LEVELS or prior.told.shape[0] != FEATURES:
         raise ValueError(
-            f"{path} is a model of {prior.into.shape[0] - LEVELS} modes and {prior.told.shape[0]} features; it must be "
-            f"of {SIZE} and {FEATURES}: train it anew: python -m d4orm_planners.mmd.training"
+            f"{path} is a model of {prior.into.shape[0] - LEVELS} modes and {prior.told.shape[0]} features; it must "
+            f"be of {SIZE} and {FEATURES}: train it anew: python -m d4orm_planners.mmd.training"
         )
     return prior
 

@@ -1,8 +1,8 @@
 """The frame in which a robot's motion is described: its shortest way, and how much room there is beside it.
 
-The model never sees a map. It learns how motions differ from the shortest way driven at an even pace, in lengths of
-that way: how far ahead or behind they are on it, and how far beside it. So one model serves all maps, sizes and
-directions, and a robot that waits or hurries stays on its way.
+The model never sees a map. It learns how motions differ from the shortest way driven at an even pace, in lengths of that
+way: how far ahead or behind they are on it, and how far beside it. So one model serves all maps, sizes and directions,
+and a robot that waits or hurries stays on its way.
 """
 
 from __future__ import annotations
@@ -193,7 +193,7 @@ def round_tangents(reference: Any, tangents: Any) -> None:
 
 @compiled
 def locate(frame: Any, axis: Any, sines: Any, deviation: Any, motion: Any, i: Any, spot: Any) -> None:
-    """Fill ``spot`` ``(4, 3)``: point of a motion [m], directions ahead and aside there, and its place on the way [m].
+    """Fill ``spot`` ``(4, 3)``: a motion's point [m], directions ahead and aside there, its place on the way [m].
 
     Args:
         frame: The robot's way.
