@@ -1,8 +1,8 @@
 """The frame in which a robot's motion is described: its shortest way, and how much room there is beside it.
 
 The model never sees a map. It learns how motions differ from the shortest way driven at an even pace, in lengths of
-that way: how far ahead or behind they are on it, and how far beside it. So one model serves all maps, sizes and directions,
-and a robot that waits or hurries stays on its way.
+that way: how far ahead or behind they are on it, and how far beside it. So one model serves all maps, sizes and
+directions, and a robot that waits or hurries stays on its way.
 """
 
 from __future__ import annotations
