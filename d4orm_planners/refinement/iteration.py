@@ -36,7 +36,7 @@ def _better_roundabout(search: Search) -> Trajectory | None:
     for side in (1, -1):
         controls = drive_roundabout(search.problem, search.engine, side)
         if controls is None:
-            return None
+            continue
         candidate = evaluate_controls(search.engine, search.problem, controls)
         if candidate.rank > best.rank:
             best = candidate

@@ -56,7 +56,7 @@ class Bends(NamedTuple):
 
 
 def drive_roundabout(problem: Problem, engine: Engine, side: int) -> FloatArray | None:
-    """Controls ``(H, K, m)`` of a team in a roundabout; whether robots keep clear of all else is not looked at.
+    """Controls ``(H, K, m)`` of a team in a roundabout.
 
     Args:
         problem: The team.
@@ -64,7 +64,7 @@ def drive_roundabout(problem: Problem, engine: Engine, side: int) -> FloatArray 
         side: 1 to pass the middle to the left of it, -1 to the right.
 
     Returns:
-        ``None`` in space, or where somebody begins or ends within the roundabout.
+        ``None`` in space, where somebody begins or ends within the roundabout, or comes within the margin of anything.
     """
     if problem.dimension != 2 or problem.num_robots < 2:
         return None
@@ -72,19 +72,24 @@ def drive_roundabout(problem: Problem, engine: Engine, side: int) -> FloatArray 
     if bends is None:
         return None
     speed, acceleration = (problem.team.limits[:, column].astype(np.float64) for column in (SPEED, ACCELERATION))
-    states, nobody = problem.start, np.zeros(problem.num_robots, bool)
+    states, docked = problem.start, np.zeros(problem.num_robots, bool)
     controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
+    # Who accelerates has the velocity at the end of a step, and who sets its velocity has it all the time.
+    lead = np.array([1.0 if ACCELERATION in model.control_limits else 0.5 for model in problem.team.robot_models])
     for t in range(problem.horizon):
-        now, after = problem.dt * t, problem.dt * (t + 1)
+        now, then = problem.dt * t, problem.dt * (t + lead)
         due, _ = bends.at(_driven(now, speed, acceleration))
-        _, direction = bends.at(_driven(after, speed, acceleration))
-        wanted = direction * np.minimum(speed, acceleration * after)[:, None] + CORRECTION * (due - states[:, :2])
+        _, direction = bends.at(_driven(then, speed, acceleration))
+        wanted = direction * np.minimum(speed, acceleration * then)[:, None] + CORRECTION * (due - states[:, :2])
         controls[t] = track_velocities(problem, states, wanted.astype(np.float32))
-        states = engine.step(problem.arrays, states, nobody, controls[t]).states
+        after = engine.step(problem.arrays, states, docked, controls[t])
+        if after.margin_violated.any():
+            return None
+        states, docked = after.states, after.arrived & problem.docks
     return controls
 
 
-def _driven(time: float, speed: Floats, acceleration: Floats) -> Floats:
+def _driven(time: float | Floats, speed: Floats, acceleration: Floats) -> Floats:
     """How far robots have driven that set out at time zero, as fast as they can."""
     gaining = np.minimum(time, speed / acceleration)
     driven: Floats = 0.5 * acceleration * gaining**2 + speed * (time - gaining)
