@@ -55,23 +55,32 @@ def make_network(key: Any, inputs: int, outputs: int, width: int = 64) -> Any:
     return {**layers, "log_std": jnp.full(outputs, -0.5)}
 
 
+def along(vector: Any, rows: Any) -> Any:
+    """The same vector for all rows: JAX can be told to refuse to do that by itself."""
+    return jnp.broadcast_to(vector, rows.shape)
+
+
 def apply(layers: Any, x: Any) -> Any:
     """The output of a network."""
-    for weight, bias in layers[:-1]:
-        x = jnp.tanh(x @ weight + bias)
-    return x @ layers[-1][0] + layers[-1][1]
+    for number, (weight, bias) in enumerate(layers):
+        x = x @ weight
+        x = x + along(bias, x)
+        if number < len(layers) - 1:
+            x = jnp.tanh(x)
+    return x
 
 
 def log_density(network: Any, observation: Any, action: Any) -> Any:
     """Logarithm of the density of an action, normal around what the network says."""
-    mean, log_std = apply(network["actor"], observation), network["log_std"]
+    mean = apply(network["actor"], observation)
+    log_std = along(network["log_std"], mean)
     return (-0.5 * ((action - mean) / jnp.exp(log_std)) ** 2 - log_std - 0.5 * np.log(2 * np.pi)).sum(-1)
 
 
 def seen(env: FunctionalEnv, observations: Any) -> Any:
     """Observations of order one."""
     scale = np.minimum(np.maximum(np.abs(env.layout.high), 1e-3), REACH)
-    return jnp.clip(observations / scale, -1, 1)
+    return jnp.clip(observations / along(scale, observations), -1, 1)
 
 
 def collect(env: FunctionalEnv, network: Any, carry: Any, key: Any) -> tuple[Any, tuple[Sample, Any]]:
@@ -80,9 +89,9 @@ def collect(env: FunctionalEnv, network: Any, carry: Any, key: Any) -> tuple[Any
     observation = seen(env, observations)
     draw, move = jax.random.split(key)
     mean = apply(network["actor"], observation)
-    action = mean + jnp.exp(network["log_std"]) * jax.random.normal(draw, mean.shape)
+    action = mean + along(jnp.exp(network["log_std"]), mean) * jax.random.normal(draw, mean.shape)
     value = apply(network["critic"], observation)[..., 0]
-    controls = jnp.clip(action, -1, 1) * env.action_limits
+    controls = jnp.clip(action, -1, 1) * along(env.action_limits, action)
     state, moment = jax.vmap(env.step)(jax.random.split(move, len(observations)), state, controls)
     done = moment.finished | moment.done[:, None]
     sample = Sample(

@@ -14,7 +14,7 @@ ROUNDS = 96
 """Rounds of the search in an iteration: one annealing."""
 FIRST_ROUNDS = 4
 """Rounds for a plan that has just been found."""
-GUIDED_ROUNDS = 12
+GUIDED_ROUNDS = 8
 """The same for one that was found on a roadmap, with all its corners and stops."""
 
 
