@@ -13,7 +13,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.engine.draws import draw_normals, draw_uniforms
 from d4orm_planners.mmd.guiding import Surroundings, guide
 from d4orm_planners.mmd.prior import SIZE, Prior, kept_signal, level_features, load_prior, posterior, predict, tell
-from d4orm_planners.mmd.tracking import Driven, drive_along
+from d4orm_planners.mmd.tracking import Tracked, drive_along
 from d4orm_planners.mmd.way_frame import Floats, WayFrame, sine_table
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class Batch:
 
     motions: FloatArray
     durations: Floats
-    driven: Driven
+    driven: Tracked
     steps: int
 
 

@@ -24,7 +24,7 @@ GAIN = np.float32(1.5)
 """Share of its distance from the motion that a robot makes up for in a second [1/s]."""
 
 
-class Driven(NamedTuple):
+class Tracked(NamedTuple):
     """What came of driving along ``B`` motions.
 
     Attributes:
@@ -107,7 +107,7 @@ def tracking_kernel(name: str) -> Any:
 
 def drive_along(
     problem: Problem, robot: int, frame: WayFrame, sines: Any, deviation: Any, space: Any, durations: Any, motions: Any
-) -> Driven:
+) -> Tracked:
     """Drive a robot along each of some motions, as if it were alone: by the clock, and then straight to its goal.
 
     Args:
@@ -121,7 +121,7 @@ def drive_along(
         motions: ``(B, 2 MODES)`` float32 whitened modes.
     """
     arrays, count, horizon = problem.arrays, len(motions), problem.horizon
-    driven = Driven(
+    driven = Tracked(
         np.zeros((count, horizon, problem.control_size), np.float32),
         np.empty((count, horizon + 1, 3)),
         np.empty(count, np.int64),

@@ -23,7 +23,7 @@ _LEAST = 1e-4
 """Least deviation of a mode or a feature that it is divided by."""
 
 
-class Denoiser(nn.Module):
+class Network(nn.Module):
     """The network of :class:`~d4orm_planners.mmd.prior.Prior`, as torch trains it.
 
     Args:
@@ -73,7 +73,7 @@ def train(
     motions, features = torch.tensor(flat / deviation), torch.tensor((examples.features - mean) / spread)
     signal = kept_signal(_RESOLUTION)[1:]
     levels, kept = torch.tensor(level_features(signal)), torch.tensor(signal.astype(np.float32))
-    network = Denoiser(width, layers)
+    network = Network(width, layers)
     average = torch.optim.swa_utils.AveragedModel(network)
     optimiser = torch.optim.AdamW(network.parameters(), 1e-3, weight_decay=0.01)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=steps)
@@ -95,7 +95,7 @@ def train(
     return _weights(network, deviation, mean, spread)
 
 
-def _weights(network: Denoiser, deviation: np.ndarray, mean: np.ndarray, spread: np.ndarray) -> Prior:
+def _weights(network: Network, deviation: np.ndarray, mean: np.ndarray, spread: np.ndarray) -> Prior:
     """The network's weights as the planner reads them: what is multiplied from the left, first."""
     linear = [network.into, *network.hidden, network.out]
     into, *hidden, out = (layer.weight.detach().numpy().T for layer in linear)
