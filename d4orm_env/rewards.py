@@ -183,30 +183,27 @@ def no_terms(function: RewardFunction | None, shape: tuple[int, ...]) -> dict[st
     return {name: np.zeros(shape, np.float32) for name in term_names(function)}
 
 
-def compute_terms(function: RewardFunction | None, step: RewardInput) -> dict[str, FloatArray]:
-    """``(..., K)`` float32 each: what a reward was made of, if it says so.
-
-    Raises:
-        ValueError: If a term has another shape, or a value that is not finite.
-    """
-    if not term_names(function):
-        return {}
-    terms = function.terms(step)  # type: ignore[union-attr] # it has names for them
-    return {name: compute_rewards(lambda _, name=name: terms[name], step) for name in term_names(function)}  # type: ignore[misc]
-
-
-def compute_rewards(function: RewardFunction, step: RewardInput) -> FloatArray:
-    """``(..., K)`` float32 rewards of a step, checked.
+def compute_rewards(function: RewardFunction, step: RewardInput) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """``(..., K)`` float32 rewards of a step, checked, and their terms, of which a reward that has some is the sum.
 
     Raises:
         ValueError: If the function returns another shape, or a value that is not finite.
     """
-    name = getattr(function, "__name__", type(function).__name__)
+    name, shape = getattr(function, "__name__", type(function).__name__), step.distances.shape
+    names = term_names(function)
+    if not names:
+        return _checked(function(step), name, shape), {}
+    terms = function.terms(step)  # type: ignore[attr-defined] # it has names for them
+    return _checked(sum(terms.values()), name, shape), {
+        term: _checked(terms[term], f"{name}.{term}", shape) for term in names
+    }
+
+
+def _checked(values: ArrayLike, name: str, expected: tuple[int, ...]) -> FloatArray:
     try:
-        rewards = as_float32(function(step))
+        rewards = as_float32(values)
     except ValueError as error:
         raise ValueError(f"reward {name!r}: {error}") from error
-    expected = step.distances.shape
     if rewards.shape != expected:
         axes = "(K,)" if len(expected) == 1 else "(B, K)"
         raise ValueError(f"reward {name!r} returned shape {rewards.shape}; expected {axes} = {expected}")

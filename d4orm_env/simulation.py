@@ -32,7 +32,6 @@ from d4orm_env.rewards import (
     RewardInput,
     along_ways,
     compute_rewards,
-    compute_terms,
     find_reward,
     no_terms,
     paper_reward,
@@ -333,8 +332,8 @@ class Simulation:
             dt=self.problem.dt,
         )
         step = along_ways(step, self.problem.ways) if self.along_ways else step
-        self._terms = compute_terms(reward, step)
-        return compute_rewards(reward, step)
+        rewards, self._terms = compute_rewards(reward, step)
+        return rewards
 
     def _distances(self, states: FloatArray) -> FloatArray:
         """``(K,)`` to the present goals [m]."""

@@ -22,7 +22,7 @@ from d4orm_env.env_inputs import checked_states, joint_controls
 from d4orm_env.episode_record import EpisodeCounts, episode_metrics
 from d4orm_env.joint_env import joint_spaces
 from d4orm_env.options import EnvOptions
-from d4orm_env.rewards import RewardInput, along_ways, compute_rewards, compute_terms, no_terms
+from d4orm_env.rewards import RewardInput, along_ways, compute_rewards, no_terms
 from d4orm_env.scenarios.problems import ScenarioLike
 from d4orm_env.simulation import Simulation
 from d4orm_env.team_step import Info
@@ -361,10 +361,9 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         if self._template.along_ways:
             drawn = [problem.ways for problem in self._problems] if self._template.redraws else None
             step = along_ways(step, drawn or self.problem.ways)
-        self.robot_rewards = np.where(moved[:, None], compute_rewards(reward, step), np.float32(0))
-        self._terms = {
-            name: np.where(moved[:, None], term, np.float32(0)) for name, term in compute_terms(reward, step).items()
-        }
+        rewards, terms = compute_rewards(reward, step)
+        self.robot_rewards = np.where(moved[:, None], rewards, np.float32(0))
+        self._terms = {name: np.where(moved[:, None], term, np.float32(0)) for name, term in terms.items()}
         worlds.reward[:] = self.robot_rewards.mean(axis=1)
         # Where a world was reset both are zero.
         worlds.total_reward[moved] = before.total_reward[moved] + self.robot_rewards[moved].sum(axis=1)

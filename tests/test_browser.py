@@ -154,6 +154,14 @@ def tick(page: Page, label: str) -> None:
         page.mouse(kind, x, y)
 
 
+def look_at(page: Page, playground: Any, text: str) -> None:
+    """Open the playground's page, and wait until it says something."""
+    page.look()
+    page.offline(False)
+    page.open(playground.address)
+    page.until(f"document.body.textContent.includes('{text}')")
+
+
 def click(page: Page, text: str) -> None:
     """Click on a button, or open a folder, as soon as it is there."""
     find = f"[...document.querySelectorAll('button, div')].findLast((part) => part.textContent.trim() === {text!r})"
@@ -177,11 +185,8 @@ def test_the_playground_pauses_and_a_dragged_goal_replans(page: Page, tmp_path: 
 
 def pause_and_drag(page: Page, playground: Any, tmp_path: Path) -> None:
     session = playground.session
-    page.look()
-    page.offline(False)
     page.complaints.clear()
-    page.open(playground.address)
-    page.until("document.body.textContent.includes('circle, 4 robots, d4orm-c2f')")
+    look_at(page, playground, "circle, 4 robots, d4orm-c2f")
     tick(page, "Paused")
     wait_for(lambda: session.frame.moment.state == "paused")
     page.until("document.body.textContent.includes('d4orm-c2f: paused')")
@@ -211,11 +216,8 @@ def test_obstacles_are_dragged_and_scenes_and_replays_saved(page: Page, tmp_path
     problem = make_problem("circle", num_robots=2, seed=0)
     with running(problem.resumed_at(problem.start, problem.goal, world=world), "goal") as playground:
         session = playground.session
-        page.look()
-        page.offline(False)
         page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
-        page.open(playground.address)
-        page.until("document.body.textContent.includes('circle, 2 robots, goal')")
+        look_at(page, playground, "circle, 2 robots, goal")
         tick(page, "Paused")
         wait_for(lambda: session.frame.moment.state == "paused" and len(playground.clients) == 1)
         page.drag(pixel(playground, (0, 0)), pixel(playground, (0.9, 0.9)))
@@ -236,10 +238,7 @@ def test_goals_are_dragged_in_space(page: Page) -> None:
     with running(make_problem("sphere", num_robots=3, seed=0), "goal") as playground:
         session = playground.session
         session.pause(True)
-        page.look()
-        page.offline(False)
-        page.open(playground.address)
-        page.until("document.body.textContent.includes('sphere, 3 robots, goal: paused')")
+        look_at(page, playground, "sphere, 3 robots, goal: paused")
         wait_for(lambda: len(playground.clients) == 1)
         page.frames(8)
         goal, wanted = session.frame.goals[0], pixel(playground, np.zeros(3))
@@ -257,11 +256,8 @@ def test_policies_are_ticked_and_drive_side_by_side(page: Page, tmp_path: Path) 
     with running(make_problem("circle", num_robots=3, seed=0), "goal") as playground:
         session = playground.session
         session.pause(True)  # nobody stands on a goal yet
-        page.look()
-        page.offline(False)
         page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
-        page.open(playground.address)
-        page.until("document.body.textContent.includes('circle, 3 robots, goal: paused')")
+        look_at(page, playground, "circle, 3 robots, goal: paused")
         wait_for(lambda: len(playground.clients) == 1)
         click(page, "Who drives")
         tick(page, "D4orm-C2F")
@@ -286,10 +282,7 @@ def test_policies_are_ticked_and_drive_side_by_side(page: Page, tmp_path: Path) 
 def test_a_slow_planner_does_not_freeze_the_page(page: Page) -> None:
     with running(make_problem("circle", num_robots=3, seed=0), "goal") as playground:
         session = playground.session
-        page.look()
-        page.offline(False)
-        page.open(playground.address)
-        page.until("document.body.textContent.includes('circle, 3 robots, goal')")
+        look_at(page, playground, "circle, 3 robots, goal")
         ended = threading.Event()
         register_policy("slow", lambda: Slow(ended))
         session.choose("slow")
@@ -317,10 +310,7 @@ class Slow(DriveToGoal):
 def test_a_slider_disturbs_from_the_next_step_on(page: Page) -> None:
     with running(make_problem("circle", num_robots=3, seed=0), "goal") as playground:
         session = playground.session
-        page.look()
-        page.offline(False)
-        page.open(playground.address)
-        page.until("document.body.textContent.includes('circle, 3 robots, goal')")
+        look_at(page, playground, "circle, 3 robots, goal")
         session.set_lifelong(True)
         click(page, "What goes wrong")
         time.sleep(1.0)

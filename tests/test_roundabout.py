@@ -42,6 +42,13 @@ def test_robots_of_any_planar_model_drive_in_it(model: str) -> None:
     assert (np.abs(controls) <= problem.team.control_limits).all()
 
 
+def test_there_is_none_where_ways_do_not_cross() -> None:
+    states = np.zeros((3, 4))
+    states[:, :2] = [[-3, 0], [3, 1], [-3, 2]]
+    problem = Problem(Team(("holonomic2d",) * 3), states, [[3, 0], [-3, 1], [3, 2]])
+    assert drive_roundabout(problem, get_engine("cpu"), 1) is None
+
+
 def test_there_is_none_in_space_nor_where_somebody_begins_within() -> None:
     engine = get_engine("cpu")
     assert drive_roundabout(make_problem("sphere", num_robots=6), engine, 1) is None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,12 +89,11 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float) 
         rows.append(row.ravel())
         least.append((-np.sqrt(2 * brakes * room) if room > 0 else -PARTING * room) + speed)
 
-    for i, j in combinations(range(count), 2):
-        offset = places[i] - places[j]
-        away = float(np.linalg.norm(offset))
-        if away < NEAR and (free[i] or free[j]) and away > 0:
-            normal = offset / away
-            add({i: normal, j: -normal}, away - radius[i] - radius[j] - gap, braking[i] + braking[j])
+    offsets = places[:, None] - places
+    apart = np.linalg.norm(offsets, axis=2)
+    for i, j in np.argwhere(np.triu((apart > 0) & (apart < NEAR) & (free[:, None] | free))).tolist():
+        normal, away = offsets[i, j] / apart[i, j], float(apart[i, j])
+        add({i: normal, j: -normal}, away - radius[i] - radius[j] - gap, braking[i] + braking[j])
     able = np.flatnonzero(free).tolist()
     for body in joint.bodies[joint.bodies[:, -1] > 0] if len(joint.bodies) else ():
         for i in able:

@@ -227,11 +227,10 @@ class Guide:
     def refine(self, step: int, due: bool) -> bool:
         """Take over what the refinement has done meanwhile, and give it more to do if that is ``due``."""
         index = self.index + self._config.subgoal_offset
-        if self._config.refine == "off" or index >= len(self.guidance.path) - 1:
+        guidance, over = self.guidance, index >= len(self.guidance.path) - 1
+        if self._config.refine == "off" or over or not isinstance(guidance, Guidance):
             return False
-        if not isinstance(self.guidance, Guidance):
-            return False
-        guidance, seed = self.guidance, derived_seed(self._seed, Stream.REFINEMENT, step)
+        seed = derived_seed(self._seed, Stream.REFINEMENT, step)
         if self._config.refine == "sync":
             if due:
                 self.guidance = self._refined(guidance, index, seed)

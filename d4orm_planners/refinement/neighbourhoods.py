@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.metrics import arrival_steps
+from d4orm_env.core.portable import log
 from d4orm_env.engine.beam_search import BeamRules
 from d4orm_env.engine.path_index import BLOCK
 from d4orm_planners.refinement.beams import Company, Manner, find_ways
@@ -113,7 +114,8 @@ class _Neighbourhoods:
     def run(self, temperature: float) -> None:
         """One round."""
         groups = np.stack([self.group() for _ in range(RULES.groups)])
-        slack = temperature * self.random.exponential(size=len(groups))
+        # Exponential, by a logarithm that is the same everywhere.
+        slack = -temperature * log(1 - self.random.random(len(groups)))
         blocks = self.random.integers(0, 2, len(groups)) * self.arrival[groups[:, 0]] / self.problem.dt // BLOCK
         blocks = (blocks * self.random.random(len(groups))).astype(np.int64)
         manner = Manner(tuple(np.array(RULES.angles) * self.random.uniform(*RULES.scales)), RULES.paces)

@@ -8,12 +8,14 @@ Search among single robots' ways does not find it, because nobody gains by begin
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.portable import arctan2, cos, sin
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine.base import Engine
@@ -23,6 +25,8 @@ Floats = NDArray[np.float64]
 
 SLACK = 0.002
 """Added to the distance that robots keep from each other in it [m]."""
+PARALLEL = 1e-6
+"""Ways are parallel whose directions differ by less, squared [rad^2]."""
 CORRECTION = 1.0
 """What of its distance from where it should be a robot makes good in a second [1/s]."""
 
@@ -49,7 +53,7 @@ class Bends(NamedTuple):
         round_ = np.clip((lengths - self.first) / self.radius, 0, np.abs(self.angles[:, 1]))
         side = np.sign(self.angles[:, 1])
         angle = self.angles[:, 0] + side * round_
-        spoke = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        spoke = np.stack([cos(angle), sin(angle)], axis=1)
         direction = side[:, None] * np.stack([-spoke[:, 1], spoke[:, 0]], axis=1)
         rest = lengths - self.first - self.radius * round_
         return self.centre + self.radius[:, None] * spoke + rest[:, None] * direction, direction
@@ -64,7 +68,8 @@ def drive_roundabout(problem: Problem, engine: Engine, side: int) -> FloatArray 
         side: 1 to pass the middle to the left of it, -1 to the right.
 
     Returns:
-        ``None`` in space, where somebody begins or ends within the roundabout, or comes within the margin of anything.
+        ``None`` in space, where ways do not cross, where somebody begins or ends within the roundabout, or comes within
+        the margin of anything.
     """
     if problem.dimension != 2 or problem.num_robots < 2:
         return None
@@ -101,11 +106,12 @@ def _bends(problem: Problem, side: int) -> Bends | None:
     along = end - begin
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
     across = side * np.stack([-along[:, 1], along[:, 0]], axis=1)
-    # The place that is nearest to all straight ways.
-    middle = np.linalg.lstsq(across, (across * begin).sum(axis=1), rcond=None)[0]
+    middle = _nearest_to_all(begin, across)
+    if middle is None:
+        return None
     limits, radius = problem.team.limits.astype(np.float64), np.asarray(problem.team.radius, np.float64)
     apart = 2 * radius.max() + problem.margin + SLACK
-    least = apart / (2 * np.sin(np.pi / problem.num_robots))
+    least = apart / (2 * float(sin(np.pi / problem.num_robots)))
     bend = np.maximum(limits[:, SPEED] ** 2 / limits[:, ACCELERATION], least)
     # Where robots cannot turn that sharply the arc reaches round the middle on the far side too.
     centre = middle - (bend - least)[:, None] * across
@@ -113,9 +119,25 @@ def _bends(problem: Problem, side: int) -> Bends | None:
     away = np.linalg.norm([before, behind], axis=2)
     if (away <= bend).any():
         return None
-    spread = np.arccos(bend / away)
-    turns = np.arctan2([before[:, 1], behind[:, 1]], [before[:, 0], behind[:, 0]])
+    straight = np.sqrt(away**2 - bend**2)
+    spread = arctan2(straight, np.stack([bend, bend]))
+    turns = arctan2(np.stack([before[:, 1], behind[:, 1]]), np.stack([before[:, 0], behind[:, 0]]))
     # To the left of the middle is clockwise round it.
     first, last = turns[0] - side * spread[0], turns[1] + side * spread[1]
     angle = -side * np.mod(-side * (last - first), 2 * np.pi)
-    return Bends(begin, centre, bend, np.sqrt(away[0] ** 2 - bend**2), np.stack([first, angle], axis=1))
+    return Bends(begin, centre, bend, straight[0], np.stack([first, angle], axis=1))
+
+
+def _nearest_to_all(places: Floats, normals: Floats) -> Floats | None:
+    """``(2,)`` the place nearest to straight ways through ``places`` ``(K, 2)``; ``None`` if they are parallel.
+
+    By normal equations whose sums are exact, so that it is the same on every processor.
+    """
+    offset = (normals * places).sum(axis=1)
+    x, y = normals.T
+    xx, xy, yy = (math.fsum((a * b).tolist()) for a, b in ((x, x), (x, y), (y, y)))
+    right, up = (math.fsum((a * offset).tolist()) for a in (x, y))
+    determinant = xx * yy - xy * xy
+    if determinant < PARALLEL * len(places) ** 2:
+        return None
+    return np.array([yy * right - xy * up, xx * up - xy * right]) / determinant

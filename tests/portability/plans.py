@@ -47,6 +47,7 @@ CASES = {
     "cars": Case("d4orm", {}, "circle", {"num_robots": 4, "model": "car"}),
     "in space": Case("d4orm", {}, "sphere", {"num_robots": 8}),
     "among walls": Case("d4orm-d", {"improve": True}, "rooms", {"num_robots": 8}, 3),
+    "a roundabout": Case("d4orm-d", {"improve": True}, "circle", {"num_robots": 6}, 3),
     "amswarm": Case("amswarm", {}, "amswarm_3", {}, 1),
     "mmd": Case("mmd", {"improve": True}, "rooms", {"num_robots": 5}, 4),
     "through a corridor": Case("guided", {"improve": True}, "corridor", {"num_robots": 6}, 2),
