@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from planner_support import hop_problem
+from scipy.optimize import nnls
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.problem import Problem
@@ -18,7 +19,7 @@ from d4orm_env.engine.choice import get_engine
 from d4orm_env.joint_state import JointState
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import make_policy, run_episode
-from d4orm_planners.d4orm_c2f.barrier import safe_velocities
+from d4orm_planners.d4orm_c2f.barrier import Barriers, find_nearest, safe_velocities
 from d4orm_planners.d4orm_c2f.filtering import StateFilter
 from d4orm_planners.d4orm_c2f.lateness import MOST, Lateness
 from d4orm_planners.d4orm_c2f.policy import D4ormC2F
@@ -96,13 +97,15 @@ def test_states_that_are_known_are_taken_as_they_are() -> None:
 
 
 @pytest.mark.parametrize("share", [1.0, 0.8, 0.5])
-def test_robots_that_do_less_than_asked_are_believed_to_be_weaker(share: float) -> None:
+@pytest.mark.parametrize("capped", [True, False])
+def test_robots_that_do_less_than_asked_are_believed_to_be_weaker(share: float, capped: bool) -> None:
+    """By that share, and not once more by what they do less: at the limit as they go, and below it."""
     problem, random = hop_problem(3), np.random.default_rng(0)
     weakness = Weakness(problem)
-    for _ in range(30):
-        angle = random.uniform(0, 2 * np.pi, 3)
-        told = np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
-        weakness.observe(told, share * told, ALL)
+    for step in range(60):
+        angle, size = random.uniform(0, 2 * np.pi, 3), 1.0 if step < 30 else 0.6
+        told = size * np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
+        weakness.observe(told, min(1, share / size) * told if capped else share * told, ALL)
     for name in ("max_speed", "max_acceleration", "max_turn_rate"):
         believed = getattr(weakness.problem.team, name) / getattr(problem.team, name)
         np.testing.assert_allclose(believed, share, rtol=1e-5)
@@ -152,6 +155,38 @@ def test_two_robots_that_follow_safe_velocities_never_touch(seed: int) -> None:
         result = engine.step(problem.arrays, states, ~free, track_velocities(problem, states, safe))
         states = result.states
         assert not result.collided.any()
+
+
+@given(seed=st.integers(0, 10**6), rows=st.integers(1, 12), d=st.sampled_from([2, 3]))
+@settings(max_examples=60, deadline=None)
+def test_the_nearest_velocities_are_those_of_least_squares(seed: int, rows: int, d: int) -> None:
+    """Against non-negative least squares (Lawson and Hanson, Solving Least Squares Problems, chapter 23)."""
+    random = np.random.default_rng(seed)
+    one, other = random.integers(0, 4, rows), random.integers(-1, 4, rows)
+    other[other == one] = -1
+    normals = random.normal(size=(rows, d))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    wanted, kept = random.normal(size=(2, 4, d))
+    # There are some: those kept.
+    least = -Barriers(one, other, normals, np.zeros(rows)).missing(kept) - random.uniform(0, 1, rows)
+    barriers = Barriers(one, other, normals, least)
+    matrix = np.zeros((rows, 4, d))
+    matrix[np.arange(rows), one] = normals
+    matrix[other >= 0, other[other >= 0]] = -normals[other >= 0]
+    system, target = np.vstack([matrix.reshape(rows, -1).T, barriers.missing(wanted)]), np.zeros(4 * d + 1)
+    target[-1] = 1
+    left = system @ nnls(system, target)[0] - target
+    found = wanted.copy()
+    if find_nearest(*barriers, found):
+        np.testing.assert_allclose(found - wanted, (-left[:-1] / left[-1]).reshape(4, d), atol=1e-3)
+    else:
+        assert barriers.missing(found).max() < 0.05
+
+
+def test_between_walls_that_close_in_there_are_no_velocities() -> None:
+    normals = np.array([[1.0, 0], [-1, 0]])
+    barriers = Barriers(np.zeros(2, np.int64), np.full(2, -1), normals, np.array([0.1, 0.1]))
+    assert not find_nearest(*barriers, np.zeros((1, 2)))
 
 
 def test_velocities_that_are_safe_are_left_alone() -> None:

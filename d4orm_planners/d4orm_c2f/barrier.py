@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_model import ACCELERATION, SPEED
+from d4orm_env.engine import tiles
+from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.tiles import OPTIONS
 from d4orm_env.joint_state import JointState
 
 NEAR = 1.5
@@ -17,6 +21,12 @@ NEAR = 1.5
 
 PARTING = 2.0
 """With what is nearer than it should be, robots part at so much of what is missing per second [1/s]."""
+
+SWEEPS = 400
+"""Times that every barrier is met at most; by then there are no velocities that keep to all, or hardly any."""
+
+EXACT = 1e-6
+"""Changes of that size are none [m/s]."""
 
 _STEP = 1e-3
 """For the direction away from an obstacle [m]."""
@@ -31,8 +41,7 @@ def safe_velocities(problem: Problem, joint: JointState, wanted: FloatArray, fre
     ``n (v_i - v_j) >= -sqrt(2 (a_i + a_j) (d - gap))``: the braking-distance barrier of Wang, Ames and Egerstedt
     (Safety barrier certificates for collisions-free multirobot systems, IEEE Trans. Robotics 33, 2017), here for the
     velocities of the next step. On a body that obeys nobody, a side of the bounds, or the nearest obstacle, the robot
-    does all the braking. The nearest velocities to those wanted are a least-distance problem, solved by non-negative
-    least squares (Lawson and Hanson, Solving Least Squares Problems, chapter 23).
+    does all the braking. Taken are the nearest velocities to those wanted.
 
     Args:
         problem: The robots and obstacles.
@@ -44,56 +53,55 @@ def safe_velocities(problem: Problem, joint: JointState, wanted: FloatArray, fre
     Returns:
         ``(K, d)`` [m/s]; zero for robots for which there are none.
     """
-    rows, least = _barriers(problem, joint, free, gap)
-    present = np.where(free[:, None], wanted, 0).astype(np.float64)
-    missing = least - rows @ present.ravel()
-    if not (missing > 0).any():
-        return present.astype(np.float32)
-    change = _least_change(rows, missing)
-    if change is None:
+    barriers = _barriers(problem, joint, free, gap)
+    velocities = np.where(free[:, None], wanted, 0).astype(np.float64)
+    if not (barriers.missing(velocities) > 0).any():
+        return velocities.astype(np.float32)
+    if not find_nearest(*barriers, velocities):
         return np.zeros_like(wanted)
     speed = problem.team.limits[:, SPEED, None].astype(np.float64)
-    safe = present + change.reshape(present.shape)
-    pace = np.linalg.norm(safe, axis=1, keepdims=True)
-    return (safe * np.minimum(1, speed / np.maximum(pace, 1e-9))).astype(np.float32)
+    pace = np.linalg.norm(velocities, axis=1, keepdims=True)
+    return (velocities * np.minimum(1, speed / np.maximum(pace, 1e-9))).astype(np.float32)
 
 
-def _least_change(rows: Array, least: Array) -> Array | None:
-    """The smallest ``x`` with ``rows @ x >= least``; ``None`` if there is none."""
-    # Here, because importing SciPy's optimisation takes long.
-    from scipy.optimize import nnls
+class Barriers(NamedTuple):
+    """``normals @ (v_one - v_other) >= least`` for velocities; nobody is -1, and stands.
 
-    system = np.vstack([rows.T, least])
-    target = np.zeros(len(system))
-    target[-1] = 1
-    weights, residual = nnls(system, target)
-    left = system @ weights - target
-    if residual < 1e-9:
-        return None
-    change: Array = -left[:-1] / left[-1]
-    return change
+    Attributes:
+        one: ``(R,)`` robots.
+        other: ``(R,)`` robots.
+        normals: ``(R, d)`` unit vectors.
+        least: ``(R,)`` [m/s].
+    """
+
+    one: IntArray
+    other: IntArray
+    normals: Array
+    least: Array
+
+    def missing(self, velocities: Array) -> Array:
+        """``(R,)`` how much of it velocities ``(K, d)`` lack [m/s]."""
+        standing = np.vstack([velocities, np.zeros((1, velocities.shape[1]))])
+        missing: Array = self.least - (self.normals * (standing[self.one] - standing[self.other])).sum(axis=1)
+        return missing
 
 
-def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float) -> tuple[Array, Array]:
-    """``rows @ v >= least`` for the velocities ``v`` ``(K d,)`` of all robots."""
-    d, count = problem.dimension, problem.num_robots
+def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float) -> Barriers:
+    """What the velocities of those who are ``free`` have to keep to."""
+    d = problem.dimension
     places, radius = joint.states[:, :d].astype(np.float64), np.asarray(problem.team.radius, np.float64)
     braking = np.where(free, problem.team.limits[:, ACCELERATION].astype(np.float64), 0)
-    rows: list[Array] = []
-    least: list[float] = []
+    rows: list[tuple[int, int, Array, float]] = []
 
-    def add(towards: dict[int, Array], room: float, brakes: float, speed: float = 0.0) -> None:
-        row = np.zeros((count, d))
-        for robot, normal in towards.items():
-            row[robot] = normal if free[robot] else 0
-        rows.append(row.ravel())
-        least.append((-np.sqrt(2 * brakes * room) if room > 0 else -PARTING * room) + speed)
+    def add(one: int, other: int, normal: Array, room: float, brakes: float, speed: float = 0.0) -> None:
+        least = (-np.sqrt(2 * brakes * room) if room > 0 else -PARTING * room) + speed
+        rows.append((one, other, normal, least))
 
     offsets = places[:, None] - places
     apart = np.linalg.norm(offsets, axis=2)
     for i, j in np.argwhere(np.triu((apart > 0) & (apart < NEAR) & (free[:, None] | free))).tolist():
-        normal, away = offsets[i, j] / apart[i, j], float(apart[i, j])
-        add({i: normal, j: -normal}, away - radius[i] - radius[j] - gap, braking[i] + braking[j])
+        normal, room = offsets[i, j] / apart[i, j], float(apart[i, j]) - radius[i] - radius[j] - gap
+        add(i if free[i] else -1, j if free[j] else -1, normal, room, braking[i] + braking[j])
     able = np.flatnonzero(free).tolist()
     for body in joint.bodies[joint.bodies[:, -1] > 0] if len(joint.bodies) else ():
         for i in able:
@@ -101,11 +109,46 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float) 
             away = float(np.linalg.norm(offset))
             if 0 < away < NEAR:
                 normal = offset / away
-                room = away - radius[i] - float(body[-1]) - gap
-                add({i: normal}, room, braking[i], float(normal @ body[d : 2 * d]))
+                speed = float((normal * body[d : 2 * d]).sum())
+                add(i, -1, normal, away - radius[i] - float(body[-1]) - gap, braking[i], speed)
     for i, normal, room in _walls(problem, places[able], able):
-        add({i: normal}, room - radius[i] - gap, braking[i])
-    return np.array(rows).reshape(-1, count * d), np.array(least)
+        add(i, -1, normal, room - radius[i] - gap, braking[i])
+    one, other, normals, least = zip(*rows) if rows else ((), (), (), ())
+    return Barriers(
+        np.array(one, np.int64), np.array(other, np.int64), np.array(normals).reshape(-1, d), np.array(least, float)
+    )
+
+
+@cached_kernel(fingerprint((tiles,)), variant="nearest", **OPTIONS)
+def find_nearest(one: Any, other: Any, normals: Any, least: Any, velocities: Any) -> Any:
+    """Move ``velocities`` ``(K, d)`` to the nearest that keep to all barriers; whether any were found.
+
+    Every barrier in turn is met exactly, by as little as is needed in view of what it has been given so far (Hildreth,
+    A quadratic programming procedure, Naval Research Logistics Quarterly 4, 1957), until none changes anything.
+    """
+    given = np.zeros(len(least))
+    for _ in range(SWEEPS):
+        largest = 0.0
+        for row in range(len(least)):
+            i, j = one[row], other[row]
+            lacking = least[row]
+            for axis in range(normals.shape[1]):
+                if i >= 0:
+                    lacking -= normals[row, axis] * velocities[i, axis]
+                if j >= 0:
+                    lacking += normals[row, axis] * velocities[j, axis]
+            movable = (1 if i >= 0 else 0) + (1 if j >= 0 else 0)
+            change = max(lacking / movable, -given[row])
+            given[row] += change
+            largest = max(largest, abs(change))
+            for axis in range(normals.shape[1]):
+                if i >= 0:
+                    velocities[i, axis] += change * normals[row, axis]
+                if j >= 0:
+                    velocities[j, axis] -= change * normals[row, axis]
+        if largest < EXACT:
+            return True
+    return False
 
 
 def _walls(problem: Problem, places: Array, robots: list[int]) -> Iterator[tuple[int, Array, float]]:

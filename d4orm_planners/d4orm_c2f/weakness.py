@@ -69,7 +69,11 @@ class Weakness:
         self._most[most] = np.maximum(self._most, done)[most]
         weak = (self._asked >= ENOUGH) & (self._most < AS_STRONG)
         share = np.where(weak, self._most, 1.0)
-        added = (np.asarray(executed, np.float64) - share[:, None] * told) * going[:, None]
+        # A weak robot does that share of everything, or all that it is asked to up to that share of its limits.
+        capped = np.where(weak, share / np.maximum(np.maximum(asked, share), 1e-9), 1.0)
+        scaled, cut = (np.asarray(executed, np.float64) - factor[:, None] * told for factor in (share, capped))
+        nearer = effort(self._first, cut) < effort(self._first, scaled)
+        added = np.where(nearer[:, None], cut, scaled) * going[:, None]
         self._seen += 1
         self._added += max(FORGOTTEN, 1 / (FIRST + self._seen)) * (added - self._added)
         held_back = STEP * np.floor(effort(self._first, self._added) / STEP)

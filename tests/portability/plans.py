@@ -1,4 +1,4 @@
-"""Plans that must come out the same, to the bit, on every processor: prints a digest of each as JSON.
+"""Plans and episodes that must come out the same, to the bit, on every processor: prints a digest of each as JSON.
 
 `digests.json` beside this file holds what they are. A change of the planners or of the physics changes them: then
 `python tests/portability/plans.py > tests/portability/digests.json`, and say so in the changelog.
@@ -13,18 +13,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from d4orm_env import make_problem
-from d4orm_planners import make_planner
+from d4orm_env import make_problem, navigation_v0
+from d4orm_env.disturbances import Disturbance, Intruder, Push
+from d4orm_planners import make_planner, make_policy, run_episode
 
 
 class Case(NamedTuple):
-    """What to plan."""
+    """What to plan, or to execute under disturbances."""
 
     planner: str
     settings: dict[str, Any]
     scenario: str
     arguments: dict[str, Any]
     max_iterations: int = 2
+    disturbances: tuple[Disturbance[Any], ...] = ()
 
 
 CASES = {
@@ -50,6 +52,9 @@ CASES = {
     "a roundabout": Case("d4orm-d", {"improve": True}, "circle", {"num_robots": 6}, 3),
     "amswarm": Case("amswarm", {}, "amswarm_3", {}, 1),
     "mmd": Case("mmd", {"improve": True}, "rooms", {"num_robots": 5}, 4),
+    "under way": Case(
+        "d4orm-c2f", {"refine": "sync"}, "circle", {"num_robots": 6}, 0, (Intruder(4, 0.8), Push(0.3, 0.3))
+    ),
     "through a corridor": Case("guided", {"improve": True}, "corridor", {"num_robots": 6}, 2),
 }
 
@@ -60,9 +65,15 @@ QUICK = ("d4orm", "d4orm-d", "mppi", "cem", "mixed models")
 def digest(case: Case) -> str:
     """The problem, the controls and the states that they lead to, as 16 hexadecimal digits."""
     problem = make_problem(case.scenario, seed=0, **case.arguments)
-    planner = make_planner(case.planner, engine="cpu", **case.settings)
-    plan = planner.solve(problem, seed=1, max_iterations=case.max_iterations)
-    arrays = (problem.start, problem.goal, plan.controls, plan.trajectory.states, plan.trajectory.rewards)
+    if case.disturbances:
+        env = navigation_v0.parallel_env(problem=problem, disturbances=case.disturbances)
+        done = run_episode(env, make_policy(case.planner, engine="cpu", **case.settings), seed=1)
+        controls = np.zeros(0)  # the states tell them
+    else:
+        planner = make_planner(case.planner, engine="cpu", **case.settings)
+        done = planner.solve(problem, seed=1, max_iterations=case.max_iterations)
+        controls = done.controls
+    arrays = (problem.start, problem.goal, controls, done.trajectory.states, done.trajectory.rewards)
     content = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
     return hashlib.sha256(content).hexdigest()[:16]
 
