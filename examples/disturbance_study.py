@@ -1,20 +1,22 @@
-"""How often do controllers bring eight robots home when something goes wrong: ten disturbances, three scenarios.
+"""How often do controllers bring eight robots home when something goes wrong: ten disturbances, another physics.
 
     python examples/disturbance_study.py --seeds 50 --out disturbance_study
 
 D4orm-C2F beside a plan of D4orm-D executed open loop, ORCA and PPO, each with the same seeds, on the circle, on random
-places and in rooms. Every disturbance is on by itself at one level, beside no disturbance at all. Written is for every
-policy, scenario and disturbance how many trials succeeded, with Wilson's 95% interval, in how many somebody touched
-anything, and how many ended too late; an overview of these, and a heat map. Seeds count once all policies have met
-them. Trials are stored in the folder one by one, and a call that was
-broken off, or one with more seeds or scenarios, goes on from there. `--trials FILE` makes table and heat map of trials
-that are in a Parquet file, such as those in `data/`.
+places and in rooms. Every disturbance is on by itself at one level, beside no disturbance at all; and on the circle and
+on random places the same robots are rigid bodies in MuJoCo, as pucks and on two wheels, where that is installed.
+Written is for every policy, scenario and disturbance how many trials succeeded, with Wilson's 95% interval, in how many
+somebody touched anything, and how many ended too late; an overview of these, and a heat map. Seeds count once all
+policies have met them. Trials are stored in the folder one by one, and a call that was broken off, or one with more
+seeds or scenarios, goes on from there. `--trials FILE` makes table and heat map of trials that are in a Parquet file,
+such as those in `data/`.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -57,21 +59,32 @@ DISTURBANCES: dict[str, Disturbance[Any]] = {
     "limits 20% weaker": LimitMismatch(0.8),
 }
 NOTHING = "none"
+BODIES = {"MuJoCo, pucks": "holonomic2d", "MuJoCo, two wheels": "differential_drive"}
+"""What is on instead of a disturbance, and the robots' model."""
+COLUMNS = (NOTHING, *DISTURBANCES, *BODIES)
 
 Cells = dict[tuple[str, str, str], list[Trial]]
 """Trials by scenario, policy and disturbance."""
 
 
-def run(scenarios: Iterable[str], policies: dict[str, dict[str, Any]], seeds: int, out: Path) -> None:
-    """Trials of every policy under every disturbance, into the store."""
+def run(
+    scenarios: tuple[str, ...], policies: dict[str, dict[str, Any]], seeds: int, workers: int | None, out: Path
+) -> None:
+    """Trials of every policy under every disturbance and in MuJoCo, into the store."""
     levels: dict[str, list[list[Disturbance[Any]]]] = {
         NOTHING: [[]],
         **{name: [[one]] for name, one in DISTURBANCES.items()},
     }
-    study = Study(
-        policies=policies, scenarios=tuple(scenarios), num_robots=ROBOTS, seeds=range(seeds), disturbances=levels
-    )
-    run_study(study, out, workers=1, progress=tell)
+    study = Study(policies=policies, scenarios=scenarios, num_robots=ROBOTS, seeds=range(seeds), disturbances=levels)
+    run_study(study, out, workers=workers, progress=tell)
+    for model in BODIES.values() if find_spec("mujoco") else ():
+        # PPO was trained for one of the models only.
+        able = {name: given for name, given in policies.items() if (name, model) != ("ppo", "differential_drive")}
+        inside = tuple(scenario for scenario in scenarios if scenario != "rooms")
+        study = Study(
+            policies=able, scenarios=inside, num_robots=ROBOTS, seeds=range(seeds), model=model, physics="mujoco"
+        )
+        run_study(study, out, workers=workers, progress=tell)
 
 
 def tell(what: str, done: int, total: int) -> None:
@@ -83,10 +96,11 @@ def by_cell(trials: Iterable[Trial]) -> Cells:
     """The table's cells."""
     named = {Condition(disturbances=(one,)).text: name for name, one in DISTURBANCES.items()}
     cells: Cells = {}
+    bodies = {model: name for name, model in BODIES.items()}
     for trial in trials:
-        disturbance = named.get(trial.disturbances, NOTHING)
+        disturbance = bodies[trial.model] if trial.physics == "mujoco" else named.get(trial.disturbances, NOTHING)
         cells.setdefault((trial.scenario, trial.label, disturbance), []).append(trial)
-    order = [SCENARIOS, tuple(POLICIES), (NOTHING, *DISTURBANCES)]
+    order = [SCENARIOS, tuple(POLICIES), COLUMNS]
     return dict(sorted(cells.items(), key=lambda cell: [known.index(one) for known, one in zip(order, cell[0])]))
 
 
@@ -110,6 +124,7 @@ def overview(cells: Cells) -> list[dict[str, Any]]:
     rows: dict[tuple[str, str], dict[str, Any]] = {}
     for (scenario, policy, disturbance), trials in cells.items():
         row = rows.setdefault((scenario, policy), {"scenario": scenario, "policy": policy, "trials": len(trials)})
+        row.update({name: row.get(name, "-") for name in COLUMNS})
         touched = sum(trial.collided > 0 for trial in trials)
         row[disturbance] = f"{sum(trial.success for trial in trials)}, {touched}"
     return list(rows.values())
@@ -118,26 +133,23 @@ def overview(cells: Cells) -> list[dict[str, Any]]:
 def complete(trials: Iterable[Trial]) -> list[Trial]:
     """Trials of those seeds that all policies in the scenario have met under every disturbance."""
     found: dict[tuple[str, int], list[Trial]] = {}
-    policies: dict[str, set[str]] = {}
     for trial in trials:
         found.setdefault((trial.scenario, trial.seed), []).append(trial)
-        policies.setdefault(trial.scenario, set()).add(trial.label)
-    wanted = {scenario: len(labels) * (1 + len(DISTURBANCES)) for scenario, labels in policies.items()}
     order = sorted(found, key=lambda key: (SCENARIOS.index(key[0]), key[1]))
-    return [trial for key in order if len(found[key]) == wanted[key[0]] for trial in found[key]]
+    all_of = {place: max(len(some) for (where, _), some in found.items() if where == place) for place, _ in order}
+    return [trial for key in order if len(found[key]) == all_of[key[0]] for trial in found[key]]
 
 
 def draw(cells: Cells, path: Path) -> None:
     """Success as a heat map: a panel per scenario, a row per policy, a column per disturbance."""
     scenarios = list(dict.fromkeys(scenario for scenario, _, _ in cells))
-    columns = [NOTHING, *DISTURBANCES]
     figure, axes = plt.subplots(len(scenarios), 1, figsize=(9, 1.2 + 1.7 * len(scenarios)), sharex=True, squeeze=False)
     for axis, scenario in zip(axes[:, 0], scenarios, strict=True):
         policies = list(dict.fromkeys(policy for place, policy, _ in cells if place == scenario))
-        shares = np.full((len(policies), len(columns)), np.nan)
+        shares = np.full((len(policies), len(COLUMNS)), np.nan)
         for (place, policy, disturbance), trials in cells.items():
             if place == scenario:
-                shares[policies.index(policy), columns.index(disturbance)] = np.mean([one.success for one in trials])
+                shares[policies.index(policy), COLUMNS.index(disturbance)] = np.mean([one.success for one in trials])
         axis.imshow(shares, vmin=0, vmax=1, cmap="viridis", aspect="auto")
         for (row, column), share in np.ndenumerate(shares):
             if not np.isnan(share):
@@ -146,7 +158,7 @@ def draw(cells: Cells, path: Path) -> None:
         axis.set_title(f"{scenario}, {ROBOTS} robots: trials that succeed [%]", loc="left")
         axis.set_yticks(range(len(policies)), policies)
         axis.grid(False)
-    axes[-1, 0].set_xticks(range(len(columns)), columns, rotation=30, ha="right")
+    axes[-1, 0].set_xticks(range(len(COLUMNS)), COLUMNS, rotation=30, ha="right")
     figure.tight_layout()
     save_figure(figure, path)
 
@@ -156,6 +168,7 @@ def main() -> int:
     parser = argument_parser(__doc__)
     parser.add_argument("--seeds", type=count, default=50)
     parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=SCENARIOS)
+    parser.add_argument("--workers", type=count, help="processes, by default one per core")
     parser.add_argument("--trials", type=Path, help="run nothing; a Parquet file of trials")
     arguments = parser.parse_args()
     if arguments.trials is not None:
@@ -163,7 +176,7 @@ def main() -> int:
     else:
         chosen = {"orca": {}} if arguments.quick else POLICIES
         scenarios, seeds = (SCENARIOS[:1], 1) if arguments.quick else (arguments.scenarios, arguments.seeds)
-        run(scenarios, chosen, seeds, arguments.out)
+        run(tuple(scenarios), chosen, seeds, arguments.workers, arguments.out)
         # With those of calls before.
         trials = TrialStore(arguments.out / STORE).trials()
         trials = complete(trials)
