@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,10 +18,12 @@ from d4orm_env.engine.choice import get_engine
 from d4orm_planners import make_planner
 from d4orm_planners.guidance.lacam import Moves, find_moves
 from d4orm_planners.guidance.planner import leads_round
+from d4orm_planners.guidance.pursuit import gear_towards
 from d4orm_planners.guidance.replanning import Others, find_way
 from d4orm_planners.guidance.roadmap import Roadmap, lay_roadmap
-from d4orm_planners.guidance.routes import join_routes, make_routes, stops_of
+from d4orm_planners.guidance.routes import Stops, join_routes, make_routes, stops_of
 from d4orm_planners.guidance.team import Driven, Replanning, drive_moves
+from d4orm_planners.guidance.timed_drive import drive_by_clock
 
 
 def walled(
@@ -199,6 +202,59 @@ def test_a_drive_along_found_moves_is_what_the_engine_makes_of_its_controls(mode
     assert verify(problem, driven.until(problem.horizon)).ok
 
 
+@numba.njit
+def gear(along: float, across: float, speed: float, backs_up: bool) -> float:
+    return float(gear_towards(np.float32(along), np.float32(across), np.float32(speed), backs_up))
+
+
+@pytest.mark.parametrize(
+    ("degrees", "speed", "swings_round", "backs_up"),
+    [
+        (0, 0, 1, 1), (180, 0, -1, -1), (10, -1, 1, 1), (-170, 1, -1, -1),
+        # Aside, a robot that drives goes on in its gear, and one that backs up does so until the point is ahead.
+        (80, 0, 1, -1), (-80, 0, 1, -1), (100, 0, -1, 1), (40, 1, 1, 1), (30, -1, 1, -1),
+        (115, 1, 1, 1), (65, -1, -1, -1), (125, 1, -1, 1), (55, -1, 1, -1),
+    ],
+)  # fmt: skip
+def test_a_robot_that_turns_as_it_drives_chooses_its_gear(
+    degrees: float, speed: float, swings_round: int, backs_up: int
+) -> None:
+    along, across = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    assert gear(along, across, speed, False) == swings_round
+    assert gear(along, across, speed, True) == backs_up
+
+
+@pytest.mark.parametrize("heading", np.arange(-180, 180, 45))
+@pytest.mark.parametrize("way", [[(0, 0), (3, 0)], [(0, 0), (2, 0), (2, 2)], [(0, 0), (1.5, 0), (1.5, 1), (0, 1)]])
+def test_a_car_follows_a_route_from_every_heading(way: Any, heading: float) -> None:
+    start = [[0, 0, np.radians(heading), 0, 0]]
+    problem = Problem(Team(("car",)), start, [way[-1]], World(dimension=2), horizon=400)
+    corners = np.hstack([np.array(way, float), np.zeros((len(way), 1))])
+    times = np.arange(len(way)) * 40.0
+    stops = Stops(corners, np.array([0, len(way)]), np.append(-1.0, times[:-1]), times)
+    (route,) = make_routes(problem, stops, [0], 0.1)
+    turning = problem.team.turning_radius[0]
+    assert (route.bends > turning - 1e-6).all()
+    for backs_up in (False, True):
+        controls, places, arrival = drive_by_clock(problem, 0, route, stops, 400, hurrying=True, backs_up=backs_up)
+        assert arrival <= 400
+        assert verify(problem, controls[:, None]).ok
+        gaps = np.linalg.norm(places[: arrival + 1, None] - route.points, axis=2).min(axis=1)
+        # It leaves the route no farther than turning round takes, and is on it in the end.
+        assert gaps.max() < 4 * turning
+        assert gaps[arrival - 5 :].max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("scenario", "seed"), [("corridor", 3), ("corridor", 4), ("doorway", 4), ("maze", 5), ("rooms", 4)]
+)
+def test_a_car_alone_finds_its_way_among_walls(scenario: str, seed: int) -> None:
+    problem = make_problem(scenario, num_robots=1, seed=seed, model="car")
+    plan = make_planner("guided").solve(problem, seed=0, max_iterations=4)
+    assert plan.solved
+    assert verify(problem, plan.controls).ok
+
+
 @pytest.mark.parametrize("fault", ["nobody", "across", "ahead"])
 def test_a_way_in_space_and_time_lets_others_pass(fault: str) -> None:
     """Another robot crosses, or drives the same way ahead and stops for a while where both have to go."""
@@ -259,6 +315,7 @@ def test_ways_one_by_one_displace_those_in_the_way() -> None:
         ("rooms", 12, {}), ("maze", 8, {}), ("warehouse", 12, {}), ("corridor", 8, {}), ("doorway", 8, {}),
         ("rooms", 8, {"model": "unicycle"}), ("rooms", 8, {"model": "velocity2d"}),
         ("forest", 10, {"model": "differential_drive"}), ("forest", 10, {"model": "holonomic3d"}),
+        ("rooms", 4, {"model": "car"}), ("warehouse", 6, {"model": "car"}),
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("name", ["guided", "d4orm-d", "d4orm"])

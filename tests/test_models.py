@@ -238,6 +238,13 @@ def test_a_car_moves_on_the_circle_of_its_steering(wheelbase: float) -> None:
     assert x == pytest.approx(expected, abs=1e-5)
 
 
+def test_only_a_car_does_not_turn_in_place() -> None:
+    models = ("car", "car", "unicycle", "differential_drive", "holonomic2d")
+    team = Team(models, own_limits={"wheelbase": [0.3, 0.5, 1, 1, 1], "max_steering": [math.atan(0.5), 0.6, 1, 1, 1]})
+    assert team.turning_radius == pytest.approx([0.6, 0.5 / math.tan(0.6), 0, 0, 0])
+    assert [model.turns_in_place for model in team.robot_models] == [False, False, True, True, True]
+
+
 @pytest.mark.parametrize("name", ["unicycle", "car"])
 @pytest.mark.parametrize("distance", [0.3, 1.0, 4.0])
 def test_the_law_of_a_robot_with_wheels_reaches_its_goal_from_every_heading(name: str, distance: float) -> None:

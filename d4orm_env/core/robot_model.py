@@ -221,21 +221,30 @@ class Model:
         """The columns of the robot's limits."""
         return (*STANDARD_LIMITS, *(limit.name for limit in self.own_limits))
 
-    def turn_rate(self, limits: FloatArray) -> float:
-        """Fastest turn of the heading that these limits allow [rad/s], zero without a heading.
+    @property
+    def turns_in_place(self) -> bool:
+        """Whether it can turn where it stands, or need not turn at all."""
+        return self.heading_index is None or self._turn_rate([1.0] * len(self.limit_names), moving=False) > 0
 
-        Sought among the states and controls at their limits, which is where models turn fastest.
-        """
-        if self.heading_index is None:
-            return 0.0
-        most = limits.tolist()
+    def turn_rate(self, limits: FloatArray) -> float:
+        """Fastest turn of the heading that these limits allow [rad/s], zero without a heading."""
+        return 0.0 if self.heading_index is None else self._turn_rate(limits.tolist(), moving=True)
+
+    def turning_radius(self, limits: FloatArray) -> float:
+        """Radius of the smallest circle that it can drive [m]: zero if it turns in place."""
+        return 0.0 if self.turns_in_place else float(limits[SPEED]) / self.turn_rate(limits)
+
+    def _turn_rate(self, most: list[float], *, moving: bool) -> float:
+        """Sought among the states and controls at their limits, which is where models turn fastest."""
         bounds = dict(self.state_limits) | dict.fromkeys(self.speed_indices, SPEED)
-        ends = [(-most[bounds[i]], most[bounds[i]]) if i in bounds else (0.0,) for i in range(self.state_size)]
-        controls = list(product(*((-most[column], most[column]) for column in self.control_limits)))
+
+        def ends(column: int | None) -> tuple[float, ...]:
+            return (0.0,) if column is None or (column == SPEED and not moving) else (-most[column], most[column])
+
+        states = list(product(*(ends(bounds.get(i)) for i in range(self.state_size))))
+        controls = list(product(*map(ends, self.control_limits)))
         return max(
-            abs(self.functions.derivative(x, u, most, PYTHON_OPS)[self.heading_index])
-            for x in product(*ends)
-            for u in controls
+            abs(self.functions.derivative(x, u, most, PYTHON_OPS)[self.heading_index]) for x in states for u in controls
         )
 
 

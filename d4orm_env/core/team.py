@@ -124,6 +124,12 @@ class Team(Frozen):
         bound.setflags(write=False)
         return bound
 
+    @property
+    def turning_radius(self) -> FloatArray:
+        """``(K,)`` radius of the smallest circle that each can drive [m]; zero for those that turn in place."""
+        models = zip(self.robot_models, self.limits, strict=True)
+        return np.array([model.turning_radius(limits) for model, limits in models], np.float32)
+
     def select(self, robots: Sequence[int]) -> Team:
         """The team of these robots only, in the order given."""
         index = list(robots)

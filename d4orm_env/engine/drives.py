@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from d4orm_env.core import robot_model, transition
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.dynamics import MODELS
+from d4orm_env.core.problem import Problem
 from d4orm_env.engine import lanes, tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import (
@@ -40,6 +41,33 @@ class DriveRules(NamedTuple):
     docking: FloatArray
     docks: np.bool_
     near2: np.float32
+
+
+class LoneRobot(NamedTuple):
+    """A robot that drives as if nobody else were there.
+
+    Attributes:
+        time_step: As of :class:`DriveRules`, like the next two.
+        docking: ``(2,)``.
+        docks: Whether it stands for ever where it has arrived.
+        limits: ``(L,)``.
+        goal: ``(d,)`` [m].
+        start: ``(n,)``.
+    """
+
+    time_step: FloatArray
+    docking: FloatArray
+    docks: np.bool_
+    limits: FloatArray
+    goal: FloatArray
+    start: FloatArray
+
+    @classmethod
+    def of(cls, problem: Problem, robot: int) -> LoneRobot:
+        """A robot of a team."""
+        arrays, goal, start = problem.arrays, problem.goal[robot], problem.start[robot]
+        docking = np.array([arrays.squared_goal_radius, arrays.squared_goal_speed])
+        return cls(arrays.time_step, docking, arrays.docks, arrays.limits[robot], goal, start)
 
 
 class DrivenWays(NamedTuple):

@@ -18,19 +18,15 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_model import ACCELERATION, SPEED, TURN_RATE
 from d4orm_env.engine import lanes, tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.tiles import ONE, OPS, OPTIONS, ZERO, compiled, inlined, make_stepper, models_key, to_fixed_tuple
+from d4orm_env.engine.tiles import OPTIONS, ZERO, make_stepper, models_key, to_fixed_tuple
+from d4orm_planners.guidance import pursuit
+from d4orm_planners.guidance.pursuit import lookaheads, point_ahead, point_reached, square_to, steering
 from d4orm_planners.guidance.routes import Routes
 
-SOURCES = fingerprint((robot_model, transition, lanes, tiles))
+SOURCES = fingerprint((robot_model, transition, lanes, tiles, pursuit))
 
-LOOKAHEAD = 0.05
-"""Of the point of its route that a robot heads for, beyond what it drives in a step and a half [m]."""
 BRAKING = 0.5
 """Share of its acceleration that a robot counts on before corners and in them."""
-FACING, CREEP = np.float32(0.8), np.float32(0.01)
-"""Cosine of the angle between heading and way from which on a robot drives, and share of its speed before that."""
-REACHED = 4e-4
-"""Square of the distance from which on a robot has come to a point [m^2]."""
 RESERVE = 0.8
 """Share of the way to where it must stop that a robot plans to stop in."""
 BEYOND = 2.0
@@ -57,35 +53,36 @@ class Progress(NamedTuple):
     pace: Any
 
 
-@compiled
-def square_to(points: Any, i: Any, place: Any) -> Any:
-    """Squared distance of a point from a place."""
-    dx, dy, dz = points[i, 0] - place[0], points[i, 1] - place[1], points[i, 2] - place[2]
-    return dx * dx + dy * dy + dz * dz
+class Part(NamedTuple):
+    """The robots of a team that have the same model.
 
+    Attributes:
+        time_step: ``(4,)`` see :class:`~d4orm_env.core.robot_model.TimeStep`.
+        docking: ``(2,)`` squares of the goal radius and of the goal speed.
+        docks: Whether who has arrived stands there for ever.
+        robots: ``(B,)`` int64.
+        limits: ``(B, L)``.
+        goals: ``(B, d)`` [m].
+    """
 
-@compiled
-def point_reached(points: Any, arcs: Any, at: Any, last: Any, place: Any) -> Any:
-    """The point that a robot has come to that was at ``at``: as far on as each next one is nearer, or reached."""
-    following = at
-    while following < last:
-        following += 1
-        # Where two arcs join, points coincide but for rounding.
-        if arcs[following] - arcs[at] > 0.01 or following == last:
-            gap = square_to(points, following, place)
-            if gap > square_to(points, at, place) and gap > REACHED:
-                break
-            at = following
-    return at
+    time_step: Any
+    docking: Any
+    docks: Any
+    robots: Any
+    limits: Any
+    goals: Any
 
 
 @cached_kernel(SOURCES, variant="direct", **OPTIONS)
-def direct(routes: Any, paces: Any, dt: Any, beyond: Any, positions: Any, standing: Any, progress: Any) -> None:
+def direct(
+    routes: Any, paces: Any, sights: Any, dt: Any, beyond: Any, positions: Any, standing: Any, progress: Any
+) -> None:
     """Say where everybody is to drive next.
 
     Args:
         routes: The routes.
         paces: ``(T,)`` how fast each point may be passed [m/s].
+        sights: ``(K,)`` how far ahead robots look at least [m].
         dt: Time step [s].
         beyond: How far robots may plan to drive beyond their goals, which stop them [m].
         positions: ``(K, 3)`` float64 where they are [m].
@@ -105,15 +102,7 @@ def direct(routes: Any, paces: Any, dt: Any, beyond: Any, positions: Any, standi
         progress.waits[k] = wait
         i, here = first + progress.at[k], positions[k]
         limit = last if wait == end else max(first + routes.wait_at[wait] - 1, i)
-        # The slower it must be there, the less far ahead it looks. A sharp corner is driven to before it is turned, and
-        # left as soon as it is as good as reached.
-        target, slowest = min(i + 1, limit), paces[i]
-        while target < limit and (
-            (arcs[target] - arcs[i] < LOOKAHEAD + 1.5 * dt * slowest and routes.bends[target] > 0.0)
-            or square_to(points, target, here) < REACHED
-        ):
-            target += 1
-            slowest = min(slowest, paces[target])
+        target = point_ahead(routes, paces, i, limit, np.inf, (sights[k], dt), here)
         progress.targets[k, 0], progress.targets[k, 1] = points[target, 0], points[target, 1]
         progress.targets[k, 2] = points[target, 2]
         room = RESERVE * (arcs[limit] - arcs[i])
@@ -145,96 +134,26 @@ def fill_paces(arcs: Any, dt: Any, corner: Any, speed: Any, braking: Any, paces:
 
 
 @cache
-def steering(name: str) -> Any:
-    """Compiled control of a robot of the model with this name towards a target.
-
-    ``(state, target, room, pace, limits, h) -> control`` drives as fast as ``pace`` allows, and so as to be able to
-    stop within ``room``.
-    """
-    robot = MODELS[name]
-    approach, track = inlined(robot.functions.approach), inlined(robot.functions.track)
-    limit_control = inlined(robot.functions.limit_control)
-    d, heading = robot.dimension, -1 if robot.heading_index is None else robot.heading_index
-    if d == 2:
-
-        @inlined
-        def scaled(origin: Any, step: Any, factor: Any) -> Any:
-            return (origin[0] + step[0] * factor, origin[1] + step[1] * factor)
-
-        @inlined
-        def length(step: Any) -> Any:
-            return np.sqrt(step[0] * step[0] + step[1] * step[1])
-
-        @inlined
-        def between(state: Any, target: Any) -> Any:
-            return (target[0] - state[0], target[1] - state[1])
-    else:
-
-        @inlined
-        def scaled(origin: Any, step: Any, factor: Any) -> Any:
-            return (origin[0] + step[0] * factor, origin[1] + step[1] * factor, origin[2] + step[2] * factor)
-
-        @inlined
-        def length(step: Any) -> Any:
-            return np.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
-
-        @inlined
-        def between(state: Any, target: Any) -> Any:
-            return (target[0] - state[0], target[1] - state[1], target[2] - state[2])
-
-    @inlined
-    def steer(state: Any, target: Any, room: Any, pace: Any, limits: Any, h: Any) -> Any:
-        gap = between(state, target)
-        distance = length(gap)
-        # As fast as it could drive to a point straight ahead that is as far off as its room goes, towards its target.
-        factor = room / distance if distance > ZERO else ZERO
-        wanted = approach(state, scaled(state, gap, factor), limits, h, OPS)
-        if heading >= 0 and distance > ZERO:
-            # It turns before it drives.
-            facing = (OPS.cos(state[heading]) * gap[0] + OPS.sin(state[heading]) * gap[1]) / distance
-            pace *= min(max((facing - FACING) / (ONE - FACING), CREEP), ONE)
-        speed = length(wanted)
-        if speed > pace:
-            factor = pace / speed
-            wanted = scaled(between(wanted, wanted), wanted, factor)
-        return limit_control(track(state, wanted, limits, h, OPS), limits, OPS)
-
-    return steer
-
-
-@cache
 def drive_kernel(name: str) -> Any:
     """One compiled step of the robots of the model with this name that drive to where they are directed.
 
-    Args of the kernel: the time step, ``docking`` ``(2,)``, ``docks``, ``robots`` ``(B,)``, ``limits`` and ``goals`` of
-    these, the whole team's :class:`Progress`, ``states`` ``(K, n)`` and ``docked`` ``(K,)`` changed in place, and
-    ``controls`` ``(K, m)`` output.
+    Args of the kernel: the :class:`Part`, the whole team's :class:`Progress`, ``states`` ``(K, n)`` and ``docked``
+    ``(K,)`` changed in place, and ``controls`` ``(K, m)`` output.
     """
     robot = MODELS[name]
     (move, dock), steer = make_stepper(robot), steering(name)
     n, m, d, num_limits = robot.state_size, robot.control_size, robot.dimension, len(robot.limit_names)
 
     @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
-    def drive(
-        dt: Any,
-        docking: Any,
-        docks: Any,
-        robots: Any,
-        limits: Any,
-        goals: Any,
-        progress: Any,
-        states: Any,
-        docked: Any,
-        controls: Any,
-    ) -> None:
-        h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])
-        rules = (docking[0], docking[1], docks)
-        for b in range(robots.shape[0]):
-            k = robots[b]
-            own, goal = to_fixed_tuple(limits[b], num_limits), to_fixed_tuple(goals[b], d)
+    def drive(part: Any, progress: Any, states: Any, docked: Any, controls: Any) -> None:
+        h = transition.TimeStep(part.time_step[0], part.time_step[1], part.time_step[2], part.time_step[3])
+        docks, rules = part.docks, (part.docking[0], part.docking[1], part.docks)
+        for b in range(part.robots.shape[0]):
+            k = part.robots[b]
+            own, goal = to_fixed_tuple(part.limits[b], num_limits), to_fixed_tuple(part.goals[b], d)
             state, target = to_fixed_tuple(states[k], n), to_fixed_tuple(progress.targets[k], d)
             standing = transition.stands(docked[k], docks)
-            control = steer(state, target, progress.room[k], progress.pace[k], own, h)
+            control = steer(state, target, progress.room[k], progress.pace[k], True, own, h)
             for i in range(m):
                 controls[k, i] = ZERO if standing else control[i]
             control = to_fixed_tuple(controls[k], m)
@@ -262,6 +181,7 @@ def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[Floa
         [paces_along(problem, robot, routes.arcs[own], routes.bends[own]) for robot, own in enumerate(routes.each())]
     )
     controls = np.zeros((most_steps, num_robots, problem.control_size), np.float32)
+    sights = lookaheads(problem)
     states, docked = problem.start.copy(), np.zeros(num_robots, bool)
     progress = Progress(
         at=np.zeros(num_robots, np.int64),
@@ -276,19 +196,20 @@ def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[Floa
     parts = []
     for name in dict.fromkeys(team.models):
         robots = np.array([k for k, model in enumerate(team.models) if model == name], np.int64)
-        parts.append((drive_kernel(name), robots, arrays.limits[robots], problem.goal[robots]))
+        part = Part(arrays.time_step, docking, arrays.docks, robots, arrays.limits[robots], problem.goal[robots])
+        parts.append((drive_kernel(name), part))
     beyond = BEYOND if problem.docks and problem.goal_speed is None else 0.0
     ends, steps = np.diff(routes.first) - 1, 0
     while True:
         places[steps, :, :d] = states[:, :d]
-        direct(routes, paces, problem.dt, beyond, places[steps], docked & problem.docks, progress)
+        direct(routes, paces, sights, problem.dt, beyond, places[steps], docked & problem.docks, progress)
         # Without docking a robot may come through its goal before it has made way for others.
         there = docked & (problem.docks | (progress.at == ends))
         arrivals[:] = np.where(there, np.minimum(arrivals, steps), most_steps + 1)
         if steps == most_steps or there.all():
             return controls[:steps], places[: steps + 1], arrivals
-        for drive, *rows in parts:
-            drive(arrays.time_step, docking, arrays.docks, *rows, progress, states, docked, controls[steps])
+        for drive, part in parts:
+            drive(part, progress, states, docked, controls[steps])
         steps += 1
 
 

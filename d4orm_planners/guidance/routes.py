@@ -184,9 +184,10 @@ def _corner_radii(problem: Problem, corners: Floats, owner: IntArray, cut: float
     radii[inner] = 0.0
     # Who turns back does so on the spot.
     inner = inner[_bends_at(corners, inner).cosine > TURNING_BACK]
+    turning = problem.team.turning_radius.astype(np.float64)[owner]
     for share in CUTS:
         bends = _bends_at(corners, inner)
-        most = share * cut * bends.cosine / (1 - bends.cosine)
+        most = share * np.maximum(cut * bends.cosine / (1 - bends.cosine), turning[inner])
         radius = np.minimum(most, bends.straight * bends.cosine / bends.sine)
         fits = np.ones(len(inner), bool)
         if problem.world.num_obstacles:

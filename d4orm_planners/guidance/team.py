@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numba import types
@@ -107,6 +108,8 @@ class Replanning:
         places = [roadmap.nodes[ends] for ends in (roadmap.starts, roadmap.goals)]
         gaps = [np.sqrt(((ends[:, None] - ends) ** 2).sum(axis=2)) for ends in places]
         self.ends_apart = np.minimum(gaps[0], gaps[1] - self.bodies.docked) - 1e-6
+        # Who turns in place need not back up.
+        self.turns = [(False,) if model.turns_in_place else (False, True) for model in problem.team.robot_models]
         d = problem.dimension
         ends = np.stack([problem.world.clearance(place[:, :d]) for place in places])
         self.own_room = ends.min(axis=0) - TOUCH
@@ -227,8 +230,8 @@ class Replanning:
         )
         route = make_routes(self.problem, stops, [robot], cut)[0]
         # As soon as it can, or else by the clock of its way.
-        for hurrying in (True, False):
-            drive = drive_by_clock(self.problem, robot, route, stops, steps, hurrying=hurrying)
+        for backs_up, hurrying in product(self.turns[robot], (True, False)):
+            drive = drive_by_clock(self.problem, robot, route, stops, steps, hurrying=hurrying, backs_up=backs_up)
             if self.fits(Others(driven.places, np.minimum(apart + TOUCH, others.need)), robot, drive, latest):
                 driven.controls[:, robot], driven.places[:, robot], driven.arrivals[robot] = drive
                 if self.linger is not None:

@@ -12,9 +12,11 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.tiles import OPTIONS, ZERO, make_stepper, models_key, to_fixed_tuple
-from d4orm_planners.guidance import execution
-from d4orm_planners.guidance.execution import BEYOND, LOOKAHEAD, REACHED, RESERVE, point_reached, square_to, steering
+from d4orm_env.engine.drives import LoneRobot
+from d4orm_env.engine.tiles import OPTIONS, ZERO, inlined, make_stepper, models_key, to_fixed_tuple
+from d4orm_planners.guidance import execution, pursuit
+from d4orm_planners.guidance.execution import BEYOND, RESERVE
+from d4orm_planners.guidance.pursuit import point_ahead, point_reached, square_to, steering
 from d4orm_planners.guidance.routes import Route, Stops
 
 SOURCES = execution.SOURCES + fingerprint((execution,))
@@ -34,6 +36,8 @@ class Timed(NamedTuple):
         corners: ``(C,)`` float64 length of the route up to each corner [m].
         departs: ``(C,)`` float64 step at which it may set out for each corner from the one before.
         arrives: ``(C,)`` float64 step at which it should be there.
+        sight: How far ahead the robot looks at least [m].
+        beyond: How far it may plan to drive beyond its goal, which stops it [m].
     """
 
     points: Any
@@ -43,89 +47,84 @@ class Timed(NamedTuple):
     corners: Any
     departs: Any
     arrives: Any
+    sight: Any
+    beyond: Any
+
+
+@inlined
+def stop_before(route: Any, step: Any, at: Any, corner: Any, stride: Any) -> Any:
+    """Length of the route up to where a robot at point ``at`` has to be able to stop [m]; ``stride`` in a step [m].
+
+    It stays where it waits until it may set out, and stops there only if it has to.
+    """
+    last = route.corners.shape[0] - 1
+    if step < route.departs[corner]:
+        return route.corners[corner - 1]
+    if corner < last:
+        soonest = step + (route.corners[corner] - route.arcs[at]) / stride
+        if soonest + 2 < route.departs[corner + 1]:
+            return route.corners[corner]
+    return route.corners[last]
+
+
+@inlined
+def pace_to(route: Any, step: Any, at: Any, corner: Any, stop: Any, dt: Any) -> Any:
+    """How fast it should be, in order to come to the next corner at its time [m/s]."""
+    pace, time = np.float32(route.paces[at]), route.arrives[corner] - step
+    if time > 1.0 and stop >= route.corners[corner]:
+        pace = min(pace, np.float32((route.corners[corner] - route.arcs[at] + 0.02) / (time * dt)))
+    return pace
 
 
 @cache
 def timed_kernel(name: str) -> Any:
     """The compiled drive of a robot of the model with this name along a :class:`Timed` route.
 
-    Args of the kernel: the time step, ``docking`` ``(2,)``, ``docks``, ``limits``, ``goal``, the route, how far the
-    robot may plan to drive beyond its goal, ``state`` ``(n,)`` to begin with, ``controls`` ``(T, m)`` and ``places``
-    ``(T + 1, 3)``, output. It returns the step of arrival, ``T + 1`` for none.
+    Args of the kernel: the :class:`~d4orm_env.engine.drives.LoneRobot`, the route, whether the robot backs up, see
+    :func:`~d4orm_planners.guidance.pursuit.gear_towards`, ``controls`` ``(T, m)`` and ``places`` ``(T + 1, 3)``,
+    output. It returns the step of arrival, ``T + 1`` for none.
     """
-    robot = MODELS[name]
-    (move, dock), steer = make_stepper(robot), steering(name)
-    n, m, d, num_limits = robot.state_size, robot.control_size, robot.dimension, len(robot.limit_names)
+    model = MODELS[name]
+    (move, dock), steer = make_stepper(model), steering(name)
+    n, m, d, num_limits = model.state_size, model.control_size, model.dimension, len(model.limit_names)
 
     @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
-    def drive(
-        dt: Any,
-        docking: Any,
-        docks: Any,
-        limits: Any,
-        goal: Any,
-        route: Any,
-        beyond: Any,
-        state: Any,
-        controls: Any,
-        places: Any,
-    ) -> Any:
-        h, rules = transition.TimeStep(dt[0], dt[1], dt[2], dt[3]), (docking[0], docking[1], docks)
-        own, goal_place, x = to_fixed_tuple(limits, num_limits), to_fixed_tuple(goal, d), to_fixed_tuple(state, n)
-        points, arcs, last, last_corner = route.points, route.arcs, route.arcs.shape[0] - 1, route.corners.shape[0] - 1
-        target_place = np.zeros(d, np.float32)
-        at, corner, there, steps, arrival = 0, min(1, last_corner), False, controls.shape[0], controls.shape[0] + 1
-        places[0] = 0.0
+    def drive(robot: Any, route: Any, backs_up: Any, controls: Any, places: Any) -> Any:
+        dt, docks, rules = robot.time_step, robot.docks, (robot.docking[0], robot.docking[1], robot.docks)
+        h, own = transition.TimeStep(dt[0], dt[1], dt[2], dt[3]), to_fixed_tuple(robot.limits, num_limits)
+        goal, x = to_fixed_tuple(robot.goal, d), to_fixed_tuple(robot.start, n)
+        last, last_corner, steps = route.arcs.shape[0] - 1, route.corners.shape[0] - 1, controls.shape[0]
+        target_place, end = np.zeros(d, np.float32), route.corners[last_corner]
+        at, corner, there, arrival = 0, min(1, last_corner), False, steps + 1
+        places[:] = 0.0
         for i in range(d):
             places[0, i] = x[i]
         for step in range(steps):
             here = places[step]
-            at = point_reached(points, arcs, at, last, here)
-            while corner < last_corner and arcs[at] >= route.corners[corner] - 0.02:
+            at = point_reached(route.points, route.arcs, at, last, here)
+            while corner < last_corner and route.arcs[at] >= route.corners[corner] - 0.02:
                 corner += 1
-            # It stays where it waits until it may set out, and stops there only if it has to.
-            stop = route.corners[last_corner]
-            if step < route.departs[corner]:
-                stop = route.corners[corner - 1]
-            elif corner < last_corner:
-                soonest = step + (route.corners[corner] - arcs[at]) / (own[0] * dt[0])
-                if soonest + 2 < route.departs[corner + 1]:
-                    stop = route.corners[corner]
-            pace = np.float32(route.paces[at])
-            time = route.arrives[corner] - step
-            if time > 1.0 and stop >= route.corners[corner]:
-                pace = min(pace, np.float32((route.corners[corner] - arcs[at] + 0.02) / (time * dt[0])))
-            target, slowest = min(at + 1, last), route.paces[at]
-            while (
-                target < last
-                and arcs[target] < stop
-                and (
-                    (arcs[target] - arcs[at] < LOOKAHEAD + 1.5 * dt[0] * slowest and route.bends[target] > 0.0)
-                    or square_to(points, target, here) < REACHED
-                )
-            ):
-                target += 1
-                slowest = min(slowest, route.paces[target])
-            if arcs[target] > stop + 0.02:
+            stop = stop_before(route, step, at, corner, own[0] * dt[0])
+            pace = pace_to(route, step, at, corner, stop, dt[0])
+            target = point_ahead(route, route.paces, at, last, stop, (route.sight, dt[0]), here)
+            if route.arcs[target] > stop + 0.02:
                 target = at
-            room = RESERVE * max(stop - arcs[at], 0.0)
-            if stop == route.corners[last_corner]:
-                room += beyond
+            room = RESERVE * max(stop - route.arcs[at], 0.0)
+            if stop == end:
+                room += route.beyond
             elif room < 0.1:
-                room = np.sqrt(square_to(points, target, here))
+                room = np.sqrt(square_to(route.points, target, here))
             for i in range(d):
-                target_place[i] = points[target, i]
+                target_place[i] = route.points[target, i]
             standing = transition.stands(there, docks)
-            control = steer(x, to_fixed_tuple(target_place, d), np.float32(room), pace, own, h)
+            control = steer(x, to_fixed_tuple(target_place, d), np.float32(room), pace, backs_up, own, h)
             for i in range(m):
                 controls[step, i] = ZERO if standing else control[i]
             control = to_fixed_tuple(controls[step], m)
-            x, _, there = dock(standing, move(standing, x, control, own, h), control, own, goal_place, rules)
-            places[step + 1] = 0.0
+            x, _, there = dock(standing, move(standing, x, control, own, h), control, own, goal, rules)
             for i in range(d):
                 places[step + 1, i] = x[i]
-            done = there and (docks or at == last)
-            if not done:
+            if not (there and (docks or at == last)):
                 arrival = steps + 1
             elif arrival > steps:
                 arrival = step + 1
@@ -135,7 +134,14 @@ def timed_kernel(name: str) -> Any:
 
 
 def drive_by_clock(
-    problem: Problem, robot: int, route: Route, stops: Stops, steps: int, *, hurrying: bool = False
+    problem: Problem,
+    robot: int,
+    route: Route,
+    stops: Stops,
+    steps: int,
+    *,
+    hurrying: bool = False,
+    backs_up: bool = False,
 ) -> tuple[FloatArray, Any, int]:
     """``(controls (T, m), places (T + 1, 3), arrival)`` of one robot along its route.
 
@@ -146,9 +152,9 @@ def drive_by_clock(
         stops: Its corners, the steps at which it may set out for each, and at which it should be there.
         steps: ``T``.
         hurrying: Whether it comes to each as soon as it can, and waits only where it would have waited.
+        backs_up: Whether it backs up, if it drives in order to turn, where it could swing round.
     """
     departs, arrives = stops.departs, stops.arrives
-    arrays, model = problem.arrays, problem.team.models[robot]
     # Corners are rounded: the middle of those of its points that are passed at its time.
     at = (np.searchsorted(route.times, arrives) + np.searchsorted(route.times, arrives, side="right") - 1) // 2
     if hurrying:
@@ -160,16 +166,9 @@ def drive_by_clock(
     paces = execution.paces_along(problem, robot, arcs, route.bends, share)
     controls = np.zeros((steps, problem.control_size), np.float32)
     places = np.empty((steps + 1, 3))
-    arrival = timed_kernel(model)(
-        arrays.time_step,
-        np.array([arrays.squared_goal_radius, arrays.squared_goal_speed]),
-        arrays.docks,
-        arrays.limits[robot],
-        problem.goal[robot],
-        Timed(route.points, arcs, paces, route.bends, arcs[at], departs, arrives),
-        np.float32(BEYOND if problem.docks and problem.goal_speed is None else 0.0),
-        problem.start[robot],
-        controls,
-        places,
-    )
+    sight = pursuit.lookaheads(problem)[robot]
+    beyond = np.float32(BEYOND if problem.docks and problem.goal_speed is None else 0.0)
+    timed = Timed(route.points, arcs, paces, route.bends, arcs[at], departs, arrives, sight, beyond)
+    drive = timed_kernel(problem.team.models[robot])
+    arrival = drive(LoneRobot.of(problem, robot), timed, backs_up, controls, places)
     return controls, places, int(arrival)

@@ -12,6 +12,7 @@ from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine import lanes, tiles, wavefront
 from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.drives import LoneRobot
 from d4orm_env.engine.tiles import OPS, OPTIONS, inlined, make_stepper, models_key, to_fixed_tuple
 from d4orm_env.engine.wavefront import clearance_at
 from d4orm_planners.mmd import clock, way_frame
@@ -43,20 +44,19 @@ class Tracked(NamedTuple):
 @cache
 def tracking_kernel(name: str) -> Any:
     """The compiled drives of a robot of the model with this name; see :func:`drive_along`."""
-    robot = MODELS[name]
-    move, dock = make_stepper(robot)
-    approach, track = inlined(robot.functions.approach), inlined(robot.functions.track)
-    limit_control = inlined(robot.functions.limit_control)
-    n, m, d, num_limits = robot.state_size, robot.control_size, robot.dimension, len(robot.limit_names)
+    model = MODELS[name]
+    move, dock = make_stepper(model)
+    approach, track = inlined(model.functions.approach), inlined(model.functions.track)
+    limit_control = inlined(model.functions.limit_control)
+    n, m, d, num_limits = model.state_size, model.control_size, model.dimension, len(model.limit_names)
 
     @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
     def drive(
-        rules: Any, frame: Any, sines: Any, deviation: Any, space: Any, durations: Any, motions: Any, driven: Any
+        robot: Any, frame: Any, sines: Any, deviation: Any, space: Any, durations: Any, motions: Any, driven: Any
     ) -> None:
-        dt, docking, docks, limits, goal_place, start = rules
+        dt, docks, docking = robot.time_step, robot.docks, (robot.docking[0], robot.docking[1], robot.docks)
         h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])
-        docking_rules = (docking[0], docking[1], docks)
-        own, goal = to_fixed_tuple(limits, num_limits), to_fixed_tuple(goal_place, d)
+        own, goal = to_fixed_tuple(robot.limits, num_limits), to_fixed_tuple(robot.goal, d)
         last, horizon = sines.shape[0] - 1, driven.controls.shape[1]
         points, wanted = np.empty((last + 1, 3)), np.zeros(d, np.float32)
         paces, times, spot = np.empty(last + 1), np.empty(last + 1), np.empty((4, 3))
@@ -67,7 +67,7 @@ def tracking_kernel(name: str) -> Any:
                 points[i] = spot[0]
             fill_clock(points, durations[b], frame.speed, frame.acceleration, paces, times)
             i = 0
-            x, there, arrival, least = to_fixed_tuple(start, n), False, horizon + 1, np.inf
+            x, there, arrival, least = to_fixed_tuple(robot.start, n), False, horizon + 1, np.inf
             driven.places[b] = 0.0
             for axis in range(d):
                 driven.places[b, 0, axis] = x[axis]
@@ -91,7 +91,7 @@ def tracking_kernel(name: str) -> Any:
                 else:
                     for axis in range(m):
                         driven.controls[b, step, axis] = control[axis]
-                x, _, there = dock(standing, move(standing, x, control, own, h), control, own, goal, docking_rules)
+                x, _, there = dock(standing, move(standing, x, control, own, h), control, own, goal, docking)
                 for axis in range(d):
                     driven.places[b, step + 1, axis] = x[axis]
                 place = driven.places[b, step + 1]
@@ -120,15 +120,13 @@ def drive_along(
         durations: ``(B,)`` how long the motions take [s].
         motions: ``(B, 2 MODES)`` float32 whitened modes.
     """
-    arrays, count, horizon = problem.arrays, len(motions), problem.horizon
+    count, horizon = len(motions), problem.horizon
     driven = Tracked(
         np.zeros((count, horizon, problem.control_size), np.float32),
         np.empty((count, horizon + 1, 3)),
         np.empty(count, np.int64),
         np.empty(count),
     )
-    docking = np.array([arrays.squared_goal_radius, arrays.squared_goal_speed])
-    rules = (arrays.time_step, docking, arrays.docks, arrays.limits[robot], problem.goal[robot], problem.start[robot])
     kernel = tracking_kernel(problem.team.models[robot])
-    kernel(rules, frame, sines, deviation, space, durations, motions, driven)
+    kernel(LoneRobot.of(problem, robot), frame, sines, deviation, space, durations, motions, driven)
     return driven
