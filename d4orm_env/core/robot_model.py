@@ -232,7 +232,8 @@ class Model:
 
     def turning_radius(self, limits: FloatArray) -> float:
         """Radius of the smallest circle that it can drive [m]: zero if it turns in place."""
-        return 0.0 if self.turns_in_place else float(limits[SPEED]) / self.turn_rate(limits)
+        rate = math.inf if self.turns_in_place else self.turn_rate(limits)
+        return float(limits[SPEED]) / rate if rate else math.inf
 
     def _turn_rate(self, most: list[float], *, moving: bool) -> float:
         """Sought among the states and controls at their limits, which is where models turn fastest."""
