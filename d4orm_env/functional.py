@@ -127,22 +127,28 @@ def step(
     following = State(worlds.state[..., 0], worlds.docked[..., 0], steps, happened.controls)
     if function is None:
         return following, happened
+    given = _reward_input(problem, state, following, happened, before)
+    return following, happened._replace(rewards=jnp.asarray(function(given)))
+
+
+def _reward_input(problem: Problem, state: State, after: State, happened: Step, distances: jax.Array) -> RewardInput:
+    """What a reward is told of a step that began in ``state``, at these distances ``(K,)`` from the goals."""
+    arrays = _arrays(problem)
     traced: dict[str, Any] = {
         "previous_states": state.states,
-        "states": following.states,
+        "states": after.states,
         "controls": happened.controls,
         "goals": arrays.goal,
-        "previous_distances": before,
-        "distances": after,
+        "previous_distances": distances,
+        "distances": happened.distances,
         "initial_distances": 1 / arrays.inverse_initial_distance,
         "previously_arrived": state.arrived,
-        "arrived": following.arrived,
+        "arrived": after.arrived,
         "collided": happened.collided,
         "margin_violated": happened.margin_violated,
         "paper": happened.rewards,
     }
-    transition = RewardInput(**traced, team=problem.team, dt=problem.dt)
-    return following, happened._replace(rewards=jnp.asarray(function(transition)))
+    return RewardInput(**traced, team=problem.team, dt=problem.dt)
 
 
 def observe(problem: Problem, state: State, layout: ObservationLayout, max_cycles: int | None = None) -> jax.Array:

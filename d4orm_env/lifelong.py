@@ -7,6 +7,8 @@ import numpy as np
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.core.team import Team
 from d4orm_env.core.transition import arrives
 
 _BATCH = 256
@@ -25,22 +27,21 @@ def goal_region(problem: Problem) -> FloatArray:
     return np.stack([places.min(axis=0) - room, places.max(axis=0) + room]).astype(np.float32)
 
 
-def reached_goals(problem: Problem, goals: FloatArray, states: FloatArray, controls: FloatArray) -> BoolArray:
+def reached_goals(team: Team, arrays: ProblemArrays, states: FloatArray, controls: FloatArray) -> BoolArray:
     """``(K,)`` which robots are within the goal radius of their goals, at no more than the goal speed.
 
     Args:
-        problem: The problem; its goals are not looked at.
-        goals: ``(K, d)`` present goals [m].
+        team: The robots.
+        arrays: The problem, with their present goals.
         states: ``(K, n)``.
         controls: ``(K, m)`` executed last, of which first-order robots' speed is read.
     """
-    offsets = goals - states[:, : problem.dimension]
+    offsets = arrays.goal - states[:, : arrays.goal.shape[1]]
     squared_speed = np.zeros(len(states), np.float32)
-    if problem.goal_speed is not None:
-        for robot, model in enumerate(problem.team.robot_models):
-            velocity = model.functions.velocity(states[robot], controls[robot], problem.arrays.limits[robot], NUMPY_OPS)
+    if np.isfinite(arrays.squared_goal_speed):
+        for robot, model in enumerate(team.robot_models):
+            velocity = model.functions.velocity(states[robot], controls[robot], arrays.limits[robot], NUMPY_OPS)
             squared_speed[robot] = sum(component * component for component in velocity)
-    arrays = problem.arrays
     reached: BoolArray = arrives(
         (offsets * offsets).sum(axis=1), squared_speed, arrays.squared_goal_radius, arrays.squared_goal_speed
     )
@@ -69,11 +70,10 @@ def fresh_goal(
     """
     radius = np.asarray(problem.team.radius, np.float64)
     reach = radius + radius[robot] + problem.margin
-    own_reach = reach.copy()
-    own_reach[robot] = problem.goal_radius + radius[robot] + problem.margin
     others = np.arange(problem.num_robots) != robot
     bodies = np.concatenate([positions, goals[others]]).astype(np.float64)
-    keep_off = np.concatenate([own_reach, reach[others]])
+    keep_off = np.concatenate([reach, reach[others]])
+    keep_off[robot] = problem.goal_radius + radius[robot] + problem.margin
     low, high = goal_region(problem).astype(np.float64)
     for _ in range(_ATTEMPTS):
         places = random.uniform(low, high, (_BATCH, problem.dimension))

@@ -195,7 +195,7 @@ class Simulation:
             arrays = arrays._replace(squared_goal_radius=np.float32(-1))
         result = self._met(self._move(arrays, states, controls))
         if self.lifelong:
-            arrived = reached_goals(self.problem, self.arrays.goal, result.states, result.controls)
+            arrived = reached_goals(self.problem.team, self.arrays, result.states, result.controls)
         else:
             arrived = result.arrived.copy()
         rewards = result.rewards if self.reward is None else self._rewards(self.reward, result, arrived)

@@ -39,7 +39,7 @@ class _Field(NamedTuple):
         """``(Q, d)`` where to go first from places ``(Q, d)``, ``(Q,)`` the length of the way, ``(Q,)`` its anchor."""
         from d4orm_env.engine.wavefront import look
 
-        spatial = _spatial(places)
+        spatial = in_space(places)
         target, length, anchor = spatial.copy(), np.empty(len(spatial)), np.empty(len(spatial), np.int32)
         look(self.space, self.lattice, self.reach, self.front, spatial, target, length, anchor)
         return target[:, : places.shape[1]], length, anchor
@@ -141,7 +141,7 @@ def shortest_ways(problem: Problem) -> Ways:
     space = make_space(problem)
     length, fields = np.full(problem.num_robots, np.inf), []
     lattices: dict[tuple[float, int], Lattice] = {}
-    for robot, goal in enumerate(_spatial(problem.goal.astype(np.float64))):
+    for robot, goal in enumerate(in_space(problem.goal.astype(np.float64))):
         reach = float(np.asarray(problem.team.radius)[robot]) + problem.margin
         for refinement in range(1 + REFINEMENTS):
             if (reach, refinement) not in lattices:
@@ -208,13 +208,12 @@ def lay_lattice(
     if space is not None:
         settle_nodes(space, lattice, reach)
         return lattice
-    index = np.indices(tuple(lattice.size)).reshape(3, -1).T
-    lattice.places[:] = lattice.low + index * step
+    lattice.places[:] = lattice.low + np.indices(tuple(lattice.size)).reshape(3, -1).T * step
     inside = (lattice.places[:, :d] >= bounds[0] + reach) & (lattice.places[:, :d] <= bounds[1] - reach)
     lattice.free[:] = inside.all(axis=1)
     return lattice
 
 
-def _spatial(places: Floats) -> Floats:
+def in_space(places: Floats) -> Floats:
     """Places ``(Q, d)`` in three dimensions."""
     return np.hstack([places, np.zeros((len(places), 3 - places.shape[1]))])

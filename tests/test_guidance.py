@@ -19,7 +19,7 @@ from d4orm_planners import make_planner
 from d4orm_planners.guidance.lacam import Moves, find_moves
 from d4orm_planners.guidance.planner import leads_round
 from d4orm_planners.guidance.pursuit import gear_towards
-from d4orm_planners.guidance.replanning import Others, find_way
+from d4orm_planners.guidance.replanning import Others, Trip, find_way
 from d4orm_planners.guidance.roadmap import Roadmap, lay_roadmap
 from d4orm_planners.guidance.routes import Stops, join_routes, make_routes, stops_of
 from d4orm_planners.guidance.team import Driven, Replanning, drive_moves
@@ -271,7 +271,7 @@ def test_a_way_in_space_and_time_lets_others_pass(fault: str) -> None:
         places[200:, 1] = [3, 3, 0]
     others = Others(places, np.full(2, 0.41))
     bodies = replanning.bodies
-    way = find_way(roadmap, replanning.cells, bodies, bodies.costs[0], others, 0, 0.09, 4, 400, -1)
+    way = find_way(roadmap, replanning.cells, bodies, others, 0, Trip(0.09, 4, 400, -1))
     assert way[0].tolist() == [roadmap.starts[0], 0, 0]
     assert way[-1, 0] == roadmap.goals[0]
     assert (way[1:, 1] >= way[:-1, 2]).all()

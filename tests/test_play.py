@@ -366,7 +366,7 @@ def test_scenes_go_through_files(scene: Problem, random: np.random.Generator) ->
     start = np.array(changed.start)
     start[:, 2] = 0.4
     under_way = changed.resumed_at(start, changed.goal)
-    read = panel.read_scene(scenario_text(panel.at_rest(under_way)).encode())
+    read = panel.read_scene(scenario_text(edits.at_rest(under_way)).encode())
     assert read.replace(name="x") == changed.replace(name="x")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -99,7 +100,11 @@ class Frozen:
                     array.setflags(write=False)
             object.__setattr__(self, name, value)
 
-    def __getstate__(self) -> dict[str, object]:
+    def replace(self, **changes: Any) -> Self:
+        """A copy with some attributes changed, checked again."""
+        return type(self)(**self.__getstate__() | changes)
+
+    def __getstate__(self) -> dict[str, Any]:
         return {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
 
     def __setstate__(self, state: dict[str, object]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -297,10 +297,6 @@ class Problem(Frozen):
         from d4orm_env.render.pictures import plot
 
         return plot(self, None, axes)
-
-    def replace(self, **changes: object) -> Problem:
-        """A copy with some attributes changed, checked again."""
-        return Problem(**{attribute.name: getattr(self, attribute.name) for attribute in fields(self)} | changes)
 
     def resumed_at(self, start: ArrayLike, goal: ArrayLike, **changes: object) -> Problem:
         """The same team in the same world in other states, for planning on from there.

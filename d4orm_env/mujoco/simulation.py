@@ -9,8 +9,9 @@ from d4orm_env.core.observation_layout import Spare
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.core.transition import arrives, stands
+from d4orm_env.core.transition import stands
 from d4orm_env.engine.base import StepResult
+from d4orm_env.lifelong import reached_goals
 from d4orm_env.mujoco.bodies import TeamBodies
 from d4orm_env.mujoco.physics import Physics
 from d4orm_env.mujoco.scene import check_problem
@@ -87,7 +88,7 @@ class MujocoSimulation(Simulation):
         controls = self._limited(controls, arrays.limits, standing)
         states, touched = self.bodies.advance(controls, arrays.limits, self._intruders)
         states = self._measured(states, standing)
-        arrived = standing | self._arrives(arrays, states, controls)
+        arrived = standing | reached_goals(self.problem.team, arrays, states, controls)
         docking = np.flatnonzero(np.asarray(stands(arrived, self.problem.docks)) & ~standing)
         for robot in docking:
             model = self.problem.team.robot_models[robot]
@@ -112,18 +113,6 @@ class MujocoSimulation(Simulation):
             columns = list(model.speed_indices)
             states[robot, columns] = np.clip(states[robot, columns], -most[robot], most[robot])
         return states
-
-    def _arrives(self, arrays: ProblemArrays, states: FloatArray, controls: FloatArray) -> BoolArray:
-        squared_speed = np.zeros(len(states), np.float32)
-        if np.isfinite(arrays.squared_goal_speed):
-            for robot, model in enumerate(self.problem.team.robot_models):
-                velocity = model.functions.velocity(states[robot], controls[robot], arrays.limits[robot], NUMPY_OPS)
-                squared_speed[robot] = sum(component * component for component in velocity)
-        offsets = arrays.goal - states[:, : self.problem.dimension]
-        there: BoolArray = arrives(
-            (offsets * offsets).sum(axis=1), squared_speed, arrays.squared_goal_radius, arrays.squared_goal_speed
-        )
-        return there
 
     def _judged(
         self, arrays: ProblemArrays, states: FloatArray, controls: FloatArray, arrived: BoolArray, touched: BoolArray

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryFile
 
@@ -67,12 +68,9 @@ def save_animation(
             raise ValueError(f"{path} needs ffmpeg, which is not on the PATH; install it, or write a .gif instead")
         most = _MOST_FRAMES_PER_SECOND[kind]
         steps, rate = frame_steps(problem, trajectory, _frame_rate(problem, fps, speed, most), speed, max_frames)
-        renderer = FrameRenderer(problem, frame_size(problem, trajectory), trajectory.positions)
-        try:
-            write = _write_gif if kind == ".gif" else _write_mp4
+        write = _write_gif if kind == ".gif" else _write_mp4
+        with closing(FrameRenderer(problem, frame_size(problem, trajectory), trajectory.positions)) as renderer:
             write(temporary, _Frames(renderer, trajectory, steps, marks), rate)
-        finally:
-            renderer.close()
     return path
 
 

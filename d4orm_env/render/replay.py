@@ -71,12 +71,7 @@ def motion(
         ValueError: If the trajectory, the goals or the bodies do not fit the problem, or are not finite.
     """
     checked_trajectory(problem, trajectory)
-    places = problem.goal[None] if goals is None else np.asarray(goals, np.float32)
-    shape = (len(trajectory.states), *problem.goal.shape)
-    if goals is not None and (places.shape != shape or not np.isfinite(places).all()):
-        raise ValueError(f"goals have shape {places.shape}; they must be finite and of shape (T+1, K, d) = {shape}")
-    if (places == places[0]).all():
-        places = places[:1]
+    places = problem.goal[None] if goals is None else _checked_goals(problem, goals, len(trajectory.states))
     end = _end(problem, trajectory)
     flags = trajectory.arrived * 1 + trajectory.collided * 2 + trajectory.margin_violated * 4
     content = {
@@ -94,6 +89,15 @@ def motion(
     if denoising is not None:
         content["denoising"] = _denoising(denoising)
     return ReplayMotion(content)
+
+
+def _checked_goals(problem: Problem, goals: ArrayLike, moments: int) -> FloatArray:
+    """``(T+1, K, d)`` goals, or ``(1, K, d)`` where they are always the same."""
+    places: FloatArray = np.asarray(goals, np.float32)
+    shape = (moments, *problem.goal.shape)
+    if places.shape != shape or not np.isfinite(places).all():
+        raise ValueError(f"goals have shape {places.shape}; they must be finite and of shape (T+1, K, d) = {shape}")
+    return places[:1] if (places == places[0]).all() else places
 
 
 @dataclass(frozen=True, eq=False)

@@ -125,14 +125,21 @@ def alternate(method: Any, bodies: Any, robot: Any, limits: Any, goal: Any, fixe
         if max(violation, change) <= method.tolerance:
             break
         _accumulate(method, targets, bends, right)
-        for i in range(size):
-            for axis in range(d):
-                now = 0.0
-                for j in range(size):
-                    now += squares[i, j] * motion[j, axis]
-                multiplier[i, axis] -= penalty * (now - right[i, axis])
+        _raise_multiplier(squares, motion, right, penalty, multiplier)
         penalty = min(penalty * method.growth, MOST_PENALTY)
     return violation
+
+
+@compiled
+def _raise_multiplier(squares: Any, motion: Any, right: Any, penalty: Any, multiplier: Any) -> None:
+    """Add to the multiplier ``(n+1, d)`` what the constraints are violated by."""
+    size, d = motion.shape
+    for i in range(size):
+        for axis in range(d):
+            now = 0.0
+            for j in range(size):
+                now += squares[i, j] * motion[j, axis]
+            multiplier[i, axis] -= penalty * (now - right[i, axis])
 
 
 @compiled
@@ -183,15 +190,7 @@ def _project(
         The largest violation.
     """
     robots, (steps, d), radius = len(bodies.radius), guess.place.shape, bodies.radius[robot]
-    worst = 0.0
-    for step in range(steps):
-        for axis in range(d):
-            low, high = bodies.bounds[0, axis] + radius, bodies.bounds[1, axis] - radius
-            x = guess.place[step, axis]
-            targets.place[step, axis] = min(max(x, low), high)
-            worst = max(worst, low - x, x - high)
-        worst = max(worst, _shorten(guess.velocity[step], limits[0], targets.velocity[step]))
-        worst = max(worst, _shorten(guess.acceleration[step], limits[1], targets.acceleration[step]))
+    worst = _stay_within(bodies.bounds, radius, limits, guess, targets)
     for body in range(len(minded)):
         if not minded[body]:
             continue
@@ -210,6 +209,21 @@ def _project(
             else:
                 before = _push(guess.place[step], box[:d], box[d : 2 * d], least, targets.place[step])
             worst = max(worst, reach - before)
+    return worst
+
+
+@compiled
+def _stay_within(bounds: Any, radius: Any, limits: Any, guess: Any, targets: Any) -> Any:
+    """Write the targets of the bounds and of the limits of speed and acceleration; return the largest violation."""
+    (steps, d), worst = guess.place.shape, 0.0
+    for step in range(steps):
+        for axis in range(d):
+            low, high = bounds[0, axis] + radius, bounds[1, axis] - radius
+            x = guess.place[step, axis]
+            targets.place[step, axis] = min(max(x, low), high)
+            worst = max(worst, low - x, x - high)
+        worst = max(worst, _shorten(guess.velocity[step], limits[0], targets.velocity[step]))
+        worst = max(worst, _shorten(guess.acceleration[step], limits[1], targets.acceleration[step]))
     return worst
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -78,10 +79,8 @@ class Demonstrations:
 
     def record(self, seed: int) -> RecordedEpisode:
         """The episode of a seed."""
-        env = self.make_env()
-        episode = record_episode(env, make_policy(self._source, **self.settings), seed)
-        env.close()
-        return episode
+        with closing(self.make_env()) as env:
+            return record_episode(env, make_policy(self._source, **self.settings), seed)
 
     @property
     def policy_name(self) -> str:

@@ -52,6 +52,13 @@ class Progress(NamedTuple):
     room: Any
     pace: Any
 
+    @classmethod
+    def of(cls, routes: Routes) -> Progress:
+        """Of robots that are about to set out."""
+        waits, size = routes.wait_first[:-1].copy(), len(routes.first) - 1
+        targets = np.zeros((size, 3), np.float32)
+        return cls(np.zeros(size, np.int64), waits, targets, np.zeros(size, np.float32), np.zeros(size, np.float32))
+
 
 class Part(NamedTuple):
     """The robots of a team that have the same model.
@@ -176,29 +183,17 @@ def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[Floa
         Controls ``(T, K, m)``, places ``(T + 1, K, 3)`` float64 [m] and ``(K,)`` the step of each arrival; ``T + 1``
         for who has not arrived.
     """
-    team, arrays, d, num_robots = problem.team, problem.arrays, problem.dimension, problem.num_robots
+    d, num_robots = problem.dimension, problem.num_robots
     paces = np.concatenate(
         [paces_along(problem, robot, routes.arcs[own], routes.bends[own]) for robot, own in enumerate(routes.each())]
     )
     controls = np.zeros((most_steps, num_robots, problem.control_size), np.float32)
     sights = lookaheads(problem)
     states, docked = problem.start.copy(), np.zeros(num_robots, bool)
-    progress = Progress(
-        at=np.zeros(num_robots, np.int64),
-        waits=routes.wait_first[:-1].copy(),
-        targets=np.zeros((num_robots, 3), np.float32),
-        room=np.zeros(num_robots, np.float32),
-        pace=np.zeros(num_robots, np.float32),
-    )
+    progress = Progress.of(routes)
     places = np.zeros((most_steps + 1, num_robots, 3))
     arrivals = np.full(num_robots, most_steps + 1, np.int64)
-    docking = np.array([arrays.squared_goal_radius, arrays.squared_goal_speed])
-    parts = []
-    for name in dict.fromkeys(team.models):
-        robots = np.array([k for k, model in enumerate(team.models) if model == name], np.int64)
-        part = Part(arrays.time_step, docking, arrays.docks, robots, arrays.limits[robots], problem.goal[robots])
-        parts.append((drive_kernel(name), part))
-    beyond = BEYOND if problem.docks and problem.goal_speed is None else 0.0
+    parts, beyond = _parts(problem), BEYOND if problem.docks and problem.goal_speed is None else 0.0
     ends, steps = np.diff(routes.first) - 1, 0
     while True:
         places[steps, :, :d] = states[:, :d]
@@ -211,6 +206,17 @@ def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[Floa
         for drive, part in parts:
             drive(part, progress, states, docked, controls[steps])
         steps += 1
+
+
+def _parts(problem: Problem) -> list[tuple[Any, Part]]:
+    """The robots by model, with what drives them."""
+    arrays, models, parts = problem.arrays, np.array(problem.team.models), []
+    docking = np.array([arrays.squared_goal_radius, arrays.squared_goal_speed])
+    for name in dict.fromkeys(problem.team.models):
+        robots = np.flatnonzero(models == name)
+        part = Part(arrays.time_step, docking, arrays.docks, robots, arrays.limits[robots], problem.goal[robots])
+        parts.append((drive_kernel(name), part))
+    return parts
 
 
 def paces_along(problem: Problem, robot: int, arcs: Any, bends: Any, share: float = BRAKING) -> Any:

@@ -50,6 +50,16 @@ class Configuration:
     def __post_init__(self) -> None:
         self.order = np.argsort(-self.priorities, kind="stable").astype(np.int64)
 
+    def next_constraint(self, roadmap: Roadmap) -> Constraint:
+        """What to try next; those that say of one robot more where it goes come after all others."""
+        constraint = self.untried.popleft()
+        if len(constraint.robots) < len(self.order):
+            robot = int(self.order[len(constraint.robots)])
+            at = int(self.positions[robot])
+            for place in (at, *roadmap.heads[roadmap.first[at] : roadmap.first[at + 1]].tolist()):
+                self.untried.append(Constraint((*constraint.robots, robot), (*constraint.places, place)))
+        return constraint
+
 
 @dataclass(frozen=True, eq=False)
 class Moves:
@@ -140,6 +150,25 @@ class Team:
                     return False
         return True
 
+    def after(self, here: Configuration, scratch: Scratch, seed: int) -> Configuration | None:
+        """Where a step leads under the next constraint that is untried; ``None`` where that cannot be kept."""
+        bodies, constraint = self.bodies, here.next_constraint(self.roadmap)
+        forced = np.array(constraint.robots, np.int64), np.array(constraint.places, np.int64)
+        self.find_ways(here.positions)
+        scratch.may_dock[:] = ~self.holds
+        while True:
+            positions = here.positions.copy()
+            count = step_team(self.roadmap, bodies, scratch, here.order, *forced, seed, positions)
+            came = self.arrived(positions) & ~self.arrived(here.positions)
+            if count < 0:
+                return None
+            if not bodies.docks or not came.any() or self.find_ways(positions):
+                waiting = np.where(self.arrived(positions), here.priorities % 1, here.priorities + 1)
+                return Configuration(positions, here, scratch.moves[:count].copy(), waiting)
+            # Who would close somebody's only way must wait until that one has passed.
+            scratch.may_dock[came] = False
+            self.find_ways(here.positions)
+
 
 def find_moves(
     problem: Problem, roadmap: Roadmap, seed: int, should_stop: Callable[[], bool], max_steps: int = 1_000_000
@@ -157,14 +186,13 @@ def find_moves(
         The moves; ``None`` where somebody has no way on the roadmap.
     """
     team, num_robots = Team(problem, roadmap), problem.num_robots
-    bodies, costs = team.bodies, team.bodies.costs
-    length = costs[np.arange(num_robots), roadmap.starts].astype(np.float64)
+    length = team.bodies.costs[np.arange(num_robots), roadmap.starts].astype(np.float64)
     if not np.isfinite(length).all():
         return None
     team.order_arrivals()
     scratch = _scratch(roadmap, num_robots)
     start = Configuration(roadmap.starts.copy(), None, np.empty((0, 2), np.int64), length / (length.max() + 1))
-    known, open_, best, moves = {start.positions.tobytes(): start}, [start], start, np.empty((num_robots, 2), np.int64)
+    known, open_, best = {start.positions.tobytes(): start}, [start], start
     for step in range(max_steps):
         if not open_ or should_stop():
             break
@@ -176,34 +204,9 @@ def find_moves(
         if not here.untried:
             open_.pop()
             continue
-        constraint = here.untried.popleft()
-        if len(constraint.robots) < num_robots:
-            robot = int(here.order[len(constraint.robots)])
-            at = int(here.positions[robot])
-            for place in (at, *roadmap.heads[roadmap.first[at] : roadmap.first[at + 1]].tolist()):
-                here.untried.append(Constraint((*constraint.robots, robot), (*constraint.places, place)))
-        team.find_ways(here.positions)
-        scratch.may_dock[:] = ~team.holds
-        forced = np.array(constraint.robots, np.int64), np.array(constraint.places, np.int64)
-        while True:
-            positions = here.positions.copy()
-            count = step_team(roadmap, bodies, scratch, here.order, *forced, (seed + step) % 2**62, positions, moves)
-            came = team.arrived(positions) & ~team.arrived(here.positions)
-            if count < 0 or not bodies.docks or not came.any() or team.find_ways(positions):
-                break
-            # Who would close somebody's only way must wait until that one has passed.
-            scratch.may_dock[came] = False
-            team.find_ways(here.positions)
-        if count < 0:
-            continue
-        again = known.get(positions.tobytes())
-        if again is not None:
-            open_.append(again)
-            continue
-        waiting = np.where(team.arrived(positions), here.priorities % 1, here.priorities + 1)
-        following = Configuration(positions, here, moves[:count].copy(), waiting)
-        known[positions.tobytes()] = following
-        open_.append(following)
+        following = team.after(here, scratch, (seed + step) % 2**62)
+        if following is not None:
+            open_.append(known.setdefault(following.positions.tobytes(), following))
     return _moves_to(best, team.arrived(best.positions))
 
 
@@ -215,10 +218,10 @@ def _scratch(roadmap: Roadmap, num_robots: int) -> Scratch:
         who=np.zeros(len(roadmap.nodes), np.int32),
         robots=np.zeros(num_robots, np.int64),
         edges=np.zeros(num_robots, np.int64),
-        heads=np.zeros(num_robots, np.int64),
         tried=np.zeros(num_robots, np.int64),
         options=np.zeros((num_robots, degree), np.int64),
         worth=np.zeros(degree),
+        moves=np.empty((num_robots, 2), np.int64),
     )
 
 

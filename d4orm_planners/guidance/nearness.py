@@ -59,6 +59,16 @@ def cell_range(cells: Any, axis: Any, lowest: Any, highest: Any) -> Any:
     return max(first, 0), min(last, cells.size[axis] - 1) + 1
 
 
+@inlined
+def cells_about(cells: Any, tail: Any, head: Any, reach: Any) -> Any:
+    """Along each axis the range of cells with all that may be within ``reach`` of the line between two places [m]."""
+    return (
+        cell_range(cells, 0, min(tail[0], head[0]) - reach, max(tail[0], head[0]) + reach),
+        cell_range(cells, 1, min(tail[1], head[1]) - reach, max(tail[1], head[1]) + reach),
+        cell_range(cells, 2, min(tail[2], head[2]) - reach, max(tail[2], head[2]) + reach),
+    )
+
+
 @compiled
 def squared_gap(points: Any, u: Any, tails: Any, v: Any, heads: Any, w: Any) -> Any:
     """Squared distance of point ``u`` to the line from ``tails[v]`` to ``heads[w]``."""
@@ -91,15 +101,7 @@ def near_lines(cells: Any, tails: Any, heads: Any, reach: Any, first: Any, items
     count = 0
     for q in range(tails.shape[0]):
         first[q] = count
-        low_i, high_i = cell_range(
-            cells, 0, min(tails[q, 0], heads[q, 0]) - reach, max(tails[q, 0], heads[q, 0]) + reach
-        )
-        low_j, high_j = cell_range(
-            cells, 1, min(tails[q, 1], heads[q, 1]) - reach, max(tails[q, 1], heads[q, 1]) + reach
-        )
-        low_k, high_k = cell_range(
-            cells, 2, min(tails[q, 2], heads[q, 2]) - reach, max(tails[q, 2], heads[q, 2]) + reach
-        )
+        (low_i, high_i), (low_j, high_j), (low_k, high_k) = cells_about(cells, tails[q], heads[q], reach)
         for i in range(low_i, high_i):
             for j in range(low_j, high_j):
                 for k in range(low_k, high_k):

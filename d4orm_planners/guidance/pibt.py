@@ -62,10 +62,10 @@ class Scratch(NamedTuple):
         who: ``(N,)`` int32 the robot at each node; -1 for nobody.
         robots: ``(K,)`` int64 those that others make way for, the first one first.
         edges: ``(K,)`` int64 by which each wants to go.
-        heads: ``(K,)`` int64 where that leads.
         tried: ``(K,)`` int64 how many edges each has tried.
         options: ``(K, D)`` int64 the edges that each tries in turn.
         worth: ``(D,)`` float64 how good they are.
+        moves: ``(K, 2)`` int64 robot and edge of each move, in their order.
     """
 
     state: Any
@@ -73,10 +73,10 @@ class Scratch(NamedTuple):
     who: Any
     robots: Any
     edges: Any
-    heads: Any
     tried: Any
     options: Any
     worth: Any
+    moves: Any
 
 
 @compiled
@@ -227,7 +227,7 @@ def _in_the_way(roadmap: Any, bodies: Any, scratch: Any, positions: Any, k: Any,
 
 @compiled
 def _move(
-    roadmap: Any, bodies: Any, scratch: Any, positions: Any, root: Any, forced: Any, seed: Any, moves: Any, count: Any
+    roadmap: Any, bodies: Any, scratch: Any, positions: Any, root: Any, forced: Any, seed: Any, count: Any
 ) -> Any:
     """Let a robot move, and before it those that are in its way; how many moves there are then.
 
@@ -239,7 +239,6 @@ def _move(
         root: The robot.
         forced: The node that it must go to; -1 for where it likes.
         seed: Of ties.
-        moves: ``(room, 2)`` robot and edge, output.
         count: Moves so far.
     """
     depth = 0
@@ -277,7 +276,7 @@ def _move(
             head = np.int64(roadmap.heads[e])
             scratch.who[positions[k]], scratch.who[head] = -1, k
             positions[k] = head
-            moves[count, 0], moves[count, 1] = k, e
+            scratch.moves[count, 0], scratch.moves[count, 1] = k, e
             count += 1
             scratch.state[k] = DONE
             depth -= 1
@@ -286,28 +285,19 @@ def _move(
 
 @cached_kernel(SOURCES, variant="step", **OPTIONS)
 def step_team(
-    roadmap: Any,
-    bodies: Any,
-    scratch: Any,
-    order: Any,
-    robots: Any,
-    places: Any,
-    seed: Any,
-    positions: Any,
-    moves: Any,
+    roadmap: Any, bodies: Any, scratch: Any, order: Any, robots: Any, places: Any, seed: Any, positions: Any
 ) -> Any:
     """Let the whole team move.
 
     Args:
         roadmap: The roadmap.
         bodies: The robots.
-        scratch: Working space.
+        scratch: Working space; its moves are output.
         order: ``(K,)`` who goes first.
         robots: ``(C,)`` robots that must go ...
         places: ... to these nodes ``(C,)``, or stay there.
         seed: Of ties.
         positions: ``(K,)`` int64 the robots' nodes, changed in place.
-        moves: ``(K, 2)`` int64 robot and edge, in their order, output.
 
     Returns:
         How many moves there are; -1 where somebody could not go where it must.
@@ -326,11 +316,11 @@ def step_team(
     for number in range(robots.shape[0]):
         k = robots[number]
         if scratch.state[k] == FREE:
-            count = _move(roadmap, bodies, scratch, positions, k, places[number], seed, moves, count)
+            count = _move(roadmap, bodies, scratch, positions, k, places[number], seed, count)
         if positions[k] != places[number]:
             return -1
     for number in range(order.shape[0]):
         k = order[number]
         if scratch.state[k] == FREE:
-            count = _move(roadmap, bodies, scratch, positions, k, -1, seed, moves, count)
+            count = _move(roadmap, bodies, scratch, positions, k, -1, seed, count)
     return count

@@ -6,13 +6,14 @@ import heapq
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba.extending import register_jitable
 
 from d4orm_env.engine import wavefront
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS, compiled
 from d4orm_env.engine.wavefront import is_free_line
 from d4orm_planners.guidance import nearness, pibt
-from d4orm_planners.guidance.nearness import cell_range
+from d4orm_planners.guidance.nearness import cells_about
 
 SOURCES = fingerprint((nearness, pibt, wavefront))
 
@@ -98,9 +99,7 @@ def _is_line_clear(others: Any, k: Any, tail: Any, head: Any, depart: Any, arriv
 
 
 @cached_kernel(SOURCES, variant="straighten", **OPTIONS)
-def straighten(
-    roadmap: Any, bodies: Any, space: Any, others: Any, k: Any, reach: Any, nodes: Any, departs: Any, arrives: Any
-) -> Any:
+def straighten(roadmap: Any, bodies: Any, space: Any, others: Any, k: Any, reach: Any, way: Any) -> Any:
     """Leave out nodes of a way where the straight line is free of obstacles and of others.
 
     Args:
@@ -110,31 +109,28 @@ def straighten(
         others: Where they are.
         k: The robot.
         reach: What it keeps from obstacles [m].
-        nodes: ``(n,)`` of the way, changed in place as all that follow.
-        departs: ``(n,)`` steps at which it sets out for each.
-        arrives: ``(n,)`` steps at which it comes to each.
+        way: ``(n, 3)`` of :func:`find_way`, changed in place.
 
     Returns:
         How many are left.
     """
-    goal, count, i = bodies.goals[k], 1, 0
-    while i + 1 < nodes.shape[0]:
+    nodes, goal, docked, count, i = roadmap.nodes, bodies.goals[k], bodies.docked + bodies.slack, 1, 0
+    while i + 1 < way.shape[0]:
         j = i + 1
-        depart, tail = departs[j], roadmap.nodes[nodes[i]]
-        while j + 1 < nodes.shape[0]:
-            head = roadmap.nodes[nodes[j + 1]]
-            near = nearness.squared_gap(roadmap.nodes, goal, roadmap.nodes, nodes[i], roadmap.nodes, nodes[j + 1])
-            docked = bodies.docked + bodies.slack
-            if bodies.docks and nodes[j + 1] != goal and near < docked * docked:
+        depart, tail = way[j, 1], nodes[way[i, 0]]
+        while j + 1 < way.shape[0]:
+            head = nodes[way[j + 1, 0]]
+            near = nearness.squared_gap(nodes, goal, nodes, way[i, 0], nodes, way[j + 1, 0])
+            if bodies.docks and way[j + 1, 0] != goal and near < docked * docked:
                 break
             # Nested, because the compiler leaves out what is never reached.
             if space is not None:  # noqa: SIM102
                 if not is_free_line(space, reach, tail, head):
                     break
-            if not _is_line_clear(others, k, tail, head, depart, arrives[j + 1]):
+            if not _is_line_clear(others, k, tail, head, depart, way[j + 1, 2]):
                 break
             j += 1
-        nodes[count], departs[count], arrives[count] = nodes[j], depart, arrives[j]
+        way[count, 0], way[count, 1], way[count, 2] = way[j, 0], depart, way[j, 2]
         count, i = count + 1, j
     return count
 
@@ -163,9 +159,7 @@ def _close_nodes(cells: Any, others: Any, k: Any, begins: Any) -> None:
                 if after[0] != place[0] or after[1] != place[1] or after[2] != place[2]:
                     break
                 end += 1
-            low_i, high_i = cell_range(cells, 0, place[0] - need, place[0] + need)
-            low_j, high_j = cell_range(cells, 1, place[1] - need, place[1] + need)
-            low_k, high_k = cell_range(cells, 2, place[2] - need, place[2] + need)
+            (low_i, high_i), (low_j, high_j), (low_k, high_k) = cells_about(cells, place, place, need)
             for ci in range(low_i, high_i):
                 for cj in range(low_j, high_j):
                     for ck in range(low_k, high_k):
@@ -200,19 +194,38 @@ def _fill_begins(begins: Any, ends: Any) -> None:
                 end = step
 
 
+class Trip(NamedTuple):
+    """How a robot is taken to drive when its way is planned.
+
+    Attributes:
+        stride: How far it drives in a step [m].
+        launch: Steps that it loses whenever it sets out.
+        latest: Step by which it must have arrived.
+        linger: Steps for which it stays at its goal; negative for ever.
+    """
+
+    stride: float
+    launch: Any
+    latest: int
+    linger: int
+
+
+@register_jitable(nogil=True, **OPTIONS)
+def _followed_back(path: Any, entry: Any) -> Any:
+    """``(n, 3)`` the way that ends with an entry."""
+    count, walk = 0, entry
+    while walk >= 0:
+        count, walk = count + 1, path[walk, 3]
+    found, walk = np.empty((count, 3), np.int64), entry
+    while walk >= 0:
+        count -= 1
+        found[count, 0], found[count, 1], found[count, 2] = path[walk, 0], path[walk, 1], path[walk, 2]
+        walk = path[walk, 3]
+    return found
+
+
 @cached_kernel(SOURCES, variant="way", **OPTIONS)
-def find_way(
-    roadmap: Any,
-    cells: Any,
-    bodies: Any,
-    costs: Any,
-    others: Any,
-    k: Any,
-    stride: Any,
-    launch: Any,
-    latest: Any,
-    linger: Any,
-) -> Any:
+def find_way(roadmap: Any, cells: Any, bodies: Any, others: Any, k: Any, trip: Any) -> Any:
     """The soonest way of a robot to its goal among all others: safe interval path planning.
 
     After M. Phillips and M. Likhachev, *SIPP: safe interval path planning for dynamic environments* (ICRA 2011).
@@ -221,20 +234,17 @@ def find_way(
         roadmap: The roadmap.
         cells: Its nodes.
         bodies: The robots.
-        costs: ``(N,)`` float32 length of the way from every node.
         others: Where they are.
         k: The robot.
-        stride: How far it drives in a step [m].
-        launch: Steps that it loses whenever it sets out.
-        latest: Step by which it must have arrived.
-        linger: Steps for which it stays at its goal; negative for ever.
+        trip: How it drives.
 
     Returns:
         ``(n, 3)`` int64 nodes, the steps at which it sets out for each and comes to each; none where there is no way.
     """
-    goal, start, nodes = bodies.goals[k], np.int64(roadmap.starts[k]), roadmap.nodes
+    goal, start, nodes, costs = bodies.goals[k], np.int64(roadmap.starts[k]), roadmap.nodes, bodies.costs[k]
+    stride, latest = trip.stride, trip.latest
     # Nobody may come near its goal once it stands there for good.
-    dock = others.positions.shape[0] - 1 if linger < 0 else -1
+    dock = others.positions.shape[0] - 1 if trip.linger < 0 else -1
     while dock >= 0 and _is_clear(others, k, dock, nodes[goal, 0], nodes[goal, 1], nodes[goal, 2]):
         dock -= 1
     boxes = np.empty((latest // BLOCK + 2, others.positions.shape[1], 6))
@@ -261,15 +271,7 @@ def find_way(
         if came[node, begin] != entry:
             continue
         if node == goal and arrived > dock:
-            count, walk = 0, entry
-            while walk >= 0:
-                count, walk = count + 1, path[walk, 3]
-            found, walk = np.empty((count, 3), np.int64), entry
-            while walk >= 0:
-                count -= 1
-                found[count, 0], found[count, 1], found[count, 2] = path[walk, 0], path[walk, 1], path[walk, 2]
-                walk = path[walk, 3]
-            return found
+            return _followed_back(path, entry)
         if node == goal and bodies.docks:
             continue
         tail = nodes[node]
@@ -282,7 +284,7 @@ def find_way(
                 continue
             steps, depart, failures = np.int64(np.ceil(roadmap.lengths[e] / stride)), arrived, 0
             while depart < ends[node, begin]:
-                lost = launch if depart > arrived or path[entry, 3] < 0 else 0
+                lost = trip.launch if depart > arrived or path[entry, 3] < 0 else 0
                 until = depart + steps + lost
                 if until + left > latest:
                     break
@@ -297,7 +299,7 @@ def find_way(
                 depart += 1
                 if head == goal and bodies.docks and until <= dock:
                     continue
-                if head == goal and ends[head, safe] < min(until + linger, latest):
+                if head == goal and ends[head, safe] < min(until + trip.linger, latest):
                     depart += ends[head, safe] - until
                     continue
                 if not _is_line_free(others, boxes, k, tail, nodes[head], depart - 1, until):

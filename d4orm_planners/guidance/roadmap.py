@@ -10,7 +10,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS
 from d4orm_env.engine.wavefront import Space, free_lines, make_space
-from d4orm_env.ways import lay_lattice
+from d4orm_env.ways import in_space, lay_lattice
 from d4orm_planners.guidance import nearness
 from d4orm_planners.guidance.nearness import find_near, sort_into_cells
 
@@ -70,7 +70,7 @@ def lay_roadmap(problem: Problem, fineness: float = 1.0) -> Roadmap:
     step = float(np.sqrt(2.0) * spread / fineness)
     reaches = np.unique(radius + problem.margin)
     space = make_space(problem) if problem.world.num_obstacles else None
-    ends = np.unique(_spatial(np.concatenate([problem.start[:, :d], problem.goal]).astype(np.float64)), axis=0)
+    ends = np.unique(in_space(np.concatenate([problem.start[:, :d], problem.goal]).astype(np.float64)), axis=0)
     places = _lattice_nodes(problem, space, float(reaches[-1]) * (1 + WALL_SLACK), step)
     near_end = np.diff(find_near(sort_into_cells(ends, step), places, places, REPLACED * step)[0]) > 0
     nodes = np.concatenate([places[~near_end], ends])
@@ -106,13 +106,9 @@ def _assembled(problem: Problem, nodes: Any, one: Any, other: Any, room: Any, re
     )
 
 
-def _spatial(places: Any) -> Any:
-    return np.hstack([places, np.zeros((len(places), 3 - places.shape[1]))])
-
-
 def _numbers(nodes: Any, places: Any) -> Any:
     """``(K,)`` the nodes that are at places ``(K, d)``."""
-    wanted = _spatial(places.astype(np.float64))
+    wanted = in_space(places.astype(np.float64))
     return np.array([int(np.flatnonzero((nodes == place).all(axis=1))[-1]) for place in wanted], np.int64)
 
 

@@ -19,7 +19,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS
 from d4orm_planners.guidance import nearness
-from d4orm_planners.guidance.nearness import Cells, cell_range, sort_into_cells
+from d4orm_planners.guidance.nearness import Cells, cells_about, sort_into_cells
 from d4orm_planners.guidance.roadmap import Roadmap
 
 SOURCES = fingerprint((nearness,))
@@ -244,27 +244,21 @@ def _find_waits(cells: Cells, first: IntArray, times: Floats, radius: Any, margi
     owner = np.repeat(np.arange(num_robots), np.diff(first))
     wait_first = np.empty(num_robots + 1, np.int64)
     while True:
-        at, whom, until = (np.empty(room, np.int64) for _ in range(3))
-        count = find_waits(cells, first, owner, times, radius, margin + WAIT_SLACK, wait_first, at, whom, until)
+        waits = np.empty((room, 3), np.int64)
+        count = find_waits(cells, first, owner, times, radius, margin + WAIT_SLACK, wait_first, waits)
         if count <= room:
-            return wait_first, at[:count], whom[:count], until[:count]
+            return wait_first, *np.ascontiguousarray(waits[:count].T)
         room = count
 
 
 @cached_kernel(SOURCES, variant="waits", **OPTIONS)
 def find_waits(
-    cells: Any,
-    first: Any,
-    owner: Any,
-    times: Any,
-    radius: Any,
-    margin: Any,
-    wait_first: Any,
-    wait_at: Any,
-    wait_for: Any,
-    wait_until: Any,
+    cells: Any, first: Any, owner: Any, times: Any, radius: Any, margin: Any, wait_first: Any, waits: Any
 ) -> Any:
-    """Whom robots have to let pass; see :class:`Routes`. ``owner`` ``(T,)`` is the robot of each point.
+    """Whom robots have to let pass; see :class:`Routes`.
+
+    ``owner`` ``(T,)`` is the robot of each point, and ``waits`` ``(room, 3)`` is at which point, for whom and until it
+    has come where.
 
     Returns:
         How many waits there are; as many as there is room for are written.
@@ -279,9 +273,7 @@ def find_waits(
         passed[:] = 0
         for a in range(first[k], first[k + 1]):
             num_touched = 0
-            low_i, high_i = cell_range(cells, 0, points[a, 0] - reach, points[a, 0] + reach)
-            low_j, high_j = cell_range(cells, 1, points[a, 1] - reach, points[a, 1] + reach)
-            low_k, high_k = cell_range(cells, 2, points[a, 2] - reach, points[a, 2] + reach)
+            (low_i, high_i), (low_j, high_j), (low_k, high_k) = cells_about(cells, points[a], points[a], reach)
             for ci in range(low_i, high_i):
                 for cj in range(low_j, high_j):
                     for ck in range(low_k, high_k):
@@ -310,8 +302,8 @@ def find_waits(
                 wanted[j] = 0
                 if until > passed[j]:
                     passed[j] = until
-                    if count < wait_at.shape[0]:
-                        wait_at[count], wait_for[count], wait_until[count] = a - first[k], j, until
+                    if count < waits.shape[0]:
+                        waits[count, 0], waits[count, 1], waits[count, 2] = a - first[k], j, until
                     count += 1
     wait_first[num_robots] = count
     return count

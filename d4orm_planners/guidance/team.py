@@ -17,7 +17,7 @@ from d4orm_env.engine.wavefront import make_space
 from d4orm_planners.guidance.execution import drive_along
 from d4orm_planners.guidance.lacam import Team
 from d4orm_planners.guidance.nearness import sort_into_cells
-from d4orm_planners.guidance.replanning import Others, find_way, straighten, touches
+from d4orm_planners.guidance.replanning import Others, Trip, find_way, straighten, touches
 from d4orm_planners.guidance.roadmap import WALL_SLACK, Roadmap
 from d4orm_planners.guidance.routes import Floats, Stops, join_routes, make_routes, stops_of
 from d4orm_planners.guidance.timed_drive import drive_by_clock, timed_kernel
@@ -204,30 +204,19 @@ class Replanning:
         roadmap, bodies, steps = self.roadmap, self.bodies, len(driven.controls)
         apart = bodies.radius[robot] + bodies.radius + bodies.margin
         others = Others(driven.places, np.minimum(apart + KEEP, self.ends_apart[robot]))
+        linger = -1 if self.linger is None else self.linger
         # Looked for among the sooner ones at first, because that is where it mostly is.
         for bound in sorted({min(int(SOON * self.alone[robot]) + PATIENCE, latest), latest}):
-            way = find_way(
-                roadmap,
-                self.cells,
-                bodies,
-                bodies.costs[robot],
-                others,
-                robot,
-                cruise * self.strides[robot],
-                self.launch[robot],
-                bound,
-                -1 if self.linger is None else self.linger,
-            )
+            trip = Trip(cruise * self.strides[robot], self.launch[robot], bound, linger)
+            way = find_way(roadmap, self.cells, bodies, others, robot, trip)
             if len(way):
                 break
         else:
             return False
-        nodes, departs, arrives = (np.ascontiguousarray(column) for column in way.T)
         reach = bodies.reach[robot] * (1 + WALL_SLACK * 2 / 3)
-        left = straighten(roadmap, bodies, self.space, others, robot, reach, nodes, departs, arrives)
-        stops = Stops(
-            roadmap.nodes[nodes[:left]], np.array([0, left]), departs[:left].astype(float), arrives[:left].astype(float)
-        )
+        left = straighten(roadmap, bodies, self.space, others, robot, reach, way)
+        nodes, departs, arrives = way[:left].T
+        stops = Stops(roadmap.nodes[nodes], np.array([0, left]), departs.astype(float), arrives.astype(float))
         route = make_routes(self.problem, stops, [robot], cut)[0]
         # As soon as it can, or else by the clock of its way.
         for backs_up, hurrying in product(self.turns[robot], (True, False)):

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.world import World
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.mmd.way_frame import POINTS, Floats, WayFrame, make_frame, sine_table, world_space
 from d4orm_planners.registry import make_planner
@@ -58,15 +58,12 @@ def draw_examples(count: int, seed: int, progress: Callable[[int], object] = lam
     """
     features: list[FloatArray] = []
     modes: list[FloatArray] = []
-    for frame, places in _motions(seed):
+    for frame, places in islice(_motions(seed), -(-count // 2)):
         ahead, aside = modes_of(frame, places).astype(np.float32)
-        for told, side in zip(frame.features, (1, -1), strict=True):
-            features.append(told)
-            modes.append(np.stack([ahead, side * aside]))
+        features.extend(frame.features)
+        modes += [np.stack([ahead, aside]), np.stack([ahead, -aside])]
         progress(len(modes))
-        if len(modes) >= count:
-            return Examples(np.stack(features), np.stack(modes))
-    raise AssertionError("there is no end of motions")
+    return Examples(np.stack(features), np.stack(modes))
 
 
 def modes_of(frame: WayFrame, places: Floats) -> Floats:
@@ -124,16 +121,7 @@ def _with_phantoms(problem: Problem, frame: WayFrame, random: np.random.Generato
     if len(circles) == 0 < number:
         return None
     world = problem.world
-    hindered = problem.replace(
-        world=World(
-            2,
-            circles=np.concatenate([world.circles, circles]),
-            boxes=world.boxes,
-            polygons=world.polygons,
-            lower=world.lower,
-            upper=world.upper,
-        )
-    )
+    hindered = problem.replace(world=world.replace(circles=np.concatenate([world.circles, circles])))
     return hindered if np.isfinite(hindered.ways.length).all() else None
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba.extending import register_jitable
 
 from d4orm_env.engine import tiles, wavefront
 from d4orm_env.engine.caching import cached_kernel, fingerprint
@@ -17,7 +18,7 @@ from d4orm_env.engine.tiles import OPTIONS, compiled
 from d4orm_env.engine.wavefront import clearance_at
 from d4orm_planners.mmd import clock, way_frame
 from d4orm_planners.mmd.clock import fill_clock
-from d4orm_planners.mmd.way_frame import locate
+from d4orm_planners.mmd.way_frame import locate, trace
 
 _PROBE = 1e-3
 """Distance over which the slope of the clearance is measured [m]."""
@@ -50,6 +51,19 @@ class Surroundings(NamedTuple):
     pull: float
 
 
+@register_jitable(nogil=True, **OPTIONS)
+def _point_variance(sines: Any, deviation: Any) -> Any:
+    """``(N + 1, 2)`` how much each point varies among the examples, ahead and aside."""
+    points, modes = sines.shape
+    variance = np.zeros((points, 2))
+    for i in range(points):
+        for mode in range(modes):
+            for side in range(2):
+                part = deviation[side * modes + mode] * sines[i, mode]
+                variance[i, side] += part * part
+    return variance
+
+
 @cached_kernel(fingerprint((tiles, wavefront, clock, way_frame)), variant="guide", **OPTIONS)
 def guide(frame: Any, sines: Any, deviation: Any, surroundings: Any, durations: Any, steps: Any, motions: Any) -> None:
     """Change motions so that they violate less.
@@ -64,12 +78,7 @@ def guide(frame: Any, sines: Any, deviation: Any, surroundings: Any, durations: 
         motions: ``(B, 2 M)`` float32 whitened modes, changed in place.
     """
     last, modes = sines.shape[0] - 1, sines.shape[1]
-    variance = np.zeros((last + 1, 2))
-    for i in range(last + 1):
-        for mode in range(modes):
-            for side in range(2):
-                part = deviation[side * modes + mode] * sines[i, mode]
-                variance[i, side] += part * part
+    variance = _point_variance(sines, deviation)
     backing = _BACKING * variance.max()
     points, paces, times = np.empty((last + 1, 3)), np.empty(last + 1), np.empty(last + 1)
     spot, push = np.empty((4, 3)), np.empty(3)
@@ -77,9 +86,7 @@ def guide(frame: Any, sines: Any, deviation: Any, surroundings: Any, durations: 
         axis = frame.axes[b % frame.axes.shape[0]]
         for _ in range(steps):
             quiet = True
-            for i in range(last + 1):
-                locate(frame, axis, sines[i], deviation, motions[b], i, spot)
-                points[i] = spot[0]
+            trace(frame, axis, sines, deviation, motions[b], spot, points)
             fill_clock(points, durations[b], frame.speed, frame.acceleration, paces, times)
             for i in range(1, last):
                 # It may have moved with the points before it.

@@ -10,6 +10,7 @@ from pydantic import Field
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
+from d4orm_planners.guidance.planner import NoWays
 from d4orm_planners.planner import Iteration, Planner, PlannerConfig
 from d4orm_planners.search import Search
 from d4orm_planners.settings import Count, NotNegative, Number, Samples, ShareOrNone, Steps
@@ -62,17 +63,6 @@ class MMDConfig(PlannerConfig):
         super().__post_init__()
         if self.slowest < self.quickest:
             raise ValueError(f"slowest is {self.slowest:g}; it must be at least quickest, which is {self.quickest:g}")
-
-
-@dataclass(frozen=True)
-class NoWays:
-    """The state of the search when somebody has no way to its goal.
-
-    Attributes:
-        why: For the record of the iterations.
-    """
-
-    why: str
 
 
 class MMD(Planner):

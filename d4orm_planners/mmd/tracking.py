@@ -13,11 +13,11 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.engine import lanes, tiles, wavefront
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.drives import LoneRobot
-from d4orm_env.engine.tiles import OPS, OPTIONS, inlined, make_stepper, models_key, to_fixed_tuple
+from d4orm_env.engine.tiles import OPS, OPTIONS, compiled, inlined, make_stepper, models_key, to_fixed_tuple
 from d4orm_env.engine.wavefront import clearance_at
 from d4orm_planners.mmd import clock, way_frame
 from d4orm_planners.mmd.clock import fill_clock
-from d4orm_planners.mmd.way_frame import WayFrame, locate
+from d4orm_planners.mmd.way_frame import WayFrame, trace
 
 SOURCES = fingerprint((robot_model, transition, lanes, tiles, wavefront, clock, way_frame))
 
@@ -41,6 +41,16 @@ class Tracked(NamedTuple):
     clearances: Any
 
 
+@compiled
+def _catch_up(points: Any, times: Any, i: Any, time: Any, dt: Any, place: Any, wanted: Any) -> None:
+    """Fill ``wanted`` ``(d,)`` with the velocity from a place to where the motion is a step later [m/s]."""
+    for axis in range(wanted.shape[0]):
+        pace = (points[i + 1, axis] - points[i, axis]) / (times[i + 1] - times[i])
+        error = points[i, axis] + (time - times[i]) * pace - place[axis]
+        # By the next step the motion has gone on as well.
+        wanted[axis] = pace + GAIN * (error - pace * dt)
+
+
 @cache
 def tracking_kernel(name: str) -> Any:
     """The compiled drives of a robot of the model with this name; see :func:`drive_along`."""
@@ -61,10 +71,7 @@ def tracking_kernel(name: str) -> Any:
         points, wanted = np.empty((last + 1, 3)), np.zeros(d, np.float32)
         paces, times, spot = np.empty(last + 1), np.empty(last + 1), np.empty((4, 3))
         for b in range(motions.shape[0]):
-            axis_aside = frame.axes[b % frame.axes.shape[0]]
-            for i in range(last + 1):
-                locate(frame, axis_aside, sines[i], deviation, motions[b], i, spot)
-                points[i] = spot[0]
+            trace(frame, frame.axes[b % frame.axes.shape[0]], sines, deviation, motions[b], spot, points)
             fill_clock(points, durations[b], frame.speed, frame.acceleration, paces, times)
             i = 0
             x, there, arrival, least = to_fixed_tuple(robot.start, n), False, horizon + 1, np.inf
@@ -77,11 +84,7 @@ def tracking_kernel(name: str) -> Any:
                     i += 1
                 standing = transition.stands(there, docks)
                 if i < last:
-                    for axis in range(d):
-                        pace = (points[i + 1, axis] - points[i, axis]) / (times[i + 1] - times[i])
-                        error = points[i, axis] + (time - times[i]) * pace - driven.places[b, step, axis]
-                        # By the next step the motion has gone on as well.
-                        wanted[axis] = pace + GAIN * (error - pace * dt[0])
+                    _catch_up(points, times, i, time, dt[0], driven.places[b, step], wanted)
                     control = track(x, to_fixed_tuple(wanted, d), own, h, OPS)
                 else:
                     control = track(x, approach(x, goal, own, h, OPS), own, h, OPS)

@@ -8,11 +8,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.mmd.dataset import Examples, draw_examples
 from d4orm_planners.mmd.prior import LEVELS, SIZE, Prior, kept_signal, level_features
 from d4orm_planners.mmd.way_frame import FEATURES
@@ -67,11 +69,10 @@ def train(
         progress: Called now and then with the step and the loss.
     """
     torch.manual_seed(seed)
-    flat = examples.modes.reshape(len(examples.modes), SIZE)
+    flat, signal = examples.modes.reshape(len(examples.modes), SIZE), kept_signal(_RESOLUTION)[1:]
     deviation = np.maximum(np.sqrt((flat**2).mean(axis=0)), _LEAST)
     mean, spread = examples.features.mean(axis=0), np.maximum(examples.features.std(axis=0), _LEAST)
     motions, features = torch.tensor(flat / deviation), torch.tensor((examples.features - mean) / spread)
-    signal = kept_signal(_RESOLUTION)[1:]
     levels, kept = torch.tensor(level_features(signal)), torch.tensor(signal.astype(np.float32))
     network = Network(width, layers)
     average = torch.optim.swa_utils.AveragedModel(network)
@@ -79,10 +80,7 @@ def train(
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=steps)
     for step in range(steps):
         chosen, at = torch.randint(len(motions), (256,)), torch.randint(_RESOLUTION, (256,))
-        clean, noise, share = motions[chosen], torch.randn(256, SIZE), kept[at, None]
-        noisy = share.sqrt() * clean + (1 - share).sqrt() * noise
-        wanted = (clean - share.sqrt() * noisy) / (1 - share).sqrt()
-        loss = ((network(noisy, levels[at], features[chosen]) - wanted) ** 2).mean()
+        loss = _loss(network, motions[chosen], kept[at, None], levels[at], features[chosen])
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -93,6 +91,13 @@ def train(
             progress(step, float(loss.detach()))
     network.load_state_dict(average.module.state_dict())
     return _weights(network, deviation, mean, spread)
+
+
+def _loss(network: Network, clean: Tensor, share: Tensor, level: Tensor, features: Tensor) -> Any:
+    """Mean square error for motions of which that share of the variance is kept as noise is added."""
+    noisy = share.sqrt() * clean + (1 - share).sqrt() * torch.randn(clean.shape)
+    wanted = (clean - share.sqrt() * noisy) / (1 - share).sqrt()
+    return ((network(noisy, level, features) - wanted) ** 2).mean()
 
 
 def _weights(network: Network, deviation: np.ndarray, mean: np.ndarray, spread: np.ndarray) -> Prior:
@@ -106,11 +111,9 @@ def _weights(network: Network, deviation: np.ndarray, mean: np.ndarray, spread: 
 
 
 def save_prior(prior: Prior, path: Path) -> None:
-    """Write a model as ``.npz``, under a temporary name until it is complete."""
-    temporary = path.with_name(f"{path.name}.part")
-    with temporary.open("wb") as file:
+    """Write a model into an ``.npz`` file, which is whole or not there."""
+    with replaced_when_done(path, (".npz",)) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **prior._asdict())
-    temporary.replace(path)
 
 
 def main() -> None:

@@ -166,7 +166,7 @@ def resample(way: Any, reference: Any) -> Any:
     corner, passed, own = 0, 0.0, 0.0
     for i in range(last + 1):
         arc = total * i / last
-        while corner < way.shape[0] - 1 and (corner == 0 or (passed + own < arc and corner < way.shape[0] - 1)):
+        while corner < way.shape[0] - 1 and (corner == 0 or passed + own < arc):
             passed += own
             corner += 1
             own = _gap(way, corner)
@@ -219,6 +219,14 @@ def locate(frame: Any, axis: Any, sines: Any, deviation: Any, motion: Any, i: An
     spot[2, 2] = axis[0] * spot[1, 1] - axis[1] * spot[1, 0]
     for x in range(3):
         spot[0, x] = spot[3, x] + frame.length * aside * spot[2, x]
+
+
+@compiled
+def trace(frame: Any, axis: Any, sines: Any, deviation: Any, motion: Any, spot: Any, points: Any) -> None:
+    """Fill ``points`` ``(N + 1, 3)`` with those of a motion [m]; all else as of :func:`locate`, ``spot`` as scratch."""
+    for i in range(points.shape[0]):
+        locate(frame, axis, sines[i], deviation, motion, i, spot)
+        points[i] = spot[0]
 
 
 @compiled

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_resolution
-from d4orm_env.core.world import World
 from d4orm_env.lifelong import goal_region
 
 Edit = Callable[[Problem], Problem]
@@ -36,12 +35,26 @@ def move_goal(problem: Problem, robot: int, place: ArrayLike) -> Problem:
 
 def move_robot(problem: Problem, robot: int, place: ArrayLike) -> Problem:
     """Put a robot elsewhere, at rest: ``place`` ``(d,)`` [m]."""
-    start, model = np.array(problem.start), problem.team.robot_models[robot]
+    start = np.array(problem.start)
     start[robot, : problem.dimension] = place
-    own = tuple(float(value) for value in start[robot, : model.state_size])
-    start[robot, : model.state_size] = model.functions.rest(own, 0.0)
+    _stop(problem, start, robot)
     _check_place(problem, "the robot", robot, start[:, : problem.dimension])
     return problem.resumed_at(start, problem.goal)
+
+
+def at_rest(problem: Problem) -> Problem:
+    """The scene with all robots at rest, as files have it."""
+    start = np.array(problem.start)
+    for robot in range(problem.num_robots):
+        _stop(problem, start, robot)
+    return problem.resumed_at(start, problem.goal)
+
+
+def _stop(problem: Problem, states: FloatArray, robot: int) -> None:
+    """Bring a robot to rest in ``states`` ``(K, n)``."""
+    model = problem.team.robot_models[robot]
+    own = tuple(float(value) for value in states[robot, : model.state_size])
+    states[robot, : model.state_size] = model.functions.rest(own, 0.0)
 
 
 def push(problem: Problem, robot: int, shove: ArrayLike) -> Problem:
@@ -147,9 +160,7 @@ def _places(problem: Problem) -> tuple[FloatArray, FloatArray]:
 
 
 def _with_world(problem: Problem, **changes: Any) -> Problem:
-    world = problem.world
-    parts: dict[str, Any] = {name: getattr(world, name) for name in ("dimension", *KINDS, "lower", "upper")}
-    changed = problem.resumed_at(problem.start, problem.goal, world=World(**parts | changes))
+    changed = problem.resumed_at(problem.start, problem.goal, world=problem.world.replace(**changes))
     _check_world(changed)
     return changed
 

@@ -173,7 +173,7 @@ class Panel:
         load = self._gui.add_upload_button("Load scene", mime_type=".yaml,.yml")
 
         def save_scene(event: Any) -> None:
-            _send(event.client, "scene.yaml", scenario_text(at_rest(self._session.scene)))
+            _send(event.client, "scene.yaml", scenario_text(edits.at_rest(self._session.scene)))
 
         def save_replay(event: Any) -> None:
             _send(event.client, "replay.html", self._session.replay().html)
@@ -238,15 +238,6 @@ def read_scene(content: bytes) -> Problem:
     if problem.num_robots > edits.MOST_ROBOTS:
         raise ValueError(f"the scene has {problem.num_robots} robots; at most {edits.MOST_ROBOTS} can be played with")
     return problem
-
-
-def at_rest(scene: Problem) -> Problem:
-    """A scene with all robots at rest, as files have it."""
-    start = np.array(scene.start)
-    for robot, model in enumerate(scene.team.robot_models):
-        own = tuple(float(value) for value in start[robot, : model.state_size])
-        start[robot, : model.state_size] = model.functions.rest(own, 0.0)
-    return scene.resumed_at(start, scene.goal)
 
 
 def _push_somebody(scene: Problem, random: np.random.Generator) -> Problem:

@@ -121,7 +121,7 @@ class Session:
         """
 
         def make() -> None:
-            before = [lane.scene for lane in self._lanes]
+            before = [one.scene for one in self._lanes]
             leader = min(lane, len(before) - 1)
             after = edit(before[leader])
             scenes = [

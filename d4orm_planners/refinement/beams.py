@@ -69,6 +69,12 @@ class Company:
     beside: FloatArray
     radius: NDArray[np.float64]
 
+    @classmethod
+    def nobody(cls, robots: IntArray, horizon: int, dimension: int) -> Company:
+        """No others but the team."""
+        beside = np.zeros((len(robots), 0, horizon + 1, dimension), np.float32)
+        return cls(robots[:, None], beside, np.zeros((len(robots), 0)))
+
 
 def find_ways(
     team: TeamPaths,
@@ -95,9 +101,7 @@ def find_ways(
     """
     problem, horizon = team.problem, team.problem.horizon
     blocks, limits = np.broadcast_to(blocks, len(robots)), np.broadcast_to(np.asarray(limits, float), len(robots))
-    if company is None:
-        nobody = np.zeros((len(robots), 0, horizon + 1, problem.dimension), np.float32)
-        company = Company(robots[:, None], nobody, np.zeros((len(robots), 0)))
+    company = company or Company.nobody(robots, horizon, problem.dimension)
     u, x = (np.ascontiguousarray(rows[:, robots].swapaxes(0, 1)) for rows in (team.controls, team.states))
     arrived = np.zeros(len(robots), bool)
     for model, members in by_model(problem):
