@@ -23,7 +23,7 @@ def test_a_goal_is_reached_there_and_no_faster_than_the_goal_speed(model: str) -
     kind = MODELS[model]
     # The third robot drives at half a metre a second: by its state, or where it has no inertia by its control.
     (states if kind.speed_indices else controls)[2, kind.speed_indices[0] if kind.speed_indices else 0] = 0.5
-    assert reached_goals(problem, problem.goal, states, controls).tolist() == [True, False, False]
+    assert reached_goals(problem.team, problem.arrays, states, controls).tolist() == [True, False, False]
 
 
 def test_new_goals_lie_where_the_robot_can_get_to() -> None:
