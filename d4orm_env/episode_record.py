@@ -7,10 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 
 Counts = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 
 class EpisodeRecord:

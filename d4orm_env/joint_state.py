@@ -25,16 +25,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, frozen_array
+from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, Floats, frozen_array
 from d4orm_env.core.observation_layout import Spare
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_model import ACCELERATION, SPEED
 
 __all__ = ["JointState", "join_state", "split_state"]
-
-Floats = NDArray[np.float64]
 
 
 class JointState(NamedTuple):

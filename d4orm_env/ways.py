@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 
 if TYPE_CHECKING:
     from d4orm_env.engine.wavefront import Front, Lattice, Space
 
-Floats = NDArray[np.float64]
 
 MAX_NODES, MAX_NODES_IN_ALL = 2**21, 2**24
 """Most nodes of a grid, and of the grids of all robots together; coarser ones where there would be more."""

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import IntArray
+from d4orm_env.core.arrays import Floats, IntArray
 from d4orm_env.core.collision import axis_gap
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import inverse_initial_distance
@@ -40,7 +40,6 @@ CASADI = {"print_time": False, "show_eval_warnings": False}
 """Options of every solve."""
 
 Options = Mapping[str, object]
-Floats = NDArray[np.float64]
 Contacts = dict[tuple[int, int], NDArray[np.int64]]
 """Steps at which robot ``k`` is kept clear of body ``b``: robot ``b``, or from ``K`` on obstacle ``b - K``."""
 

@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 FloatArray = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
+Floats = NDArray[np.float64]
+"""Where float32 is not enough."""
 
 
 SMALLEST, LARGEST = 1e-7, 1e6

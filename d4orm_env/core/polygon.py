@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import FloatArray
-
-Floats = NDArray[np.float64]
+from d4orm_env.core.arrays import FloatArray, Floats
 
 _PAIRS_AT_ONCE = 2**20
 

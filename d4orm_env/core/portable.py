@@ -21,9 +21,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from d4orm_env.core.arrays import Floats
 from d4orm_env.core.robot_model import Ops
 
-Floats = NDArray[np.float64]
 Real: TypeAlias = Any
 """An array or a number, float32 or float64, whichever the arguments are."""
 Function = Callable[..., Real]

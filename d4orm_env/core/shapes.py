@@ -11,9 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import FloatArray
-
-Floats = NDArray[np.float64]
+from d4orm_env.core.arrays import FloatArray, Floats
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.shapes import Shapes
 
 MAX_BYTES = 64 * 2**20
@@ -42,7 +42,6 @@ _PAIRS_AT_ONCE = 2**18
 _EPSILON = float(np.finfo(np.float32).eps)
 
 Ints = NDArray[np.int32]
-Floats = NDArray[np.float64]
 
 
 class WorldIndex(NamedTuple):

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from d4orm_env.core.arrays import Floats
 
 GRAVITY = 9.81
 """[m/s^2]."""

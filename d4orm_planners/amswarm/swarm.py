@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine.base import Engine
 from d4orm_planners.amswarm.alternation import Bodies, Guess, Method, alternate
-from d4orm_planners.amswarm.bernstein import Floats, first_coefficients, sample_basis
+from d4orm_planners.amswarm.bernstein import first_coefficients, sample_basis
 from d4orm_planners.steering import present_velocities, track_velocities
 
 if TYPE_CHECKING:

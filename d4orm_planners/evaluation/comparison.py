@@ -7,12 +7,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from d4orm_env.core.arrays import Floats
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import wilson_interval
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,9 +12,8 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import IntArray
+from d4orm_env.core.arrays import Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS
@@ -36,8 +35,6 @@ WAIT_SLACK = 0.09
 """Distance beyond radii and margin that robots under way keep [m]."""
 SHARPEST = 0.1
 """Radius below which corners are not rounded [m]."""
-
-Floats = NDArray[np.float64]
 
 
 class Route(NamedTuple):

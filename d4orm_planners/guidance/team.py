@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from numba import types
 
-from d4orm_env.core.arrays import FloatArray, IntArray
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 from d4orm_env.core.metrics import arrival_steps
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
@@ -19,7 +19,7 @@ from d4orm_planners.guidance.lacam import Team
 from d4orm_planners.guidance.nearness import sort_into_cells
 from d4orm_planners.guidance.replanning import Others, Trip, find_way, straighten, touches
 from d4orm_planners.guidance.roadmap import WALL_SLACK, Roadmap
-from d4orm_planners.guidance.routes import Floats, Stops, join_routes, make_routes, stops_of
+from d4orm_planners.guidance.routes import Stops, join_routes, make_routes, stops_of
 from d4orm_planners.guidance.timed_drive import drive_by_clock, timed_kernel
 
 FIRST_CUT = 0.03

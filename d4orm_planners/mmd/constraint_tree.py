@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.wavefront import Space
 from d4orm_planners.mmd.conflicts import count_conflicts, first_conflict
 from d4orm_planners.mmd.denoising import Batch, Denoiser
 from d4orm_planners.mmd.guiding import Surroundings
-from d4orm_planners.mmd.way_frame import Floats, WayFrame
+from d4orm_planners.mmd.way_frame import WayFrame
 
 if TYPE_CHECKING:
     from d4orm_planners.mmd.planner import MMDConfig

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios import make_problem
-from d4orm_planners.mmd.way_frame import POINTS, Floats, WayFrame, make_frame, sine_table, world_space
+from d4orm_planners.mmd.way_frame import POINTS, WayFrame, make_frame, sine_table, world_space
 from d4orm_planners.registry import make_planner
 
 KINDS: tuple[tuple[str, dict[str, object]], ...] = (

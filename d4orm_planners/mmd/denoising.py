@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.draws import draw_normals, draw_uniforms
 from d4orm_planners.mmd.guiding import Surroundings, guide
 from d4orm_planners.mmd.prior import SIZE, Prior, kept_signal, level_features, load_prior, posterior, predict, tell
 from d4orm_planners.mmd.tracking import Tracked, drive_along
-from d4orm_planners.mmd.way_frame import Floats, WayFrame, sine_table
+from d4orm_planners.mmd.way_frame import WayFrame, sine_table
 
 if TYPE_CHECKING:
     from d4orm_planners.mmd.planner import MMDConfig

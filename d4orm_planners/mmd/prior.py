@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.portable import cos
 from d4orm_env.engine import tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS
-from d4orm_planners.mmd.way_frame import FEATURES, MODES, Floats
+from d4orm_planners.mmd.way_frame import FEATURES, MODES
 
 WEIGHTS = Path(__file__).with_name("weights.npz")
 """What comes with the package; see `docs/planners/mmd.md` for its card."""

@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from d4orm_env.core.arrays import Floats
 from d4orm_env.core.portable import sin
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_model import ACCELERATION, SPEED
@@ -19,8 +19,6 @@ from d4orm_env.engine import tiles, wavefront
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS, compiled
 from d4orm_env.engine.wavefront import Space, clearance_at, make_space
-
-Floats = NDArray[np.float64]
 
 SOURCES = fingerprint((tiles, wavefront))
 

@@ -9,9 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import FloatArray, IntArray
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 from d4orm_env.core.metrics import arrival_steps
 from d4orm_env.core.portable import log
 from d4orm_env.engine.beam_search import BeamRules
@@ -19,8 +18,6 @@ from d4orm_env.engine.path_index import BLOCK
 from d4orm_planners.refinement.beams import Company, Manner, find_ways
 from d4orm_planners.refinement.team import TeamPaths
 from d4orm_planners.steering import straight_drives
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

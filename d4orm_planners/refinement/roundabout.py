@@ -12,16 +12,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.portable import arctan2, cos, sin
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine.base import Engine
 from d4orm_planners.steering import track_velocities
-
-Floats = NDArray[np.float64]
 
 SLACK = 0.002
 """Added to the distance that robots keep from each other in it [m]."""
