@@ -104,8 +104,8 @@ def steering(name: str) -> Any:
     """
     robot = MODELS[name]
     approach, track = inlined(robot.functions.approach), inlined(robot.functions.track)
-    limit_control, turned = inlined(robot.functions.limit_control), _turning(robot)
     scaled, length, between = _vectors(robot.dimension)
+    limit_control, turned = inlined(robot.functions.limit_control), _turning(robot, length)
 
     @inlined
     def steer(state: Any, target: Any, room: Any, pace: Any, backs_up: Any, limits: Any, h: Any) -> Any:
@@ -157,7 +157,7 @@ def _vectors(dimension: int) -> tuple[Any, Any, Any]:
     return scaled, length, between
 
 
-def _turning(robot: Model) -> Any:
+def _turning(robot: Model, length: Any) -> Any:
     """What a robot makes of a velocity towards a point that is so far off, and of its pace, in order to face it."""
     heading, velocity = robot.heading_index, inlined(robot.functions.velocity)
     at_rest = (ZERO,) * robot.control_size
@@ -168,13 +168,12 @@ def _turning(robot: Model) -> Any:
 
     @inlined
     def in_place(state: Any, gap: Any, wanted: Any, pace: Any, backs_up: Any, limits: Any) -> Any:
-        distance = np.sqrt(gap[0] * gap[0] + gap[1] * gap[1])
-        facing = (OPS.cos(state[heading]) * gap[0] + OPS.sin(state[heading]) * gap[1]) / distance
+        facing = (OPS.cos(state[heading]) * gap[0] + OPS.sin(state[heading]) * gap[1]) / length(gap)
         return wanted, pace * min(max((facing - FACING) / (ONE - FACING), CREEP), ONE)
 
     @inlined
     def as_it_drives(state: Any, gap: Any, wanted: Any, pace: Any, backs_up: Any, limits: Any) -> Any:
-        x, y, distance = OPS.cos(state[heading]), OPS.sin(state[heading]), np.sqrt(gap[0] * gap[0] + gap[1] * gap[1])
+        x, y, distance = OPS.cos(state[heading]), OPS.sin(state[heading]), length(gap)
         along, across = (x * gap[0] + y * gap[1]) / distance, (x * gap[1] - y * gap[0]) / distance
         own = velocity(state, at_rest, limits, OPS)
         gear = gear_towards(along, across, x * own[0] + y * own[1], backs_up)
@@ -182,12 +181,12 @@ def _turning(robot: Model) -> Any:
             pace *= BACKING
         if along * gear < BESIDE[0]:
             along, across = gear * BESIDE[0], BESIDE[1] if across >= ZERO else -BESIDE[1]
-        speed = min(np.sqrt(wanted[0] * wanted[0] + wanted[1] * wanted[1]), pace)
+        speed = min(length(wanted), pace)
         return ((x * along - y * across) * speed, (y * along + x * across) * speed), pace
 
-    if robot.turns_in_place:
-        return needs_not if heading is None else in_place
-    return as_it_drives
+    if heading is None:
+        return needs_not
+    return in_place if robot.turns_in_place or robot.dimension == 3 else as_it_drives
 
 
 @inlined
