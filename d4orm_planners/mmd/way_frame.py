@@ -224,7 +224,8 @@ def trace(frame: Any, axis: Any, sines: Any, deviation: Any, motion: Any, spot: 
     """Fill ``points`` ``(N + 1, 3)`` with those of a motion [m]; all else as of :func:`locate`, ``spot`` as scratch."""
     for i in range(points.shape[0]):
         locate(frame, axis, sines[i], deviation, motion, i, spot)
-        points[i] = spot[0]
+        for x in range(3):
+            points[i, x] = spot[0, x]
 
 
 @compiled
