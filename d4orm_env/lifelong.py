@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
@@ -83,8 +83,7 @@ def fresh_goal(
         if free.any() and problem.world.num_obstacles and np.isfinite(problem.ways.length[robot]):
             free[free] = np.isfinite(problem.ways.distance_from(robot, places[free]))
         if free.any():
-            place: FloatArray = places[np.argmax(free)].astype(np.float32)
-            return place
+            return as_float32(places[np.argmax(free)])
     raise RuntimeError(
         f"no free place for a new goal of robot_{robot} between {low.tolist()} and {high.tolist()}; "
         "use a larger world, fewer robots or a smaller margin for lifelong mode"

@@ -204,12 +204,12 @@ def lay_lattice(
         places=np.empty((size.prod(), 3)),
         free=np.empty(size.prod(), np.bool_),
     )
-    if space is not None:
+    if space is None:
+        lattice.places[:] = lattice.low + np.indices(tuple(lattice.size)).reshape(3, -1).T * step
+        inside = (lattice.places[:, :d] >= bounds[0] + reach) & (lattice.places[:, :d] <= bounds[1] - reach)
+        lattice.free[:] = inside.all(axis=1)
+    else:
         settle_nodes(space, lattice, reach)
-        return lattice
-    lattice.places[:] = lattice.low + np.indices(tuple(lattice.size)).reshape(3, -1).T * step
-    inside = (lattice.places[:, :d] >= bounds[0] + reach) & (lattice.places[:, :d] <= bounds[1] - reach)
-    lattice.free[:] = inside.all(axis=1)
     return lattice
 
 

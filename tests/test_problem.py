@@ -360,6 +360,19 @@ def test_replace_checks_again_and_keeps_the_rest() -> None:
         problem.replace(horizon=0)
 
 
+def test_worlds_and_teams_are_replaced_alike() -> None:
+    problem = two_robots()
+    world, team = problem.world.replace(circles=[[0, 2, 0.5]]), problem.team.replace(radius=0.1)
+    assert world.circles.tolist() == [[0, 2, 0.5]]
+    assert (world.boxes.tolist(), world.upper.tolist()) == (problem.world.boxes.tolist(), [4, 4])
+    np.testing.assert_array_equal(team.radius, np.float32([0.1, 0.1]))
+    np.testing.assert_array_equal(team.limits, problem.team.limits)
+    with pytest.raises(ValueError, match=r"radius of circles\[0\] is -1; it must be positive"):
+        problem.world.replace(circles=[[0, 2, -1]])
+    with pytest.raises(TypeError, match="circle"):
+        problem.world.replace(circle=[])
+
+
 def test_select_takes_robots_in_the_order_given() -> None:
     problem = two_robots(margin=0.02)
     swapped = problem.select([1, 0])

@@ -110,8 +110,7 @@ def alternate(method: Any, bodies: Any, robot: Any, limits: Any, goal: Any, fixe
     rows = _mind(method, bodies, robot, guess, minded) + 1  # the bounds are always minded
     bends = 1.0 if limits[1] < math.inf else 0.0
     squares = rows * method.squares[0] + method.squares[1] + bends * method.squares[2]
-    violation = _project(method, bodies, robot, limits, minded, motion[0], guess, targets)
-    penalty = method.penalty
+    violation, penalty = _project(method, bodies, robot, limits, minded, motion[0], guess, targets), method.penalty
     for _ in range(method.alternations):
         _accumulate(method, targets, bends, right)
         for i in range(size):

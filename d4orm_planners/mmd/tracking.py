@@ -13,7 +13,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.engine import lanes, tiles, wavefront
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.drives import LoneRobot
-from d4orm_env.engine.tiles import OPS, OPTIONS, compiled, inlined, make_stepper, models_key, to_fixed_tuple
+from d4orm_env.engine.tiles import OPS, OPTIONS, ZERO, compiled, inlined, make_stepper, models_key, to_fixed_tuple
 from d4orm_env.engine.wavefront import clearance_at
 from d4orm_planners.mmd import clock, way_frame
 from d4orm_planners.mmd.clock import fill_clock
@@ -89,11 +89,8 @@ def tracking_kernel(name: str) -> Any:
                 else:
                     control = track(x, approach(x, goal, own, h, OPS), own, h, OPS)
                 control = limit_control(control, own, OPS)
-                if standing:
-                    driven.controls[b, step] = 0.0
-                else:
-                    for axis in range(m):
-                        driven.controls[b, step, axis] = control[axis]
+                for axis in range(m):
+                    driven.controls[b, step, axis] = ZERO if standing else control[axis]
                 x, _, there = dock(standing, move(standing, x, control, own, h), control, own, goal, docking)
                 for axis in range(d):
                     driven.places[b, step + 1, axis] = x[axis]
