@@ -150,8 +150,13 @@ class Team:
                     return False
         return True
 
-    def after(self, here: Configuration, scratch: Scratch, seed: int) -> Configuration | None:
-        """Where a step leads under the next constraint that is untried; ``None`` where that cannot be kept."""
+    def after(
+        self, here: Configuration, scratch: Scratch, seed: int, known: dict[bytes, Configuration]
+    ) -> Configuration | None:
+        """Where a step leads under the next constraint that is untried; ``None`` where that cannot be kept.
+
+        A configuration that is ``known`` is returned itself; others are added.
+        """
         bodies, constraint = self.bodies, here.next_constraint(self.roadmap)
         forced = np.array(constraint.robots, np.int64), np.array(constraint.places, np.int64)
         self.find_ways(here.positions)
@@ -163,11 +168,15 @@ class Team:
             if count < 0:
                 return None
             if not bodies.docks or not came.any() or self.find_ways(positions):
-                waiting = np.where(self.arrived(positions), here.priorities % 1, here.priorities + 1)
-                return Configuration(positions, here, scratch.moves[:count].copy(), waiting)
+                break
             # Who would close somebody's only way must wait until that one has passed.
             scratch.may_dock[came] = False
             self.find_ways(here.positions)
+        key = positions.tobytes()
+        if key not in known:
+            waiting = np.where(self.arrived(positions), here.priorities % 1, here.priorities + 1)
+            known[key] = Configuration(positions, here, scratch.moves[:count].copy(), waiting)
+        return known[key]
 
 
 def find_moves(
@@ -204,9 +213,9 @@ def find_moves(
         if not here.untried:
             open_.pop()
             continue
-        following = team.after(here, scratch, (seed + step) % 2**62)
+        following = team.after(here, scratch, (seed + step) % 2**62, known)
         if following is not None:
-            open_.append(known.setdefault(following.positions.tobytes(), following))
+            open_.append(following)
     return _moves_to(best, team.arrived(best.positions))
 
 

@@ -17,7 +17,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine import tiles, wavefront
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.tiles import OPTIONS, compiled
+from d4orm_env.engine.tiles import OPTIONS, compiled, inlined
 from d4orm_env.engine.wavefront import Space, clearance_at, make_space
 
 SOURCES = fingerprint((tiles, wavefront))
@@ -219,7 +219,7 @@ def locate(frame: Any, axis: Any, sines: Any, deviation: Any, motion: Any, i: An
         spot[0, x] = spot[3, x] + frame.length * aside * spot[2, x]
 
 
-@compiled
+@inlined
 def trace(frame: Any, axis: Any, sines: Any, deviation: Any, motion: Any, spot: Any, points: Any) -> None:
     """Fill ``points`` ``(N + 1, 3)`` with those of a motion [m]; all else as of :func:`locate`, ``spot`` as scratch."""
     for i in range(points.shape[0]):
