@@ -57,6 +57,8 @@ def completed(name: str, out: Path, *arguments: str) -> None:
         ("train_and_compare", "stable_baselines3", "rl"),
         ("train_and_compare", "pyrvo", "orca"),
         ("jax_ppo", "optax", "jaxrl"),
+        ("cleanrl_ppo", "torch", "rl"),
+        ("torchrl_mappo", "torchrl", "rl"),
         ("imitate_expert", "stable_baselines3", "rl"),
         ("read_results", "pandas", "dev"),
         ("read_results", "pyarrow", "evaluate"),
@@ -234,6 +236,29 @@ def test_ppo_in_one_jit_learns_to_arrive(tmp_path: Path) -> None:
     success = [float(row["success"].removesuffix("%")) for row in table(out / "jax_ppo.csv")]
     assert success[0] < 20
     assert success[-1] > 50
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "module"),
+    [("cleanrl_ppo", "torch"), ("torchrl_mappo", "torchrl"), ("benchmarl_mappo", "benchmarl.environments")],
+)
+def test_recipes_learn_something(name: str, module: str, tmp_path: Path) -> None:
+    pytest.importorskip(module, exc_type=ImportError)
+    out = tmp_path / "out"
+    completed(name, out)
+    success = [float(row["success"].removesuffix("%")) for row in table(out / f"{name}.csv")]
+    assert success[0] < 10
+    assert success[-1] > 20
+
+
+def test_a_policy_gives_a_planner_its_first_guess(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("warm_start", out)
+    without, warm = table(out / "warm_start.csv")
+    assert (without["from"], warm["from"]) == ("nothing", "ppo")
+    assert warm["solved"] == without["solved"] == "2 of 2"
+    assert float(warm["iterations"]) <= float(without["iterations"])
 
 
 @pytest.mark.slow
