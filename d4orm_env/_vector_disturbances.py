@@ -68,7 +68,8 @@ class DisturbedBatch:
         if self._nothing:
             return controls
         states, controls = self._disturbed.act(self._scene, controls)
-        np.copyto(self._worlds.state, states)
+        if states is not self._worlds.state:
+            np.copyto(self._worlds.state, states)
         return controls
 
     def meet(self, moved: BoolArray) -> None:
@@ -93,9 +94,10 @@ class DisturbedBatch:
         rows: Worlds | slice = slice(None) if len(worlds) == len(batch.steps) else worlds
         seen = self._disturbed.see(self._scene, None if isinstance(rows, slice) else worlds)
         if isinstance(rows, slice):
-            self._seen = Seen(*(np.array(part) for part in seen))
+            self._seen = seen
         else:
-            assert self._seen is not None
+            # Not in place: of what was seen last some may be the worlds' own arrays, or a disturbance's memory.
+            self._seen = Seen(*(np.array(part) for part in self.seen))
             for past, new in zip(self._seen, seen):
                 past[worlds] = new
         states, controls, bodies = (part[rows] for part in self._seen)

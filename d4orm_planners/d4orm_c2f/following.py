@@ -12,8 +12,11 @@ from d4orm_env.engine.base import Engine
 from d4orm_env.joint_state import JointState
 from d4orm_planners.steering import preferred_velocities, track_velocities
 
-STUCK_WITHIN, STUCK_AFTER = 0.3, 25
-"""How far a robot has to get [m] in so many time steps not to be stuck."""
+STUCK_WITHIN, STUCK_AFTER = 3, 25
+"""How many waypoints a robot has to get on in so many time steps not to be stuck."""
+
+WAITING_WITHIN = 0.15
+"""A robot this near to where it should be by now waits [m]."""
 
 CAREFUL_FOR = 30
 """Steps for which a robot that was stuck follows its path."""
@@ -26,31 +29,30 @@ CATCHING_UP = 2.0
 
 
 class Patience:
-    """Watches an episode for robots that hardly move although they are not at their goals.
+    """Watches an episode for robots that do not get on along their paths.
 
     Args:
         joint: Where they begin.
     """
 
     def __init__(self, joint: JointState) -> None:
-        self._places = joint.states[:, : joint.goals.shape[1]].copy()
+        self._indices = np.zeros(len(joint.goals), int)
         self._since = np.full(len(joint.goals), joint.steps)
         self._careful_until = np.full(len(joint.goals), joint.steps)
 
-    def observe(self, joint: JointState, due: FloatArray) -> tuple[BoolArray, BoolArray]:
+    def observe(self, step: int, indices: IntArray, waiting: BoolArray) -> tuple[BoolArray, BoolArray]:
         """``(K,)`` who is stuck now, and who is or was not long ago, so that it follows its path slowly.
 
         Args:
-            joint: Where the robots are.
-            due: ``(K, d)`` where they should be by now: some have to wait.
+            step: Time step.
+            indices: ``(K,)`` waypoints that the robots are at; lower ones than before are of another path.
+            waiting: ``(K,)`` who is where it should be by now, or ahead of the team.
         """
-        places = joint.states[:, : joint.goals.shape[1]]
-        moved = np.linalg.norm(places - self._places, axis=1) > STUCK_WITHIN
-        moved |= np.linalg.norm(places - due, axis=1) < STUCK_WITHIN
-        self._places[moved], self._since[moved] = places[moved], joint.steps
-        late = joint.steps - self._since > STUCK_AFTER
-        self._careful_until[late] = joint.steps + CAREFUL_FOR
-        return late, self._careful_until > joint.steps
+        moved = (indices >= self._indices + STUCK_WITHIN) | (indices < self._indices) | waiting
+        self._indices[moved], self._since[moved] = indices[moved], step
+        late = step - self._since > STUCK_AFTER
+        self._careful_until[late] = step + CAREFUL_FOR
+        return late, self._careful_until > step
 
 
 def follow_slowly(

@@ -22,7 +22,7 @@ from d4orm_planners.d4orm_c2f.coarse import (
     rest_of,
     subgoal_indices,
 )
-from d4orm_planners.d4orm_c2f.following import STUCK_AFTER, Patience, follow_slowly, keep_time
+from d4orm_planners.d4orm_c2f.following import STUCK_AFTER, WAITING_WITHIN, Patience, follow_slowly, keep_time
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.d4orm_c2f.sight import within_sight
 from d4orm_planners.d4orm_d.planner import D4ormD
@@ -86,7 +86,7 @@ class Guide:
         """Begin at the beginning of a guidance, which sends the robots ``anew`` ``(K,)`` another way than before."""
         self.anew = anew
         self.guidance = guidance
-        self.index, self._due_index, self._indices = 0, 0, np.zeros(len(joint.goals), int)
+        self.index, self._indices = 0, np.zeros(len(joint.goals), int)
         self._goals, self._began = joint.goals, joint.steps
         self._nearest, self._nearest_at = float("inf"), joint.steps
 
@@ -152,7 +152,7 @@ class Guide:
         moving = ~docked
         stuck, lost = np.zeros_like(docked), False
         if self._config.replan:
-            stuck, self.stuck = self._patience.observe(joint, self._due(joint))
+            stuck, self.stuck = self._patience.observe(joint.steps, self._indices, self._waiting(joint))
             lost = bool(moving.any()) and self._is_lost(joint, moving)
         if not moving.any():
             return False
@@ -199,10 +199,12 @@ class Guide:
             initial[: len(rest), keep] = rest[:, keep]
         return initial
 
-    def _due(self, joint: JointState) -> FloatArray:
-        """``(K, d)`` where the robots should be by now: as far as the others, and half as far as planned."""
-        self._due_index = max(self._due_index, self.index, (joint.steps - self._began) // 2)
-        return self.guidance.path[min(self._due_index, len(self.guidance.path) - 1)]
+    def _waiting(self, joint: JointState) -> BoolArray:
+        """``(K,)`` who is where it should be by now, or ahead of the team, and so has to wait."""
+        due = self.guidance.path[min(self.index, len(self.guidance.path) - 1)]
+        away = np.linalg.norm(joint.states[:, : self.problem.dimension] - due, axis=1)
+        waiting: BoolArray = (away < WAITING_WITHIN) | (self._indices > self.index)
+        return waiting
 
     def _is_lost(self, joint: JointState, moving: BoolArray) -> bool:
         """Whether the robots under way are far from their waypoints, at the end of the path, or get no nearer."""
