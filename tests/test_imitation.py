@@ -179,6 +179,13 @@ def test_an_expert_is_told_that_another_drives() -> None:
     make_policy("d4orm-c2f", **own)
 
 
+def test_what_is_practised_along_with_a_scenario_has_robots_like_its_own(tmp_path: Path) -> None:
+    spatial = replace(TINY, scenario="sphere", scenario_settings={}, episodes=4, rounds=2, epochs=1)
+    assert imitate(spatial, tmp_path / "imitation").network.header.model == "holonomic3d"
+    settings = TrainingSettings(scenario="sphere", num_robots=2, steps=1024, num_envs=16, lessons=2)
+    assert train(settings, tmp_path / "ppo").network.header.model == "holonomic3d"
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

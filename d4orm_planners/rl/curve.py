@@ -45,11 +45,6 @@ class Evaluation:
         return self.success_rate, -self.travel_time
 
 
-def best_of(evaluations: Sequence[Evaluation]) -> Evaluation | None:
-    """The evaluation of the highest rank, if there is any."""
-    return max(evaluations, key=lambda evaluation: evaluation.rank, default=None)
-
-
 def evaluate_network(network: Network, worlds: RobotVecEnv, seed: int) -> tuple[float, float]:
     """Success rate and mean travel time [s] of one episode in every world, without exploring."""
     success, travel_time = (float(np.mean(values)) for values in zip(*run_worlds(network, worlds, seed)))

@@ -27,7 +27,7 @@ from d4orm_planners.registry import make_policy, setting_names
 from d4orm_planners.rl.algorithms import ALGORITHMS
 from d4orm_planners.rl.checkpoints import Checkpoints
 from d4orm_planners.rl.cloning import clone, imitation_error, normalize
-from d4orm_planners.rl.curve import Evaluation, best_of, evaluate_network, write_curve
+from d4orm_planners.rl.curve import Evaluation, evaluate_network, write_curve
 from d4orm_planners.rl.dataset_samples import dataset_samples
 from d4orm_planners.rl.network import CLIP, EPSILON, Network
 from d4orm_planners.rl.practice import VALIDATION_SEED, Many, Practice
@@ -163,10 +163,8 @@ class _Run:
             *evaluate_network(network, self._validation, VALIDATION_SEED), seconds, recorded / seconds,
             imitation_error(network, *held),
         )  # fmt: skip
-        best = best_of(self.evaluations)
-        if best is None or evaluation.rank >= best.rank:
-            network.save(self.checkpoints.policy_path)
         self.evaluations = [*self.evaluations, evaluation]
+        self.checkpoints.keep_best(network, self.evaluations)
         self.checkpoints.save(index, self._model, self._env, self.evaluations)
         write_curve(self._out, self.evaluations)
 

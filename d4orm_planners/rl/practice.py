@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
+from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios import make_problem
 from d4orm_env.scenarios.problems import unknown_argument
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
@@ -52,12 +53,19 @@ class Practice(CheckedSettings):
         complaint = unknown_argument(self.scenario, self.scenario_settings)
         if complaint:
             raise ValueError(f"scenario_settings: {complaint}")
-        make_problem(self.scenario, num_robots=self.num_robots, model=self.model, **self.scenario_settings)
+        self._example()
+
+    def _example(self) -> Problem:
+        """An instance of the scenario."""
+        return make_problem(**self.arguments(self.scenario), num_robots=self.num_robots)
 
     def arguments(self, scenario: str) -> dict[str, Any]:
-        """Of environments of the scenario to be learned, or of ``random``, but for the team's size."""
-        own = dict(self.scenario_settings) if scenario == self.scenario else {}
-        return {"scenario": scenario, "model": self.model, **own}
+        """Of environments of the scenario to be learned, or of ``random`` with robots like its own, but for their
+        number.
+        """
+        if scenario == self.scenario:
+            return {"scenario": scenario, "model": self.model, **self.scenario_settings}
+        return {"scenario": scenario, "model": self._example().team.models[0]}
 
     def draws(self, scenario: str, num_robots: int) -> bool:
         """Whether instances of such a scenario differ."""

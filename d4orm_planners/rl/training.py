@@ -25,7 +25,7 @@ from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm
 from d4orm_planners.rl.checkpoints import Checkpoints
 from d4orm_planners.rl.curriculum import Lesson, common_batch, make_lessons, team_sizes
-from d4orm_planners.rl.curve import Evaluation, best_of, evaluate_network, write_curve
+from d4orm_planners.rl.curve import Evaluation, evaluate_network, write_curve
 from d4orm_planners.rl.network import CLIP, EPSILON, Network, load_network
 from d4orm_planners.rl.practice import VALIDATION_SEED, Many, Practice
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
@@ -147,10 +147,8 @@ class _Run:
             done + lesson.steps, lesson.num_robots, lesson.scenario,
             *evaluate_network(network, self._validation, VALIDATION_SEED), seconds, robots.seconds / seconds,
         )  # fmt: skip
-        best = best_of(self.evaluations)
-        if best is None or evaluation.rank >= best.rank:
-            network.save(self.checkpoints.policy_path)
         self.evaluations = [*self.evaluations, evaluation]
+        self.checkpoints.keep_best(network, self.evaluations)
         self._checkpoint = self.checkpoints.save(index, model, normalized, self.evaluations)
         write_curve(self._out, self.evaluations)
         robots.close()
