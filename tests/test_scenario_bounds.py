@@ -9,6 +9,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 from scenario_support import WALLED, needed, scenario_models
 
 from d4orm_env import load_problem, navigation_v0, save_problem
@@ -71,6 +73,28 @@ def test_a_robot_touches_them() -> None:
     away = {"robot_0": np.array([1.0, 0.0], np.float32)}
     # It starts 0.35 m from them, surface to wall, and has come 0.32 m after eight steps, 0.405 m after nine.
     assert [env.step(away)[-1]["robot_0"]["collided"] for _ in range(9)] == [False] * 8 + [True]
+
+
+@given(
+    name=st.sampled_from(["circle", "random", "swap"]),
+    num_robots=st.integers(1, 6),
+    seed=st.integers(0, 3),
+    corners=st.tuples(*(st.floats(-5, 5, width=32) for _ in range(4))),
+)
+def test_either_everybody_keeps_the_margin_or_somebody_is_named(
+    name: str, num_robots: int, seed: int, corners: tuple[float, ...]
+) -> None:
+    lower, upper = corners[:2], corners[2:]
+    plain = make_problem(name, num_robots, seed)
+    places = np.vstack([plain.start[:, :2], plain.goal]).astype(np.float64)
+    room = np.minimum(places - lower, np.subtract(upper, places)).min() - float(plain.team.radius[0]) - plain.margin
+    assume(abs(room) > 1e-5)
+    if room > 0:
+        problem = make_problem(name, num_robots, seed, bounds=(lower, upper))
+        assert problem == plain.replace(world=problem.world)
+    else:
+        with pytest.raises(ValueError, match="use wider bounds|must lie below upper"):
+            make_problem(name, num_robots, seed, bounds=(lower, upper))
 
 
 BAD = [

@@ -18,6 +18,11 @@ try:
 except ModuleNotFoundError as error:
     missing = (error.name or "benchmarl").partition(".")[0]
     raise ImportError(f"this integration needs {missing}; install it with: pip install benchmarl") from None
+except ImportError as error:
+    raise ImportError(
+        f"BenchMARL does not work with the TorchRL that is installed ({error}); give the two an environment of their "
+        "own, with: pip install d4orm-env benchmarl"
+    ) from None
 
 __all__ = ["NavigationTask"]
 
@@ -50,8 +55,7 @@ class NavigationTask(TaskClass):
         return False
 
     def max_steps(self, env: TorchRLNavigation) -> int:
-        worlds: TorchRLNavigation = env.base_env if hasattr(env, "base_env") else env
-        return worlds.worlds.max_cycles
+        return env.worlds.max_cycles
 
     def group_map(self, env: TorchRLNavigation) -> dict[str, list[str]]:
         return env.group_map

@@ -30,7 +30,8 @@ class Layout:
         world: Obstacles and bounds of the scenario itself.
         travel: The distance the horizon is made for [m]: the same for every seed, so that problems that differ in
             their seed alone have the same shapes.
-        area: Where random obstacles are placed, in an open world; ``None`` where ``world`` has walls, and them already.
+        area: Where robots start and end: random obstacles are placed there, and bounds around it. ``None`` where
+            ``world`` has walls, and its obstacles already.
     """
 
     starts: Points
