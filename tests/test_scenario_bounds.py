@@ -93,7 +93,7 @@ def test_either_everybody_keeps_the_margin_or_somebody_is_named(
         problem = make_problem(name, num_robots, seed, bounds=(lower, upper))
         assert problem == plain.replace(world=problem.world)
     else:
-        with pytest.raises(ValueError, match="use wider bounds|must lie below upper"):
+        with pytest.raises(ValueError, match=r"use wider bounds|must lie below upper"):
             make_problem(name, num_robots, seed, bounds=(lower, upper))
 
 
