@@ -98,7 +98,7 @@ def test_an_imitation_that_was_broken_off_goes_on_to_the_same_end(imitated: Path
 
 def test_dagger_asks_the_expert_where_the_learner_has_led(imitated: Path) -> None:
     env = navigation_v0.parallel_env(scenario="random", num_robots=2, size=2.5)
-    learner = load_network(imitated / "policy.safetensors")
+    learner = load_network(imitated / "policy.safetensors").controls
     own, led = (record_samples(env, make_policy("goal"), 7, driver) for driver in (None, learner))
     np.testing.assert_array_equal(own.observations[:2], led.observations[:2])
     np.testing.assert_array_equal(own.controls[:2], led.controls[:2])

@@ -188,7 +188,7 @@ class _Run:
         env = navigation_v0.parallel_env(num_robots=settings.num_robots, **settings.arguments(scenario))
         expert = make_policy(settings.expert, **settings.all_expert_settings)
         seed = derived_seed(settings.seed, Stream.DEMONSTRATIONS, index, episode)
-        record_samples(env, expert, seed, self._network(index) if index else None).save(path)
+        record_samples(env, expert, seed, self._network(index).controls if index else None).save(path)
         env.close()
 
     def _samples(self, last: int) -> tuple[tuple[Any, Any], tuple[Any, Any]]:

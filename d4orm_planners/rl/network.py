@@ -91,6 +91,11 @@ class Network:
         actions: FloatArray = np.tanh(hidden) if self.header.squashed else np.clip(hidden, -1, 1)
         return actions
 
+    def controls(self, observations: FloatArray, limits: FloatArray) -> FloatArray:
+        """``(N, m)`` most likely controls for ``(N, D)`` observations of robots with limits ``(N, m)``."""
+        features, frames = self.features.encode(observations)
+        return self.features.decode(self(features), frames, limits)
+
     def save(self, path: str | Path) -> None:
         """Write a policy file.
 

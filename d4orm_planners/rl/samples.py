@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -16,10 +16,11 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.policy import Policy, robot_indices
 from d4orm_planners.rl.features import Features
-from d4orm_planners.rl.network import Network
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
+
+Driver = Callable[[FloatArray, FloatArray], FloatArray]
 
 MAX_BYTES = 2**31
 """Of one array of a file that is read."""
@@ -74,14 +75,15 @@ class Samples:
 _ARRAYS = tuple(field.name for field in fields(Samples))
 
 
-def record_samples(env: ParallelEnv, expert: Policy, seed: int, learner: Network | None = None) -> Samples:
+def record_samples(env: ParallelEnv, expert: Policy, seed: int, learner: Driver | None = None) -> Samples:
     """Run an episode and ask the expert at every step what to do.
 
     Args:
         env: A :mod:`d4orm_env.navigation_v0` parallel environment of a team of one model.
         expert: Who is asked.
         seed: Seeds both.
-        learner: Who drives; by default the expert. With a learner the expert is asked where that has led the team.
+        learner: Who drives, as ``(observations (N, D), limits (N, m)) -> controls (N, m)``; by default the expert. With
+            a learner the expert is asked where that has led the team.
 
     Returns:
         What the robots saw until they arrived, and what the expert said.
@@ -95,11 +97,6 @@ def record_samples(env: ParallelEnv, expert: Policy, seed: int, learner: Network
         seen, own = np.stack(list(acting.values())), limits[robot_indices(acting)]
         controls = np.stack([np.asarray(asked[agent], np.float32) for agent in acting])
         parts.append(Samples(seen, controls, own))
-        driven = controls if learner is None else _driven(learner, seen, own)
+        driven = controls if learner is None else learner(seen, own)
         observations, *_ = env.step(dict(zip(acting, driven, strict=True)))
     return Samples.joined(parts)
-
-
-def _driven(network: Network, observations: FloatArray, limits: FloatArray) -> FloatArray:
-    features, frames = network.features.encode(observations)
-    return network.features.decode(network(features), frames, limits)
