@@ -47,6 +47,8 @@ def reroute(team: TeamPaths) -> None:
             if len(robots):
                 ways = find_ways(team, robots, blocks, manner, rules)
                 team.take_best(robots, ways)
+                if team.search.should_stop():
+                    return
                 lost = robots[~ways.arrived[:, 0]]
                 if len(lost):
                     _try_detours(team, lost, random)

@@ -81,6 +81,8 @@ def find_ways(
 ) -> Drives:
     """The best ways that robots ``(R,)`` find; who finds none does what it does, and does not arrive.
 
+    So do those left over when the search should stop.
+
     Args:
         team: What all do.
         robots: Their numbers.
@@ -119,9 +121,14 @@ def _search(
     """Controls ``(R, H, m)``, states ``(R, H+1, n)`` and who arrives, of robots of one model that did as given."""
     found, search = np.zeros(len(u), bool), search_kernel(model.name)
     arrays, table = team.problem.arrays, team.index.table
-    Threads(available_cores()).over(
-        len(u), lambda part: search(arrays, table, moves, rules, seekers, part, u, x, found)
-    )
+
+    def look(part: IntArray) -> None:
+        for first in range(part[0], part[1]):
+            if team.search.should_stop():
+                break
+            search(arrays, table, moves, rules, seekers, np.array((first, first + 1)), u, x, found)
+
+    Threads(available_cores()).over(len(u), look)
     return u, x, found
 
 
