@@ -62,6 +62,14 @@ class Episode(Shown):
         """How the team did."""
         return outcome_rows(self.metrics, self.problem.num_robots)
 
+    @property
+    def controls(self) -> FloatArray:
+        """``(H, K, m)`` what was executed within the horizon, then zeros: a planner's ``initial_controls``."""
+        executed = self.trajectory.controls[: self.problem.horizon]
+        controls = np.zeros((self.problem.horizon, *executed.shape[1:]), np.float32)
+        controls[: len(executed)] = executed
+        return controls
+
     @cached_property
     def stretch(self) -> float:
         """Way travelled over the shortest free way, see :func:`d4orm_env.core.metrics.mean_stretch`.

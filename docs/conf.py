@@ -42,6 +42,7 @@ autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
 # Optional extras that a build of the documentation does without.
 autodoc_mock_imports = [
+    "benchmarl",
     "casadi",
     "h5py",
     "jaxmarl",

@@ -77,10 +77,10 @@ def run(
     }
     study = Study(policies=policies, scenarios=scenarios, num_robots=ROBOTS, seeds=range(seeds), disturbances=levels)
     run_study(study, out, workers=workers, progress=tell)
-    for model in BODIES.values() if find_spec("mujoco") else ():
+    inside = tuple(scenario for scenario in scenarios if scenario != "rooms")
+    for model in BODIES.values() if inside and find_spec("mujoco") else ():
         # PPO was trained for one of the models only.
         able = {name: given for name, given in policies.items() if (name, model) != ("ppo", "differential_drive")}
-        inside = tuple(scenario for scenario in scenarios if scenario != "rooms")
         study = Study(
             policies=able, scenarios=inside, num_robots=ROBOTS, seeds=range(seeds), model=model, physics="mujoco"
         )

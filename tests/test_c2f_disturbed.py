@@ -23,7 +23,7 @@ from d4orm_planners.d4orm_c2f.barrier import Barriers, find_nearest, safe_veloci
 from d4orm_planners.d4orm_c2f.filtering import StateFilter
 from d4orm_planners.d4orm_c2f.lateness import MOST, Lateness
 from d4orm_planners.d4orm_c2f.policy import D4ormC2F
-from d4orm_planners.d4orm_c2f.standing import AFTER, Standing
+from d4orm_planners.d4orm_c2f.standing import AFTER, BRAKING_AFTER, Standing
 from d4orm_planners.d4orm_c2f.weakness import Weakness
 from d4orm_planners.steering import track_velocities
 
@@ -133,6 +133,22 @@ def test_who_stands_whatever_it_is_told_is_taken_for_docked_until_it_moves() -> 
     np.testing.assert_array_equal(seen.goals[[0, 2]], problem.goal[[0, 2]])
     states[1, 0] += 0.2
     assert not standing.observe(joint(problem, states, controls=executed), told).arrived.any()
+
+
+def test_who_brakes_whatever_it_is_told_is_taken_for_docked_where_it_will_come_to_rest() -> None:
+    problem, engine = hop_problem(2), get_engine("cpu")
+    standing, states = Standing(problem), problem.start.copy()
+    states[:, 2] = 0.9
+    told = np.array([[0.0, 0.9], [0.0, -0.9]], np.float32)
+    executed = np.zeros_like(told)
+    for step in range(9):
+        seen = standing.observe(joint(problem, states, controls=executed), told)
+        assert standing.robots.tolist() == [step >= BRAKING_AFTER, False]
+        executed = told.copy()
+        executed[0] = track_velocities(problem, states, np.zeros((2, 2), np.float32))[0]
+        states = engine.step(problem.arrays, states, np.zeros(2, bool), executed).states
+    assert abs(states[0, 2]) < 0.05
+    np.testing.assert_allclose(seen.states[0, :2], states[0, :2], atol=0.05)
 
 
 @given(seed=st.integers(0, 10**6))

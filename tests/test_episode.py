@@ -195,3 +195,24 @@ def test_a_bad_seed_is_refused(seed: Any) -> None:
     env = navigation_v0.parallel_env(problem=make_problem("circle", num_robots=2))
     with pytest.raises(ValueError, match="seed"):
         run_episode(env, make_policy("goal"), seed=seed)
+
+
+@pytest.mark.parametrize("cycles", [None, 20])
+def test_executed_controls_begin_a_plan(cycles: int | None) -> None:
+    problem = line_problem([0.35, 1.5])
+    horizon = problem.horizon if cycles is None else min(problem.horizon, cycles)
+    env = navigation_v0.parallel_env(problem=problem, max_cycles=cycles)
+    episode = run_episode(env, "goal")
+    steps = min(len(episode.trajectory.controls), horizon)
+    assert episode.controls.shape == (problem.horizon, 2, problem.control_size)
+    np.testing.assert_array_equal(episode.controls[:steps], episode.trajectory.controls[:steps])
+    assert not episode.controls[steps:].any()
+
+
+def test_a_planner_has_nothing_to_do_where_an_episode_was_a_solution() -> None:
+    problem = make_problem("random", 2, 3)
+    episode = run_episode(navigation_v0.parallel_env(problem=problem), "ppo")
+    assert episode.metrics["success"] == 1
+    plan = cheap_planner("d4orm-d").solve(problem, seed=0, initial_controls=episode.controls)
+    assert plan.solved
+    assert plan.iterations == 0

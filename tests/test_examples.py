@@ -57,7 +57,9 @@ def completed(name: str, out: Path, *arguments: str) -> None:
         ("train_and_compare", "stable_baselines3", "rl"),
         ("train_and_compare", "pyrvo", "orca"),
         ("jax_ppo", "optax", "jaxrl"),
-        ("clone_expert", "minari", "dataset"),
+        ("cleanrl_ppo", "torch", "rl"),
+        ("torchrl_mappo", "torchrl", "rl"),
+        ("imitate_expert", "stable_baselines3", "rl"),
         ("read_results", "pandas", "dev"),
         ("read_results", "pyarrow", "evaluate"),
         ("onboard_lifelong", "zenoh", "zenoh"),
@@ -215,13 +217,14 @@ def test_gradient_ascent_through_the_dynamics_raises_the_reward(tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_a_network_learns_from_demonstrations(tmp_path: Path) -> None:
-    for module in ("minari", "torch", "stable_baselines3"):
-        pytest.importorskip(module)
+def test_a_network_learns_from_a_planner(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3")
     out = tmp_path / "out"
-    completed("clone_expert", out)
-    rows = {row["policy"]: float(row["success"].removesuffix("%")) for row in table(out / "clone_expert.csv")}
-    assert rows["clone of 160 episodes"] >= 40
+    completed("imitate_expert", out)
+    rows = {row["policy"]: float(row["success"].removesuffix("%")) for row in table(out / "imitate_expert.csv")}
+    assert list(rows) == ["clone", "DAgger", "DAgger, then PPO", "d4orm-c2f", "goal"]
+    assert max(rows["clone"], rows["DAgger"]) >= 40
+    assert rows["DAgger, then PPO"] >= 40
     assert rows["d4orm-c2f"] >= 80
 
 
@@ -233,6 +236,29 @@ def test_ppo_in_one_jit_learns_to_arrive(tmp_path: Path) -> None:
     success = [float(row["success"].removesuffix("%")) for row in table(out / "jax_ppo.csv")]
     assert success[0] < 20
     assert success[-1] > 50
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "module"),
+    [("cleanrl_ppo", "torch"), ("torchrl_mappo", "torchrl"), ("benchmarl_mappo", "benchmarl.environments")],
+)
+def test_recipes_learn_something(name: str, module: str, tmp_path: Path) -> None:
+    pytest.importorskip(module, exc_type=ImportError)
+    out = tmp_path / "out"
+    completed(name, out)
+    success = [float(row["success"].removesuffix("%")) for row in table(out / f"{name}.csv")]
+    assert success[0] < 10
+    assert success[-1] > 20
+
+
+def test_a_policy_gives_a_planner_its_first_guess(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("warm_start", out)
+    without, warm = table(out / "warm_start.csv")
+    assert (without["from"], warm["from"]) == ("nothing", "ppo")
+    assert warm["solved"] == without["solved"] == "2 of 2"
+    assert float(warm["iterations"]) <= float(without["iterations"])
 
 
 @pytest.mark.slow

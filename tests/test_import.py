@@ -113,7 +113,12 @@ def test_the_planners_are_not_loaded_by_the_environment() -> None:
     assert run_python(code) == "False"
 
 
-def test_an_integration_says_which_library_is_missing() -> None:
-    code = "import sys; sys.modules['jaxmarl'] = None\nimport d4orm_env.integrations.jaxmarl"
+@pytest.mark.parametrize(
+    ("library", "package"), [("jaxmarl", "jaxmarl"), ("torchrl", "'d4orm-env[rl]'"), ("benchmarl", "benchmarl")]
+)
+def test_an_integration_says_which_library_is_missing(library: str, package: str) -> None:
+    if library != "jaxmarl":
+        pytest.importorskip("torchrl")
+    code = f"import sys; sys.modules[{library!r}] = None\nimport d4orm_env.integrations.{library}"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert "ImportError: this integration needs jaxmarl; install it with: pip install jaxmarl" in result.stderr
+    assert f"ImportError: this integration needs {library}; install it with: pip install {package}" in result.stderr

@@ -85,6 +85,6 @@ def test_streams_keep_their_numbers() -> None:
     names = """
         SAMPLES DEFORMATION_START REPAIR REPAIR_ORDER DETOURS CHOICE NODE PERTURBATION COARSE_PLAN REFINEMENT
         CONTROL_LOOP CONTROLLER_NOISE RANDOM_CONTROLS PREFERRED_DIRECTION CONTROL_NOISE TRAINING_WORLDS TRAINING
-        TAKEOVER GUIDANCE NEIGHBOURHOODS
+        TAKEOVER GUIDANCE NEIGHBOURHOODS DEMONSTRATIONS
     """
     assert {stream.name: stream.value for stream in Stream} == {name: i for i, name in enumerate(names.split())}

@@ -34,6 +34,7 @@ class Stream(IntEnum):
     TAKEOVER = 17  # the seeds of the plans that a team makes on the way, by takeover
     GUIDANCE = 18  # ties of path finding, by try, and which robots are replanned, by iteration
     NEIGHBOURHOODS = 19  # which robots look for faster ways, and how, by iteration
+    DEMONSTRATIONS = 20  # of an expert, by round and episode
 
 
 def derived_seed(seed: int, stream: Stream, *key: int) -> int:

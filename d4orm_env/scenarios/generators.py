@@ -47,8 +47,8 @@ def sphere(settings: Settings, *, diameter: float = 5.0) -> Problem:
 def random(settings: Settings, *, size: float | None = None) -> Problem:
     """Random starts and goals in a square, or in a cube for 3D robots; set by the seed.
 
-    The square is centred on the origin and holds the centres of the robots; the world has no bounds. Starts keep more
-    than the margin to each other, and goals to each other. The horizon is made for the diagonal.
+    The square is centred on the origin and holds the centres of the robots; the world has no bounds unless asked for.
+    Starts keep more than the margin to each other, and goals to each other. The horizon is made for the diagonal.
 
     Args:
         settings: The common arguments.

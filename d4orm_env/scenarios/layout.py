@@ -12,6 +12,7 @@ from d4orm_env.core.portable import arctan2
 from d4orm_env.core.problem import MAX_HORIZON, Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
+from d4orm_env.scenarios.bounding import require_inside, with_bounds
 from d4orm_env.scenarios.placement import Area, Points, with_random_obstacles
 from d4orm_env.scenarios.settings import Settings
 
@@ -29,7 +30,8 @@ class Layout:
         world: Obstacles and bounds of the scenario itself.
         travel: The distance the horizon is made for [m]: the same for every seed, so that problems that differ in
             their seed alone have the same shapes.
-        area: Where random obstacles are placed; ``None`` where ``world`` has them already.
+        area: Where robots start and end: random obstacles are placed there, and bounds around it. ``None`` where
+            ``world`` has walls, and its obstacles already.
     """
 
     starts: Points
@@ -43,12 +45,13 @@ def build(settings: Settings, layout: Layout) -> Problem:
     """The problem of that layout.
 
     Raises:
-        ValueError: If the random obstacles do not fit, or a start or goal does not keep the margin.
+        ValueError: If bounds or random obstacles do not fit, or a start or goal does not keep the margin.
     """
     team = settings.team
     places = np.vstack([layout.starts, layout.goals])
     horizon = settings.horizon
-    world = layout.world
+    world = with_bounds(settings, layout.world, layout.area)
+    require_inside(settings, world, layout.starts, layout.goals)
     if layout.area is not None:
         world = with_random_obstacles(settings, world, places, layout.area)
     problem = Problem(

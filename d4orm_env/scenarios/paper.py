@@ -1,6 +1,6 @@
 """The scenarios that the paper's authors measure on, as their published code of 2026 defines them (section IV-B).
 
-All have 100 steps, whatever the way, and no bounds.
+All have 100 steps, whatever the way, and no bounds unless asked for.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def paper_obstacles(settings: Settings, *, diameter: float = 5.0) -> Problem:
     radius = SINGLE_RADIUS if count == 1 else settings.obstacle_radius
     obstacles = np.hstack([_obstacle_centres(settings), np.full((count, 1), bounded(radius, "obstacle_radius"))])
     world = World(circles=obstacles) if settings.team.dimension == 2 else World(3, cylinders=obstacles)
-    return build(settings, replace(layout, world=world, area=None))
+    return build(replace(settings, num_obstacles=0), replace(layout, world=world))
 
 
 def _grid(count: int) -> Points:

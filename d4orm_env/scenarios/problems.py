@@ -73,8 +73,8 @@ def make_problem(
 
     Every scenario of this package takes ``num_robots`` (default 8; AMSwarm has 10), ``seed`` (0), ``model``
     (``"holonomic2d"``, or ``"holonomic3d"`` where the scenario is three-dimensional; one name or one per robot),
-    ``num_obstacles`` (0), ``obstacle_radius``, ``radius``, ``margin``, ``dt``, ``horizon``, ``goal_radius``,
-    ``goal_speed``, ``arrival``, ``max_speed``, ``max_acceleration`` and ``max_turn_rate``; see
+    ``num_obstacles`` (0), ``obstacle_radius``, ``bounds`` (if it is open), ``radius``, ``margin``, ``dt``, ``horizon``,
+    ``goal_radius``, ``goal_speed``, ``arrival``, ``max_speed``, ``max_acceleration`` and ``max_turn_rate``; see
     :class:`~d4orm_env.scenarios.settings.Settings` for units and defaults, which are the paper's, and
     :mod:`~d4orm_env.scenarios.generators` and the modules beside it for each scenario's own arguments. An argument that
     is ``None`` takes its default. Robots start at rest; those with a heading face their goals.

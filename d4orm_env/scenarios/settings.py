@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import SupportsFloat
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import positive_number, whole_number
 from d4orm_env.core.dynamics import get_model
@@ -33,6 +33,8 @@ class Settings:
         model: One model name for all robots, or ``K`` names.
         num_obstacles: Random circles (spheres in space) placed inside the scenario.
         obstacle_radius: Radius of circular obstacles [m].
+        bounds: Of a scenario that is open: a margin [m] around the box in which its robots start and end, or the lower
+            and the upper corner ``(2, d)`` [m].
         radius: Robot radius [m], one or ``K``.
         margin: Safety margin [m].
         dt: Time step [s].
@@ -55,6 +57,7 @@ class Settings:
     model: str | Sequence[str] | None = "holonomic2d"
     num_obstacles: int = 0
     obstacle_radius: float = 0.15
+    bounds: SupportsFloat | list[list[float]] | tuple[Sequence[float], ...] | NDArray[np.floating] | None = None
     radius: ArrayLike = 0.15
     margin: float = 0.05
     dt: float = 0.1

@@ -1,27 +1,39 @@
-"""``d4orm train``: reinforcement learning."""
+"""``d4orm train``: reinforcement learning, and imitation of an expert."""
 
 from __future__ import annotations
 
 import math
 import shlex
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from d4orm_planners.commands.dataclass_options import takes
-from d4orm_planners.commands.inputs import make_folder, parse_settings
+from d4orm_planners.commands.inputs import make_folder, parse_settings, refuse_options
 from d4orm_planners.commands.options import Model
+
+if TYPE_CHECKING:
+    from d4orm_planners.rl.training import TrainingResult
+
+
+IMITATION = "imitation"
+_REINFORCEMENT_ONLY = ("steps", "num_envs", "curriculum", "lessons", "start_from")
+_IMITATION_ONLY = ("expert", "expert_settings", "dataset", "episodes", "rounds", "epochs")
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
     """What to learn, and where to write it."""
 
-    algorithm: Annotated[str, typer.Argument(help="ppo or sac.")]
+    context: typer.Context
+    algorithm: Annotated[str, typer.Argument(help="ppo or sac, or imitation of an expert.")]
     scenario: Annotated[str, typer.Option("--scenario", "-s", help="What to learn.")] = "random"
     num_robots: Annotated[int, typer.Option("--num-robots", "--robots", "-k", help="Size of the full team.")] = 4
     steps: Annotated[float, typer.Option("--steps", help="Robot-steps, as 5e6.")] = 5e6
@@ -32,6 +44,23 @@ class TrainOptions:
     ] = None
     curriculum: Annotated[bool, typer.Option(help="Begin with smaller teams.")] = False
     lessons: Annotated[int, typer.Option("--lessons", help="Parts with a checkpoint and an evaluation each.")] = 50
+    start_from: Annotated[
+        Path | None, typer.Option("--start-from", help="A policy file of the same algorithm that learns on.")
+    ] = None
+    expert: Annotated[str, typer.Option("--expert", help="Imitation: whom to imitate.")] = "d4orm-c2f"
+    expert_settings: Annotated[
+        list[str] | None,
+        typer.Option("--expert-set", help="Imitation: a setting of the expert, as num_samples=64; repeatable."),
+    ] = None
+    dataset: Annotated[
+        str | None,
+        typer.Option("--dataset", help="Imitation: folder or name of a dataset to begin with; recorded by default."),
+    ] = None
+    episodes: Annotated[int, typer.Option("--episodes", help="Imitation: episodes to record in each round.")] = 100
+    rounds: Annotated[
+        int, typer.Option("--rounds", help="Imitation: the first clones the expert, the others are DAgger's.")
+    ] = 5
+    epochs: Annotated[int, typer.Option("--epochs", help="Imitation: how often a round looks at all samples.")] = 20
     scenario_settings: Annotated[
         list[str] | None,
         typer.Option("--scenario-set", "--set", help="An argument of the scenario, as size=4; repeatable."),
@@ -45,24 +74,14 @@ class TrainOptions:
 
 @takes(TrainOptions)
 def train(options: TrainOptions) -> None:
-    """Train a policy that all robots share, with Stable-Baselines3; run again to go on where it was broken off."""
-    training = _training()
-    steps = options.steps
-    if not (math.isfinite(steps) and steps == int(steps) >= 1):
-        raise ValueError(f"--steps is {steps:g}; it must be a whole number of at least 1")
-    same = ("algorithm", "scenario", "num_robots", "seed", "model", "num_envs", "curriculum", "lessons")
-    settings = training.TrainingSettings(
-        **{name: getattr(options, name) for name in same},
-        steps=int(steps),
-        scenario_settings=parse_settings(options.scenario_settings, "--scenario-set"),
-    )
+    """Train a policy that all robots share, by reinforcement or imitation; run again to go on where it stopped."""
+    learn = _imitation(options) if options.algorithm == IMITATION else _reinforcement(options)
     folder = options.out or Path("runs") / options.algorithm
     make_folder(folder)
     from d4orm_planners.commands.progress import resumable, tell_results
 
     with resumable(f"the checkpoints are kept in {folder}", enabled=not options.quiet) as progress:
-        command = shlex.join(["d4orm", *sys.argv[1:]])
-        result = training.train(settings, folder, progress=progress, command=command)
+        result = learn(folder, progress=progress, command=shlex.join(["d4orm", *sys.argv[1:]]))
     if not options.quiet:
         best = max(result.curve, key=lambda evaluation: evaluation.rank)
         tell_results(
@@ -70,12 +89,46 @@ def train(options: TrainOptions) -> None:
             f"{best.steps} steps",
             (result.policy_path, folder / "curve.csv", folder / "curve.png"),
         )
-        typer.echo(f"use it: make_policy({options.algorithm!r}, path={str(result.policy_path)!r})")
+        name = result.network.header.algorithm
+        typer.echo(f"use it: make_policy({name!r}, path={str(result.policy_path)!r})")
 
 
-def _training() -> ModuleType:
+def _reinforcement(options: TrainOptions) -> Callable[..., TrainingResult]:
+    """The training that was asked for."""
+    training = _library("training")
+    if options.algorithm not in training.ALGORITHMS:
+        known = ", ".join((*training.ALGORITHMS, IMITATION))
+        raise ValueError(f"algorithm {options.algorithm!r} is unknown; choose one of {known}")
+    refuse_options(options.context, _IMITATION_ONLY, f"is for imitation; use it with 'd4orm train {IMITATION}'")
+    steps = options.steps
+    if not (math.isfinite(steps) and steps == int(steps) >= 1):
+        raise ValueError(f"--steps is {steps:g}; it must be a whole number of at least 1")
+    same = ("algorithm", "num_envs", "curriculum", "lessons", "start_from")
+    own = {name: getattr(options, name) for name in same}
+    settings = training.TrainingSettings(**_practice(options), **own, steps=int(steps))
+    return partial(training.train, settings)
+
+
+def _imitation(options: TrainOptions) -> Callable[..., TrainingResult]:
+    """The same, from an expert."""
+    imitation = _library("imitation")
+    refuse_options(options.context, _REINFORCEMENT_ONLY, "is for ppo and sac; leave it out")
+    own = {name: getattr(options, name) for name in ("expert", "dataset", "episodes", "rounds", "epochs")}
+    expert_settings = parse_settings(options.expert_settings, "--expert-set")
+    settings = imitation.ImitationSettings(**_practice(options), **own, expert_settings=expert_settings)
+    return partial(imitation.imitate, settings)
+
+
+def _practice(options: TrainOptions) -> dict[str, Any]:
+    """What both have in common."""
+    return {
+        **{name: getattr(options, name) for name in ("scenario", "num_robots", "seed", "model")},
+        "scenario_settings": parse_settings(options.scenario_settings, "--scenario-set"),
+    }
+
+
+def _library(name: str) -> ModuleType:
     try:
-        from d4orm_planners.rl import training
+        return import_module(f"d4orm_planners.rl.{name}")
     except ModuleNotFoundError as error:
         raise ImportError(f"training needs {error.name}; install it with: pip install 'd4orm-env[rl]'") from None
-    return training

@@ -72,7 +72,8 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
             from what the robots report to have executed.
         filter_states: Whether states that are seen to be noisy are filtered.
         learn_limits: Whether robots that never do as much as they are asked to are taken to be that much weaker.
-        stalls: Whether a robot that stands whatever it is told is taken for an obstacle, which the others drive around.
+        stalls: Whether a robot that brakes or stands whatever it is told is taken for an obstacle, which the others
+            drive around.
         last_resort: Whether robots whose plan would end in contact are told to brake or to evade instead.
         refine: Whether the guidance is refined while it is followed: in a ``"background"`` thread, ``"sync"`` between
             control loops, which gives the same controls every time, or ``"off"``.

@@ -51,6 +51,14 @@ class Algorithm:
         model.lr_schedule = FloatSchedule(self.learning_rate * (0.1 + 0.9 * remaining))
 
 
+def _batch_size(steps: int, num_envs: int) -> int:
+    """About 4096 samples, such that batches of one size make up an update; ``steps`` is a power of two."""
+    parts = 1
+    while parts < steps and steps * num_envs // parts > 4096:
+        parts *= 2
+    return steps * num_envs // parts
+
+
 class _PPO(Algorithm):
     buffer = "rollout_buffer"
     num_envs = 1024
@@ -62,7 +70,7 @@ class _PPO(Algorithm):
             env,
             learning_rate=self.learning_rate,
             n_steps=self.steps_per_update,
-            batch_size=min(4096, self.steps_per_update * env.num_envs),
+            batch_size=_batch_size(self.steps_per_update, env.num_envs),
             n_epochs=4,
             gamma=self.gamma,
             gae_lambda=0.95,

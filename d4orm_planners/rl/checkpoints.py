@@ -66,6 +66,11 @@ class Checkpoints:
         """The policy that did best so far."""
         return load_network(self.policy_path)
 
+    def keep_best(self, network: Network, evaluations: Sequence[Evaluation]) -> None:
+        """Write the policy, if the last of its training's evaluations is as good as any."""
+        if evaluations[-1].rank == max(evaluation.rank for evaluation in evaluations):
+            network.save(self.policy_path)
+
     def latest(self) -> Checkpoint | None:
         """The last complete checkpoint."""
         complete = self._complete()

@@ -19,13 +19,15 @@ class Evaluation:
     """A point of the curve.
 
     Attributes:
-        steps: Robot-steps trained.
+        steps: Robot-steps trained, or in an imitation, learned from.
         num_robots: Size of the team trained last.
         scenario: Scenario trained last.
         success_rate: Share of the validation episodes in which all arrived and none ever touched anything.
         travel_time: Their mean arrival time [s], with the whole episode for robots that did not arrive.
         seconds: What the lesson took.
-        env_share: Share of it that went into stepping the environment.
+        env_share: Share of it that went into stepping the environment; in an imitation, into recording.
+        imitation_error: Root mean square of the actions less those of the expert, in units of the limits, in episodes
+            that were not learned from; ``None`` without an expert.
     """
 
     steps: int
@@ -35,6 +37,7 @@ class Evaluation:
     travel_time: float
     seconds: float
     env_share: float
+    imitation_error: float | None = None
 
     @property
     def rank(self) -> tuple[float, float]:

@@ -97,6 +97,23 @@ class Features:
         within: FloatArray = np.clip(controls, -limits, limits)
         return within
 
+    def actions(self, controls: FloatArray, frames: FloatArray, limits: FloatArray) -> FloatArray:
+        """The actions that :meth:`decode` makes these controls of.
+
+        Args:
+            controls: ``(N, m)`` in physical units; what goes beyond the limits is brought within.
+            frames: ``(N, 2)`` as from :meth:`encode`.
+            limits: ``(N, m)`` largest controls.
+
+        Returns:
+            ``(N, m)`` in ``[-1, 1]``.
+        """
+        if self.turned:
+            within = controls * np.minimum(1, limits / np.maximum(_norm(controls), 1e-6))
+            controls = _into(frames, within.astype(np.float32))
+        actions: FloatArray = np.clip(controls / limits, -1, 1)
+        return actions
+
     def _neighbors(self, frame: FloatArray, observations: FloatArray) -> FloatArray:
         own, part, seen = self.slices.own, self.slices.neighbor, self.slices.neighbors(observations)
         max_speed = observations[:, own.max_speed]

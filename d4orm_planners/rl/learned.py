@@ -114,8 +114,7 @@ class _NetworkActor:
             )
 
     def controls(self, observations: FloatArray, limits: FloatArray) -> FloatArray:
-        features, frames = self.network.features.encode(observations)
-        return self.network.features.decode(self.network(features), frames, limits)
+        return self.network.controls(observations, limits)
 
 
 class _ZipActor:

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -91,6 +90,11 @@ class Network:
                 hidden = activation(hidden)
         actions: FloatArray = np.tanh(hidden) if self.header.squashed else np.clip(hidden, -1, 1)
         return actions
+
+    def controls(self, observations: FloatArray, limits: FloatArray) -> FloatArray:
+        """``(N, m)`` most likely controls for ``(N, D)`` observations of robots with limits ``(N, m)``."""
+        features, frames = self.features.encode(observations)
+        return self.features.decode(self(features), frames, limits)
 
     def save(self, path: str | Path) -> None:
         """Write a policy file.
@@ -181,32 +185,3 @@ def _checked(path: Path, header: Header, arrays: dict[str, np.ndarray]) -> dict[
     if (arrays["observation_variance"] < 0).any():
         raise ValueError(f"policy file {path}: observation_variance is negative in places; it must not be")
     return arrays
-
-
-def network_of(header: Mapping[str, Any], model: Any, normalization: Any) -> Network:
-    """The deterministic policy of a Stable-Baselines3 model.
-
-    Args:
-        header: Fields of :class:`Header` that the model does not tell.
-        model: A PPO or SAC model with fully connected layers.
-        normalization: Its ``VecNormalize``.
-    """
-    import torch
-
-    policy = model.policy
-    squashed = hasattr(policy, "actor")
-    hidden, last = (
-        (policy.actor.latent_pi, policy.actor.mu) if squashed else (policy.mlp_extractor.policy_net, policy.action_net)
-    )
-    layers = [layer for layer in [*hidden, last] if isinstance(layer, torch.nn.Linear)]
-    arrays = {
-        "observation_mean": normalization.obs_rms.mean,
-        "observation_variance": normalization.obs_rms.var,
-        "reward_variance": normalization.ret_rms.var,
-    }
-    for index, layer in enumerate(layers):
-        arrays[f"weight_{index}"] = layer.weight.detach().numpy()
-        arrays[f"bias_{index}"] = layer.bias.detach().numpy()
-    activation = "relu" if any(isinstance(layer, torch.nn.ReLU) for layer in hidden) else "tanh"
-    full = Header(format=FORMAT, activation=activation, squashed=squashed, layers=len(layers), **header)
-    return Network(full, {name: np.array(value, np.float32) for name, value in arrays.items()})

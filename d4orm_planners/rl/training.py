@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import Field
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -22,69 +22,43 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
 from d4orm_env.core.seeds import Stream, derived_seed
-from d4orm_env.scenarios import make_problem
-from d4orm_env.scenarios.problems import unknown_argument
 from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm
 from d4orm_planners.rl.checkpoints import Checkpoints
 from d4orm_planners.rl.curriculum import Lesson, common_batch, make_lessons, team_sizes
 from d4orm_planners.rl.curve import Evaluation, evaluate_network, write_curve
-from d4orm_planners.rl.network import CLIP, EPSILON, Network, network_of
+from d4orm_planners.rl.network import CLIP, EPSILON, Network, load_network
+from d4orm_planners.rl.practice import VALIDATION_SEED, Many, Practice
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
-from d4orm_planners.settings import CheckedSettings, Count, Whole, one_of
+from d4orm_planners.rl.sb3_network import network_of, set_network
+from d4orm_planners.settings import Count, PathText, one_of
 
 Progress = Callable[[str, int, int], object]
-_VALIDATION_SEED = 0
-"""Worlds are seeded one by one from here in validation, and in training from numbers of 64 random bits."""
 _INSTANCES = 256
 """Drawn for each lesson, at most."""
 
-Many = Annotated[Count, Field(le=100_000)]
-"""Robots or worlds that act at once: beyond, their observations would fill the memory."""
-Seed = Annotated[Whole, Field(ge=0)]
-
 
 @dataclass(frozen=True, kw_only=True)
-class TrainingSettings(CheckedSettings):
-    """What to train on, and how long.
+class TrainingSettings(Practice):
+    """What to train for, and how long.
 
     Attributes:
         algorithm: ``"ppo"`` or ``"sac"``.
-        scenario: What is to be learned. Instances of ``random`` are practised along with any other scenario.
-        num_robots: Size of the full team.
         steps: Robot-steps, rounded up to whole updates.
-        seed: Of everything that is drawn.
-        model: Robot model; ``None`` is the scenario's own.
         num_envs: Robots that act at once; ``None`` is the algorithm's own number.
         curriculum: Whether smaller teams come first.
         lessons: Parts of the training, each with a checkpoint and an evaluation at its end.
-        validation_worlds: Episodes per evaluation.
-        scenario_settings: Arguments of the scenario.
+        start_from: A policy file of the same algorithm, whose network learns on; ``None`` begins with nothing.
 
     Raises:
         ValueError: If a value makes no sense; the message names it.
     """
 
     algorithm: Annotated[str, one_of(ALGORITHMS)] = "ppo"
-    scenario: str = "random"
-    num_robots: Many = 4
     steps: Annotated[Count, Field(le=10**15)] = 5_000_000
-    seed: Seed = 0
-    model: str | None = None
     num_envs: Many | None = None
     curriculum: bool = False
     lessons: Annotated[Count, Field(le=1000)] = 50
-    validation_worlds: Many = 100
-    scenario_settings: Mapping[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("num_robots", "seed", "model"):
-            if name in self.scenario_settings:
-                raise ValueError(f"scenario_settings has {name!r}; give it itself, --{name.replace('_', '-')}")
-        complaint = unknown_argument(self.scenario, self.scenario_settings)
-        if complaint:
-            raise ValueError(f"scenario_settings: {complaint}")
-        make_problem(self.scenario, num_robots=self.num_robots, model=self.model, **self.scenario_settings)
+    start_from: PathText | None = None
 
     @property
     def batch(self) -> int:
@@ -146,9 +120,8 @@ class _Run:
         self._total = sum(lesson.steps for lesson in self.lessons)
         self._model: BaseAlgorithm | None = None
         # First of all, because it refuses what cannot be learned, and nothing is to be written then.
-        self._validation = self._worlds(
-            Lesson(settings.num_robots, settings.scenario, 0), _VALIDATION_SEED, validation=True
-        )
+        self._validation = settings.validation()
+        self._start = None if settings.start_from is None else load_network(settings.start_from)
         self.checkpoints = Checkpoints(out, asdict(settings))
         self._checkpoint = self.checkpoints.latest()
         self.evaluations: list[Evaluation] = [] if self._checkpoint is None else self._checkpoint.evaluations
@@ -166,29 +139,26 @@ class _Run:
         watch = _Watch(lambda steps: self._progress(_describe(lesson, self.evaluations), done + steps, self._total))
         model.learn(lesson.steps, callback=watch, reset_num_timesteps=False)
         seconds = time.perf_counter() - begin
-        network = network_of(self._header(index), model, normalized)
+        header = self.settings.header(
+            self.settings.algorithm, self._validation, command=self._command, lesson=index + 1
+        )
+        network = network_of(header, model, normalized)
         evaluation = Evaluation(
             done + lesson.steps, lesson.num_robots, lesson.scenario,
-            *evaluate_network(network, self._validation, _VALIDATION_SEED), seconds, robots.seconds / seconds,
+            *evaluate_network(network, self._validation, VALIDATION_SEED), seconds, robots.seconds / seconds,
         )  # fmt: skip
-        best = _best(self.evaluations)
-        if best is None or evaluation.rank >= best.rank:
-            network.save(self.checkpoints.policy_path)
         self.evaluations = [*self.evaluations, evaluation]
+        self.checkpoints.keep_best(network, self.evaluations)
         self._checkpoint = self.checkpoints.save(index, model, normalized, self.evaluations)
         write_curve(self._out, self.evaluations)
         robots.close()
 
-    def _worlds(self, lesson: Lesson, seed: int, validation: bool = False) -> RobotVecEnv:
-        settings = self.settings
-        kwargs = dict(settings.scenario_settings) if lesson.scenario == settings.scenario else {}
-        drawn = _differs(lesson, settings.model, kwargs)
-        count = settings.validation_worlds if drawn else 1
-        worlds = count if validation else settings.batch // lesson.num_robots
-        if drawn:
-            pool = None if validation else min(_INSTANCES, 2 * worlds)
-            kwargs |= {"randomize_instance": True, "num_instances": pool}
-        return RobotVecEnv(worlds, lesson.num_robots, lesson.scenario, seed=seed, model=settings.model, **kwargs)
+    def _worlds(self, lesson: Lesson, seed: int) -> RobotVecEnv:
+        settings, worlds = self.settings, self.settings.batch // lesson.num_robots
+        kwargs = settings.arguments(lesson.scenario)
+        if settings.draws(lesson.scenario, lesson.num_robots):
+            kwargs |= {"randomize_instance": True, "num_instances": min(_INSTANCES, 2 * worlds)}
+        return RobotVecEnv(worlds, lesson.num_robots, seed=seed, **kwargs)
 
     def _restored(self, env: VecNormalize) -> BaseAlgorithm:
         """The model with the state of the last checkpoint, in a new environment."""
@@ -201,22 +171,13 @@ class _Run:
             model.set_env(env, force_reset=True)
         if self._checkpoint is not None:
             self._checkpoint.restore(env, model, fresh)
+        elif self._start is not None:
+            set_network(model, env, self._start)
         return model
 
     def _training_seed(self, number: int) -> int:
         """A seed for the libraries' own random states, which take 32 bits."""
         return derived_seed(self.settings.seed, Stream.TRAINING, number) % 2**32
-
-    def _header(self, index: int) -> dict[str, object]:
-        features, problem = self._validation.features, self._validation.problem
-        return {
-            "algorithm": self.settings.algorithm,
-            "model": problem.team.models[0],
-            "dimension": features.slices.dimension,
-            "num_neighbors": features.slices.num_neighbors,
-            "num_obstacles": features.slices.num_obstacles,
-            "training": {"command": self._command, "lesson": index + 1, **asdict(self.settings)},
-        }
 
 
 class _Watch(BaseCallback):
@@ -239,18 +200,6 @@ class _Watch(BaseCallback):
         self._report(self.num_timesteps - self._first)
 
 
-def _best(evaluations: list[Evaluation]) -> Evaluation | None:
-    return max(evaluations, key=lambda evaluation: evaluation.rank, default=None)
-
-
 def _describe(lesson: Lesson, evaluations: list[Evaluation]) -> str:
     last = f"; success {evaluations[-1].success_rate:.0%}" if evaluations else ""
     return f"{lesson.scenario}, {lesson.num_robots} robots{last}"
-
-
-def _differs(lesson: Lesson, model: str | None, kwargs: Mapping[str, object]) -> bool:
-    """Whether instances of the scenario differ."""
-    first, second = (
-        make_problem(lesson.scenario, num_robots=lesson.num_robots, seed=seed, model=model, **kwargs) for seed in (0, 1)
-    )
-    return first != second

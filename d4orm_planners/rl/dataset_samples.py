@@ -1,0 +1,80 @@
+"""Samples of an expert from a Minari dataset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from d4orm_env import navigation_v0
+from d4orm_env.core.errors import first_line
+from d4orm_planners.rl.samples import Samples
+
+if TYPE_CHECKING:
+    from pettingzoo import ParallelEnv
+
+
+def dataset_samples(path: str, model: str, size: int) -> list[Samples]:
+    """The episodes of a Minari dataset of ``d4orm dataset``, of a team or of robots.
+
+    Args:
+        path: Its folder, or its name where Minari finds it.
+        model: Robot model that is to learn.
+        size: Numbers in an observation of one robot.
+
+    Raises:
+        ValueError: If there is no such dataset, or its robots or observations are others.
+        ImportError: If Minari is not installed.
+    """
+    dataset = _dataset(path)
+    env, told = _environment(dataset, path)
+    team = env.unwrapped.problem.team
+    if set(team.models) != {model} or env.observation_space(env.possible_agents[0]).shape != (size,):
+        raise ValueError(
+            f"dataset {path!r} is of {', '.join(sorted(set(team.models)))} robots with observations of "
+            f"{env.observation_space(env.possible_agents[0]).shape[0]} numbers, and {model} with {size} are to learn; "
+            "record one for them with 'd4orm dataset --model'"
+        )
+    env.close()
+    episodes = []
+    for episode, own in zip(dataset, dataset.storage.get_episode_metadata(dataset.episode_indices), strict=True):
+        limits = team.control_limits[:] if told["agents"] == "team" else team.control_limits[[int(own["robot"])]]
+        moments = (len(episode.actions), len(limits))
+        # A team's robots that have arrived send zeros.
+        acting = ~np.asarray(episode.infos["arrived"])[:-1].reshape(moments)
+        seen = np.asarray(episode.observations[:-1], np.float32).reshape(*moments, size)
+        controls = np.asarray(episode.actions, np.float32).reshape(*moments, limits.shape[1])
+        episodes.append(Samples(seen[acting], controls[acting], np.broadcast_to(limits, controls.shape)[acting]))
+    return episodes
+
+
+def _dataset(path: str) -> Any:
+    try:
+        import minari
+    except ModuleNotFoundError as error:
+        raise ImportError(f"a dataset needs {error.name}; install it with: pip install 'd4orm-env[dataset]'") from None
+    folders = (Path(path), Path(path) / "data")
+    for folder in folders:
+        if (folder / "main_data.hdf5").is_file():
+            return minari.MinariDataset(folder)
+    try:
+        return minari.load_dataset(path)
+    except Exception as error:  # a name that is none, a folder that is none, or files that Minari cannot read
+        raise ValueError(
+            f"dataset {path!r} cannot be read ({first_line(error)}); give the folder or the name of one of "
+            "'d4orm dataset'"
+        ) from None
+
+
+def _environment(dataset: Any, path: str) -> tuple[ParallelEnv, Any]:
+    """An environment with the dataset's teams, and what it says about itself."""
+    told = dataset.storage.metadata.get("demonstrations")
+    try:
+        arguments = {name: value for name, value in told["environment"].items() if name != "disturbances"}
+        return navigation_v0.parallel_env(**arguments), told
+    except (TypeError, KeyError, AttributeError, ValueError) as error:
+        raise ValueError(
+            f"dataset {path!r} does not say in a form that can be read of which team it is ({error}); record one with "
+            "'d4orm dataset'"
+        ) from None

@@ -1,0 +1,213 @@
+"""Imitation: behaviour cloning of an expert, then DAgger, into the network that PPO learns and goes on from.
+
+A round collects episodes, learns from all that there are so far, and ends with an evaluation and a checkpoint. In the
+first the expert drives, or a dataset of it stands for that; in the others the learner drives and the expert says at
+every step what it would do there (S. Ross, G. Gordon, D. Bagnell: A Reduction of Imitation Learning and Structured
+Prediction to No-Regret Online Learning, AISTATS 2011; here the expert drives in the first round only). An episode is on
+disk as soon as it ends, and a round depends on those and on the checkpoint before it only: a killed training goes on.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated, Any
+
+from pydantic import Field
+from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import VecNormalize
+
+from d4orm_env import navigation_v0
+from d4orm_env.core.seeds import Stream, derived_seed, generator
+from d4orm_planners.registry import make_policy, setting_names
+from d4orm_planners.rl.algorithms import ALGORITHMS
+from d4orm_planners.rl.checkpoints import Checkpoints
+from d4orm_planners.rl.cloning import clone, imitation_error, normalize
+from d4orm_planners.rl.curve import Evaluation, evaluate_network, write_curve
+from d4orm_planners.rl.dataset_samples import dataset_samples
+from d4orm_planners.rl.network import CLIP, EPSILON, Network
+from d4orm_planners.rl.practice import VALIDATION_SEED, Many, Practice
+from d4orm_planners.rl.samples import Samples, record_samples
+from d4orm_planners.rl.sb3_network import network_of
+from d4orm_planners.rl.training import Progress, TrainingResult
+from d4orm_planners.settings import Count, PathText
+
+LEARNER = "ppo"
+"""Whose network learns, and whose policy it is then."""
+HELD_OUT = 10
+"""One in so many episodes is not learned from but tells the imitation error."""
+
+OTHERS_DRIVE: Mapping[str, object] = MappingProxyType(
+    {"delay": 0, "filter_states": False, "learn_limits": False, "stalls": False, "reaction_time": 0.0, "refine": "sync"}
+)
+"""Settings of an expert that has them: it is asked while another drives, and must not conclude from what robots do that
+they are late, weak, noisy or stalled."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImitationSettings(Practice):
+    """Whom to imitate, and how long.
+
+    Attributes:
+        expert: A planner or policy by name or import path. A planner's plan is executed open loop, which tells nothing
+            of what to do elsewhere: with one, leave it at one round.
+        expert_settings: Its settings, over :data:`OTHERS_DRIVE`.
+        dataset: Folder or name of a dataset of ``d4orm dataset`` that stands for the first round's episodes; ``None``
+            has them recorded.
+        episodes: To record in each round. Every other one is of ``random`` where another scenario is to be learned.
+        rounds: The first clones the expert, the others are DAgger's.
+        epochs: Of each round.
+
+    Raises:
+        ValueError: If a value makes no sense; the message names it.
+        TypeError: For a setting that the expert does not have.
+    """
+
+    expert: str = "d4orm-c2f"
+    expert_settings: Mapping[str, Any] = field(default_factory=dict)
+    dataset: PathText | None = None
+    episodes: Annotated[Many, Field(ge=2)] = 100
+    rounds: Annotated[Count, Field(le=1000)] = 5
+    epochs: Annotated[Count, Field(le=100_000)] = 20
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        make_policy(self.expert, **self.expert_settings)
+
+    @property
+    def all_expert_settings(self) -> dict[str, Any]:
+        """What the expert is made with."""
+        own = {name: value for name, value in OTHERS_DRIVE.items() if name in setting_names(self.expert)}
+        return own | dict(self.expert_settings)
+
+
+def imitate(
+    settings: ImitationSettings, out: str | os.PathLike[str], progress: Progress | None = None, command: str = ""
+) -> TrainingResult:
+    """Learn from an expert, or go on with what was broken off.
+
+    ``out`` then holds ``policy.safetensors``, the policy that did best in validation, which is one of ``"ppo"``;
+    ``curve.csv`` and ``curve.png``, the evaluations; ``checkpoints/``, the last two; and ``episodes/``, all that was
+    recorded.
+
+    Args:
+        settings: Whom to imitate.
+        out: Folder to write to, and to go on from.
+        progress: Called as ``progress(what, episodes and epochs done, in all)``.
+        command: How the training was called, for the policy file.
+
+    Raises:
+        ValueError: For settings that make no sense, or other settings than those of the training in ``out``.
+        OSError: If the folder cannot be used.
+    """
+    run = _Run(settings, Path(out), progress or (lambda what, done, total: None), command)
+    for index in range(len(run.evaluations), settings.rounds):
+        run.learn(index)
+    return TrainingResult(run.checkpoints.policy(), tuple(run.evaluations), run.checkpoints.policy_path)
+
+
+class _Run:
+    """An imitation under way."""
+
+    def __init__(self, settings: ImitationSettings, out: Path, progress: Progress, command: str) -> None:
+        self.settings, self._out, self._command = settings, out, command
+        self._progress = progress
+        # First of all, because it refuses what cannot be learned, and nothing is to be written then.
+        self._validation = settings.validation()
+        self._given = self._from_dataset()
+        self.checkpoints = Checkpoints(out, asdict(settings))
+        self._episodes = out / "episodes"
+        self._episodes.mkdir(exist_ok=True)
+        self._env = VecNormalize(self._validation, clip_obs=CLIP, epsilon=EPSILON)
+        set_random_seed(derived_seed(settings.seed, Stream.TRAINING, 0) % 2**32)
+        self._model = ALGORITHMS[LEARNER].make(self._env)
+        checkpoint = self.checkpoints.latest()
+        self.evaluations: list[Evaluation] = [] if checkpoint is None else checkpoint.evaluations
+        if checkpoint is not None:
+            checkpoint.restore(self._env, self._model, fresh=True)
+
+    def learn(self, index: int) -> None:
+        """One round, its evaluation and its checkpoint."""
+        begin, settings = time.perf_counter(), self.settings
+        each, drivers = settings.episodes + settings.epochs, ("cloning", "DAgger")
+        what = f"{drivers[min(index, 1)]}, round {index + 1} of {settings.rounds}{self._so_far}"
+
+        def report(done: int) -> None:
+            self._progress(what, index * each + done, settings.rounds * each)
+
+        for episode in range(settings.episodes if index or self._given is None else 0):
+            report(episode)
+            self._record(index, episode)
+        recorded = time.perf_counter() - begin
+        known, held = self._samples(index)
+        if not index:
+            normalize(self._env, known[0])
+        random = generator(settings.seed, Stream.TRAINING, index + 1)
+        clone(
+            self._model, self._env, *known, epochs=settings.epochs, random=random,
+            report=lambda epoch: report(settings.episodes + epoch),
+        )  # fmt: skip
+        self._conclude(index, self._network(index), len(known[0]), held, begin, recorded)
+
+    def _conclude(
+        self, index: int, network: Network, steps: int, held: tuple[Any, Any], begin: float, recorded: float
+    ) -> None:
+        """Judge what has been learned, and keep it."""
+        seconds = time.perf_counter() - begin
+        evaluation = Evaluation(
+            steps, self.settings.num_robots, self.settings.scenario,
+            *evaluate_network(network, self._validation, VALIDATION_SEED), seconds, recorded / seconds,
+            imitation_error(network, *held),
+        )  # fmt: skip
+        self.evaluations = [*self.evaluations, evaluation]
+        self.checkpoints.keep_best(network, self.evaluations)
+        self.checkpoints.save(index, self._model, self._env, self.evaluations)
+        write_curve(self._out, self.evaluations)
+
+    @property
+    def _so_far(self) -> str:
+        return f"; success {self.evaluations[-1].success_rate:.0%}" if self.evaluations else ""
+
+    def _network(self, index: int) -> Network:
+        told = {"command": self._command, "round": index + 1}
+        return network_of(self.settings.header(LEARNER, self._validation, **told), self._model, self._env)
+
+    def _path(self, index: int, episode: int) -> Path:
+        return self._episodes / f"{index:03d}-{episode:06d}.npz"
+
+    def _record(self, index: int, episode: int) -> None:
+        """Record an episode of a round, unless it is there."""
+        settings, path = self.settings, self._path(index, episode)
+        if path.exists():
+            return
+        scenario = "random" if episode % 2 else settings.scenario
+        env = navigation_v0.parallel_env(num_robots=settings.num_robots, **settings.arguments(scenario))
+        expert = make_policy(settings.expert, **settings.all_expert_settings)
+        seed = derived_seed(settings.seed, Stream.DEMONSTRATIONS, index, episode)
+        record_samples(env, expert, seed, self._network(index).controls if index else None).save(path)
+        env.close()
+
+    def _samples(self, last: int) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+        """Inputs and targets of all rounds so far: those to learn from, and those held out."""
+        recorded = self.settings.episodes
+        episodes = [*(self._given or ())]
+        for index in range(0 if self._given is None else 1, last + 1):
+            episodes += [Samples.load(self._path(index, episode)) for episode in range(recorded)]
+        held = episodes[::HELD_OUT]
+        learned = [samples for number, samples in enumerate(episodes) if number % HELD_OUT]
+        features = self._validation.features
+        return Samples.joined(learned).learnable(features), Samples.joined(held).learnable(features)
+
+    def _from_dataset(self) -> list[Samples] | None:
+        path = self.settings.dataset
+        if path is None:
+            return None
+        worlds = self._validation
+        episodes = dataset_samples(path, worlds.problem.team.models[0], worlds.features.slices.size)
+        if len(episodes) < 2:
+            raise ValueError(f"dataset {path!r} has {len(episodes)} episodes; at least 2 are needed")
+        return episodes

@@ -1,0 +1,80 @@
+"""Policies of Stable-Baselines3 as networks of this package, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from d4orm_planners.rl.network import FORMAT, Header, Network
+
+START_COUNT = 1e6
+"""How many observations the normalisation of a network that learns on counts for: what it knows is not forgotten."""
+
+
+def network_of(header: Mapping[str, Any], model: Any, normalization: Any) -> Network:
+    """The deterministic policy of a Stable-Baselines3 model.
+
+    Args:
+        header: Fields of :class:`~d4orm_planners.rl.network.Header` that the model does not tell.
+        model: A PPO or SAC model with fully connected layers.
+        normalization: Its ``VecNormalize``.
+    """
+    layers = _layers(model)
+    arrays = {
+        "observation_mean": normalization.obs_rms.mean,
+        "observation_variance": normalization.obs_rms.var,
+        "reward_variance": normalization.ret_rms.var,
+    }
+    for index, layer in enumerate(layers):
+        arrays[f"weight_{index}"] = layer.weight.detach().numpy()
+        arrays[f"bias_{index}"] = layer.bias.detach().numpy()
+    activation = "relu" if any(isinstance(layer, torch.nn.ReLU) for layer in _actor(model)) else "tanh"
+    full = Header(format=FORMAT, activation=activation, squashed=_squashed(model), layers=len(layers), **header)
+    return Network(full, {name: np.array(value, np.float32) for name, value in arrays.items()})
+
+
+def set_network(model: Any, normalization: Any, network: Network) -> None:
+    """Have a model act as a network does, in its own normalisation; what it thinks of states is left as it is.
+
+    Args:
+        model: As for :func:`network_of`.
+        normalization: Likewise.
+        network: Of the same algorithm and shapes.
+
+    Raises:
+        ValueError: If it is another kind of network; the message says which is wanted.
+    """
+    layers, arrays = _layers(model), network.arrays
+    mine = [tuple(layer.weight.shape) for layer in layers]
+    theirs = [arrays[f"weight_{index}"].shape for index in range(network.header.layers)]
+    if mine != theirs or network.header.squashed != _squashed(model):
+        raise ValueError(
+            f"the policy to start from is a network of {network.header.algorithm} with layers {theirs}, and {mine} are "
+            "wanted; give one that was trained for the same robots by the same algorithm"
+        )
+    with torch.no_grad():
+        for index, layer in enumerate(layers):
+            layer.weight.copy_(torch.as_tensor(arrays[f"weight_{index}"]))
+            layer.bias.copy_(torch.as_tensor(arrays[f"bias_{index}"]))
+    seen = normalization.obs_rms
+    seen.mean, seen.var = (arrays[f"observation_{part}"].astype(np.float64) for part in ("mean", "variance"))
+    seen.count = START_COUNT
+
+
+def _squashed(model: Any) -> bool:
+    return hasattr(model.policy, "actor")
+
+
+def _actor(model: Any) -> list[Any]:
+    """What a model acts by, in order."""
+    policy = model.policy
+    if _squashed(model):
+        return [*policy.actor.latent_pi, policy.actor.mu]
+    return [*policy.mlp_extractor.policy_net, policy.action_net]
+
+
+def _layers(model: Any) -> list[torch.nn.Linear]:
+    return [layer for layer in _actor(model) if isinstance(layer, torch.nn.Linear)]
