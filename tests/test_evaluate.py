@@ -674,7 +674,10 @@ def test_a_worker_lost_on_a_cluster_is_a_row(tmp_path: Path) -> None:
         ("nowhere", "Ray address 'nowhere' is neither auto, nor local, nor of the form host:port"),
     ],
 )
-def test_an_unreachable_cluster_is_one_line(d4orm, address: str, message: str) -> None:
+def test_an_unreachable_cluster_is_one_line(d4orm, address: str, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Other tests start instances meanwhile, which come and go.
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setattr("ray._private.services.find_gcs_addresses", lambda: set())
     status, _, err = d4orm("evaluate", "-p", "goal", "-k", "2", "-n", "1", "--ray", address)
     assert (status, err.count("\n")) == (2, 1)
     assert message in err

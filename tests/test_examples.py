@@ -182,7 +182,7 @@ def test_policies_meet_every_disturbance(tmp_path: Path) -> None:
     out = tmp_path / "out"
     completed("disturbance_study", out)
     rows = table(out / "disturbance_study.csv")
-    assert len({row["disturbance"] for row in rows}) == len(rows) == 11
+    assert len({row["disturbance"] for row in rows}) == len(rows) == 13
     assert {(row["scenario"], row["policy"], row["trials"], row["errors"]) for row in rows} == {
         ("circle", "orca", "1", "0")
     }
