@@ -20,7 +20,7 @@ from d4orm_env.core.world import World
 from d4orm_env.disturbances import Delay, Intruder, Push
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.cpu import CpuEngine
-from d4orm_env.joint_state import JointState
+from d4orm_env.joint_state import JointState, split_state
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Episode, make_policy, run_episode
@@ -316,10 +316,10 @@ def replanned(
     calls = []
     plan = Guide.plan
 
-    def coarse_plan(self: Guide, joint: JointState, initial: Any, iterations: int, *more: Any) -> Any:
+    def coarse_plan(self: Guide, joint: JointState, docked: Any, initial: Any, iterations: int, *more: Any) -> Any:
         if initial is not None:
             calls.append((joint, initial.copy(), iterations, self.guidance, self.index))
-        return plan(self, joint, initial, iterations, *more)
+        return plan(self, joint, docked, initial, iterations, *more)
 
     monkeypatch.setattr(Guide, "plan", coarse_plan)
     world = navigation_v0.parallel_env(**env)
@@ -392,7 +392,7 @@ def test_who_lost_the_guidance_begins_anew_straight_to_the_goals(monkeypatch: py
     assert all(anew.any() for anew in begun)
 
 
-def test_with_new_goals_for_some_the_others_keep_what_is_left_of_the_guidance(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_with_new_goals_for_some_the_others_keep_to_their_ways(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = make_problem("random", num_robots=3, seed=1)
     policy = controller(replan_distance=50.0, patience=1000, coarse_iterations=3, replan_iterations=2)
     factor = policy.config.coarse_factor
@@ -405,10 +405,42 @@ def test_with_new_goals_for_some_the_others_keep_what_is_left_of_the_guidance(mo
             continue
         assert iterations == 2
         some += changed.any() and not changed.all()
-        rest = guidance.controls[index // factor :]
-        np.testing.assert_array_equal(initial[: len(rest), ~changed], rest[: len(initial), ~changed])
+        coarse = coarse_problem(problem.resumed_at(joint.states, joint.goals), factor)
+        ways = guidance.path[index - index % factor :: factor][: len(initial) + 1, ~changed]
+        driven = get_engine("cpu").rollout(coarse, initial).positions[: len(ways), ~changed]
+        off = np.linalg.norm(driven - ways, axis=2)
+        assert (off <= np.maximum(off[0], 0.25)).all()
         np.testing.assert_array_equal(initial[:, changed], straight(problem, joint, factor)[:, changed])
     assert some
+
+
+def test_ways_of_robots_that_were_pushed_lead_on_to_their_ends() -> None:
+    problem = circle(4)
+    policy, env = controller(), navigation_v0.parallel_env(problem=problem)
+    env.reset(seed=0)
+    policy.reset(env, seed=0)
+    joint = split_state(problem, env.state())
+    states = joint.states + np.float32([0.1, -0.1, 0.4, 0.3])
+    everybody = np.ones(4, bool)
+    initial = policy._guide._beginning(joint._replace(states=states), everybody)
+    coarse = coarse_problem(problem.resumed_at(states, problem.goal), policy.config.coarse_factor)
+    assert get_engine("cpu").rollout(coarse, initial).arrived[-1].all()
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_who_docked_at_the_rim_of_its_goal_stays_there_in_new_plans(seed: int) -> None:
+    problem = make_problem("random", num_robots=20, seed=seed)
+    policy, env = controller(coarse_iterations=1), navigation_v0.parallel_env(problem=problem)
+    env.reset(seed=0)
+    policy.reset(env, seed=0)
+    joint, docked = split_state(problem, env.state()), np.arange(20) % 2 == 0
+    away = np.random.default_rng(seed).normal(size=(20, 2))
+    states = joint.states.copy()
+    states[docked] = 0
+    rim = problem.goal + 0.99 * problem.goal_radius * away / np.linalg.norm(away, axis=1, keepdims=True)
+    states[docked, :2] = rim[docked]
+    plan = policy._guide.plan(joint._replace(states=states, arrived=docked), docked, None, 20, thorough=True)
+    assert np.linalg.norm(plan.path[:, docked] - states[docked, :2], axis=2).max() <= problem.goal_radius
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ from d4orm_planners.d4orm_c2f.coarse import (
     rest_of,
     subgoal_indices,
 )
-from d4orm_planners.d4orm_c2f.following import STUCK_AFTER, WAITING_WITHIN, Patience, follow_slowly, keep_time
+from d4orm_planners.d4orm_c2f.following import STUCK_AFTER, WAITING_WITHIN, Patience, keep_time
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.d4orm_c2f.sight import within_sight
 from d4orm_planners.d4orm_d.planner import D4ormD
@@ -75,11 +75,11 @@ class Guide:
         # the team does not get on there may be no other ways.
         self._planner, self._thorough = (_coarse_planner(config, reroute=reroute) for reroute in (False, True))
 
-    def begin(self, joint: JointState) -> None:
-        """Plan for the episode."""
+    def begin(self, joint: JointState, docked: BoolArray) -> None:
+        """Plan for the episode, in which those ``docked`` ``(K,)`` stay where they are."""
         everybody = np.ones(self.problem.num_robots, bool)
         self._patience, self.stuck = Patience(joint), ~everybody
-        self.guidance, self.index = self.plan(joint, None, self._config.coarse_iterations), 0
+        self.guidance, self.index = self.plan(joint, docked, None, self._config.coarse_iterations), 0
         self._follow(joint, self._relayed(joint, everybody) or self.guidance, everybody)
 
     def _follow(self, joint: JointState, guidance: Waypoints, anew: BoolArray) -> None:
@@ -90,11 +90,19 @@ class Guide:
         self._goals, self._began = joint.goals, joint.steps
         self._nearest, self._nearest_at = float("inf"), joint.steps
 
-    def plan(self, joint: JointState, initial: FloatArray | None, iterations: int, thorough: bool = False) -> Guidance:
+    def plan(
+        self,
+        joint: JointState,
+        docked: BoolArray,
+        initial: FloatArray | None,
+        iterations: int,
+        thorough: bool = False,
+    ) -> Guidance:
         """Plan for the whole team from where it is, until a plan passes the checks (Algorithm 4, lines 1 to 3)."""
         planner = self._thorough if thorough else self._planner
-        present = self.problem.resumed_at(joint.states, joint.goals)
-        coarse = coarse_problem(present, self._config.coarse_factor)
+        # Whoever has docked at the rim of its goal could leave it within a coarse step.
+        goals = np.where(docked[:, None], joint.states[:, : self.problem.dimension], joint.goals)
+        coarse = coarse_problem(self.problem.resumed_at(joint.states, goals), self._config.coarse_factor)
         seed, interval = derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps), self._config.check_interval
         search = Search(planner, coarse, seed, initial, check_interval=interval)
         chosen, ordered = search.current, False
@@ -127,15 +135,17 @@ class Guide:
         return within_sight(self.problem, positions, path, self._indices, targets, docked, walls)
 
     def followed(self, joint: JointState, engine: Engine, horizon: int) -> FloatArray:
-        """``(horizon, K, m)`` controls that take every robot slowly along its path."""
-        return follow_slowly(self.problem, engine, joint, self.guidance.path, self._indices, horizon)
+        """``(horizon, K, m)`` controls that take every robot along its path, from where on it it is."""
+        return keep_time(self.problem, engine, joint, self.guidance.path, self._indices, horizon)
 
     def timed(self, joint: JointState, engine: Engine, horizon: int) -> FloatArray:
         """``(horizon, K, m)`` controls that take every robot along its path in the team's time."""
+        return keep_time(self.problem, engine, joint, self.guidance.path, self._clock(), horizon)
+
+    def _clock(self) -> IntArray:
+        """``(K,)`` waypoints at which the robots should be now: the team's, or not far from where they are."""
         clock = np.full_like(self._indices, self.index)
-        if self._config.max_lag is not None:
-            clock = np.minimum(clock, self._indices + self._config.max_lag)
-        return keep_time(self.problem, engine, joint, self.guidance.path, clock, horizon)
+        return clock if self._config.max_lag is None else np.minimum(clock, self._indices + self._config.max_lag)
 
     def fresh_start(self, base: FloatArray) -> None:
         """Have those that are sent another way begin ``base`` ``(H_predict, K, m)`` with the coarse plan's controls."""
@@ -170,7 +180,7 @@ class Guide:
         thorough = lost or bool(held_up.any())
         iterations = self._config.coarse_iterations if thorough else self._config.replan_iterations
         initial = self._beginning(joint, keep & (not lost))
-        guidance = self.plan(joint, initial, iterations, thorough)
+        guidance = self.plan(joint, docked, initial, iterations, thorough)
         self._follow(joint, guidance, ~keep | lost)
         return True
 
@@ -184,7 +194,7 @@ class Guide:
         return None if ways is None else Waypoints(path=interpolate(ways, factor), ordered=True)
 
     def _beginning(self, joint: JointState, keep: BoolArray) -> FloatArray | None:
-        """``(H_c, K, m)`` straight drives, but for those that ``keep`` ``(K,)`` what is left of their ways.
+        """``(H_c, K, m)`` straight drives, but for those that ``keep`` ``(K,)`` back to and along their ways.
 
         ``None`` among walls: there the whole team's ways are found anew on the roadmap.
         """
@@ -194,9 +204,9 @@ class Guide:
         present = coarse_problem(self.problem.resumed_at(joint.states, joint.goals), factor)
         initial = straight_drives(present).controls[:, :, 0]
         if keep.any():
-            rest = self.guidance.controls[self.index // factor :]
-            initial[:, keep] = 0
-            initial[: len(rest), keep] = rest[:, keep]
+            ways = self.guidance.path[::factor]
+            along = keep_time(present, self._refiner, joint, ways, self._clock() // factor, present.horizon)
+            initial[:, keep] = along[:, keep]
         return initial
 
     def _waiting(self, joint: JointState) -> BoolArray:

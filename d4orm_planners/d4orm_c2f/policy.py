@@ -104,7 +104,7 @@ class D4ormC2F(StatePolicy):
         self.subgoals: FloatArray = joint.states[:, : self.problem.dimension]
         begin = time.perf_counter()
         self._guide = Guide(self.problem, self.config, seed, self._refiner, self._refinement, lifelong)
-        self._guide.begin(joint)
+        self._guide.begin(joint, joint.arrived & self._at_goal(joint))
         self._deviation = Deviation(self.problem, self._engine, self.config)
         self.coarse_time = time.perf_counter() - begin
 

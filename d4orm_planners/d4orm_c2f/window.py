@@ -99,16 +99,15 @@ class Window:
             self._task(now), self._rules, np.zeros_like(now.base), self._noise_scale, config.num_samples, seed
         )
         limit = problem.team.control_limits
-        controls = np.clip(now.base + result.mean, -limit, limit).astype(np.float32)
-        if now.careful is not None:
-            controls[:, now.stuck] = now.careful[:, now.stuck]
+        sampled = np.clip(now.base + result.mean, -limit, limit).astype(np.float32)
+        controls = sampled if now.careful is None else np.where(now.stuck[:, None], now.careful, sampled)
         radius = problem.goal_radius if self._docks else NOT_AT_SUBGOALS
         joint, horizon = now.joint, config.predict_horizon
         truth = problem.resumed_at(joint.states, joint.goals, horizon=horizon, goal_radius=radius)
         if not config.safe_mix:
             positions = self._engine.rollout(truth, controls).positions
             return Prediction(controls, least_gap(truth, positions[1:]))
-        return self._safe_mix(truth, controls, now)
+        return self._safe_mix(truth, controls, sampled, now)
 
     def _task(self, now: Situation) -> SamplingTask:
         """Deform the base so that everybody heads for its subgoal, or its goal where that is near."""
@@ -162,8 +161,10 @@ class Window:
         present = self.problem.resumed_at(joint.states, joint.goals, horizon=len(nothing))
         return self._with_stop(present, nothing, 0, docked)
 
-    def _safe_mix(self, window: Problem, fresh: FloatArray, now: Situation) -> Prediction:
+    def _safe_mix(self, window: Problem, fresh: FloatArray, sampled: FloatArray, now: Situation) -> Prediction:
         """Fresh controls where they keep everyone apart; where not, robots stop earlier, or do as they had in mind.
+
+        Those that are stuck do as sampled before they stop.
 
         What they had in mind was free of violations, and ends at rest. So without disturbances there always is a mix
         that is free of them too: in the last resort everybody does as before.
@@ -176,6 +177,10 @@ class Window:
         # After how many fresh steps each robot stops.
         steps = np.full(window.num_robots, horizon)
         trajectory, violated = self._violations(window_to_rest, controls, now)
+        if (held := violated & now.stuck).any():
+            fresh = np.where(held[:, None], sampled, fresh)
+            controls[:, held] = self._with_stop(window, fresh, horizon, now.docked)[:, held]
+            trajectory, violated = self._violations(window_to_rest, controls, now)
         while (violating := violated & (steps > 0)).any():
             steps[violating] //= SHORTER
             steps[steps < self._config.execute_horizon] = 0
