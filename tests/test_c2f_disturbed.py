@@ -14,6 +14,7 @@ from scipy.optimize import nnls
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.world import World
 from d4orm_env.disturbances import Bias, Delay, LimitMismatch, Push, Stall, StateDelay
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.joint_state import JointState
@@ -221,6 +222,26 @@ def test_who_cannot_be_told_anything_is_driven_around() -> None:
     states[1, 0] = 0.31
     parting = safe_velocities(problem, joint(problem, states), wanted, np.array([True, False]), 0.02)
     np.testing.assert_allclose(parting, [[-2 * 0.01, 0], [0, 0]], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("wide", "allowed"),  # sqrt(2 * 0.32 + 0.1**2) - 0.1 - 0.3 with an acceleration of 1 m/s^2 and steps of 0.1 s
+    [(0.34, np.sqrt(0.65) - 0.4), (0.05, 0.0)],
+)
+def test_with_caution_robots_could_still_brake_a_step_later_and_faster(wide: float, allowed: float) -> None:
+    world = World(2, boxes=[[-1, -5, -0.15 - wide, 5]])
+    problem = hop_problem(1, world=world, dt=0.1)
+    wanted = np.array([[-0.9, 0.2]], np.float32)
+    safe = safe_velocities(problem, joint(problem, np.zeros((1, 4))), wanted, np.ones(1, bool), 0.02, 0.3)
+    np.testing.assert_allclose(safe, [[-allowed, 0.2]], atol=1e-4)
+
+
+def test_in_a_corner_both_walls_count() -> None:
+    world = World(2, boxes=[[-1, -5, -0.25, 5], [-5, -1, 5, -0.3]])
+    problem = hop_problem(1, world=world)
+    wanted = np.array([[-0.9, -0.9]], np.float32)
+    safe = safe_velocities(problem, joint(problem, np.zeros((1, 4))), wanted, np.ones(1, bool), 0.02)
+    np.testing.assert_allclose(safe, [[-np.sqrt(2 * 0.08), -np.sqrt(2 * 0.13)]], atol=1e-4)
 
 
 def test_an_intruder_is_made_way_for() -> None:

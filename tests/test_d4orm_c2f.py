@@ -346,8 +346,10 @@ def test_undisturbed_robots_are_where_they_are_expected() -> None:
     policy = controller()
     assert episode(policy, circle(3)).metrics["success"]
     assert policy._deviation.speed < 1e-4
+    assert policy._deviation.caution == 0
     episode(policy, circle(3), disturbances=[Push(1.0, 0.3)])
     assert 0.1 < policy._deviation.speed < 0.7
+    assert 0.1 < policy._deviation.caution <= 0.4
 
 
 def test_commands_under_way_are_counted() -> None:

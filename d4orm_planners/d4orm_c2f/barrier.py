@@ -34,7 +34,9 @@ _STEP = 1e-3
 Array = NDArray[np.float64]
 
 
-def safe_velocities(problem: Problem, joint: JointState, wanted: FloatArray, free: BoolArray, gap: float) -> FloatArray:
+def safe_velocities(
+    problem: Problem, joint: JointState, wanted: FloatArray, free: BoolArray, gap: float, caution: float = 0.0
+) -> FloatArray:
     """Velocities near those wanted, at which everybody can still brake before it touches anything.
 
     Two robots may close in on each other no faster than both together can brake within what is left between them,
@@ -49,11 +51,13 @@ def safe_velocities(problem: Problem, joint: JointState, wanted: FloatArray, fre
         wanted: ``(K, d)`` [m/s].
         free: ``(K,)`` who can be told other velocities; the others stand.
         gap: What is to be left between surfaces [m].
+        caution: Robots may come to be so much faster towards anything than they are told [m/s]. If any, they are also
+            taken to go on for a time step before they brake.
 
     Returns:
         ``(K, d)`` [m/s]; zero for robots for which there are none.
     """
-    barriers = _barriers(problem, joint, free, gap)
+    barriers = _barriers(problem, joint, free, gap, caution)
     velocities = np.where(free[:, None], wanted, 0).astype(np.float64)
     if not (barriers.missing(velocities) > 0).any():
         return velocities.astype(np.float32)
@@ -86,7 +90,7 @@ class Barriers(NamedTuple):
         return missing
 
 
-def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float) -> Barriers:
+def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, caution: float) -> Barriers:
     """What the velocities of those who are ``free`` have to keep to."""
     d = problem.dimension
     places, radius = joint.states[:, :d].astype(np.float64), np.asarray(problem.team.radius, np.float64)
@@ -94,9 +98,15 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float) 
     rows: list[tuple[int, int, Array, float]] = []
 
     def add(one: int, other: int, normal: Array, room: float, brakes: float, speed: float = 0.0) -> None:
-        least = (-np.sqrt(2 * brakes * room) if room > 0 else -PARTING * room) + speed
-        rows.append((one, other, normal, least))
+        if room > 0:
+            lost = brakes * reaction
+            # Nobody has to back off as long as there is room: whoever stands keeps to everything.
+            least = min(caution + lost - np.sqrt(2 * brakes * room + lost**2), 0.0)
+        else:
+            least = -PARTING * room
+        rows.append((one, other, normal, least + speed))
 
+    reaction = problem.dt if caution else 0.0
     offsets = places[:, None] - places
     apart = np.linalg.norm(offsets, axis=2)
     for i, j in np.argwhere(np.triu((apart > 0) & (apart < NEAR) & (free[:, None] | free))).tolist():
@@ -153,16 +163,17 @@ def find_nearest(one: Any, other: Any, normals: Any, least: Any, velocities: Any
 
 def _walls(problem: Problem, places: Array, robots: list[int]) -> Iterator[tuple[int, Array, float]]:
     """What stands near robots at ``places`` ``(R, d)``: of which one, the direction away from it, and how far it is."""
-    d, (lower, upper) = problem.dimension, problem.world.bounds.astype(np.float64)
-    axes, nearest = np.eye(d), problem.world.clearance(places)
-    for robot, place, clearance in zip(robots, places, nearest):
-        if clearance >= NEAR:
-            continue
-        sides = np.concatenate([place - lower, upper - place])
-        for side in np.flatnonzero(sides < NEAR):
-            yield robot, axes[side] if side < d else -axes[side - d], float(sides[side])
-        if clearance < sides.min():
-            around = problem.world.clearance(place + _STEP * np.concatenate([axes, -axes]))
-            slope = around[:d] - around[d:]
-            if (length := np.linalg.norm(slope)) > 0:
-                yield robot, slope / length, float(clearance)
+    d, (lower, upper), shapes = problem.dimension, problem.world.bounds.astype(np.float64), problem.world.shapes
+    axes = np.eye(d)
+    inward, sides = np.concatenate([axes, -axes]), np.concatenate([places - lower, upper - places], axis=1)
+    for row, side in np.argwhere(sides < NEAR).tolist():
+        yield robots[row], inward[side], float(sides[row, side])
+    rows, items = (index.ravel() for index in np.indices((len(places), shapes.count)))
+    away = shapes.signed_distance(places[rows], items)
+    near = away < NEAR
+    rows, items, away, at = rows[near], items[near], away[near], places[rows[near]]
+    beside = [[shapes.signed_distance(at + side * _STEP * axis, items) for axis in axes] for side in (1, -1)]
+    slopes = (np.array(beside[0]) - np.array(beside[1])).T
+    lengths = np.linalg.norm(slopes, axis=1)
+    for n in np.flatnonzero(lengths).tolist():
+        yield robots[rows[n]], slopes[n] / lengths[n], float(away[n])

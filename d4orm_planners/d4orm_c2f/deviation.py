@@ -13,12 +13,26 @@ from d4orm_planners.d4orm_c2f.lateness import Lateness
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.d4orm_c2f.standing import Standing
 from d4orm_planners.d4orm_c2f.weakness import Weakness
+from d4orm_planners.steering import present_velocities
 
 DECAY = 0.98
 """What is left after a time step of the largest deviation seen."""
 
 MOST = 0.15
 """No more room than this is called for [m]."""
+
+
+RUN = 5
+"""Time steps whose changes of velocity add up before a robot is seen to have reacted."""
+
+STEADY = 0.02
+"""Changes of velocity that add up to no more are none [m/s]."""
+
+AT_ONCE = 1.5
+"""How many times the largest change in a single step may come before that."""
+
+FASTEST = 0.4
+"""Changes are not believed to come to more [m/s]."""
 
 
 class Deviation:
@@ -31,6 +45,7 @@ class Deviation:
 
     Attributes:
         speed: The largest deviation of a robot in a time step, over its length, of late [m/s].
+        drift: The largest change of a robot's velocity from what was expected within a few steps of late [m/s].
         problem: The robots with the limits that they are believed to have now.
         lateness: How late commands are executed.
         standing: Who has stalled.
@@ -45,7 +60,9 @@ class Deviation:
         self._measured: JointState | None = None
         self._estimated: JointState | None = None
         self._expected: FloatArray | None = None
-        self.speed = 0.0
+        self._expected_velocities: FloatArray | None = None
+        self._changes = np.zeros((RUN, problem.num_robots, problem.dimension), np.float32)
+        self.speed = self.drift = 0.0
 
     def observe(self, joint: JointState) -> JointState:
         """Compare where the robots are with where they were expected; where they will be once commands arrive."""
@@ -62,6 +79,12 @@ class Deviation:
             d = self.problem.dimension
             away = np.linalg.norm(joint.states[:, :d] - self._expected[:, :d], axis=1)[~joint.arrived]
             self.speed = max(self.speed, float(away.max(initial=0.0)) / self.problem.dt)
+        self.drift *= DECAY
+        if self._expected_velocities is not None:
+            change = present_velocities(self.problem, joint.states, joint.controls) - self._expected_velocities
+            self._changes = np.concatenate([np.where(joint.arrived[:, None], 0, change)[None], self._changes[:-1]])
+            sums = np.linalg.norm(np.cumsum(self._changes, axis=0), axis=2)
+            self.drift = max(self.drift, float(sums.max()), AT_ONCE * float(sums[0].max()))
         self._seen = joint
         for controls in self.lateness.under_way:
             joint = self._moved(joint, controls)
@@ -89,6 +112,7 @@ class Deviation:
         step = self._engine.step(arrays, self._seen.states, self._seen.arrived, controls)
         now = self.lateness.send(step.controls)
         self._expected = step.states if now is step.controls else self._moved(self._seen, now).states
+        self._expected_velocities = present_velocities(self.problem, self._expected, now)
 
     def _moved(self, joint: JointState, controls: FloatArray) -> JointState:
         arrays, d = self.problem.resumed_at(joint.states, joint.goals).arrays, self.problem.dimension
@@ -97,6 +121,11 @@ class Deviation:
         if len(bodies):
             bodies[:, :d] += self.problem.dt * bodies[:, d : 2 * d]
         return joint._replace(states=step.states, arrived=step.arrived & self.problem.docks, bodies=bodies)
+
+    @property
+    def caution(self) -> float:
+        """How much faster than it should be a robot may soon be, whichever way it goes [m/s]."""
+        return 0.0 if self.drift < STEADY else min(self.drift, FASTEST)
 
     def room(self, reaction_time: float) -> float:
         """How far robots get from where they are expected within so many seconds [m]."""

@@ -129,22 +129,24 @@ class D4ormC2F(StatePolicy):
         return controls
 
     def _evading(self, joint: JointState, controls: FloatArray) -> FloatArray:
-        """The controls ``(K, m)``, but for robots that would come to touch something: these brake, or evade."""
+        """The controls ``(K, m)``, but for robots that might come to touch something: these brake, or evade."""
         problem, docked = self._deviation.problem, joint.arrived & self._at_goal(joint)
         gap, now = GAP * problem.margin, min(self._next, len(self._plan) - 1)
         touching = self._window.touching(joint, docked, self._plan[now:], gap)
-        if not touching.any():
+        caution = self._deviation.caution
+        if not touching.any() and not caution:
             return controls
-        # A late loop may still be reading the plan.
-        self._plan = self._plan.copy()
-        self._plan[now:, touching] = self._window.stop(joint, docked)[: len(self._plan) - now, touching]
+        if touching.any():
+            # A late loop may still be reading the plan.
+            self._plan = self._plan.copy()
+            self._plan[now:, touching] = self._window.stop(joint, docked)[: len(self._plan) - now, touching]
         # Now they are told all that they may be able to do, whatever they are believed to be.
         braking = track_velocities(self.problem, joint.states, np.zeros_like(joint.goals))
         controls = np.where(touching[:, None], braking, controls)
         ahead = self._engine.step(problem.resumed_at(joint.states, joint.goals).arrays, joint.states, docked, controls)
         wanted = present_velocities(problem, ahead.states, ahead.controls)
         # Other velocities are reached by the next step, by which everybody will be elsewhere.
-        safe = safe_velocities(problem, joint._replace(states=ahead.states), wanted, ~docked, gap)
+        safe = safe_velocities(problem, joint._replace(states=ahead.states), wanted, ~docked, gap, caution)
         evading = np.abs(safe - wanted).max(axis=1) > NEARLY
         return np.where(evading[:, None], track_velocities(self.problem, joint.states, safe), controls)
 
