@@ -332,7 +332,7 @@ def test_lifelong_example_stays_below_its_bound(tmp_path: Path) -> None:
     goals, rate = int(row["goals reached"]), float(row["goals per robot-minute"])
     assert goals >= 2
     assert rate == pytest.approx(goals / (4 * 0.1), abs=0.01)
-    assert rate < float(row["straight-line bound"])
+    assert rate < float(row["bound"])
     assert row["robots that touched"] == row["robot-steps in contact"] == "0"
     with Image.open(out / "lifelong.gif") as animation:
         assert animation.n_frames > 5
