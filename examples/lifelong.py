@@ -3,9 +3,9 @@
     python examples/lifelong.py --minutes 1
     python examples/lifelong.py --minutes 5 --scenario warehouse --num-robots 32
 
-The throughput is compared with a bound that robots cannot beat in the long run: if nobody were in its way, a robot would
-accelerate to each of the goals that it was given, from the velocity that it had then, up to its top speed, and pass
-through. It would drive straight, or among walls along the shortest free way, wherever it was heading before.
+The throughput is compared with a bound that robots cannot beat in the long run: if nobody were in its way, a robot
+would accelerate to each of the goals that it was given, from the velocity that it had then, up to its top speed, and
+pass through. It would drive straight, or among walls along the shortest free way, wherever it was heading before.
 """
 
 from __future__ import annotations
