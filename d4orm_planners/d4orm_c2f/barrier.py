@@ -172,8 +172,8 @@ def _walls(problem: Problem, places: Array, robots: list[int]) -> Iterator[tuple
     away = shapes.signed_distance(places[rows], items)
     near = away < NEAR
     rows, items, away, at = rows[near], items[near], away[near], places[rows[near]]
-    beside = [[shapes.signed_distance(at + side * _STEP * axis, items) for axis in axes] for side in (1, -1)]
-    slopes = (np.array(beside[0]) - np.array(beside[1])).T
+    steps = _STEP * axes
+    slopes = np.stack([shapes.signed_distance(at + s, items) - shapes.signed_distance(at - s, items) for s in steps], 1)
     lengths = np.linalg.norm(slopes, axis=1)
     for n in np.flatnonzero(lengths).tolist():
         yield robots[rows[n]], slopes[n] / lengths[n], float(away[n])

@@ -21,7 +21,6 @@ DECAY = 0.98
 MOST = 0.15
 """No more room than this is called for [m]."""
 
-
 RUN = 5
 """Time steps whose changes of velocity add up before a robot is seen to have reacted."""
 
@@ -59,8 +58,7 @@ class Deviation:
         self._filter = StateFilter(problem) if config.filter_states else None
         self._measured: JointState | None = None
         self._estimated: JointState | None = None
-        self._expected: FloatArray | None = None
-        self._expected_velocities: FloatArray | None = None
+        self._expected: tuple[FloatArray, FloatArray] | None = None
         self._changes = np.zeros((RUN, problem.num_robots, problem.dimension), np.float32)
         self.speed = self.drift = 0.0
 
@@ -74,21 +72,22 @@ class Deviation:
             self.problem = self._weakness.problem
         if self.standing is not None:
             joint = self.standing.observe(joint, told)
-        self.speed *= DECAY
         if self._expected is not None:
-            d = self.problem.dimension
-            away = np.linalg.norm(joint.states[:, :d] - self._expected[:, :d], axis=1)[~joint.arrived]
-            self.speed = max(self.speed, float(away.max(initial=0.0)) / self.problem.dt)
-        self.drift *= DECAY
-        if self._expected_velocities is not None:
-            change = present_velocities(self.problem, joint.states, joint.controls) - self._expected_velocities
-            self._changes = np.concatenate([np.where(joint.arrived[:, None], 0, change)[None], self._changes[:-1]])
-            sums = np.linalg.norm(np.cumsum(self._changes, axis=0), axis=2)
-            self.drift = max(self.drift, float(sums.max()), AT_ONCE * float(sums[0].max()))
+            self._compare(joint, *self._expected)
         self._seen = joint
         for controls in self.lateness.under_way:
             joint = self._moved(joint, controls)
         return joint
+
+    def _compare(self, joint: JointState, places: FloatArray, velocities: FloatArray) -> None:
+        """Note how far robots are from the ``places`` and the ``velocities`` ``(K, d)`` that were expected."""
+        d, going = self.problem.dimension, ~joint.arrived[:, None]
+        away = np.linalg.norm(np.where(going, joint.states[:, :d] - places, 0), axis=1)
+        self.speed = max(DECAY * self.speed, float(away.max()) / self.problem.dt)
+        change = np.where(going, present_velocities(self.problem, joint.states, joint.controls) - velocities, 0)
+        self._changes = np.concatenate([change[None], self._changes[:-1]])
+        sums = np.linalg.norm(np.cumsum(self._changes, axis=0), axis=2)
+        self.drift = max(DECAY * self.drift, float(sums.max()), AT_ONCE * float(sums[0].max()))
 
     def _filtered(self, joint: JointState) -> JointState:
         """The joint state with less noise on it, where measurements are noisy."""
@@ -111,8 +110,8 @@ class Deviation:
         arrays = self.problem.resumed_at(self._seen.states, self._seen.goals).arrays
         step = self._engine.step(arrays, self._seen.states, self._seen.arrived, controls)
         now = self.lateness.send(step.controls)
-        self._expected = step.states if now is step.controls else self._moved(self._seen, now).states
-        self._expected_velocities = present_velocities(self.problem, self._expected, now)
+        states = step.states if now is step.controls else self._moved(self._seen, now).states
+        self._expected = states[:, : self.problem.dimension], present_velocities(self.problem, states, now)
 
     def _moved(self, joint: JointState, controls: FloatArray) -> JointState:
         arrays, d = self.problem.resumed_at(joint.states, joint.goals).arrays, self.problem.dimension

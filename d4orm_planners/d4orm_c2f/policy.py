@@ -104,7 +104,7 @@ class D4ormC2F(StatePolicy):
         self.subgoals: FloatArray = joint.states[:, : self.problem.dimension]
         begin = time.perf_counter()
         self._guide = Guide(self.problem, self.config, seed, self._refiner, self._refinement, lifelong)
-        self._guide.begin(joint, joint.arrived & self._at_goal(joint))
+        self._guide.begin(joint, self._docked(joint))
         self._deviation = Deviation(self.problem, self._engine, self.config)
         self.coarse_time = time.perf_counter() - begin
 
@@ -130,7 +130,7 @@ class D4ormC2F(StatePolicy):
 
     def _evading(self, joint: JointState, controls: FloatArray) -> FloatArray:
         """The controls ``(K, m)``, but for robots that might come to touch something: these brake, or evade."""
-        problem, docked = self._deviation.problem, joint.arrived & self._at_goal(joint)
+        problem, docked = self._deviation.problem, self._docked(joint)
         gap, now = GAP * problem.margin, min(self._next, len(self._plan) - 1)
         touching = self._window.touching(joint, docked, self._plan[now:], gap)
         caution = self._deviation.caution
@@ -153,7 +153,7 @@ class D4ormC2F(StatePolicy):
     def _loop(self, joint: JointState) -> None:
         """One control loop (Algorithm 4, lines 6 to 9)."""
         begin = time.perf_counter()
-        guide, docked = self._guide, joint.arrived & self._at_goal(joint)
+        guide, docked = self._guide, self._docked(joint)
         replanned = guide.replan_if_needed(joint, docked)
         refined = not replanned and guide.refine(joint.steps, due=len(self.loops) % self.config.refine_every == 0)
         targets = guide.subgoals(joint, docked)
@@ -194,7 +194,8 @@ class D4ormC2F(StatePolicy):
         self._guide.fresh_start(base)
         return base
 
-    def _at_goal(self, joint: JointState) -> BoolArray:
+    def _docked(self, joint: JointState) -> BoolArray:
+        """``(K,)`` who has arrived, and is where it has to be."""
         gap = joint.goals - joint.states[:, : self.problem.dimension]
-        near: BoolArray = np.linalg.norm(gap, axis=1) <= self.problem.goal_radius
-        return near
+        docked: BoolArray = joint.arrived & (np.linalg.norm(gap, axis=1) <= self.problem.goal_radius)
+        return docked
