@@ -10,6 +10,7 @@ from d4orm_env.engine.base import Engine
 from d4orm_env.joint_state import JointState
 from d4orm_planners.d4orm_c2f.filtering import StateFilter
 from d4orm_planners.d4orm_c2f.lateness import Lateness
+from d4orm_planners.d4orm_c2f.losses import Losses
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.d4orm_c2f.standing import Standing
 from d4orm_planners.d4orm_c2f.weakness import Weakness
@@ -47,12 +48,14 @@ class Deviation:
         drift: The largest change of a robot's velocity from what was expected within a few steps of late [m/s].
         problem: The robots with the limits that they are believed to have now.
         lateness: How late commands are executed.
+        losses: How often commands are not executed at all.
         standing: Who has stalled.
     """
 
     def __init__(self, problem: Problem, engine: Engine, config: D4ormC2FConfig) -> None:
         self.problem, self._engine = problem, engine
         self.lateness = Lateness(problem.num_robots, problem.control_size, config.delay)
+        self.losses = Losses(problem) if config.expect_losses else None
         self._weakness = Weakness(problem) if config.learn_limits else None
         self.standing = Standing(problem) if config.stalls else None
         self._filter = StateFilter(problem) if config.filter_states else None
@@ -66,8 +69,10 @@ class Deviation:
         """Compare where the robots are with where they were expected; where they will be once commands arrive."""
         told = self.lateness.observe(joint.controls, ~joint.arrived)
         joint = self._filtered(joint)
+        going = ~joint.arrived if self.standing is None else ~joint.arrived & ~self.standing.robots
+        if self.losses is not None:
+            going &= ~self.losses.observe(told, joint.controls, going)
         if self._weakness is not None:
-            going = ~joint.arrived if self.standing is None else ~joint.arrived & ~self.standing.robots
             self._weakness.observe(told, joint.controls, going)
             self.problem = self._weakness.problem
         if self.standing is not None:

@@ -102,15 +102,18 @@ class D4ormC2F(StatePolicy):
         self._window.prepare(joint)
         self._plan, self._next = self._window.no_controls(), 0
         self.subgoals: FloatArray = joint.states[:, : self.problem.dimension]
+        self._homes = np.full_like(joint.goals, np.nan)
+        self._see_docked(joint)
         begin = time.perf_counter()
         self._guide = Guide(self.problem, self.config, seed, self._refiner, self._refinement, lifelong)
-        self._guide.begin(joint, self._docked(joint))
+        self._guide.begin(joint, self._docked)
         self._deviation = Deviation(self.problem, self._engine, self.config)
         self.coarse_time = time.perf_counter() - begin
 
     def _controls(self, joint: JointState) -> FloatArray:
         goals = joint.goals
         joint = self._deviation.observe(joint)
+        self._see_docked(joint)
         believed = self._window.problem = self._guide.problem = self._deviation.problem
         if not self.loops or self._next >= self.config.execute_horizon:
             self._loop(joint)
@@ -130,7 +133,7 @@ class D4ormC2F(StatePolicy):
 
     def _evading(self, joint: JointState, controls: FloatArray) -> FloatArray:
         """The controls ``(K, m)``, but for robots that might come to touch something: these brake, or evade."""
-        problem, docked = self._deviation.problem, self._docked(joint)
+        problem, docked = self._deviation.problem, self._docked
         gap, now = GAP * problem.margin, min(self._next, len(self._plan) - 1)
         touching = self._window.touching(joint, docked, self._plan[now:], gap)
         caution = self._deviation.caution
@@ -143,17 +146,34 @@ class D4ormC2F(StatePolicy):
         # Now they are told all that they may be able to do, whatever they are believed to be.
         braking = track_velocities(self.problem, joint.states, np.zeros_like(joint.goals))
         controls = np.where(touching[:, None], braking, controls)
-        ahead = self._engine.step(problem.resumed_at(joint.states, joint.goals).arrays, joint.states, docked, controls)
-        wanted = present_velocities(problem, ahead.states, ahead.controls)
+        run = 0 if (losses := self._deviation.losses) is None else losses.run
+        # Also in between, for there may be a corner to get around; and again, for one answer may be another's question.
+        for steps in 2 * (1 + run, 1 + run // 2, 1) if run else (1,):
+            controls = self._braking_in_time(joint, controls, gap, caution if steps == 1 else 0.0, steps)
+        return controls
+
+    def _braking_in_time(
+        self, joint: JointState, controls: FloatArray, gap: float, caution: float, steps: int
+    ) -> FloatArray:
+        """The controls ``(K, m)``, but for robots that could not brake in time any more after so many steps of them."""
+        problem, docked, states = self._deviation.problem, self._docked, joint.states
+        arrays = problem.resumed_at(states, joint.goals).arrays
+        for _ in range(steps):
+            ahead = self._engine.step(arrays, states, docked, controls)
+            states = ahead.states
+        wanted = present_velocities(problem, states, ahead.controls)
         # Other velocities are reached by the next step, by which everybody will be elsewhere.
-        safe = safe_velocities(problem, joint._replace(states=ahead.states), wanted, ~docked, gap, caution)
+        safe = safe_velocities(problem, joint._replace(states=states), wanted, ~docked, gap, caution)
         evading = np.abs(safe - wanted).max(axis=1) > NEARLY
+        if steps > 1:
+            velocities = present_velocities(problem, joint.states, joint.controls)
+            safe = velocities + (safe - velocities) / np.float32(steps)
         return np.where(evading[:, None], track_velocities(self.problem, joint.states, safe), controls)
 
     def _loop(self, joint: JointState) -> None:
         """One control loop (Algorithm 4, lines 6 to 9)."""
         begin = time.perf_counter()
-        guide, docked = self._guide, self._docked(joint)
+        guide, docked = self._guide, self._docked
         replanned = guide.replan_if_needed(joint, docked)
         refined = not replanned and guide.refine(joint.steps, due=len(self.loops) % self.config.refine_every == 0)
         targets = guide.subgoals(joint, docked)
@@ -194,8 +214,9 @@ class D4ormC2F(StatePolicy):
         self._guide.fresh_start(base)
         return base
 
-    def _docked(self, joint: JointState) -> BoolArray:
-        """``(K,)`` who has arrived, and is where it has to be."""
-        gap = joint.goals - joint.states[:, : self.problem.dimension]
-        docked: BoolArray = joint.arrived & (np.linalg.norm(gap, axis=1) <= self.problem.goal_radius)
-        return docked
+    def _see_docked(self, joint: JointState) -> None:
+        """Note who has arrived, and was where it has to be: noise on measurements sends nobody off again."""
+        gap = np.linalg.norm(joint.goals - joint.states[:, : self.problem.dimension], axis=1)
+        here = joint.arrived & (gap <= self.problem.goal_radius)
+        self._homes = np.where(here[:, None], joint.goals, self._homes)
+        self._docked: BoolArray = joint.arrived & (joint.goals == self._homes).all(axis=1)

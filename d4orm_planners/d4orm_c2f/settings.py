@@ -27,10 +27,12 @@ PAPER_CONTROL = {
     "penalty": 1.0,
     "relative_distance": True,
     "safe_mix": False,
+    "drive_home": False,
     "reaction_time": 0.0,
     "delay": 0,
     "filter_states": False,
     "learn_limits": False,
+    "expect_losses": False,
     "stalls": False,
     "last_resort": False,
     "replan": False,
@@ -65,6 +67,7 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
         relative_distance: Whether distances to subgoals count relative to the initial one, as in the paper, rather than
             to how far robots get in ``m`` steps: then a robot next to its subgoal has no more to lose than others.
         safe_mix: Whether robots follow a fine plan only as far as nobody comes within the margin of anything in it.
+        drive_home: Whether robots that dock no later if they drive straight to their goals do so.
         extra_margin: Added to the problem's margin in control loops, as room for disturbances [m].
         reaction_time: The margin in control loops grows by how far robots come within so many seconds from where they
             were expected, by the largest deviation of late: nothing while they do as they are told [s].
@@ -72,6 +75,8 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
             from what the robots report to have executed.
         filter_states: Whether states that are seen to be noisy are filtered.
         learn_limits: Whether robots that never do as much as they are asked to are taken to be that much weaker.
+        expect_losses: Whether a robot that goes on with its last command is taken to have lost the new one: it is not
+            weak, and others may do so too, as often in a row as must be reckoned with.
         stalls: Whether a robot that brakes or stands whatever it is told is taken for an obstacle, which the others
             drive around.
         last_resort: Whether robots whose plan would end in contact are told to brake or to evade instead.
@@ -111,11 +116,13 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
     penalty: Positive = 10.0
     relative_distance: bool = False
     safe_mix: bool = True
+    drive_home: bool = True
     extra_margin: NotNegative = 0.0
     reaction_time: NotNegative = 0.4
     delay: Annotated[Whole, Field(ge=0, le=100)] | None = None
     filter_states: bool = True
     learn_limits: bool = True
+    expect_losses: bool = True
     stalls: bool = True
     last_resort: bool = True
     refine: Refinement = "background"

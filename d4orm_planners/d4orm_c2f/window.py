@@ -11,6 +11,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.base import Engine, MovingObstacles, SamplingRules, SamplingTask
 from d4orm_env.joint_state import JointState
+from d4orm_planners.d4orm_c2f.homing import drive_home
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.steering import track_velocities
 
@@ -107,12 +108,22 @@ class Window:
         if not config.safe_mix:
             positions = self._engine.rollout(truth, controls).positions
             return Prediction(controls, least_gap(truth, positions[1:]))
-        return self._safe_mix(truth, controls, sampled, now)
+        special = now.stuck
+        if config.drive_home and self._docks:
+            near = self._near_goals(now) & ~now.docked & ~now.stuck
+            controls, home = drive_home(truth, self._engine, controls, near)
+            special = special | home
+        return self._safe_mix(truth, controls, special, sampled, now)
+
+    def _near_goals(self, now: Situation) -> BoolArray:
+        """``(K,)`` whose subgoal is as good as the goal."""
+        near: BoolArray = np.linalg.norm(now.subgoals - now.joint.goals, axis=1) <= self.problem.goal_radius
+        return near
 
     def _task(self, now: Situation) -> SamplingTask:
         """Deform the base so that everybody heads for its subgoal, or its goal where that is near."""
         problem, config, goals = self.problem, self._config, now.joint.goals
-        near = np.linalg.norm(now.subgoals - goals, axis=1) <= problem.goal_radius
+        near = self._near_goals(now)
         window = problem.resumed_at(
             now.joint.states,
             np.where((near | now.docked)[:, None], goals, now.subgoals),
@@ -161,10 +172,12 @@ class Window:
         present = self.problem.resumed_at(joint.states, joint.goals, horizon=len(nothing))
         return self._with_stop(present, nothing, 0, docked)
 
-    def _safe_mix(self, window: Problem, fresh: FloatArray, sampled: FloatArray, now: Situation) -> Prediction:
+    def _safe_mix(
+        self, window: Problem, fresh: FloatArray, special: BoolArray, sampled: FloatArray, now: Situation
+    ) -> Prediction:
         """Fresh controls where they keep everyone apart; where not, robots stop earlier, or do as they had in mind.
 
-        Those that are stuck do as sampled before they stop.
+        Those whose controls are ``special`` ``(K,)`` do as sampled before they stop.
 
         What they had in mind was free of violations, and ends at rest. So without disturbances there always is a mix
         that is free of them too: in the last resort everybody does as before.
@@ -177,7 +190,7 @@ class Window:
         # After how many fresh steps each robot stops.
         steps = np.full(window.num_robots, horizon)
         trajectory, violated = self._violations(window_to_rest, controls, now)
-        if (held := violated & now.stuck).any():
+        if (held := violated & special).any():
             fresh = np.where(held[:, None], sampled, fresh)
             controls[:, held] = self._with_stop(window, fresh, horizon, now.docked)[:, held]
             trajectory, violated = self._violations(window_to_rest, controls, now)
