@@ -15,14 +15,16 @@ from scipy.optimize import nnls
 from d4orm_env import navigation_v0
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
-from d4orm_env.disturbances import Bias, Delay, LimitMismatch, Push, Stall, StateDelay
+from d4orm_env.disturbances import Bias, Delay, Dropout, LimitMismatch, Push, Stall, StateDelay
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.joint_state import JointState
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import make_policy, run_episode
 from d4orm_planners.d4orm_c2f.barrier import Barriers, find_nearest, safe_velocities
 from d4orm_planners.d4orm_c2f.filtering import StateFilter
+from d4orm_planners.d4orm_c2f.homing import drive_home
 from d4orm_planners.d4orm_c2f.lateness import MOST, Lateness
+from d4orm_planners.d4orm_c2f.losses import Losses
 from d4orm_planners.d4orm_c2f.policy import D4ormC2F
 from d4orm_planners.d4orm_c2f.standing import AFTER, BRAKING_AFTER, Standing
 from d4orm_planners.d4orm_c2f.weakness import Weakness
@@ -119,6 +121,99 @@ def test_what_is_added_to_commands_is_kept_back() -> None:
         told = random.uniform(-0.5, 0.5, (3, 2)).astype(np.float32)
         weakness.observe(told, told + np.array([[0, 0], [0.12, 0], [0, -0.22]], np.float32), ALL)
     np.testing.assert_allclose(weakness.problem.team.max_acceleration, [1, 0.9, 0.8], rtol=1e-5)
+
+
+@pytest.mark.parametrize(("share", "runs"), [(0.0, {0}), (0.1, {4, 5}), (0.3, {7, 8, 9}), (0.7, {10})])
+def test_how_many_commands_may_get_lost_in_a_row_is_found_out(share: float, runs: set[int]) -> None:
+    """So many that 0.1, 0.3 to that power are about one in ten thousand; ten at most."""
+    random, losses = np.random.default_rng(1), Losses(hop_problem(3))
+    executed = np.zeros((3, 2), np.float32)
+    for _ in range(300):
+        told = random.uniform(-0.7, 0.7, (3, 2)).astype(np.float32)
+        lost = random.uniform(size=3) < share
+        executed = np.where(lost[:, None], executed, told)
+        np.testing.assert_array_equal(losses.observe(told, executed, ALL), lost)
+    assert losses.run in runs
+
+
+def test_noise_and_robots_that_stand_tell_of_no_losses() -> None:
+    random, losses = np.random.default_rng(1), Losses(hop_problem(3))
+    for _ in range(100):
+        told = random.uniform(-0.7, 0.7, (3, 2)).astype(np.float32)
+        noisy = told + random.normal(0, 0.1, (3, 2)).astype(np.float32)
+        noisy[0] = 0
+        assert losses.observe(told, noisy, ALL).tolist() == [True, False, False]
+    assert losses.run == 0
+
+
+def test_who_goes_on_with_its_last_command_is_not_weak() -> None:
+    problem = make_problem("circle", num_robots=4)
+    env, policy = navigation_v0.parallel_env(problem=problem, disturbances=[Dropout(0.4)]), controller()
+    observations, _ = env.reset(seed=0)
+    policy.reset(env, seed=0)
+    for _ in range(30):
+        observations, *_ = env.step(policy.act(observations, env.state()))
+        np.testing.assert_array_equal(policy._deviation.problem.team.limits, problem.team.limits)
+    assert policy._deviation.losses is not None
+    assert policy._deviation.losses.run > 5
+
+
+@pytest.mark.parametrize(("steps", "holds"), [(1, False), (6, True)])
+def test_a_command_may_be_held_for_so_many_steps_before_robots_brake(steps: int, holds: bool) -> None:
+    """From 0.4 m/s and 0.8 m before a wall; with an eye to the next step only, full speed ahead is fine."""
+    problem = hop_problem(1, world=World(2, boxes=[[0.9, -5, 1, 5]]), dt=0.1)
+    policy, env = controller(), navigation_v0.parallel_env(problem=problem)
+    env.reset(seed=0)
+    policy.reset(env, seed=0)
+    states = np.array([[0, 2, 0.4, 0]], np.float32)
+    ahead, nobody = np.array([[1, 0]], np.float32), np.zeros(1, bool)
+    present = joint(problem, states, controls=ahead)
+    held = policy._braking_in_time(present, ahead, 0.0, 0.0, steps)
+    engine, gap = get_engine("cpu"), np.inf
+    for step in range(20):
+        braking = track_velocities(problem, states, np.zeros((1, 2), np.float32))
+        states = engine.step(problem.arrays, states, nobody, held if step < 6 else braking).states
+        gap = min(gap, 0.9 - float(problem.team.radius[0]) - states[0, 0])
+    assert (gap >= -1e-3) == holds
+
+
+def test_noise_on_measurements_sends_nobody_off_again() -> None:
+    problem = hop_problem(2)
+    policy, env = controller(), navigation_v0.parallel_env(problem=problem)
+    env.reset(seed=0)
+    policy.reset(env, seed=0)
+    for away, goals, docked in [
+        (2.0, problem.goal, False),
+        (0.5, problem.goal, True),
+        (2.0, problem.goal, True),
+        (2.0, problem.goal + np.float32(1), False),
+    ]:
+        states = problem.start.copy()
+        states[:, :2] = problem.goal + np.float32([away * problem.goal_radius, 0])
+        policy._see_docked(joint(problem, states, goals=goals, arrived=np.array([True, False])))
+        assert policy._docked.tolist() == [docked, False]
+
+
+def test_who_is_nearly_there_drives_straight_home() -> None:
+    """Past the goal at full speed where that meets it, with a turn to stop there where it does not; or as sampled."""
+    problem = hop_problem(4, dt=0.1, horizon=20)
+    states = np.zeros((4, 4), np.float32)
+    states[:, :2] = problem.goal
+    states[:, 0] -= [0.9, 0.9, 0.9, 3.0]
+    states[:, 1] += [0.1, 0.1, 0.1, 0.1]
+    states[:, 2] = [1.0, 1.0, 1.0, 1.0]
+    controls = np.zeros((20, 4, 2), np.float32)
+    window, engine = problem.resumed_at(states, problem.goal), get_engine("cpu")
+    chosen, home = drive_home(window, engine, controls, np.array([True, False, True, True]))
+    assert home.tolist() == [True, False, True, False]
+    np.testing.assert_array_equal(chosen[:, ~home], controls[:, ~home])
+    missed, met = engine.rollout(window, controls).arrived, engine.rollout(window, chosen).arrived
+    assert not missed[-1].any()
+    assert met[-1].tolist() == home.tolist()
+    assert np.argmax(met[:, 0]) == 9  # 0.9 m at 1 m/s, but for the goal's radius and the turn
+    again, home = drive_home(window, engine, chosen, np.array([True, False, False, False]))
+    assert home.tolist() == [True, False, False, False]
+    np.testing.assert_array_equal(again, chosen)
 
 
 def test_who_stands_whatever_it_is_told_is_taken_for_docked_until_it_moves() -> None:
@@ -290,6 +385,7 @@ def test_a_robot_that_has_stalled_is_driven_around() -> None:
 def test_finding_out_changes_nothing_while_all_is_as_believed(model: str) -> None:
     problem = make_problem("circle", num_robots=4, model=model)
     known = {"delay": 0, "filter_states": False, "learn_limits": False, "stalls": False, "last_resort": False}
+    known["expect_losses"] = False
     plain, watchful = (
         run_episode(navigation_v0.parallel_env(problem=problem), controller(**config), seed=0) for config in (known, {})
     )

@@ -10,6 +10,9 @@ from d4orm_env.core.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine.base import Engine
 from d4orm_planners.steering import straight_drives
 
+PASSING = 1e-6
+"""Goal radius of robots that drive through a place and do not dock there [m]."""
+
 
 def drive_home(window: Problem, engine: Engine, controls: FloatArray, near: BoolArray) -> tuple[FloatArray, BoolArray]:
     """The controls, but straight drives for robots that dock by these no later.
@@ -36,7 +39,7 @@ def drive_home(window: Problem, engine: Engine, controls: FloatArray, near: Bool
     # Past the goal at full speed where that meets it; else so that robots could stop there.
     for beyond in (speed**2 / (2 * acceleration), np.zeros_like(speed)):
         aimed = window.goal + beyond * offsets / np.maximum(away, window.goal_radius)
-        straight = straight_drives(window.resumed_at(window.start, aimed, goal_radius=0.0)).controls[:, :, 0]
+        straight = straight_drives(window.resumed_at(window.start, aimed, goal_radius=PASSING)).controls[:, :, 0]
         sooner = near & ~home & (_docking_times(window, engine, straight) <= latest)
         controls = np.where(sooner[:, None], straight, controls)
         home |= sooner

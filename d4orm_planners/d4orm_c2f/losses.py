@@ -39,19 +39,19 @@ class Losses:
         self.run = 0
 
     def observe(self, told: FloatArray, executed: FloatArray, going: BoolArray) -> BoolArray:
-        """``(K,)`` whose last command got lost.
+        """``(K,)`` who goes on with the command before, or stands as before, whatever it was told.
 
         Args:
             told: ``(K, m)`` the commands that should have been executed in the last step.
             executed: ``(K, m)`` those that were.
             going: ``(K,)`` whose tell anything: docked robots execute none.
         """
-        # Whoever stands may be kept from moving by something else.
-        lost: BoolArray = going & executed.any(axis=1) & (executed == self._last).all(axis=1)
-        lost &= (executed != told).any(axis=1)
+        lost: BoolArray = going & (executed == self._last).all(axis=1) & (executed != told).any(axis=1)
         new = going & (effort(self._problem, told - self._last) > NOTICED)
+        # Whoever stands may be kept from moving by something else.
+        self._lost += int((lost & new & executed.any(axis=1)).sum())
+        self._sent += int(new.sum())
         self._last = executed
-        self._sent, self._lost = self._sent + int(new.sum()), self._lost + int((lost & new).sum())
         if self._lost:
             self.run = min(math.ceil(math.log(RARE) / math.log(self._lost / self._sent)), MOST)
         return lost

@@ -11,12 +11,9 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.base import Engine, MovingObstacles, SamplingRules, SamplingTask
 from d4orm_env.joint_state import JointState
-from d4orm_planners.d4orm_c2f.homing import drive_home
+from d4orm_planners.d4orm_c2f.homing import PASSING, drive_home
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.steering import track_velocities
-
-NOT_AT_SUBGOALS = 1e-6
-"""Goal radius while everyone is on the way: a robot drives through its subgoal [m]."""
 
 SHORTER = 3
 """How many times fewer fresh steps a robot takes before it stops if it would violate the margin otherwise."""
@@ -102,7 +99,7 @@ class Window:
         limit = problem.team.control_limits
         sampled = np.clip(now.base + result.mean, -limit, limit).astype(np.float32)
         controls = sampled if now.careful is None else np.where(now.stuck[:, None], now.careful, sampled)
-        radius = problem.goal_radius if self._docks else NOT_AT_SUBGOALS
+        radius = problem.goal_radius if self._docks else PASSING
         joint, horizon = now.joint, config.predict_horizon
         truth = problem.resumed_at(joint.states, joint.goals, horizon=horizon, goal_radius=radius)
         if not config.safe_mix:
@@ -129,7 +126,7 @@ class Window:
             np.where((near | now.docked)[:, None], goals, now.subgoals),
             horizon=config.predict_horizon,
             margin=problem.margin + config.extra_margin + now.room,
-            goal_radius=problem.goal_radius if near.any() and self._docks else NOT_AT_SUBGOALS,
+            goal_radius=problem.goal_radius if near.any() and self._docks else PASSING,
         )
         reach = problem.dt * config.subgoal_offset * float(np.max(np.asarray(problem.team.max_speed)))
         return SamplingTask(
@@ -232,7 +229,7 @@ class Window:
 
     def touching(self, joint: JointState, docked: BoolArray, controls: FloatArray, gap: float) -> BoolArray:
         """``(K,)`` who comes within a gap [m] of anything if all execute ``controls`` ``(T, K, m)``, and a stop."""
-        radius = self.problem.goal_radius if self._docks else NOT_AT_SUBGOALS
+        radius = self.problem.goal_radius if self._docks else PASSING
         present = self.problem.resumed_at(
             joint.states, joint.goals, horizon=len(controls), margin=gap, goal_radius=radius
         )
