@@ -14,6 +14,10 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 Floats = NDArray[np.float64]
 """Where float32 is not enough."""
+Ints = NDArray[np.int32]
+"""Where they must not take more room."""
+Whole = int | np.int64
+"""A number of something in compiled code, which tells no int from an int64."""
 
 
 SMALLEST, LARGEST = 1e-7, 1e6

@@ -260,7 +260,7 @@ class WorldEngine(Engine, Protocol):
         arrays: ProblemArrays,
         layout: ObservationLayout,
         max_cycles: int,
-        orders: NDArray[np.int64],
+        orders: NDArray[np.uint8],
         batch: WorldBatch,
         out: FloatArray,
     ) -> None:
