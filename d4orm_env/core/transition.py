@@ -8,14 +8,9 @@ problem says that who has arrived may be moved again: then it has arrived for as
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
-
-from d4orm_env.core.robot_model import ModelFunctions, N, Number, Ops, TimeStep, Truth
+from d4orm_env.core.robot_model import Flag, ModelFunctions, N, Number, Ops, TimeStep, Truth
 
 __all__ = ["TimeStep", "advance", "arrives"]
-
-Flag: TypeAlias = Any
-"""A :class:`Truth` as the library of the numbers has it."""
 
 
 def advance(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numba.extending import register_jitable
@@ -149,32 +149,32 @@ for _function in (
 
 
 @compiled
-def _uint32(x: Any) -> Any:
+def _uint32(x: int) -> np.uint32:
     return np.uint32(x)
 
 
 @compiled
-def _int32(x: Any) -> Any:
+def _int32(x: int) -> np.int32:
     return np.int32(x)
 
 
 @compiled
-def _to_float(x: Any) -> Any:
+def _to_float(x: np.int32) -> np.float32:
     return np.float32(x)
 
 
 @compiled
-def _float_bits(x: Any) -> Any:
+def _float_bits(x: np.float32) -> np.int32:
     return np.float32(x).view(np.int32)
 
 
 @compiled
-def _bits_float(x: Any) -> Any:
+def _bits_float(x: np.int32) -> np.float32:
     return np.int32(x).view(np.float32)
 
 
 @compiled
-def _sqrt(x: Any) -> Any:
+def _sqrt(x: np.float32) -> np.float32:
     return np.sqrt(x)
 
 
