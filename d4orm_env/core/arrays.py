@@ -110,7 +110,7 @@ class Frozen:
         """A copy with some attributes changed, checked again."""
         return type(self)(**self.__getstate__() | changes)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         return {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
 
     def __setstate__(self, state: dict[str, object]) -> None:

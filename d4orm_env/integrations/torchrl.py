@@ -103,10 +103,10 @@ class TorchRLNavigation(EnvBase):
         ends = (torch.as_tensor(np.broadcast_to(end, shape).copy(), device=self.device) for end in (low, high))
         return Bounded(*ends, shape, device=self.device, dtype=torch.float32)
 
-    def _composite(self, parts: dict[str, Any]) -> Composite:
+    def _composite(self, parts: dict[str, object]) -> Composite:
         return Composite(parts, shape=self._shape, device=self.device)
 
-    def _of_robots(self, parts: dict[str, Any]) -> Composite:
+    def _of_robots(self, parts: dict[str, object]) -> Composite:
         return Composite({GROUP: self._composite(parts)}, shape=self.batch_size, device=self.device)
 
     def _set_seed(self, seed: int | None) -> None:

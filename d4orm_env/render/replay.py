@@ -42,7 +42,7 @@ class ReplayMotion:
         content: What the page reads: lists, numbers and texts only.
     """
 
-    content: dict[str, Any]
+    content: dict[str, object]
 
 
 def motion(
@@ -159,7 +159,7 @@ class Replay:
         return f'<iframe sandbox="allow-scripts" style="{style}" srcdoc="{escape(self.html)}"></iframe>'
 
 
-def rounded(array: ArrayLike) -> dict[str, Any]:
+def rounded(array: ArrayLike) -> dict[str, object]:
     """Numbers ``(..., c)`` as 16-bit ones between the least and the most of each of the ``c`` components."""
     values = np.asarray(array, np.float64)
     flat = values.reshape(-1, values.shape[-1])
@@ -169,7 +169,7 @@ def rounded(array: ArrayLike) -> dict[str, Any]:
     return {"low": low.tolist(), "step": step.tolist(), "data": _text(data)}
 
 
-def _setting(problem: Problem) -> dict[str, Any]:
+def _setting(problem: Problem) -> dict[str, object]:
     """Team and world, which do not change."""
     models = problem.team.robot_models
     return {
@@ -185,7 +185,7 @@ def _setting(problem: Problem) -> dict[str, Any]:
     }
 
 
-def _denoising(denoising: Denoising) -> dict[str, Any]:
+def _denoising(denoising: Denoising) -> dict[str, object]:
     samples, kept = denoising.samples, denoising.samples.shape[1]
     return {
         "labels": list(denoising.labels),
@@ -198,7 +198,7 @@ def _denoising(denoising: Denoising) -> dict[str, Any]:
     }
 
 
-def _bodies(problem: Problem, bodies: FloatArray, steps: int, end: int) -> dict[str, Any]:
+def _bodies(problem: Problem, bodies: FloatArray, steps: int, end: int) -> dict[str, object]:
     """Where what is no robot is, and its radius."""
     d = problem.dimension
     if bodies.ndim != 3 or len(bodies) != steps or bodies.shape[2] != 2 * d + 1 or not np.isfinite(bodies).all():
@@ -216,12 +216,12 @@ def _end(problem: Problem, trajectory: Trajectory) -> int:
     return last + 1 if np.isinf(everyone) else min(last, round((everyone + _AFTERMATH) / problem.dt)) + 1
 
 
-def _clearance(problem: Problem, positions: FloatArray) -> dict[str, Any]:
+def _clearance(problem: Problem, positions: FloatArray) -> dict[str, object]:
     clearance = problem.world.clearance(positions)
     return rounded(np.where(np.isfinite(clearance), clearance, _NO_CLEARANCE)[..., None])
 
 
-def _obstacles(problem: Problem) -> dict[str, Any]:
+def _obstacles(problem: Problem) -> dict[str, object]:
     world = problem.world
     return {
         "balls": world.balls.tolist(),

@@ -65,7 +65,7 @@ class DatasetFiles:
         storage.update_metadata({"recorded_seeds": [int(episode.metadata["seed"]) for episode in episodes]})
         partial.rename(final)
 
-    def write_main(self, metadata: Mapping[str, Any]) -> None:
+    def write_main(self, metadata: Mapping[str, object]) -> None:
         """Write the main file and the metadata anew, for the shards that are there."""
         import h5py
 
@@ -121,7 +121,7 @@ class _Part:
 
     steps: int
     pick: Callable[[np.ndarray], np.ndarray]
-    extra: Mapping[str, Any]
+    extra: Mapping[str, object]
     together: bool
 
 

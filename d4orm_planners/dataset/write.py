@@ -145,7 +145,7 @@ def _pack(recording: Recording, files: DatasetFiles, shard_size: int) -> None:
             recording.forget(seed)
 
 
-def _metadata(demonstrations: Demonstrations, dataset_id: str, dropped: int) -> dict[str, Any]:
+def _metadata(demonstrations: Demonstrations, dataset_id: str, dropped: int) -> dict[str, object]:
     """What the dataset says about itself."""
     identity = demonstrations.identity
     return {

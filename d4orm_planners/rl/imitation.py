@@ -68,7 +68,7 @@ class ImitationSettings(Practice):
     """
 
     expert: str = "d4orm-c2f"
-    expert_settings: Mapping[str, Any] = field(default_factory=dict)
+    expert_settings: Mapping[str, object] = field(default_factory=dict)
     dataset: PathText | None = None
     episodes: Annotated[Many, Field(ge=2)] = 100
     rounds: Annotated[Count, Field(le=1000)] = 5
@@ -79,7 +79,7 @@ class ImitationSettings(Practice):
         make_policy(self.expert, **self.expert_settings)
 
     @property
-    def all_expert_settings(self) -> dict[str, Any]:
+    def all_expert_settings(self) -> dict[str, object]:
         """What the expert is made with."""
         own = {name: value for name, value in OTHERS_DRIVE.items() if name in setting_names(self.expert)}
         return own | dict(self.expert_settings)
