@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cache, reduce
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,6 +31,9 @@ class _Purpose(IntEnum):
     COMMAND = 1
     MOVE = 2
     SEE = 3
+
+
+T = TypeVar("T")
 
 
 @dataclass(eq=False)
@@ -249,7 +252,7 @@ def _judge() -> Callable[..., None]:
     return judge
 
 
-def _together(join: Any, parts: Sequence[Any]) -> Any:
+def _together(join: Callable[[T, T], T], parts: Sequence[T | None]) -> T | None:
     """What several disturbances have done; ``None`` if none did."""
     done = [part for part in parts if part is not None]
     return reduce(join, done) if done else None

@@ -10,7 +10,10 @@ from types import ModuleType
 from typing import Any, ParamSpec, Protocol, TypeVar
 
 import numba
+from numba.core.base import BaseContext
 from numba.core.caching import FunctionCache
+from numba.core.codegen import JITCPUCodegen
+from numba.core.typing.templates import Signature
 
 P = ParamSpec("P")
 R_co = TypeVar("R_co", covariant=True)
@@ -43,10 +46,10 @@ class _SourceKeyedCache(FunctionCache):
         super().__init__(function)
         self._source_key = key
 
-    def _index_key(self, sig: Any, codegen: Any) -> Any:
+    def _index_key(self, sig: Signature, codegen: JITCPUCodegen) -> tuple[object, ...]:
         return sig, codegen.magic_tuple(), self._source_key
 
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
+    def load_overload(self, sig: Signature, target_context: BaseContext) -> object:
         """What is kept for arguments of these types, or ``None``."""
         self.kept()
         return super().load_overload(sig, target_context)

@@ -14,12 +14,11 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from d4orm_env.core.portable import Real
 from d4orm_env.core.robot_model import N
 
 Word: TypeAlias = Any
 """32 bits as a library has them: a whole number, or an array of them."""
-Real: TypeAlias = Any
-"""A float32, or an array of them, as the same library has it."""
 
 
 class BitOps(NamedTuple):
@@ -35,7 +34,7 @@ class BitOps(NamedTuple):
     """The int32 with the bits of a float32."""
     bits_float: Callable[..., Real]
     """The float32 with the bits of an int32."""
-    sqrt: Callable[..., Any]
+    sqrt: Callable[..., Real]
 
 
 def _u(value: int) -> np.uint32:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from html import escape
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.colors import to_hex
@@ -235,7 +234,7 @@ def _in_space(limits: list[list[float]]) -> list[list[float]]:
     return [[*corner, 0.0][:3] for corner in limits]
 
 
-def _text(array: NDArray[Any]) -> str:
+def _text(array: NDArray[np.generic]) -> str:
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
 
 

@@ -331,7 +331,7 @@ def _measure_functional(settings: BenchmarkSettings) -> Row:
     env = FunctionalEnv(problem=boxed_problem(0, "near"))
     limits, begin = env.action_limits, jax.jit(jax.vmap(env.reset))
 
-    def move(carry: tuple[EnvState, Any], key: Any) -> Any:
+    def move(carry: tuple[EnvState, Any], key: jax.Array) -> tuple[tuple[EnvState, Any], None]:
         (state, total), keys = carry, jax.random.split(key, 1 + size)
         controls = jax.random.uniform(keys[0], (size, *limits.shape), minval=-limits, maxval=limits)
         state, moment = jax.vmap(env.step)(keys[1:], state, controls)
@@ -339,7 +339,7 @@ def _measure_functional(settings: BenchmarkSettings) -> Row:
         return (state, total + moment.rewards.sum() + moment.observations.sum()), None
 
     @jax.jit
-    def steps(state: EnvState, key: Any) -> Any:
+    def steps(state: EnvState, key: jax.Array) -> tuple[EnvState, float]:
         return jax.lax.scan(move, (state, 0.0), jax.random.split(key, calls))[0]
 
     state, _ = begin(jax.random.split(jax.random.key(0), size))

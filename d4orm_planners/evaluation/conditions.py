@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from d4orm_env.core.arrays import positive_number, shown
 from d4orm_env.disturbances import Disturbance
@@ -15,7 +15,7 @@ from d4orm_env.disturbances.registry import attributes_of, disturbance_at, name_
 from d4orm_env.disturbances.selection import checked_disturbances
 from d4orm_planners.references import source_digest
 
-Levels: TypeAlias = Iterable[Any]
+Levels: TypeAlias = Iterable[object]
 DisturbanceLevels: TypeAlias = Mapping[str, Levels]
 """Levels by name, as ``{"delay": [0, 1, 2], "push.speed": [0.2, 0.5]}``, or disturbances by any label, as
 ``{"wind": [Wind(0.1), Wind(0.2)], "both": [[], [Delay(2), Wind(0.1)]]}``."""

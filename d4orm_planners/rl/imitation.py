@@ -15,13 +15,14 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import Field
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
 from d4orm_env import navigation_v0
+from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.seeds import Stream, derived_seed, generator
 from d4orm_planners.registry import make_policy, setting_names
 from d4orm_planners.rl.algorithms import ALGORITHMS
@@ -154,7 +155,13 @@ class _Run:
         self._conclude(index, self._network(index), len(known[0]), held, begin, recorded)
 
     def _conclude(
-        self, index: int, network: Network, steps: int, held: tuple[Any, Any], begin: float, recorded: float
+        self,
+        index: int,
+        network: Network,
+        steps: int,
+        held: tuple[FloatArray, FloatArray],
+        begin: float,
+        recorded: float,
     ) -> None:
         """Judge what has been learned, and keep it."""
         seconds = time.perf_counter() - begin
@@ -191,7 +198,7 @@ class _Run:
         record_samples(env, expert, seed, self._network(index).controls if index else None).save(path)
         env.close()
 
-    def _samples(self, last: int) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+    def _samples(self, last: int) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
         """Inputs and targets of all rounds so far: those to learn from, and those held out."""
         recorded = self.settings.episodes
         episodes = [*(self._given or ())]
