@@ -96,7 +96,7 @@ class FunctionalEnv:
         num_robots: int | None = None,
         *,
         num_instances: int = 256,
-        **options: Any,
+        **options: object,
     ) -> None:
         chosen = EnvOptions.of(scenario=scenario, num_robots=num_robots, **options)
         _refuse(chosen)
@@ -124,7 +124,7 @@ class FunctionalEnv:
         """``(K, m)`` largest controls, in physical units; zero where a robot has no such component."""
         return self.problem.team.control_limits
 
-    def instance(self, number: Any) -> Problem:
+    def instance(self, number: int | jax.Array) -> Problem:
         """One of the instances; the number may be traced."""
         chosen = {place: stack[number] for place, stack in self._varying.items()}
         leaves = [chosen.get(place, leaf) for place, leaf in enumerate(self._common)]

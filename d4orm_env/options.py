@@ -13,7 +13,7 @@ from d4orm_env.core.arrays import shown
 from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.controls import ControlNoise
-from d4orm_env.disturbances.disturbance import Disturbance
+from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.disturbances.selection import Disturbances, at_work, checked_disturbances
 from d4orm_env.env_inputs import noise_std
 from d4orm_env.rewards import RewardFunction
@@ -59,7 +59,7 @@ class EnvOptions:
     problem: Problem | None = None
     render_mode: str | None = None
     control_noise_std: ArrayLike = 0.0
-    disturbances: Sequence[Disturbance[Any]] = ()
+    disturbances: Sequence[AnyDisturbance] = ()
     lifelong: bool = False
     max_cycles: int | None = None
     randomize_instance: bool | None = None

@@ -281,9 +281,9 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
                 "{'reset_mask': terminations | truncations})"
             )
 
-    def _advance(self, orders: NDArray[np.int64], observations: FloatArray | None = None) -> FloatArray:
+    def _advance(self, orders: NDArray[np.uint8], observations: FloatArray | None = None) -> FloatArray:
         """Carry out ``orders`` ``(B,)``, and return what is seen ``(B, K * D)``, in ``observations`` if given."""
-        from d4orm_env.engine.worlds import SKIP, STEP
+        from d4orm_env.engine.worlds import SKIP, STEP, WorldBatch
 
         if observations is None:
             observations = np.empty_like(self._observations) if self._copy else self._observations
@@ -295,7 +295,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         else:
             for world, arrays in enumerate(self._arrays):
                 one = slice(world, world + 1)
-                part = type(self._worlds)(*(values[one] for values in self._worlds))
+                part = WorldBatch._make(values[one] for values in self._worlds)
                 advance(true(arrays), layout, cycles, orders[one], part, made[one])
         self._disturbances.meet(orders == STEP)
         if self._disturbances.alters_sight:
@@ -349,7 +349,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             goals=worlds.goal,
             previous_distances=np.where(moved[:, None], before.distance, worlds.distance),
             distances=worlds.distance,
-            initial_distances=1 / worlds.inverse,
+            initial_distances=np.float32(1) / worlds.inverse,
             previously_arrived=before.docked & moved[:, None],
             arrived=worlds.docked,
             collided=worlds.collided,
@@ -392,6 +392,6 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             "margin_violated": worlds.violated,
             "distance_to_goal": worlds.distance,
             **{f"reward_{name}": term for name, term in self._terms.items()},
-            "is_success": there.all(axis=1) & ~worlds.contacts.any(axis=1),
+            "is_success": np.asarray(there.all(axis=1) & ~worlds.contacts.any(axis=1)),
         }
         return masked(values, np.ones(self.num_envs, np.bool_) if mask is None else mask)

@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 from d4orm_env import __version__
 from d4orm_planners._machine import describe_machine
@@ -24,9 +23,9 @@ class Provenance:
     """
 
     preset: str | None
-    settings: Mapping[str, Any]
+    settings: Mapping[str, object]
     version: str
-    machine: Mapping[str, Any]
+    machine: Mapping[str, object]
 
     def __post_init__(self) -> None:
         kinds = {"preset": (str, type(None)), "settings": Mapping, "version": str, "machine": Mapping}

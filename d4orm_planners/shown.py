@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary import Row, joined
@@ -40,7 +40,7 @@ class Shown:
 
         return motion_html(self.problem, self.trajectory, self.title, self.key_figures)
 
-    def plot(self: _HasMotion, axes: Axes | None = None) -> Any:
+    def plot(self: _HasMotion, axes: Axes | None = None) -> Axes:
         """Draw the motion with matplotlib; see :func:`d4orm_env.render.pictures.plot`.
 
         Args:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,10 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 Floats = NDArray[np.float64]
 """Where float32 is not enough."""
+Ints = NDArray[np.int32]
+"""Where they must not take more room."""
+Whole = int | np.int64
+"""A number of something in compiled code, which tells no int from an int64."""
 
 
 SMALLEST, LARGEST = 1e-7, 1e6
@@ -102,11 +106,11 @@ class Frozen:
                     array.setflags(write=False)
             object.__setattr__(self, name, value)
 
-    def replace(self, **changes: Any) -> Self:
+    def replace(self, **changes: object) -> Self:
         """A copy with some attributes changed, checked again."""
         return type(self)(**self.__getstate__() | changes)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         return {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
 
     def __setstate__(self, state: dict[str, object]) -> None:

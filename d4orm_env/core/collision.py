@@ -6,7 +6,7 @@ Two bodies touch when the distance between their surfaces is zero or less, so ev
 
 from __future__ import annotations
 
-from d4orm_env.core.robot_model import Number, Ops, Truth, Vector
+from d4orm_env.core.robot_model import Flag, Number, Ops, Truth, Vector
 
 
 def axis_gap(x: Number, lower: Number, upper: Number, zero: Number, ops: Ops) -> Number:
@@ -14,7 +14,7 @@ def axis_gap(x: Number, lower: Number, upper: Number, zero: Number, ops: Ops) ->
     return ops.maximum(ops.maximum(lower - x, x - upper), zero)
 
 
-def leaves(x: Number, reach: Number, lower: Number, upper: Number) -> Truth:
+def leaves(x: Number, reach: Number, lower: Number, upper: Number) -> Flag:
     """Whether a body of that reach at ``x`` touches or leaves the interval from ``lower`` to ``upper``."""
     return (x - reach <= lower) | (x + reach >= upper)
 
@@ -32,7 +32,7 @@ def lies_left(x: Number, y: Number, along_x: Number, along_y: Number, zero: Numb
     return along_x * y - along_y * x >= zero
 
 
-def meets_triangle(corners: Vector, x: Number, y: Number, reach: Number, zero: Number, ops: Ops) -> Truth:
+def meets_triangle(corners: Vector, x: Number, y: Number, reach: Number, zero: Number, ops: Ops) -> Flag:
     """Whether a disc of that reach at ``(x, y)`` touches a triangle, ``corners`` being ``x, y`` of each in turn."""
     ax, ay, bx, by, cx, cy = corners
     edges = (

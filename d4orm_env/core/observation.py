@@ -40,7 +40,7 @@ class Sensed(NamedTuple):
 
 
 def observe_robot(
-    k: int, arrays: ProblemArrays, goal: FloatArray, sensed: Sensed, time_left: float, out: FloatArray
+    k: int, arrays: ProblemArrays, goal: FloatArray, sensed: Sensed, time_left: float | np.float32, out: FloatArray
 ) -> None:
     """Fill one robot's observation.
 

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -282,7 +282,7 @@ class Problem(Frozen):
 
         return problem_html(self, f"Problem: {self.name}", self.key_figures)
 
-    def plot(self, axes: Axes | None = None) -> Any:
+    def plot(self, axes: Axes | None = None) -> Axes:
         """Draw starts, goals and world with matplotlib; see :func:`d4orm_env.render.pictures.plot`.
 
         Args:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from d4orm_env.core.robot_model import Number
+from d4orm_env.core.robot_model import N
 
 
-def step_reward(
-    distance: Number, inverse_initial_distance: Number, pair_violation: Number, obstacle_violation: Number, one: Number
-) -> Number:
+def step_reward(distance: N, inverse_initial_distance: N, pair_violation: N, obstacle_violation: N, one: N) -> N:
     """``1 - distance / initial distance``, minus one for any robot and minus one for any obstacle within the margin.
 
     The violations are 0 or 1 and ``one`` is 1, all in the caller's precision.

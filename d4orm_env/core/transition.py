@@ -8,17 +8,14 @@ problem says that who has arrived may be moved again: then it has arrived for as
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
-
-from d4orm_env.core.robot_model import ModelFunctions, Number, Ops, TimeStep, Truth, Vector
+from d4orm_env.core.robot_model import Flag, ModelFunctions, N, Number, Ops, TimeStep, Truth
 
 __all__ = ["TimeStep", "advance", "arrives"]
 
-Flag: TypeAlias = Any
-"""A :class:`Truth` as the library of the numbers has it."""
 
-
-def advance(model: ModelFunctions, x: Vector, u: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
+def advance(
+    model: ModelFunctions, x: tuple[N, ...], u: tuple[N, ...], limits: tuple[N, ...], h: TimeStep, ops: Ops
+) -> tuple[N, ...]:
     """The state after one step under a control that :meth:`ModelFunctions.limit_control` has clipped."""
     return model.limit_state(model.integrate(x, u, limits, h, ops), limits, ops)
 

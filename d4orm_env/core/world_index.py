@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.core.arrays import FloatArray, Floats, Ints
 from d4orm_env.core.shapes import Shapes
 
 MAX_BYTES = 64 * 2**20
@@ -40,8 +40,6 @@ _PAIRS_AT_ONCE = 2**18
 """Cells times obstacles whose distances are worked out in one go."""
 
 _EPSILON = float(np.finfo(np.float32).eps)
-
-Ints = NDArray[np.int32]
 
 
 class WorldIndex(NamedTuple):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -165,3 +165,7 @@ class Disturbance(Generic[M]):
     def effect(self, memory: M, scene: Scene) -> Effect:
         """What it has done up to now."""
         return Effect()
+
+
+AnyDisturbance: TypeAlias = Disturbance[Any]
+"""Whatever its memory is."""

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cache, reduce
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.disturbance import Disturbance, Effect, Memory, Scene, Seen
+from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbance, Effect, Memory, Scene, Seen
 from d4orm_env.disturbances.draws import Ahead, Draws, Keys, Steps, episode_keys
 
 Worlds = NDArray[np.intp]
@@ -33,11 +33,14 @@ class _Purpose(IntEnum):
     SEE = 3
 
 
+T = TypeVar("T")
+
+
 @dataclass(eq=False)
 class _Running:
     """A disturbance at work: its stream of random numbers, what it draws by purpose, and what it remembers."""
 
-    disturbance: Disturbance[Any]
+    disturbance: AnyDisturbance
     stream: int
     draws: dict[_Purpose, Draws] = field(default_factory=dict)
     memory: Memory = field(default=())
@@ -73,7 +76,7 @@ class DisturbedWorlds:
     """
 
     def __init__(
-        self, disturbances: Sequence[Disturbance[Any]], problem: Problem, num_worlds: int, max_cycles: int
+        self, disturbances: Sequence[AnyDisturbance], problem: Problem, num_worlds: int, max_cycles: int
     ) -> None:
         self.problem, self.max_cycles = problem, max_cycles
         occurrences: Counter[str] = Counter()
@@ -249,7 +252,7 @@ def _judge() -> Callable[..., None]:
     return judge
 
 
-def _together(join: Any, parts: Sequence[Any]) -> Any:
+def _together(join: Callable[[T, T], T], parts: Sequence[T | None]) -> T | None:
     """What several disturbances have done; ``None`` if none did."""
     done = [part for part in parts if part is not None]
     return reduce(join, done) if done else None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,7 @@ from d4orm_env.core.arrays import FloatArray
 
 Keys = NDArray[np.uint32]
 Steps = NDArray[np.int64]
-Kernel = Callable[..., Any]
+Kernel = Callable[..., None]
 Ahead = dict[tuple[int, int, int, tuple[int, ...]], tuple[int, FloatArray]]
 """What a single world has drawn ahead in its episode: by kind of number, stream, call and shape the first step, and
 rows of numbers, one for each step from there on."""

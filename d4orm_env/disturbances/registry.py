@@ -6,24 +6,24 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import MISSING, asdict, fields, is_dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.registry import Registry
 from d4orm_env.core.yaml_text import parse_yaml
 from d4orm_env.disturbances.controls import Bias, ControlNoise, CorrelatedNoise, Delay, Dropout, Gain, Quantisation
-from d4orm_env.disturbances.disturbance import Disturbance
+from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbance
 from d4orm_env.disturbances.intruder import Intruder
 from d4orm_env.disturbances.perception import Occlusion, StateDelay, StateNoise
 from d4orm_env.disturbances.world import Drag, LimitMismatch, Push, Stall
 
-_BUILT_IN: tuple[type[Disturbance[Any]], ...] = (
+_BUILT_IN: tuple[type[AnyDisturbance], ...] = (
     ControlNoise, CorrelatedNoise, Bias, Delay, Dropout, Quantisation, Gain, StateNoise, StateDelay, Occlusion, Push,
     Stall, Intruder, Drag, LimitMismatch,
 )  # fmt: skip
 
 
-def _admit(name: str, thing: object) -> type[Disturbance[Any]]:
+def _admit(name: str, thing: object) -> type[AnyDisturbance]:
     if not (isinstance(thing, type) and issubclass(thing, Disturbance)):
         raise ValueError(
             f"disturbance {name!r} is {shown(thing)}; give a subclass of d4orm_env.disturbances.Disturbance"
@@ -38,7 +38,7 @@ for _kind in _BUILT_IN:
     DISTURBANCES.add(re.sub(r"(?<=.)(?=[A-Z])", "_", _kind.__name__).lower(), _kind)
 
 
-def register_disturbance(name: str, kind: type[Disturbance[Any]] | str) -> None:
+def register_disturbance(name: str, kind: type[AnyDisturbance] | str) -> None:
     """Let studies and the command line know disturbances of your own by a name.
 
     Args:
@@ -60,7 +60,7 @@ class Level(NamedTuple):
         fixed: Values of other attributes.
     """
 
-    kind: type[Disturbance[Any]]
+    kind: type[AnyDisturbance]
     attribute: str
     fixed: dict[str, object]
 
@@ -111,7 +111,7 @@ def _split_path(text: str) -> tuple[str, str, str]:
     return place + colon + kind, dot, attribute
 
 
-def disturbance_at(text: str, level: object) -> Disturbance[Any]:
+def disturbance_at(text: str, level: object) -> AnyDisturbance:
     """The disturbance of a name at a level, all else as by default.
 
     Args:
@@ -125,13 +125,13 @@ def disturbance_at(text: str, level: object) -> Disturbance[Any]:
     return _make(kind, {**fixed, attribute: level}, text)
 
 
-def disturbances_at(levels: Mapping[str, object]) -> tuple[Disturbance[Any], ...]:
+def disturbances_at(levels: Mapping[str, object]) -> tuple[AnyDisturbance, ...]:
     """Disturbances by name and level; what is said of several attributes of one kind is said of one disturbance.
 
     Raises:
         ValueError: As :func:`disturbance_at`, or if an attribute is given twice.
     """
-    kinds: dict[type[Disturbance[Any]], dict[str, object]] = {}
+    kinds: dict[type[AnyDisturbance], dict[str, object]] = {}
     for text, level in levels.items():
         kind, attribute, fixed = find_level(text)
         values = kinds.setdefault(kind, {})
@@ -142,7 +142,7 @@ def disturbances_at(levels: Mapping[str, object]) -> tuple[Disturbance[Any], ...
     return tuple(_make(kind, values, kind.__name__) for kind, values in kinds.items())
 
 
-def _make(kind: type[Disturbance[Any]], values: Mapping[str, object], text: str) -> Disturbance[Any]:
+def _make(kind: type[AnyDisturbance], values: Mapping[str, object], text: str) -> AnyDisturbance:
     needed = [field.name for field in fields(kind) if field.default is MISSING and field.default_factory is MISSING]
     missing = [name for name in needed if name not in values]
     if missing:
@@ -153,7 +153,7 @@ def _make(kind: type[Disturbance[Any]], values: Mapping[str, object], text: str)
     return kind(**values)
 
 
-def name_of(disturbance: Disturbance[Any]) -> str:
+def name_of(disturbance: AnyDisturbance) -> str:
     """What its kind is called here, or where it can be imported from."""
     kind = type(disturbance)
     for name in DISTURBANCES:
@@ -162,6 +162,6 @@ def name_of(disturbance: Disturbance[Any]) -> str:
     return f"{kind.__module__}:{kind.__qualname__}"
 
 
-def attributes_of(disturbance: Disturbance[Any]) -> dict[str, object]:
+def attributes_of(disturbance: AnyDisturbance) -> dict[str, object]:
     """All attributes; what is infinite, which JSON does not have, as the text ``"inf"``."""
     return {name: "inf" if value == math.inf else value for name, value in asdict(disturbance).items()}

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import reduce
-from typing import Any
 
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.observation_layout import Spare
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.disturbance import Disturbance
+from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbance
 
-Disturbances = tuple[Disturbance[Any], ...]
+Disturbances = tuple[AnyDisturbance, ...]
 
 
 def checked_disturbances(given: object) -> Disturbances:

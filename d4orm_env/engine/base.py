@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -94,6 +94,10 @@ class SamplingTask:
         return arrays._replace(inverse_initial_distance=inverse)
 
 
+Rule: TypeAlias = Callable[..., Any]
+"""It returns what the array library makes of its arrays."""
+
+
 class SamplingRules(NamedTuple):
     """The rules that tell one sampling method from another: pure functions of arrays, in NumPy or JAX alike.
 
@@ -108,8 +112,8 @@ class SamplingRules(NamedTuple):
             ``-U_hat / sigma^2 * (U - U_hat)``, summed over time and components, and over robots for team credit.
     """
 
-    weights: Callable[..., Any]
-    adapt: Callable[..., Any] | None = None
+    weights: Rule
+    adapt: Rule | None = None
     importance: float = 0.0
 
 
@@ -260,7 +264,7 @@ class WorldEngine(Engine, Protocol):
         arrays: ProblemArrays,
         layout: ObservationLayout,
         max_cycles: int,
-        orders: NDArray[np.int64],
+        orders: NDArray[np.uint8],
         batch: WorldBatch,
         out: FloatArray,
     ) -> None:

@@ -7,22 +7,33 @@ turns off by some angle. After every block the most promising of the ways so far
 from __future__ import annotations
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from d4orm_env.core import collision, robot_model, transition
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Whole
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.core.robot_model import SPEED
+from d4orm_env.core.robot_model import SPEED, TimeStep
 from d4orm_env.engine import lanes, obstacles, path_index, tiles
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
 from d4orm_env.engine.obstacles import is_closed, touches_static
-from d4orm_env.engine.path_index import count_near, is_unsure, steps_of
-from d4orm_env.engine.tiles import ONE, OPS, OPTIONS, ZERO, compiled, inlined, make_stepper, models_key, to_fixed_tuple
+from d4orm_env.engine.path_index import PathTable, count_near, is_unsure, steps_of
+from d4orm_env.engine.tiles import (
+    ONE,
+    OPS,
+    OPTIONS,
+    ZERO,
+    Row,
+    compiled,
+    inlined,
+    make_stepper,
+    models_key,
+    to_fixed_tuple,
+)
 
 SOURCES = fingerprint((robot_model, transition, collision, lanes, obstacles, tiles, path_index))
 
@@ -98,16 +109,16 @@ class _Beam(NamedTuple):
         moves: ``(N,)`` what was done in the last block.
     """
 
-    states: Any
-    velocities: Any
-    faults: Any
-    bounds: Any
-    before: Any
-    moves: Any
+    states: FloatArray
+    velocities: FloatArray
+    faults: Floats
+    bounds: Floats
+    before: IntArray
+    moves: IntArray
 
 
 @register_jitable(nogil=True, **OPTIONS)
-def _make_beam(size: Any, n: Any, d: Any) -> Any:
+def _make_beam(size: int, n: int, d: int) -> _Beam:
     return _Beam(
         np.empty((size, n), np.float32), np.empty((size, d), np.float32), np.empty(size), np.empty(size),
         np.empty(size, np.int64), np.empty(size, np.int64),
@@ -115,7 +126,7 @@ def _make_beam(size: Any, n: Any, d: Any) -> Any:
 
 
 @compiled
-def _frame(place: Any, goal: Any) -> Any:
+def _frame(place: FloatArray, goal: FloatArray) -> Row:
     """Unit vectors from a place to its goal, across in the plane, and upright to both, one after the other."""
     x, y, z = goal[0] - place[0], goal[1] - place[1], ZERO
     if goal.shape[0] == 3:
@@ -133,13 +144,13 @@ def _frame(place: Any, goal: Any) -> Any:
 
 
 @compiled
-def _turned_2(place: Any, far: Any, turn: Any, frame: Any) -> Any:
+def _turned_2(place: Row, far: np.float32, turn: Row, frame: Row) -> Row:
     x, y, _, i, j, _, _, _ = frame
     return place[0] + far * (turn[0] * x + turn[1] * i), place[1] + far * (turn[0] * y + turn[1] * j)
 
 
 @compiled
-def _turned_3(place: Any, far: Any, turn: Any, frame: Any) -> Any:
+def _turned_3(place: Row, far: np.float32, turn: Row, frame: Row) -> Row:
     x, y, z, i, j, u, v, w = frame
     return (
         place[0] + far * (turn[0] * x + turn[1] * i + turn[2] * u),
@@ -149,12 +160,12 @@ def _turned_3(place: Any, far: Any, turn: Any, frame: Any) -> Any:
 
 
 @compiled
-def _slowed_2(v: Any, pace: Any) -> Any:
+def _slowed_2(v: Row, pace: np.float32) -> Row:
     return v[0] * pace, v[1] * pace
 
 
 @compiled
-def _slowed_3(v: Any, pace: Any) -> Any:
+def _slowed_3(v: Row, pace: np.float32) -> Row:
     return v[0] * pace, v[1] * pace, v[2] * pace
 
 
@@ -162,7 +173,7 @@ _TURNED, _SLOWED = {2: _turned_2, 3: _turned_3}, {2: _slowed_2, 3: _slowed_3}
 
 
 @compiled
-def _is_like_another(ways: Any, way: Any, kept: Any, size: Any, apart2: Any) -> Any:
+def _is_like_another(ways: _Beam, way: Whole, kept: _Beam, size: int, apart2: float) -> bool:
     """Whether a way is about where one of those kept is, about as fast."""
     for other in range(size):
         gap2, change2 = 0.0, 0.0
@@ -177,7 +188,7 @@ def _is_like_another(ways: Any, way: Any, kept: Any, size: Any, apart2: Any) -> 
 
 
 @compiled
-def _keep(ways: Any, way: Any, kept: Any, number: Any) -> None:
+def _keep(ways: _Beam, way: Whole, kept: _Beam, number: Whole) -> None:
     for i in range(ways.states.shape[1]):
         kept.states[number, i] = ways.states[way, i]
     for axis in range(ways.velocities.shape[1]):
@@ -187,7 +198,9 @@ def _keep(ways: Any, way: Any, kept: Any, number: Any) -> None:
 
 
 @compiled
-def _count_beside(table: Any, robot: Any, seekers: Any, r: Any, path: Any, first: Any, last: Any) -> Any:
+def _count_beside(
+    table: PathTable, robot: Whole, seekers: Seekers, r: int, path: FloatArray, first: Whole, last: Whole
+) -> int:
     """How many of the further ways a path meets from one step to another; at its end it stands still."""
     count, end = 0, path.shape[0] - 1
     for other in range(seekers.beside.shape[1]):
@@ -204,8 +217,14 @@ def _count_beside(table: Any, robot: Any, seekers: Any, r: Any, path: Any, first
     return count
 
 
+Search: TypeAlias = Kernel[
+    [ProblemArrays, PathTable, Moves, BeamRules, Seekers, IntArray, FloatArray, FloatArray, BoolArray], None
+]
+"""A kernel of :func:`search_kernel`."""
+
+
 @cache
-def search_kernel(name: str) -> Any:
+def search_kernel(name: str) -> Search:
     """The compiled search for robots of the model with this name.
 
     For a range of the seekers it fills controls ``u`` ``(R, H, m)`` and states ``x`` ``(R, H+1, n)`` from where their
@@ -220,7 +239,9 @@ def search_kernel(name: str) -> Any:
     no_control = (ZERO,) * m
 
     @inlined
-    def aim_of(place: Any, at: Any, limits: Any, goal: Any, goal_radius: Any, moves: Any, number: Any) -> Any:
+    def aim_of(
+        place: FloatArray, at: Row, limits: Row, goal: FloatArray, goal_radius: np.float32, moves: Moves, number: Whole
+    ) -> Row:
         """Where to head: ``place`` is an array, ``at`` a tuple of the same numbers."""
         turn = to_fixed_tuple(moves.turns[number], 3)
         if moves.homewards[number]:
@@ -228,14 +249,14 @@ def search_kernel(name: str) -> Any:
         return turned(at, _FAR * limits[SPEED], turn, _frame(place, goal))
 
     @inlined
-    def control_of(state: Any, aim: Any, pace: Any, limits: Any, h: Any) -> Any:
+    def control_of(state: Row, aim: Row, pace: np.float32, limits: Row, h: TimeStep) -> Row:
         velocity = slowed(approach(state, aim, limits, h, OPS), pace)
         return limit_control(track(state, velocity, limits, h, OPS), limits, OPS)
 
     @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
     def search(
-        arrays: ProblemArrays, table: Any, moves: Moves, rules: BeamRules, seekers: Seekers, part: Any, u: FloatArray,
-        x: FloatArray, found: BoolArray,
+        arrays: ProblemArrays, table: PathTable, moves: Moves, rules: BeamRules, seekers: Seekers, part: IntArray,
+        u: FloatArray, x: FloatArray, found: BoolArray,
     ) -> None:  # fmt: skip
         dt, closed = arrays.time_step, is_closed(arrays)
         h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])

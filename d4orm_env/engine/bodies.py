@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.engine import tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS
@@ -14,7 +13,9 @@ _SOURCES = fingerprint((tiles,))
 
 
 @cached_kernel(_SOURCES, **OPTIONS)
-def meet_bodies(states: Any, radius: Any, bodies: Any, margin: Any, touched: Any, near: Any) -> None:
+def meet_bodies(
+    states: FloatArray, radius: FloatArray, bodies: FloatArray, margin: np.float32, touched: BoolArray, near: BoolArray
+) -> None:
     """Which robots are in contact with a body, and which within the margin of one.
 
     Args:

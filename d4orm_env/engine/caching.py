@@ -4,13 +4,32 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from types import ModuleType
-from typing import Any
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 import numba
+from numba.core.base import BaseContext
 from numba.core.caching import FunctionCache
+from numba.core.codegen import JITCPUCodegen
+from numba.core.typing.templates import Signature
+
+P = ParamSpec("P")
+R_co = TypeVar("R_co", covariant=True)
+
+
+class Kernel(Protocol[P, R_co]):
+    """A function that numba has compiled, or will when it is first called.
+
+    Attributes:
+        signatures: Types of arguments that it is compiled for.
+    """
+
+    @property
+    def signatures(self) -> Sequence[tuple[object, ...]]: ...
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
 
 
 def fingerprint(modules: tuple[ModuleType, ...]) -> str:
@@ -23,19 +42,19 @@ class _SourceKeyedCache(FunctionCache):
     nor what functions one kernel of a factory has that another has not.
     """
 
-    def __init__(self, function: Callable[..., Any], key: str) -> None:
+    def __init__(self, function: Callable[..., object], key: str) -> None:
         super().__init__(function)
         self._source_key = key
 
-    def _index_key(self, sig: Any, codegen: Any) -> Any:
+    def _index_key(self, sig: Signature, codegen: JITCPUCodegen) -> tuple[object, ...]:
         return sig, codegen.magic_tuple(), self._source_key
 
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
+    def load_overload(self, sig: Signature, target_context: BaseContext) -> object:
         """What is kept for arguments of these types, or ``None``."""
         self.kept()
         return super().load_overload(sig, target_context)
 
-    def kept(self) -> tuple[Any, ...]:
+    def kept(self) -> tuple[tuple[object, ...], ...]:
         """Keys of all that is kept; none, from then on, where another version kept what this one cannot read."""
         try:
             return tuple(self._cache_file._load_index())
@@ -44,7 +63,7 @@ class _SourceKeyedCache(FunctionCache):
             return ()
 
 
-def cached_kernel(key: str, variant: str = "", **options: Any) -> Callable[[Callable[..., Any]], Any]:
+def cached_kernel(key: str, variant: str = "", **options: Any) -> Callable[[Callable[P, R_co]], Kernel[P, R_co]]:
     """Decorator: compile with numba on first call, and keep the result on disk under ``key``.
 
     The kernels of a factory need a ``variant`` each, which names their files: processes that compile two of them at the
@@ -54,7 +73,7 @@ def cached_kernel(key: str, variant: str = "", **options: Any) -> Callable[[Call
     process; set ``NUMBA_CACHE_DIR`` to a folder that can.
     """
 
-    def decorate(function: Callable[..., Any]) -> Any:
+    def decorate(function: Callable[P, R_co]) -> Kernel[P, R_co]:
         function.__qualname__ += variant and f"_{variant}"
         dispatcher = numba.njit(nogil=True, **options)(function)
         with suppress(RuntimeError):
@@ -64,9 +83,9 @@ def cached_kernel(key: str, variant: str = "", **options: Any) -> Callable[[Call
     return decorate
 
 
-def has_to_be_compiled(kernel: Any) -> bool:
+def has_to_be_compiled(kernel: Kernel[..., object]) -> bool:
     """Whether a kernel of :func:`cached_kernel` could be kept on disk and has not been yet, as its sources are now."""
-    cache = kernel._cache
+    cache = getattr(kernel, "_cache", None)
     if not isinstance(cache, _SourceKeyedCache):
         return False
     return not any(key[-1] == cache._source_key for key in cache.kept())

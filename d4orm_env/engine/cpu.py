@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -65,7 +64,7 @@ class CpuEngine:
         arrays: ProblemArrays,
         layout: ObservationLayout,
         max_cycles: int,
-        orders: NDArray[np.int64],
+        orders: NDArray[np.uint8],
         batch: WorldBatch,
         out: FloatArray,
     ) -> None:
@@ -145,7 +144,7 @@ class CpuEngine:
 class Sampling:
     """One denoising run: its arrays and the threads that share its tiles."""
 
-    def __init__(self, task: SamplingTask, rules: SamplingRules, num_samples: int, seed: int, threads: Any) -> None:
+    def __init__(self, task: SamplingTask, rules: SamplingRules, num_samples: int, seed: int, threads: Threads) -> None:
         problem = task.problem
         self.task, self.threads = task, threads
         self.arrays = _typed(task.arrays)
@@ -206,7 +205,7 @@ class Sampling:
         pairs = draws.reshape(count, *draws.shape[1:3], -1)[..., : self.base.shape[2]]
         return np.ascontiguousarray(pairs.swapaxes(1, 2))
 
-    def moments(self, weights: Any, with_second: bool) -> tuple[FloatArray, FloatArray]:
+    def moments(self, weights: FloatArray, with_second: bool) -> tuple[FloatArray, FloatArray]:
         """``(H, K, m)`` weighted mean of the noise and, if asked for, of its square."""
         num_steps = len(self.base)
         odd, even = _by_counter(np.asarray(weights, np.float32))

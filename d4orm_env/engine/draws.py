@@ -4,10 +4,10 @@ moment, so that it is the same alone and in any batch.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import NDArray
 
+from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.engine import noise, tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.sampling import BIT_OPS
@@ -17,7 +17,9 @@ _SOURCES = fingerprint((noise, tiles))
 
 
 @cached_kernel(_SOURCES, **OPTIONS)
-def draw_normals(keys: Any, steps: Any, stream: Any, call: Any, out: Any) -> None:
+def draw_normals(
+    keys: NDArray[np.uint32], steps: IntArray, stream: np.uint32, call: np.uint32, out: FloatArray
+) -> None:
     """Fill ``out`` ``(B, N)`` with independent standard normals.
 
     Args:
@@ -41,7 +43,9 @@ def draw_normals(keys: Any, steps: Any, stream: Any, call: Any, out: Any) -> Non
 
 
 @cached_kernel(_SOURCES, **OPTIONS)
-def draw_uniforms(keys: Any, steps: Any, stream: Any, call: Any, out: Any) -> None:
+def draw_uniforms(
+    keys: NDArray[np.uint32], steps: IntArray, stream: np.uint32, call: np.uint32, out: FloatArray
+) -> None:
     """Fill ``out`` ``(B, N)`` with independent numbers, uniform in (0, 1); arguments as for :func:`draw_normals`."""
     for b in range(out.shape[0]):
         key = noise.stream_key(

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core import robot_model, transition
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine import lanes, tiles
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
 from d4orm_env.engine.tiles import (
     OPS,
     OPTIONS,
@@ -91,7 +91,7 @@ class DrivenWays(NamedTuple):
 
 
 @cache
-def drive_kernel(name: str) -> Any:
+def drive_kernel(name: str) -> Kernel[[DriveRules, DrivenWays, IntArray, FloatArray, FloatArray, BoolArray], None]:
     """The compiled drives of robots of the model with this name, each as if nobody else were there.
 
     The kernel fills, for robots of these numbers, controls ``u`` ``(R, V, H, m)``, left alone once docked,
@@ -105,7 +105,7 @@ def drive_kernel(name: str) -> Any:
 
     @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
     def drive(
-        rules: DriveRules, ways: DrivenWays, robots: Any, u: FloatArray, x: FloatArray, arrived: BoolArray
+        rules: DriveRules, ways: DrivenWays, robots: IntArray, u: FloatArray, x: FloatArray, arrived: BoolArray
     ) -> None:
         dt, docking = rules.time_step, (rules.docking[0], rules.docking[1], rules.docks)
         h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])

@@ -9,11 +9,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from numpy.typing import ArrayLike
 
 from d4orm_env.core import collision, reward, transition
@@ -57,12 +58,18 @@ class Worlds(NamedTuple):
         control: ``(K, m, S)`` executed last.
     """
 
-    state: Any
-    docked: Any
-    control: Any
+    state: Array
+    docked: Array
+    control: Array
 
 
-def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, control: Any) -> Worlds:
+Given: TypeAlias = Array | FloatArray
+"""Of the problem: inside a compiled function it is traced."""
+Verdict: TypeAlias = tuple[Array, Array, Array]
+"""Who collided, who violated the margin, and rewards, each ``(K, S)``."""
+
+
+def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, control: Array) -> Worlds:
     """One step of every robot in every world, docking included.
 
     Args:
@@ -80,7 +87,7 @@ def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: World
         limits = tuple(arrays.limits[robots, i][:, None] for i in range(len(model.limit_names)))
         x = tuple(worlds.state[robots, i] for i in range(model.state_size))
         u = functions.limit_control(tuple(control[robots, i] for i in range(model.control_size)), limits, OPS)
-        y: tuple[Any, ...] = transition.advance(functions, x, u, limits, h, OPS)
+        y = transition.advance(functions, x, u, limits, h, OPS)
         gap2 = sum((y[i] - arrays.goal[robots, i][:, None]) ** 2 for i in range(model.dimension))
         speed2 = sum(v * v for v in functions.velocity(y, u, limits, OPS))
         arrives = transition.arrives(gap2, speed2, arrays.squared_goal_radius, arrays.squared_goal_speed)
@@ -95,7 +102,7 @@ def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: World
     return Worlds(state, docked, executed)
 
 
-def robot_contacts(arrays: ProblemArrays, place: Any, extra: Any) -> Any:
+def robot_contacts(arrays: ProblemArrays, place: Array, extra: Array | np.float32) -> Array:
     """``(K, S)`` bool: whether a robot at ``place`` ``(K, d, S)`` is within the radii plus ``extra`` of another."""
     gaps = (place[:, None] - place[None, :]) ** 2
     reach = arrays.radius[:, None] + arrays.radius[None, :] + extra
@@ -103,17 +110,19 @@ def robot_contacts(arrays: ProblemArrays, place: Any, extra: Any) -> Any:
     return (gaps.sum(axis=2) <= reach2[..., None]).any(axis=1)
 
 
-def moving_contacts(arrays: ProblemArrays, place: Any, obstacle: Any, radius: Any, extra: Any) -> Any:
+def moving_contacts(
+    arrays: ProblemArrays, place: Array, obstacle: Given, radius: Given, extra: Array | np.float32
+) -> Array:
     """``(K, S)`` bool: the same towards bodies at ``obstacle`` ``(O, d)`` of ``radius`` ``(O,)``."""
     gaps = (place[:, None] - obstacle[None, :, :, None]) ** 2
     reach = arrays.radius[:, None] + radius[None, :] + extra
     return (gaps.sum(axis=2) <= (reach * reach)[..., None]).any(axis=1)
 
 
-def obstacle_contacts(arrays: ProblemArrays, place: Any, extra: Any) -> Any:
+def obstacle_contacts(arrays: ProblemArrays, place: Array, extra: Array | np.float32) -> Array:
     """``(K, S)`` bool: the same towards static obstacles and bounds."""
     reach = (arrays.radius + extra)[:, None]
-    hit: Any = jnp.zeros((place.shape[0], place.shape[2]), bool)
+    hit = jnp.zeros((place.shape[0], place.shape[2]), bool)
     for axis in range(place.shape[1]):
         hit |= collision.leaves(place[:, axis], reach, arrays.bounds[0, axis], arrays.bounds[1, axis])
     if len(arrays.boxes) + len(arrays.triangles) > FEW and arrays.grid is not None:
@@ -131,7 +140,7 @@ FEW = 8
 """So many obstacles are sooner tested all than looked up."""
 
 
-def _touches_box(box: Any, reach: Any, place: Any) -> Any:
+def _touches_box(box: Given, reach: Given, place: Array) -> Array:
     """Where places ``(K, ., d, S)`` are within reach of rounded boxes, ``box`` being their ``2 d + 1`` columns."""
     d, gap2 = place.shape[-2], jnp.float32(0)
     for axis in range(d):
@@ -141,12 +150,12 @@ def _touches_box(box: Any, reach: Any, place: Any) -> Any:
     return gap2 <= total * total
 
 
-def _touches_triangle(corners: Any, reach: Any, place: Any) -> Any:
+def _touches_triangle(corners: Given, reach: Given, place: Array) -> Array:
     """The same for triangles, ``corners`` being their six columns."""
-    return collision.meets_triangle(corners, place[..., 0, :], place[..., 1, :], reach, jnp.float32(0), OPS)
+    return collision.meets_triangle(tuple(corners), place[..., 0, :], place[..., 1, :], reach, jnp.float32(0), OPS)
 
 
-def _indexed_contacts(arrays: ProblemArrays, place: Any, reach: Any) -> Any:
+def _indexed_contacts(arrays: ProblemArrays, place: Array, reach: Given) -> Array:
     """``(K, S)`` bool: contacts with obstacles, see :mod:`d4orm_env.engine.obstacles`."""
     index, cell = arrays.grid, jnp.int32(0)
     for axis in range(place.shape[1]):
@@ -158,7 +167,7 @@ def _indexed_contacts(arrays: ProblemArrays, place: Any, reach: Any) -> Any:
     sure, near = clearance <= reach - index.slack, clearance <= reach + index.slack
     num_boxes = len(arrays.boxes)
 
-    def test(number: Any, hit: Any) -> Any:
+    def test(number: Array, hit: Array) -> Array:
         item = index.items[jnp.minimum(begin + number, end - 1)]
         here = jnp.zeros_like(hit)
         if num_boxes:
@@ -172,7 +181,7 @@ def _indexed_contacts(arrays: ProblemArrays, place: Any, reach: Any) -> Any:
     return jax.lax.fori_loop(jnp.int32(0), index.longest, test, sure)
 
 
-def goal_distance(arrays: ProblemArrays, place: Any) -> Any:
+def goal_distance(arrays: ProblemArrays, place: Array) -> Array:
     """``(K, S)`` distance of every robot to its goal; its gradient at the goal itself is zero."""
     gap2 = ((place - arrays.goal[..., None]) ** 2).sum(axis=1)
     tiny = jnp.float32(1e-12)
@@ -180,7 +189,9 @@ def goal_distance(arrays: ProblemArrays, place: Any) -> Any:
     return jnp.where(gap2 <= tiny, jnp.float32(0), jnp.sqrt(jnp.maximum(gap2, tiny)))
 
 
-def rewards_of(arrays: ProblemArrays, place: Any, pair_violation: Any, obstacle_violation: Any, penalty: Any) -> Any:
+def rewards_of(
+    arrays: ProblemArrays, place: Array, pair_violation: Array, obstacle_violation: Array, penalty: Array | np.float32
+) -> Array:
     """``(K, S)`` reward of one step; a violation costs ``penalty``."""
     return reward.step_reward(
         goal_distance(arrays, place),
@@ -191,7 +202,7 @@ def rewards_of(arrays: ProblemArrays, place: Any, pair_violation: Any, obstacle_
     )
 
 
-def judge(arrays: ProblemArrays, place: Any) -> tuple[Any, Any, Any]:
+def judge(arrays: ProblemArrays, place: Array) -> Verdict:
     """``(collided, margin violated, reward)`` of teams standing at ``place`` ``(K, d, S)``, each ``(K, S)``."""
     zero = jnp.float32(0)
     contact = robot_contacts(arrays, place, zero) | obstacle_contacts(arrays, place, zero)
@@ -200,14 +211,16 @@ def judge(arrays: ProblemArrays, place: Any) -> tuple[Any, Any, Any]:
 
 
 @partial(jax.jit, static_argnums=0)
-def _step(models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, control: Any) -> Any:
+def _step(models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, control: Array) -> tuple[Worlds, Verdict]:
     worlds = advance_worlds(models, arrays, worlds, control)
     return worlds, judge(arrays, worlds.state[:, : arrays.goal.shape[1]])
 
 
 @partial(jax.jit, static_argnums=0)
-def _rollout(models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, controls: Any) -> Any:
-    def advance(worlds: Worlds, control: Any) -> Any:
+def _rollout(
+    models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, controls: Array
+) -> tuple[Verdict, tuple[Worlds, Verdict]]:
+    def advance(worlds: Worlds, control: Array) -> tuple[Worlds, tuple[Worlds, Verdict]]:
         worlds, verdict = _step(models, arrays, worlds, control)
         return worlds, (worlds, verdict)
 
@@ -229,20 +242,20 @@ class _Inputs(NamedTuple):
     """What it is called with."""
 
     arrays: ProblemArrays
-    base: Any
-    docked: Any
+    base: Array
+    docked: Array
     moving: MovingObstacles | None
-    penalty: Any
-    seed: Any
+    penalty: Array
+    seed: tuple[Array, Array]
 
 
-def _deformations(static: _Static, inputs: _Inputs, step: Any, time: Any, mean: Any, scale: Any) -> Any:
+def _deformations(static: _Static, inputs: _Inputs, step: Array, time: Array, mean: Array, scale: Array) -> Array:
     """``(K, m, M)`` samples of the deformation at one time step."""
     num_robots, size = mean.shape
     counters, cosine, sine = noise.turned(jnp.arange(static.num_samples, dtype=jnp.uint32)[None, :], BIT_OPS)
     robots = jnp.arange(num_robots, dtype=jnp.uint32)[:, None]
     low, high = inputs.seed
-    draws: list[Any] = []
+    draws: list[Array] = []
     for pair in range((size + 1) // 2):
         key = noise.stream_key(low, high, step, robots, time, jnp.uint32(pair), BIT_OPS)
         x, y = noise.normal_pair(counters, key, BIT_OPS)
@@ -250,13 +263,15 @@ def _deformations(static: _Static, inputs: _Inputs, step: Any, time: Any, mean: 
     return mean[..., None] + scale[..., None] * jnp.stack(draws[:size], axis=1)
 
 
-def _score(static: _Static, inputs: _Inputs, step: Any, mean: Any, scale: Any) -> Any:
+def _score(static: _Static, inputs: _Inputs, step: Array, mean: Array, scale: Array) -> tuple[Array, Array]:
     """Roll all samples out; returns rewards ``(K, M)`` summed over time and the deformations ``(H, K, m, M)``."""
     arrays = inputs.arrays
     d = arrays.goal.shape[1]
     num_robots = arrays.goal.shape[0]
 
-    def advance(carry: Any, xs: Any) -> Any:
+    def advance(
+        carry: tuple[Worlds, Array], xs: tuple[Array, Array, Array, Array, FloatArray | None]
+    ) -> tuple[tuple[Worlds, Array], Array]:
         worlds, total = carry
         time, base, mean_now, scale_now, obstacle = xs
         deformation = _deformations(static, inputs, step, time, mean_now, scale_now)
@@ -265,7 +280,7 @@ def _score(static: _Static, inputs: _Inputs, step: Any, mean: Any, scale: Any) -
         near_robot = jnp.zeros((num_robots, static.num_samples), bool)
         if static.collisions:
             near_robot = robot_contacts(arrays, place, arrays.margin)
-            if inputs.moving is not None:
+            if inputs.moving is not None and obstacle is not None:
                 near_robot |= moving_contacts(arrays, place, obstacle, inputs.moving.radius, arrays.margin)
         near_obstacle = obstacle_contacts(arrays, place, arrays.margin)
         return (worlds, total + rewards_of(arrays, place, near_robot, near_obstacle, inputs.penalty)), deformation
@@ -285,16 +300,16 @@ def _score(static: _Static, inputs: _Inputs, step: Any, mean: Any, scale: Any) -
 class _Run(NamedTuple):
     """A denoising run on its way: means, factors on the schedule, rewards ``(N,)`` so far, samples left out."""
 
-    mean: Any
-    factor: Any
-    rewards: Any
-    excluded: Any
+    mean: Array
+    factor: Array
+    rewards: Array
+    excluded: Array
 
 
-def _denoise(static: _Static, inputs: _Inputs, noise_scale: Any, run: _Run, begin: Any, end: Any) -> _Run:
+def _denoise(static: _Static, inputs: _Inputs, noise_scale: Array, run: _Run, begin: Array, end: Array) -> _Run:
     """The steps from ``begin`` to before ``end``; both are arguments, so that one compilation serves all parts."""
 
-    def update(step: Any, run: _Run) -> _Run:
+    def update(step: Array, run: _Run) -> _Run:
         mean, factor, sigma = run.mean, run.factor, noise_scale[step]
         rewards, deformations = _score(static, inputs, step.astype(jnp.uint32), mean, factor * sigma)
         if static.credit == "team":
@@ -302,7 +317,7 @@ def _denoise(static: _Static, inputs: _Inputs, noise_scale: Any, run: _Run, begi
         finite = jnp.isfinite(rewards)
         # A sample that blew up has weight zero, and zero times infinity must not reach the mean.
         usable = jnp.where(jnp.isfinite(deformations), deformations, 0)
-        extra: tuple[Any, ...] = ()
+        extra: tuple[Array, ...] = ()
         if static.rules.importance:
             slope = (inputs.base + mean) / (factor * sigma) ** 2
             ratio = -jnp.einsum("tkms,tkm->ks", usable - mean[..., None], slope)
@@ -323,7 +338,9 @@ def _denoise(static: _Static, inputs: _Inputs, noise_scale: Any, run: _Run, begi
 
 
 @lru_cache(maxsize=256)
-def _compiled_denoise(static: _Static, treedef: Any, shapes: tuple[tuple[tuple[int, ...], Any], ...]) -> Any:
+def _compiled_denoise(
+    static: _Static, treedef: jax.tree_util.PyTreeDef, shapes: tuple[tuple[tuple[int, ...], np.dtype[np.generic]], ...]
+) -> jax.stages.Compiled:
     """The denoising run compiled for arguments of these shapes, ahead of the call."""
     arguments = jax.tree.unflatten(treedef, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes])
     return jax.jit(partial(_denoise, static)).lower(*arguments).compile()
@@ -337,8 +354,8 @@ class JaxEngine:
     def step(self, arrays: ProblemArrays, states: FloatArray, arrived: BoolArray, controls: FloatArray) -> StepResult:
         """See :meth:`d4orm_env.engine.base.Engine.step`."""
         models = names_of_codes(arrays.model_codes)
-        worlds = Worlds(states[..., None], np.asarray(arrived)[..., None], np.zeros_like(controls)[..., None])
-        worlds, verdict = _step(models, arrays, worlds, jnp.asarray(controls)[..., None])
+        before = states[..., None], np.asarray(arrived)[..., None], np.zeros_like(controls)[..., None]
+        worlds, verdict = _step(models, arrays, Worlds(*map(jnp.asarray, before)), jnp.asarray(controls)[..., None])
         collided, margin_violated, rewards = (np.asarray(value)[..., 0] for value in verdict)
         state, docked, control = (np.asarray(value)[..., 0] for value in worlds)
         return StepResult(state, control, docked, collided, margin_violated, rewards)
@@ -351,12 +368,12 @@ class JaxEngine:
         """
         wanted = checked_controls(problem, controls)
         num_robots = problem.num_robots
-        worlds = Worlds(
-            problem.start[..., None],
-            np.zeros((num_robots, 1), bool),
-            np.zeros((num_robots, problem.control_size, 1), np.float32),
+        start = Worlds(
+            jnp.asarray(problem.start[..., None]),
+            jnp.zeros((num_robots, 1), bool),
+            jnp.zeros((num_robots, problem.control_size, 1), jnp.float32),
         )
-        first, (worlds, verdicts) = _rollout(problem.team.models, problem.arrays, worlds, wanted[..., None])
+        first, (worlds, verdicts) = _rollout(problem.team.models, problem.arrays, start, jnp.asarray(wanted[..., None]))
         states = np.concatenate([problem.start[None], np.asarray(worlds.state)[..., 0]])
         collided, margin_violated = (
             np.concatenate([np.asarray(first[i])[None, :, 0], np.asarray(verdicts[i])[..., 0]]) for i in range(2)
@@ -379,14 +396,15 @@ class JaxEngine:
         noise_scale: FloatArray,
         num_samples: int,
         seed: int,
-    ) -> tuple[Any, tuple[Any, ...]]:
+    ) -> tuple[jax.stages.Compiled, tuple[_Inputs, Array, _Run, Array, Array]]:
         problem = task.problem
         docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
-        inputs = _Inputs(task.arrays, task.base, docked, task.moving, np.float32(task.penalty), noise.seed_words(seed))
+        scored = (task.arrays, task.base, docked, task.moving, np.float32(task.penalty), noise.seed_words(seed))
         static = _Static(problem.team.models, rules, num_samples, task.collisions, task.credit)
         scale = np.asarray(noise_scale, np.float32)
-        run = _Run(mean, np.ones_like(mean), np.zeros_like(scale), np.int32(0))
-        arguments = jax.tree.map(jnp.asarray, (inputs, scale, run, np.int32(0), np.int32(len(scale))))
+        begun = (mean, np.ones_like(mean), np.zeros_like(scale), np.int32(0))
+        scored, scale, begun = jax.tree.map(jnp.asarray, (scored, scale, begun))
+        arguments = (_Inputs(*scored), scale, _Run(*begun), jnp.int32(0), jnp.int32(len(scale)))
         leaves, treedef = jax.tree.flatten(arguments)
         return _compiled_denoise(static, treedef, tuple((leaf.shape, leaf.dtype) for leaf in leaves)), arguments
 

@@ -4,27 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from d4orm_env.core import transition
+from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine.jax import OPS, Worlds
 
-Columns = list[Any]
+T = TypeVar("T")
+
+Columns = list[Array]
 """Arrays ``(K,)``, one for each component."""
 UNROLLED = 16
 """So many things are looked at without a loop."""
 
 
 def observe_team(
-    models: tuple[str, ...], arrays: ProblemArrays, world: Worlds, layout: ObservationLayout, time_left: Any
-) -> Any:
+    models: tuple[str, ...], arrays: ProblemArrays, world: Worlds, layout: ObservationLayout, time_left: Array
+) -> Array:
     """``(K, D)`` what every robot sees.
 
     Args:
@@ -36,7 +40,7 @@ def observe_team(
     """
     place = [world.state[:, axis] for axis in range(layout.dimension)]
     velocity, heading = _motion(models, arrays, world)
-    columns = [
+    columns: list[Array | FloatArray] = [
         *velocity,
         *heading,
         jnp.sqrt(_square(velocity)),
@@ -81,14 +85,14 @@ class _Nearest(NamedTuple):
         rows: Columns of each.
     """
 
-    keys: tuple[Any, ...]
-    rows: tuple[tuple[Any, ...], ...]
+    keys: tuple[Array, ...]
+    rows: tuple[tuple[Array, ...], ...]
 
     @classmethod
     def nothing(cls, num_robots: int, count: int, width: int) -> _Nearest:
         return cls((jnp.full(num_robots, jnp.inf),) * count, ((jnp.zeros(num_robots),) * width,) * count)
 
-    def with_another(self, key: Any, columns: Sequence[Any]) -> _Nearest:
+    def with_another(self, key: Array, columns: Sequence[Array]) -> _Nearest:
         """One more where it belongs; the last drops out for it."""
         keys, rows = [], []
         for other, row in zip(self.keys, self.rows):
@@ -99,7 +103,7 @@ class _Nearest(NamedTuple):
             columns = [jnp.where(before, old, new) for new, old in zip(columns, row)]
         return _Nearest(tuple(keys), tuple(rows))
 
-    def with_all(self, look: Callable[[Any], tuple[Any, Columns]], things: Any) -> _Nearest:
+    def with_all(self, look: Callable[[T], tuple[Array, Columns]], things: T) -> _Nearest:
         """With all ``things``, arrays whose first axis they are on; ``look`` gives key and columns of one."""
         scan = partial(jax.lax.scan, unroll=UNROLLED)
         return scan(lambda nearest, thing: (nearest.with_another(*look(thing)), None), self, things)[0]
@@ -114,7 +118,7 @@ def _neighbors(arrays: ProblemArrays, place: Columns, velocity: Columns, count: 
     """``2 d + 2`` for each."""
     robots = jnp.arange(len(arrays.radius))
 
-    def look(other: Any) -> tuple[Any, Columns]:
+    def look(other: tuple[Array, Array, Array | FloatArray]) -> tuple[Array, Columns]:
         number, motion, radius = other
         relative = [theirs - own for theirs, own in zip(motion, (*place, *velocity))]
         key = jnp.where(robots == number, jnp.inf, _square(relative[: len(place)]))
@@ -127,7 +131,7 @@ def _neighbors(arrays: ProblemArrays, place: Columns, velocity: Columns, count: 
 def _obstacles(arrays: ProblemArrays, place: Columns, count: int) -> Columns:
     """``d + 2`` for each."""
 
-    def seen(distance: Any, vector: Columns) -> tuple[Any, Columns]:
+    def seen(distance: Array, vector: Columns) -> tuple[Array, Columns]:
         return distance, [*vector, distance - arrays.radius]
 
     nearest = _Nearest.nothing(len(arrays.radius), count, len(place) + 1)
@@ -139,11 +143,11 @@ def _obstacles(arrays: ProblemArrays, place: Columns, count: int) -> Columns:
     return nearest.columns()
 
 
-def _square(vector: Columns) -> Any:
-    return sum(component * component for component in vector)
+def _square(vector: Columns) -> Array:
+    return sum((component * component for component in vector), jnp.float32(0))
 
 
-def _to_box(box: Any, place: Columns) -> tuple[Any, Columns]:
+def _to_box(box: Array, place: Columns) -> tuple[Array, Columns]:
     """Distance of a rounded box, and the vector to its nearest point."""
     d = len(place)
     offset = [jnp.clip(own, box[axis], box[d + axis]) - own for axis, own in enumerate(place)]
@@ -153,9 +157,9 @@ def _to_box(box: Any, place: Columns) -> tuple[Any, Columns]:
     return distance - radius, [component * share for component in offset]
 
 
-def _to_triangle(corners: Any, place: Columns) -> tuple[Any, Columns]:
+def _to_triangle(corners: Array, place: Columns) -> tuple[Array, Columns]:
     """The same of a triangle."""
-    inside: Any = True
+    inside: Array | bool = True
     nearest: Columns = []
     for edge in range(3):
         corner, end = corners[2 * edge : 2 * edge + 2], corners[2 * ((edge + 1) % 3) :][:2]
@@ -169,7 +173,7 @@ def _to_triangle(corners: Any, place: Columns) -> tuple[Any, Columns]:
     return jnp.sqrt(_square(vector)), vector
 
 
-def _to_walls(bounds: Any, place: Columns) -> list[tuple[Any, Columns]]:
+def _to_walls(bounds: Array | FloatArray, place: Columns) -> list[tuple[Array, Columns]]:
     """The same of the bounds: each axis' lower and upper one."""
     walls = []
     for axis, own in enumerate(place):

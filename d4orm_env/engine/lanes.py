@@ -6,14 +6,28 @@ What holds in some worlds only is a mask, one bit per world, lowest bit first.
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeAlias
 
+import numpy as np
 from llvmlite import ir
+from llvmlite.ir import IRBuilder, Value
 from numba import extending
 from numba.core import types
+from numba.core.base import BaseContext
+from numba.core.types import Type
+from numba.core.typing.context import BaseContext as TypingContext
+from numba.core.typing.templates import Signature
 
-intrinsic: Any = extending.intrinsic
-"""Its calls in compiled code lack the first argument, which type checkers cannot know."""
+from d4orm_env.core.arrays import FloatArray, Whole
+
+Generator: TypeAlias = Callable[[BaseContext, IRBuilder, Signature, tuple[Value, ...]], Value]
+"""What writes a function's instructions."""
+Instructions: TypeAlias = tuple[Signature, Generator]
+"""How numba is told of a function: by its signature, and what writes it."""
+
+intrinsic: Callable[[Callable[..., Instructions]], Callable[..., Any]] = extending.intrinsic
+"""In compiled code it is called with numbers and arrays instead of their types, and without the first argument."""
 
 TILE = 64
 """Worlds per tile, as many as a mask has bits."""
@@ -32,30 +46,32 @@ _BITS = ir.IntType(CHUNK)
 _MASK = ir.IntType(TILE)
 
 
-def _splat(builder: Any, value: Any) -> Any:
+def _splat(builder: IRBuilder, value: Value) -> Value:
     lane = builder.insert_element(ir.Constant(_FLOATS, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
     order = ir.Constant(ir.VectorType(ir.IntType(32), CHUNK), [0] * CHUNK)
     return builder.shuffle_vector(lane, ir.Constant(_FLOATS, ir.Undefined), order)
 
 
-def _place(context: Any, builder: Any, array_type: Any, array: Any, offset: Any, first: int) -> Any:
+def _place(
+    context: BaseContext, builder: IRBuilder, array_type: Type, array: Value, offset: Value, first: int
+) -> Value:
     """The address of ``array[offset + first]`` as that of a vector."""
     data = context.make_array(array_type)(context, builder, array).data
     index = builder.add(offset, ir.Constant(offset.type, first))
     return builder.bitcast(builder.gep(data, [index], inbounds=True), _FLOATS.as_pointer())
 
 
-def _load(context: Any, builder: Any, array_type: Any, array: Any, offset: Any, first: int) -> Any:
+def _load(context: BaseContext, builder: IRBuilder, array_type: Type, array: Value, offset: Value, first: int) -> Value:
     return builder.load(_place(context, builder, array_type, array, offset, first), align=4)
 
 
-def _at_most(builder: Any, first: int, values: Any, bound: Any) -> Any:
+def _at_most(builder: IRBuilder, first: int, values: Value, bound: Value) -> Value:
     """The part of a mask that begins with world ``first``; not a number is not at most anything."""
     bits = builder.bitcast(builder.fcmp_ordered("<=", values, bound), _BITS)
     return builder.shl(builder.zext(bits, _MASK), ir.Constant(_MASK, first))
 
 
-def _squared_gap(builder: Any, pairs: list[tuple[Any, Any]]) -> Any:
+def _squared_gap(builder: IRBuilder, pairs: list[tuple[Value, Value]]) -> Value:
     total = None
     for a, b in pairs:
         gap = builder.fsub(a, b)
@@ -64,14 +80,16 @@ def _squared_gap(builder: Any, pairs: list[tuple[Any, Any]]) -> Any:
     return total
 
 
-def _within(dimension: int, count: int) -> Any:
+def _within(dimension: int, count: int) -> Callable[[FloatArray, Whole, Whole, np.float32], np.uint64]:
     """``(w, a, b, squared_reach) -> mask``: where the places in the rows from ``w[a]`` and ``w[b]`` on are near, in the
     first ``count`` worlds.
     """
 
     @intrinsic
-    def within(typing_context: Any, w: Any, a: Any, b: Any, squared_reach: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def within(typing_context: TypingContext, w: Type, a: Type, b: Type, squared_reach: Type) -> Instructions:
+        def generate(
+            context: BaseContext, builder: IRBuilder, signature: Signature, arguments: tuple[Value, ...]
+        ) -> Value:
             array, offset_a, offset_b, reach = arguments
             bound = _splat(builder, reach)
             mask = ir.Constant(_MASK, 0)
@@ -96,7 +114,9 @@ chunk_within_2, chunk_within_3 = _within(2, CHUNK), _within(3, CHUNK)
 
 
 @intrinsic
-def enclose(typing_context: Any, w: Any, first: Any, step: Any, widening: Any, boxes: Any, begin: Any) -> Any:
+def enclose(
+    typing_context: TypingContext, w: Type, first: Type, step: Type, widening: Type, boxes: Type, begin: Type
+) -> Instructions:
     """Enclose the numbers of ``BLOCK`` rows, the first at ``w[first]`` and the others ``step`` numbers apart.
 
     From ``boxes[begin]`` on this fills a row of ``TILE`` lower ends, world by world, and one of upper ends,
@@ -104,7 +124,7 @@ def enclose(typing_context: Any, w: Any, first: Any, step: Any, widening: Any, b
     is not a number is left out.
     """
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def generate(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: tuple[Value, ...]) -> Value:
         array, offset, distance, extra, target, start = arguments
         offsets = [offset]
         for _ in range(1, BLOCK):
@@ -130,14 +150,16 @@ def enclose(typing_context: Any, w: Any, first: Any, step: Any, widening: Any, b
     return types.void(w, types.int64, types.int64, types.float32, boxes, types.int64), generate
 
 
-def _overlap(dimension: int, width: int, begin: int) -> Any:
+def _overlap(dimension: int, width: int, begin: int) -> Callable[[FloatArray, Whole, Whole], np.uint64]:
     """``(boxes, a, b) -> mask``: where the boxes from ``boxes[a]`` and ``boxes[b]`` on touch, of the worlds or of the
     lanes of :func:`enclose`.
     """
 
     @intrinsic
-    def overlap(typing_context: Any, boxes: Any, a: Any, b: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def overlap(typing_context: TypingContext, boxes: Type, a: Type, b: Type) -> Instructions:
+        def generate(
+            context: BaseContext, builder: IRBuilder, signature: Signature, arguments: tuple[Value, ...]
+        ) -> Value:
             array, offset_a, offset_b = arguments
             mask = ir.Constant(_MASK, 0)
             for first in range(0, width, CHUNK):
@@ -157,14 +179,16 @@ def _overlap(dimension: int, width: int, begin: int) -> Any:
     return overlap
 
 
-def _meets(dimension: int) -> Any:
+def _meets(dimension: int) -> Callable[[FloatArray, Whole, FloatArray, Whole], bool]:
     """``(boxes, a, limits, b) -> bool``: whether in any lane the boxes from ``boxes[a]`` on touch one more box, whose
     lower and upper end along the first axis, and then along the others, are the numbers from ``limits[b]`` on.
     """
 
     @intrinsic
-    def meets(typing_context: Any, boxes: Any, a: Any, limits: Any, b: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def meets(typing_context: TypingContext, boxes: Type, a: Type, limits: Type, b: Type) -> Instructions:
+        def generate(
+            context: BaseContext, builder: IRBuilder, signature: Signature, arguments: tuple[Value, ...]
+        ) -> Value:
             array, offset, others, first = arguments
             data = context.make_array(signature.args[2])(context, builder, others).data
             touch = ir.Constant(ir.VectorType(ir.IntType(1), CHUNK), [1] * CHUNK)
@@ -191,10 +215,10 @@ lanes_meet_2, lanes_meet_3 = _meets(2), _meets(3)
 
 
 @intrinsic
-def copy_chunk(typing_context: Any, source: Any, a: Any, target: Any, b: Any) -> Any:
+def copy_chunk(typing_context: TypingContext, source: Type, a: Type, target: Type, b: Type) -> Instructions:
     """Copy ``CHUNK`` numbers from ``source[a]`` on to ``target[b]`` on."""
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def generate(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: tuple[Value, ...]) -> Value:
         values = _load(context, builder, signature.args[0], arguments[0], arguments[1], 0)
         builder.store(values, _place(context, builder, signature.args[2], arguments[2], arguments[3], 0), align=4)
         return context.get_dummy_value()
@@ -202,7 +226,9 @@ def copy_chunk(typing_context: Any, source: Any, a: Any, target: Any, b: Any) ->
     return types.void(source, types.int64, target, types.int64), generate
 
 
-def _add_turned(power: int) -> Any:
+def _add_turned(
+    power: int,
+) -> Callable[[FloatArray, Whole, FloatArray, Whole, FloatArray, Whole, FloatArray, Whole], None]:
     """``(sums, a, draws, b, cosine, c, sine, d)``: add ``CHUNK`` weighted draws to as many sums, lane by lane.
 
     With power 1 the rows ``(x, y)`` from ``draws[b]`` on add ``cosine x - sine y`` and ``cosine y + sine x`` to the two
@@ -211,13 +237,23 @@ def _add_turned(power: int) -> Any:
 
     @intrinsic
     def add_turned(
-        typing_context: Any, sums: Any, a: Any, draws: Any, b: Any, cosine: Any, c: Any, sine: Any, d: Any
-    ) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            def load(array: int, row: int) -> Any:
+        typing_context: TypingContext,
+        sums: Type,
+        a: Type,
+        draws: Type,
+        b: Type,
+        cosine: Type,
+        c: Type,
+        sine: Type,
+        d: Type,
+    ) -> Instructions:
+        def generate(
+            context: BaseContext, builder: IRBuilder, signature: Signature, arguments: tuple[Value, ...]
+        ) -> Value:
+            def load(array: int, row: int) -> Value:
                 return _load(context, builder, signature.args[array], arguments[array], arguments[array + 1], row)
 
-            def multiply(x: Any, y: Any) -> Any:
+            def multiply(x: Value, y: Value) -> Value:
                 return builder.fmul(x, y)
 
             x, y = load(2, 0), load(2, CHUNK)
@@ -245,10 +281,10 @@ add_turned, add_turned_squares = _add_turned(1), _add_turned(2)
 
 
 @intrinsic
-def at_most(typing_context: Any, w: Any, offset: Any, bound: Any) -> Any:
+def at_most(typing_context: TypingContext, w: Type, offset: Type, bound: Type) -> Instructions:
     """Where ``w[offset:offset + TILE] <= bound``, as a mask."""
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def generate(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: tuple[Value, ...]) -> Value:
         array, start, limit = arguments
         limit = _splat(builder, limit)
         mask = ir.Constant(_MASK, 0)
@@ -261,10 +297,10 @@ def at_most(typing_context: Any, w: Any, offset: Any, bound: Any) -> Any:
 
 
 @intrinsic
-def subtract_where(typing_context: Any, w: Any, offset: Any, mask: Any, amount: Any) -> Any:
+def subtract_where(typing_context: TypingContext, w: Type, offset: Type, mask: Type, amount: Type) -> Instructions:
     """Take ``amount`` from ``w[offset:offset + TILE]`` where the mask is set."""
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def generate(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: tuple[Value, ...]) -> Value:
         array, start, bits, value = arguments
         value, nothing = _splat(builder, value), ir.Constant(_FLOATS, [0.0] * CHUNK)
         for first in range(0, TILE, CHUNK):
@@ -279,14 +315,14 @@ def subtract_where(typing_context: Any, w: Any, offset: Any, mask: Any, amount: 
 
 
 @intrinsic
-def use_wide_registers(typing_context: Any) -> Any:
+def use_wide_registers(typing_context: TypingContext) -> Instructions:
     """Let the compiler use all of the registers' width in the function that calls this.
 
     LLVM keeps to half of AVX-512's by default, because using all of it may slow the clock of some processors a little.
     The kernels gain more than that. Without AVX-512 this does nothing.
     """
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def generate(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: tuple[Value, ...]) -> Value:
         # llvmlite knows no attributes with values, but writes down whatever is in the set.
         set.add(builder.function.attributes, '"prefer-vector-width"="512"')
         return context.get_dummy_value()

@@ -10,25 +10,31 @@ Written in scalar style like the models.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+
+from d4orm_env.core.portable import Real
+from d4orm_env.core.robot_model import N
+
+Word: TypeAlias = Any
+"""32 bits as a library has them: a whole number, or an array of them."""
 
 
 class BitOps(NamedTuple):
     """What the noise needs from whichever library compiles it."""
 
-    uint32: Callable[..., Any]
+    uint32: Callable[..., Word]
     """Wrap to 32 bits."""
-    int32: Callable[..., Any]
+    int32: Callable[..., Word]
     """The same bits as a signed number."""
-    to_float: Callable[..., Any]
+    to_float: Callable[..., Real]
     """Convert an int32 to float32."""
-    float_bits: Callable[..., Any]
+    float_bits: Callable[..., Word]
     """The int32 with the bits of a float32."""
-    bits_float: Callable[..., Any]
+    bits_float: Callable[..., Real]
     """The float32 with the bits of an int32."""
-    sqrt: Callable[..., Any]
+    sqrt: Callable[..., Real]
 
 
 def _u(value: int) -> np.uint32:
@@ -66,12 +72,12 @@ Q0, Q1, Q2, Q3 = (
 )
 
 
-def xor_shift(x: Any, places: Any, ops: BitOps) -> Any:
+def xor_shift(x: Word, places: np.uint32, ops: BitOps) -> Word:
     """``x ^ (x >> places)``; wrapped after every operation, because numba widens 32-bit integers to 64."""
     return ops.uint32(x ^ ops.uint32(x >> places))
 
 
-def hash32(x: Any, key: Any, ops: BitOps) -> Any:
+def hash32(x: Word, key: Word, ops: BitOps) -> Word:
     """A bijection of 32-bit ``x`` for every ``key``, with full avalanche."""
     x = ops.uint32(xor_shift(x, S17, ops) * MULTIPLIER_1)
     x = ops.uint32(x ^ key)
@@ -80,7 +86,9 @@ def hash32(x: Any, key: Any, ops: BitOps) -> Any:
     return xor_shift(x, S14, ops)
 
 
-def stream_key(seed_low: Any, seed_high: Any, step: Any, robot: Any, time: Any, pair: Any, ops: BitOps) -> Any:
+def stream_key(
+    seed_low: Word, seed_high: Word, step: Word, robot: Word, time: Word, pair: Word, ops: BitOps
+) -> tuple[Word, Word]:
     """The two 32-bit keys of one stream; the arguments are uint32."""
     a = hash32(ops.uint32(seed_low + GOLDEN), seed_high, ops)
     a = hash32(ops.uint32(a + step), robot, ops)
@@ -89,7 +97,7 @@ def stream_key(seed_low: Any, seed_high: Any, step: Any, robot: Any, time: Any, 
     return a, b
 
 
-def normal_pair(sample: Any, key: Any, ops: BitOps) -> Any:
+def normal_pair(sample: Word, key: tuple[Word, Word], ops: BitOps) -> tuple[Real, Real]:
     """Two independent standard normals for sample number ``sample`` (uint32) of a stream."""
     first = hash32(ops.uint32(ops.uint32(sample * GOLDEN) ^ key[0]), key[1], ops)
     second = xor_shift(ops.uint32(xor_shift(first, S16, ops) * MULTIPLIER_ANGLE), S15, ops)
@@ -101,7 +109,7 @@ def normal_pair(sample: Any, key: Any, ops: BitOps) -> Any:
     return x, y
 
 
-def turned(sample: Any, ops: BitOps) -> Any:
+def turned(sample: Word, ops: BitOps) -> tuple[Word, Real, Real]:
     """``(counter, cosine, sine)`` of a sample: of every 64 samples the first 16 draw pairs of normals, and the others
     turn them by 180, 90 and 270 degrees.
 
@@ -120,23 +128,23 @@ def turned(sample: Any, ops: BitOps) -> Any:
     return counter, sign * (ONE - upright), sign * upright
 
 
-def unit_interval(bits: Any, ops: BitOps) -> Any:
+def unit_interval(bits: Word, ops: BitOps) -> Real:
     """The centre of one of 2^23 equal cells of (0, 1), chosen by the upper bits."""
     return (ops.to_float(ops.int32(bits >> S9)) + HALF) * TWO_TO_MINUS_23
 
 
-def quarter_sine(t: Any) -> Any:
+def quarter_sine(t: N) -> N:
     """``sin(pi / 2 * t)`` for ``t`` from 0 to 1."""
     t2 = t * t
     return t * (Q0 + t2 * (Q1 + t2 * (Q2 + t2 * Q3)))
 
 
-def with_sign(magnitude: Any, bits: Any, ops: BitOps) -> Any:
+def with_sign(magnitude: N, bits: Word, ops: BitOps) -> N:
     """``magnitude`` with the sign in the highest of ``bits``."""
     return ops.bits_float(ops.int32(ops.float_bits(magnitude) ^ ops.int32(bits & SIGN_BIT)))
 
 
-def log_unit(u: Any, ops: BitOps) -> Any:
+def log_unit(u: N, ops: BitOps) -> N:
     """Natural logarithm of ``u`` in (0, 1)."""
     bits = ops.float_bits(u)
     exponent = ops.int32(ops.int32(bits - SQRT_HALF_BITS) >> EXPONENT_SHIFT)

@@ -6,24 +6,28 @@ are tested one by one, with the arithmetic of :mod:`d4orm_env.core.collision`: t
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 from numba.cpython.unsafe import numbers
+from numpy.typing import NDArray
 
 from d4orm_env.core import collision
+from d4orm_env.core.arrays import FloatArray, Whole
+from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.core.world_index import WorldIndex
 from d4orm_env.engine.lanes import CHUNK, TILE, at_most, use_wide_registers
 from d4orm_env.engine.tiles import NOWHERE, ONE, OPS, ZERO, compiled, inlined, to_fixed_tuple
 
 _HALF = np.float32(0.5)
 _BIT = np.uint64(1)
 
-_trailing_zeros: Any = numbers.trailing_zeros
+_trailing_zeros: Callable[..., int] = numbers.trailing_zeros
 """Its calls in compiled code lack the first argument, which type checkers cannot know."""
 
 
 @inlined
-def _count_steps(index: Any, axis: Any, row: Any, cells: Any) -> None:
+def _count_steps(index: WorldIndex, axis: int, row: FloatArray, cells: NDArray[np.uint32]) -> None:
     """Carry the numbers of the cells that hold some points on by the next axis, along which they lie at ``row``.
 
     Points beyond the grid count as in its outermost cells, not a number as in the first one.
@@ -37,7 +41,7 @@ def _count_steps(index: Any, axis: Any, row: Any, cells: Any) -> None:
 
 
 @inlined
-def _touches_box(box: Any, i: Any, reach: Any, x: Any, y: Any, z: Any) -> Any:
+def _touches_box(box: FloatArray, i: int, reach: np.float32, x: np.float32, y: np.float32, z: np.float32) -> bool:
     d = box.shape[1] // 2
     gap = collision.axis_gap(x, box[i, 0], box[i, d], ZERO, OPS)
     gap2 = gap * gap
@@ -51,7 +55,16 @@ def _touches_box(box: Any, i: Any, reach: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 @inlined
-def _touches(index: Any, boxes: Any, triangles: Any, cell: Any, reach: Any, x: Any, y: Any, z: Any) -> Any:
+def _touches(
+    index: WorldIndex,
+    boxes: FloatArray,
+    triangles: FloatArray,
+    cell: Whole,
+    reach: np.float32,
+    x: np.float32,
+    y: np.float32,
+    z: np.float32,
+) -> bool:
     """Whether a body of this reach touches one of the obstacles that its cell knows."""
     for number in range(index.first[cell], index.first[cell + 1]):
         item = index.items[number]
@@ -64,7 +77,7 @@ def _touches(index: Any, boxes: Any, triangles: Any, cell: Any, reach: Any, x: A
 
 
 @inlined
-def is_closed(arrays: Any) -> Any:
+def is_closed(arrays: ProblemArrays) -> bool:
     """Whether there are obstacles or bounds at all."""
     closed = arrays.grid.clearance.shape[0] > 0
     for axis in range(arrays.goal.shape[1]):
@@ -73,7 +86,7 @@ def is_closed(arrays: Any) -> Any:
 
 
 @inlined
-def touches_static(arrays: Any, reach: Any, place: Any) -> Any:
+def touches_static(arrays: ProblemArrays, reach: np.float32, place: FloatArray) -> bool:
     """Whether a body of this reach touches an obstacle or the bounds where its centre is at ``place`` ``(d,)``."""
     index = arrays.grid
     for axis in range(place.shape[0]):
@@ -93,7 +106,14 @@ def touches_static(arrays: Any, reach: Any, place: Any) -> Any:
 
 
 @compiled
-def _near_indexed(index: Any, boxes: Any, triangles: Any, reach: Any, places: Any, spare: Any) -> Any:
+def _near_indexed(
+    index: WorldIndex,
+    boxes: FloatArray,
+    triangles: FloatArray,
+    reach: np.float32,
+    places: FloatArray,
+    spare: FloatArray,
+) -> np.uint64:
     """Where a body of this reach, its centre in the first rows of ``places``, touches an obstacle."""
     use_wide_registers()
     third = 2 * TILE if index.low.shape[0] == 3 else 0
@@ -110,7 +130,7 @@ def _near_indexed(index: Any, boxes: Any, triangles: Any, reach: Any, places: An
     sure = at_most(spare, 0, reach - index.slack)
     unsure = near & ~sure
     while unsure != NOWHERE:
-        sample: Any = np.int64(_trailing_zeros(unsure))
+        sample = np.int64(_trailing_zeros(unsure))
         unsure &= unsure - _BIT
         x, y, z = places[sample], places[TILE + sample], places[third + sample]
         if _touches(index, boxes, triangles, cells[sample], reach, x, y, z):
@@ -119,7 +139,7 @@ def _near_indexed(index: Any, boxes: Any, triangles: Any, reach: Any, places: An
 
 
 @inlined
-def near_obstacles(arrays: Any, reach: Any, places: Any, spare: Any) -> Any:
+def near_obstacles(arrays: ProblemArrays, reach: np.float32, places: FloatArray, spare: FloatArray) -> np.uint64:
     """Where a body of this reach, its centre in the first rows of ``places``, touches an obstacle or the bounds.
 
     ``spare`` is two rows to overwrite.
@@ -138,7 +158,15 @@ def near_obstacles(arrays: Any, reach: Any, places: Any, spare: Any) -> Any:
 
 
 @compiled
-def may_touch(index: Any, reach: Any, widening: Any, boxes: Any, begin: Any, axis_step: Any, spare: Any) -> Any:
+def may_touch(
+    index: WorldIndex,
+    reach: np.float32,
+    widening: np.float32,
+    boxes: FloatArray,
+    begin: Whole,
+    axis_step: int,
+    spare: FloatArray,
+) -> bool:
     """Whether a body may touch an obstacle anywhere in the lanes of :func:`~d4orm_env.engine.lanes.enclose`.
 
     Args:
@@ -162,7 +190,7 @@ def may_touch(index: Any, reach: Any, widening: Any, boxes: Any, begin: Any, axi
         for lane in range(CHUNK):
             half, middles[lane] = _HALF * (highs[lane] - lows[lane]) - widening, _HALF * (highs[lane] + lows[lane])
             squares[lane] += half * half
-            outside: Any = collision.axis_gap(middles[lane], low, high, ZERO, OPS)
+            outside = collision.axis_gap(middles[lane], low, high, ZERO, OPS)
             beyond[lane] += outside * outside
         _count_steps(index, axis, middles, cells)
         begin += axis_step

@@ -7,13 +7,13 @@ near a way is in one of the few cells around it. Memory and time grow with the r
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core import collision
-from d4orm_env.core.arrays import FloatArray, IntArray
+from d4orm_env.core.arrays import FloatArray, IntArray, Ints, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine import obstacles, tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
@@ -152,32 +152,32 @@ def judge_alone(arrays: ProblemArrays, robots: ArrayLike, ways: FloatArray) -> N
 
 
 @inlined
-def steps_of(table: Any, block: Any) -> Any:
+def steps_of(table: PathTable, block: Whole) -> tuple[Whole, Whole]:
     """First step of a block and the one after the last."""
     first = 1 + block * BLOCK
     return first, min(first + BLOCK, table.places.shape[0])
 
 
 @inlined
-def _cell(table: Any, x: Any) -> Any:
+def _cell(table: PathTable, x: float) -> int:
     """Number of the cell that a coordinate is in, along its axis."""
-    return np.int64(np.floor(x * table.scale))
+    return int(np.floor(x * table.scale))
 
 
 @inlined
-def _bucket(table: Any, i: Any, j: Any, k: Any) -> Any:
+def _bucket(table: PathTable, i: int, j: int, k: int) -> int:
     """The bucket of a cell (the hash of Teschner et al., 2003)."""
     return (i * 73856093 ^ j * 19349663 ^ k * 83492791) & (table.first.shape[1] - 1)
 
 
 @inlined
-def _own_bucket(table: Any, block: Any, robot: Any) -> Any:
+def _own_bucket(table: PathTable, block: Whole, robot: Whole) -> int:
     x, y, z = table.middle[block, robot]
     return _bucket(table, _cell(table, x), _cell(table, y), _cell(table, z))
 
 
 @compiled
-def _enclose(path: Any, dimension: Any, first: Any, last: Any) -> Any:
+def _enclose(path: FloatArray, dimension: int, first: Whole, last: Whole) -> tuple[tuple[float, float, float], float]:
     """The middle of the box round some steps of a path in so many dimensions, and the largest distance from there."""
     x_low, x_high, y_low, y_high, z_low, z_high = np.inf, -np.inf, np.inf, -np.inf, 0.0, 0.0
     for t in range(first, last):
@@ -195,7 +195,7 @@ def _enclose(path: Any, dimension: Any, first: Any, last: Any) -> Any:
 
 
 @inlined
-def _link(table: Any, block: Any, robot: Any) -> None:
+def _link(table: PathTable, block: Whole, robot: Whole) -> None:
     first, last = steps_of(table, block)
     middle, spread = _enclose(table.places[:, robot], table.places.shape[2], first, last)
     table.middle[block, robot, 0], table.middle[block, robot, 1], table.middle[block, robot, 2] = middle
@@ -209,7 +209,7 @@ def _link(table: Any, block: Any, robot: Any) -> None:
 
 
 @inlined
-def _unlink(table: Any, block: Any, robot: Any) -> None:
+def _unlink(table: PathTable, block: Whole, robot: Whole) -> None:
     bucket, following = _own_bucket(table, block, robot), table.following[block]
     other = table.first[block, bucket]
     if other == robot:
@@ -221,14 +221,14 @@ def _unlink(table: Any, block: Any, robot: Any) -> None:
 
 
 @cached_kernel(SOURCES, **OPTIONS)
-def _link_all(table: Any) -> None:
+def _link_all(table: PathTable) -> None:
     for block in range(table.first.shape[0]):
         for robot in range(table.places.shape[1]):
             _link(table, block, robot)
 
 
 @cached_kernel(SOURCES, **OPTIONS)
-def _move(table: Any, robots: Any, paths: Any) -> None:
+def _move(table: PathTable, robots: IntArray, paths: FloatArray) -> None:
     for i in range(robots.shape[0]):
         for t in range(paths.shape[0]):
             for axis in range(paths.shape[2]):
@@ -239,7 +239,16 @@ def _move(table: Any, robots: Any, paths: Any) -> None:
 
 
 @inlined
-def _first_near(table: Any, robot: Any, path: Any, begin: Any, middle: Any, spread: Any, block: Any, other: Any) -> Any:
+def _first_near(
+    table: PathTable,
+    robot: Whole,
+    path: FloatArray,
+    begin: Whole,
+    middle: tuple[float, float, float],
+    spread: float,
+    block: Whole,
+    other: Whole,
+) -> int:
     """The first step of a block at which a robot is within the margin of another, in float64; 0 if at none.
 
     Its path begins with its place at step ``begin``.
@@ -261,7 +270,9 @@ def _first_near(table: Any, robot: Any, path: Any, begin: Any, middle: Any, spre
 
 
 @inlined
-def _cells_around(table: Any, middle: Any, spread: Any) -> Any:
+def _cells_around(
+    table: PathTable, middle: tuple[float, float, float], spread: float
+) -> tuple[int, int, int, int, int, int]:
     """Lowest and highest numbers of the cells around a way through a block, along three axes."""
     x, y, z = middle
     far = table.reach + spread + table.widest[0]
@@ -273,7 +284,7 @@ def _cells_around(table: Any, middle: Any, spread: Any) -> Any:
 
 
 @inlined
-def _is_among(robot: Any, robots: Any) -> Any:
+def _is_among(robot: Whole, robots: IntArray) -> bool:
     found = False
     for other in robots:
         found |= other == robot
@@ -281,7 +292,7 @@ def _is_among(robot: Any, robots: Any) -> Any:
 
 
 @compiled
-def count_near(table: Any, robot: Any, without: Any, path: Any, begin: Any, block: Any) -> Any:
+def count_near(table: PathTable, robot: Whole, without: IntArray, path: FloatArray, begin: Whole, block: Whole) -> int:
     """How many a robot meets in a block, on a path that begins with its place at step ``begin``.
 
     Those in ``without`` ``(N,)`` do not count; it has to be one of them.
@@ -302,7 +313,7 @@ def count_near(table: Any, robot: Any, without: Any, path: Any, begin: Any, bloc
 
 
 @cached_kernel(SOURCES, **OPTIONS)
-def _pairs(table: Any, block_range: Any) -> Any:
+def _pairs(table: PathTable, block_range: IntArray) -> IntArray:
     """Pairs that are near in a range of blocks, each as one number; some of them more than once."""
     num_robots = table.places.shape[1]
     found, count = np.empty(64, np.int64), 0
@@ -329,7 +340,15 @@ def _pairs(table: Any, block_range: Any) -> Any:
 
 
 @cached_kernel(SOURCES, **OPTIONS)
-def _count_met(table: Any, robots: Any, ways: Any, until: Any, robot_range: Any, counts: Any, when: Any) -> None:
+def _count_met(
+    table: PathTable,
+    robots: IntArray,
+    ways: FloatArray,
+    until: IntArray,
+    robot_range: IntArray,
+    counts: Ints,
+    when: Ints,
+) -> None:
     """See :meth:`PathIndex.count_met`."""
     num_ways, num_blocks = ways.shape[1], table.first.shape[0]
     met = np.empty((num_ways, table.places.shape[1]), np.bool_)
@@ -362,7 +381,7 @@ def _count_met(table: Any, robots: Any, ways: Any, until: Any, robot_range: Any,
 
 
 @cached_kernel(SOURCES, **OPTIONS)
-def _judge_alone(arrays: Any, robots: Any, ways: Any, robot_range: Any, steps: Any) -> None:
+def _judge_alone(arrays: ProblemArrays, robots: IntArray, ways: FloatArray, robot_range: IntArray, steps: Ints) -> None:
     """See :func:`judge_alone`."""
     dimension, closed, never = arrays.goal.shape[1], is_closed(arrays), ways.shape[2]
     for r in range(robot_range[0], robot_range[1]):
@@ -381,7 +400,7 @@ def _judge_alone(arrays: Any, robots: Any, ways: Any, robot_range: Any, steps: A
 
 
 @inlined
-def _is_same_place(path: Any, dimension: Any, t: Any) -> Any:
+def _is_same_place(path: FloatArray, dimension: int, t: int) -> bool:
     same = True
     for axis in range(dimension):
         same &= path[t, axis] == path[t - 1, axis]
@@ -389,7 +408,7 @@ def _is_same_place(path: Any, dimension: Any, t: Any) -> Any:
 
 
 @inlined
-def is_unsure(arrays: Any, place: Any, goal: Any) -> Any:
+def is_unsure(arrays: ProblemArrays, place: FloatArray, goal: FloatArray) -> bool:
     """Whether rounding may decide, here or where the plan is judged, if a robot at this place is at its goal."""
     gap2, extent = 0.0, 0.0
     for axis in range(goal.shape[0]):

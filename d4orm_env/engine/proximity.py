@@ -8,11 +8,13 @@ that two robots keep apart in all of them. Every robot gets a list of those befo
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, Ints, Whole
+from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine import lanes, tiles
 from d4orm_env.engine.lanes import (
     BLOCK,
@@ -52,11 +54,11 @@ class Scratch(NamedTuple):
         spare: ``(2 TILE,)`` two rows to overwrite.
     """
 
-    boxes: Any
-    num_robots: Any
-    robots: Any
-    near: Any
-    spare: Any
+    boxes: FloatArray
+    num_robots: Ints
+    robots: Ints
+    near: NDArray[np.uint64]
+    spare: FloatArray
 
 
 class Bodies(NamedTuple):
@@ -69,9 +71,9 @@ class Bodies(NamedTuple):
             margin.
     """
 
-    places: Any
-    radius: Any
-    boxes: Any
+    places: FloatArray
+    radius: FloatArray
+    boxes: FloatArray
 
 
 def make_scratch(num_robots: int, dimension: int) -> Scratch:
@@ -83,7 +85,7 @@ def make_scratch(num_robots: int, dimension: int) -> Scratch:
     )  # fmt: skip
 
 
-def bound_boxes(arrays: Any) -> FloatArray:
+def bound_boxes(arrays: ProblemArrays) -> FloatArray:
     """``(S, d, 2)`` ends of the boxes round what lies beyond each of the bounds, widened by half of the margin."""
     dimension = arrays.goal.shape[1]
     low, high = np.full((2, 0, dimension), np.float32(0))
@@ -95,7 +97,7 @@ def bound_boxes(arrays: Any) -> FloatArray:
     return _widened(low, high, arrays.margin)
 
 
-def make_bodies(places: FloatArray, radius: FloatArray, margin: Any) -> Bodies:
+def make_bodies(places: FloatArray, radius: FloatArray, margin: np.float32) -> Bodies:
     """Bodies of this radius ``(O,)`` at ``places`` ``(H, O, d)``, with their boxes."""
     places, radius = np.ascontiguousarray(places, np.float32), np.ascontiguousarray(radius, np.float32)
     num_steps, num_blocks = len(places), -(-len(places) // BLOCK)
@@ -106,25 +108,25 @@ def make_bodies(places: FloatArray, radius: FloatArray, margin: Any) -> Bodies:
     return Bodies(places, radius, boxes)
 
 
-def _widened(low: Any, high: Any, margin: Any) -> FloatArray:
+def _widened(low: FloatArray, high: FloatArray, margin: np.float32) -> FloatArray:
     widening = _HALF * margin + SLACK
     return np.ascontiguousarray(np.stack([low - widening, high + widening], axis=-1), np.float32)
 
 
 @inlined
-def place_of(k: Any, step: Any, dimension: Any) -> Any:
+def place_of(k: Whole, step: int, dimension: int) -> Whole:
     """Where the rows of robot ``k``'s places after a step of the block begin: a row an axis."""
     return (k * BLOCK + step) * dimension * TILE
 
 
 @inlined
-def box_of(thing: Any, dimension: Any) -> Any:
+def box_of(thing: Whole, dimension: int) -> Whole:
     """Where the rows of a thing's boxes begin."""
     return thing * dimension * BOX
 
 
 @inlined
-def enclose(k: Any, reach: Any, dimension: Any, places: Any, boxes: Any) -> None:
+def enclose(k: int, reach: np.float32, dimension: int, places: FloatArray, boxes: FloatArray) -> None:
     """Make the boxes of robot ``k`` in this block, for its radius and half of the margin as reach."""
     for axis in range(dimension):
         first, begin = place_of(k, 0, dimension) + axis * TILE, box_of(k, dimension) + axis * BOX
@@ -132,7 +134,7 @@ def enclose(k: Any, reach: Any, dimension: Any, places: Any, boxes: Any) -> None
 
 
 @inlined
-def _overlap(a: Any, b: Any, dimension: Any, boxes: Any) -> Any:
+def _overlap(a: Whole, b: Whole, dimension: int, boxes: FloatArray) -> bool:
     """Whether two things may touch in any lane."""
     if dimension == 2:
         return lanes_overlap_2(boxes, box_of(a, dimension), box_of(b, dimension)) != NOWHERE
@@ -140,7 +142,7 @@ def _overlap(a: Any, b: Any, dimension: Any, boxes: Any) -> Any:
 
 
 @inlined
-def _samples_overlap(a: Any, b: Any, dimension: Any, boxes: Any) -> Any:
+def _samples_overlap(a: Whole, b: Whole, dimension: int, boxes: FloatArray) -> np.uint64:
     """The samples in which two robots may touch."""
     if dimension == 2:
         return worlds_overlap_2(boxes, box_of(a, dimension), box_of(b, dimension))
@@ -148,7 +150,7 @@ def _samples_overlap(a: Any, b: Any, dimension: Any, boxes: Any) -> Any:
 
 
 @inlined
-def _near_pair(reach: Any, a: Any, b: Any, dimension: Any, places: Any) -> Any:
+def _near_pair(reach: np.float32, a: Whole, b: Whole, dimension: int, places: FloatArray) -> np.uint64:
     """Where two centres are within reach, of the first ``CHUNK`` samples in the rows from ``a`` and from ``b`` on."""
     if dimension == 2:
         return chunk_within_2(places, a, b, reach * reach)
@@ -156,7 +158,7 @@ def _near_pair(reach: Any, a: Any, b: Any, dimension: Any, places: Any) -> Any:
 
 
 @inlined
-def _meets(k: Any, thing: Any, dimension: Any, boxes: Any, limits: Any) -> Any:
+def _meets(k: int, thing: int, dimension: int, boxes: FloatArray, limits: FloatArray) -> bool:
     """Whether robot ``k`` may touch, in any lane, the thing of this number in ``limits`` ``(. d 2,)``."""
     if dimension == 2:
         return lanes_meet_2(boxes, box_of(k, dimension), limits, thing * 4)
@@ -164,7 +166,7 @@ def _meets(k: Any, thing: Any, dimension: Any, boxes: Any, limits: Any) -> Any:
 
 
 @compiled
-def _list_near(dimension: Any, s: Any) -> None:
+def _list_near(dimension: int, s: Scratch) -> None:
     """List for every robot those before it that it may touch in this block."""
     use_wide_registers()
     for k in range(s.num_robots.shape[0]):
@@ -176,7 +178,7 @@ def _list_near(dimension: Any, s: Any) -> None:
 
 
 @compiled
-def _mark_listed(radius: Any, margin: Any, dimension: Any, places: Any, s: Any) -> None:
+def _mark_listed(radius: FloatArray, margin: np.float32, dimension: int, places: FloatArray, s: Scratch) -> None:
     """Flag robots within the margin of those on their lists."""
     use_wide_registers()
     for k in range(radius.shape[0]):
@@ -195,7 +197,9 @@ def _mark_listed(radius: Any, margin: Any, dimension: Any, places: Any, s: Any) 
 
 
 @compiled
-def _mark_bodies(radius: Any, margin: Any, bodies: Any, first: Any, count: Any, places: Any, s: Any) -> None:
+def _mark_bodies(
+    radius: FloatArray, margin: np.float32, bodies: Bodies, first: int, count: int, places: FloatArray, s: Scratch
+) -> None:
     """Flag robots within the margin of moving bodies."""
     _, num_bodies, dimension = bodies.places.shape
     limits, before = bodies.boxes.reshape(-1), first // BLOCK * num_bodies
@@ -211,7 +215,9 @@ def _mark_bodies(radius: Any, margin: Any, bodies: Any, first: Any, count: Any, 
 
 
 @inlined
-def mark_robots(radius: Any, margin: Any, bodies: Any, first: Any, count: Any, places: Any, s: Any) -> None:
+def mark_robots(
+    radius: FloatArray, margin: np.float32, bodies: Bodies, first: int, count: int, places: FloatArray, s: Scratch
+) -> None:
     """Flag in ``s.near`` robots within the margin of each other or of a body in a block.
 
     Args:
@@ -232,7 +238,7 @@ def mark_robots(radius: Any, margin: Any, bodies: Any, first: Any, count: Any, p
 
 
 @inlined
-def near_static(arrays: Any, k: Any, bounds: Any, boxes: Any, spare: Any) -> Any:
+def near_static(arrays: ProblemArrays, k: int, bounds: FloatArray, boxes: FloatArray, spare: FloatArray) -> bool:
     """Whether in this block any sample of robot ``k`` may be within the margin of an obstacle, or of ``bounds``, see
     :func:`bound_boxes`. ``spare`` is two rows to overwrite.
     """

@@ -8,16 +8,21 @@ quarter of a number per sample and control, because samples share it, which is a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numba.extending import register_jitable
+from numpy.typing import NDArray
 
 from d4orm_env.core import collision, reward, robot_model, transition
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.dynamics import MODELS
+from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.core.robot_model import TimeStep
 from d4orm_env.engine import lanes, noise, obstacles, proximity, tiles
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
 from d4orm_env.engine.lanes import (
     BLOCK,
     TILE,
@@ -28,7 +33,7 @@ from d4orm_env.engine.lanes import (
     use_wide_registers,
 )
 from d4orm_env.engine.noise import DRAWS
-from d4orm_env.engine.proximity import enclose, make_scratch, mark_robots, near_static, place_of
+from d4orm_env.engine.proximity import Bodies, Scratch, enclose, make_scratch, mark_robots, near_static, place_of
 from d4orm_env.engine.tiles import (
     INLINED,
     NOWHERE,
@@ -38,6 +43,8 @@ from d4orm_env.engine.tiles import (
     READ,
     WRITE,
     ZERO,
+    Docking,
+    Row,
     compiled,
     inlined,
     make_stepper,
@@ -66,13 +73,13 @@ class Workspace(NamedTuple):
         scratch: What is noted of who is near what.
     """
 
-    w: Any
-    places: Any
-    draws: Any
-    controls: Any
-    keys: Any
-    standing: Any
-    scratch: Any
+    w: FloatArray
+    places: FloatArray
+    draws: FloatArray
+    controls: FloatArray
+    keys: NDArray[np.uint32]
+    standing: BoolArray
+    scratch: Scratch
 
 
 class Scoring(NamedTuple):
@@ -86,11 +93,11 @@ class Scoring(NamedTuple):
         bounds: ``(S, d, 2)`` boxes beyond them, see :func:`~d4orm_env.engine.proximity.bound_boxes`.
     """
 
-    docked: Any
-    collisions: Any
-    penalty: Any
-    bodies: Any
-    bounds: Any
+    docked: BoolArray
+    collisions: bool
+    penalty: np.float32
+    bodies: Bodies
+    bounds: FloatArray
 
 
 class Drawing(NamedTuple):
@@ -103,10 +110,14 @@ class Drawing(NamedTuple):
         step: Number of the denoising step.
     """
 
-    offset: Any
-    scale: Any
-    seed: Any
-    step: Any
+    offset: FloatArray
+    scale: FloatArray
+    seed: NDArray[np.uint32]
+    step: int
+
+
+Score: TypeAlias = Kernel[[ProblemArrays, Scoring, Drawing, IntArray, Workspace, FloatArray, FloatArray], None]
+"""A kernel of :func:`score_kernel`."""
 
 
 def make_workspace(shape: tuple[int, ...], dimension: int) -> Workspace:
@@ -138,32 +149,32 @@ for _function in (
 
 
 @compiled
-def _uint32(x: Any) -> Any:
+def _uint32(x: int) -> np.uint32:
     return np.uint32(x)
 
 
 @compiled
-def _int32(x: Any) -> Any:
+def _int32(x: int) -> np.int32:
     return np.int32(x)
 
 
 @compiled
-def _to_float(x: Any) -> Any:
+def _to_float(x: np.int32) -> np.float32:
     return np.float32(x)
 
 
 @compiled
-def _float_bits(x: Any) -> Any:
+def _float_bits(x: np.float32) -> np.int32:
     return np.float32(x).view(np.int32)
 
 
 @compiled
-def _bits_float(x: Any) -> Any:
+def _bits_float(x: np.int32) -> np.float32:
     return np.int32(x).view(np.float32)
 
 
 @compiled
-def _sqrt(x: Any) -> Any:
+def _sqrt(x: np.float32) -> np.float32:
     return np.sqrt(x)
 
 
@@ -171,7 +182,7 @@ BIT_OPS = noise.BitOps(_uint32, _int32, _to_float, _float_bits, _bits_float, _sq
 
 
 @compiled
-def _draw(key: Any, first: Any, draws: Any) -> None:
+def _draw(key: tuple[np.uint32, np.uint32], first: int, draws: FloatArray) -> None:
     """Fill two rows with normals, from counter number ``first`` on."""
     use_wide_registers()
     for s in range(DRAWS):
@@ -181,13 +192,15 @@ def _draw(key: Any, first: Any, draws: Any) -> None:
 
 
 @compiled
-def _copy(source: Any, target: Any) -> None:
+def _copy(source: FloatArray, target: FloatArray) -> None:
     for i in range(target.shape[0]):
         target[i] = source[i]
 
 
 @inlined
-def _draw_block(keys: Any, first: Any, begin: Any, count: Any, num_pairs: Any, kept: Any, draws: Any) -> None:
+def _draw_block(
+    keys: NDArray[np.uint32], first: int, begin: int, count: int, num_pairs: int, kept: FloatArray, draws: FloatArray
+) -> None:
     """Draw a robot's noise of a block of ``count`` steps.
 
     Args:
@@ -213,14 +226,14 @@ def _draw_block(keys: Any, first: Any, begin: Any, count: Any, num_pairs: Any, k
 
 
 @compiled
-def _turn2(o: Any, c: Any, d: Any, s: Any) -> Any:
+def _turn2(o: Row, c: Row, d: FloatArray, s: int) -> tuple[Row, Row, Row, Row]:
     x, y = d[s], d[DRAWS + s]
     a, b, across, along = c[0] * x, c[1] * y, c[0] * y, c[1] * x
     return (o[0] + a, o[1] + b), (o[0] - a, o[1] - b), (o[0] - across, o[1] + along), (o[0] + across, o[1] - along)
 
 
 @compiled
-def _turn3(o: Any, c: Any, d: Any, s: Any) -> Any:
+def _turn3(o: Row, c: Row, d: FloatArray, s: int) -> tuple[Row, Row, Row, Row]:
     first, second, third, fourth = _turn2(o, c, d, s)
     # Of the second pair one component is left over.
     a, across = c[2] * d[2 * DRAWS + s], c[2] * d[3 * DRAWS + s]
@@ -229,12 +242,12 @@ def _turn3(o: Any, c: Any, d: Any, s: Any) -> Any:
 
 
 @compiled
-def _vector2(x: Any) -> Any:
+def _vector2(x: FloatArray) -> Row:
     return (x[0], x[1])
 
 
 @compiled
-def _vector3(x: Any) -> Any:
+def _vector3(x: FloatArray) -> Row:
     return (x[0], x[1], x[2])
 
 
@@ -243,7 +256,7 @@ _VECTOR = {2: _vector2, 3: _vector3}
 
 
 @cache
-def _runner(name: str) -> Any:
+def _runner(name: str) -> Callable[..., None]:
     """The compiled steps of one robot of this model in every sample of a tile, which add its reward without violations.
     The draws and controls are the same few rows for every robot: they stay in cache.
     """
@@ -257,8 +270,8 @@ def _runner(name: str) -> Any:
 
     @compiled
     def run(
-        all_limits: Any, h: Any, docking: Any, goal: Any, inverse: Any, offset: Any, scale: Any, draws: Any,
-        controls: Any, places: Any, w: Any,
+        all_limits: FloatArray, h: TimeStep, docking: Docking, goal: Row, inverse: np.float32, offset: FloatArray,
+        scale: FloatArray, draws: FloatArray, controls: FloatArray, places: FloatArray, w: FloatArray,
     ) -> None:  # fmt: skip
         use_wide_registers()
         limits = to_fixed_tuple(all_limits, num_limits)
@@ -291,7 +304,7 @@ def _runner(name: str) -> Any:
 
 
 @inlined
-def _add_standing(goal: Any, inverse: Any, count: Any, w: Any) -> None:
+def _add_standing(goal: FloatArray, inverse: np.float32, count: np.float32, w: FloatArray) -> None:
     """Add the reward, violations aside, of ``count`` steps in which the robot does not move."""
     for s in range(TILE):
         gap2 = ZERO
@@ -302,7 +315,7 @@ def _add_standing(goal: Any, inverse: Any, count: Any, w: Any) -> None:
 
 
 @inlined
-def _all_docked(w: Any) -> Any:
+def _all_docked(w: FloatArray) -> bool:
     if w[DOCKED * TILE] == ZERO:
         return False
     total = ZERO
@@ -312,7 +325,7 @@ def _all_docked(w: Any) -> Any:
 
 
 @inlined
-def _begin_tile(arrays: Any, docked: Any, w: Any) -> None:
+def _begin_tile(arrays: ProblemArrays, docked: BoolArray, w: FloatArray) -> None:
     for k in range(arrays.radius.shape[0]):
         robot = w[k * STRIDE : (k + 1) * STRIDE]
         for i in range(arrays.start.shape[1]):
@@ -322,14 +335,14 @@ def _begin_tile(arrays: Any, docked: Any, w: Any) -> None:
 
 
 @inlined
-def _stay(dimension: Any, w: Any, places: Any) -> None:
+def _stay(dimension: int, w: FloatArray, places: FloatArray) -> None:
     """Fill the places of every step of a block with where the robot is."""
     for step in range(BLOCK):
         _copy(w[: dimension * TILE], places[step * dimension * TILE : (step + 1) * dimension * TILE])
 
 
 @inlined
-def _punish_near(near: Any, count: Any, penalty: Any, w: Any) -> None:
+def _punish_near(near: NDArray[np.uint64], count: int, penalty: np.float32, w: FloatArray) -> None:
     """Take the penalty from the robots that are near each other or a body, in the steps of a block."""
     for k in range(near.shape[0]):
         for step in range(count):
@@ -338,7 +351,15 @@ def _punish_near(near: Any, count: Any, penalty: Any, w: Any) -> None:
 
 
 @inlined
-def _score_tile(run_robot: Any, arrays: Any, scoring: Any, drawing: Any, counter: Any, kept: Any, space: Any) -> None:
+def _score_tile(
+    run_robot: Callable[..., None],
+    arrays: ProblemArrays,
+    scoring: Scoring,
+    drawing: Drawing,
+    counter: int,
+    kept: FloatArray,
+    space: Workspace,
+) -> None:
     """Roll out a tile of samples, noise beginning with this counter; leave summed rewards in rows TOTAL."""
     w, places, draws, controls, standing = space.w, space.places, space.draws, space.controls, space.standing
     keys, scratch, offset, scale = space.keys, space.scratch, drawing.offset, drawing.scale
@@ -392,7 +413,9 @@ def _score_tile(run_robot: Any, arrays: Any, scoring: Any, drawing: Any, counter
 
 
 @compiled
-def _fill_keys(seed: Any, step: Any, num_robots: Any, num_steps: Any, num_pairs: Any, keys: Any) -> None:
+def _fill_keys(
+    seed: NDArray[np.uint32], step: int, num_robots: int, num_steps: int, num_pairs: int, keys: NDArray[np.uint32]
+) -> None:
     """Fill ``keys`` ``(2, K H P)`` with those of the noise streams of a denoising step."""
     for k in range(num_robots):
         for pair in range(num_pairs):
@@ -405,7 +428,7 @@ def _fill_keys(seed: Any, step: Any, num_robots: Any, num_steps: Any, num_pairs:
                 keys[1, stream] = key[1]
 
 
-def score_kernel(models: tuple[str, ...]) -> Any:
+def score_kernel(models: tuple[str, ...]) -> Score:
     """The first pass for a team of these models.
 
     The kernel fills the columns of ``rewards`` ``(K, M)`` that a range of tiles covers with mean rewards over time. Its
@@ -423,12 +446,18 @@ def score_kernel(models: tuple[str, ...]) -> Any:
 
 
 @cache
-def _score_kernel(models: tuple[str, ...]) -> Any:
+def _score_kernel(models: tuple[str, ...]) -> Score:
     run_robot = tiles.dispatch({name: _runner(name) for name in models})
 
     @cached_kernel(models_key(SOURCES, models), variant="_".join(models), **OPTIONS)
     def score_tiles(
-        arrays: Any, scoring: Any, drawing: Any, tile_range: Any, space: Any, kept: Any, rewards: Any
+        arrays: ProblemArrays,
+        scoring: Scoring,
+        drawing: Drawing,
+        tile_range: IntArray,
+        space: Workspace,
+        kept: FloatArray,
+        rewards: FloatArray,
     ) -> None:
         use_wide_registers()
         num_robots, num_samples = rewards.shape
@@ -445,7 +474,7 @@ def _score_kernel(models: tuple[str, ...]) -> Any:
 
 
 @compiled
-def _sum_lanes(sums: Any, time_range: Any, k: Any, moment: Any) -> None:
+def _sum_lanes(sums: FloatArray, time_range: IntArray, k: int, moment: FloatArray) -> None:
     """Put the sums ``(T P 2 DRAWS,)`` of robot ``k`` over their lanes into ``moment`` ``(H, K, m)``."""
     num_controls = moment.shape[2]
     rows = num_controls + num_controls % 2
@@ -462,7 +491,14 @@ def _sum_lanes(sums: Any, time_range: Any, k: Any, moment: Any) -> None:
 
 
 @cached_kernel(SOURCES, **OPTIONS)
-def average_noise(kept: Any, odd: Any, even: Any, time_range: Any, first_moment: Any, second_moment: Any) -> None:
+def average_noise(
+    kept: FloatArray,
+    odd: FloatArray,
+    even: FloatArray,
+    time_range: IntArray,
+    first_moment: FloatArray,
+    second_moment: FloatArray,
+) -> None:
     """Weighted mean of the noise, and of its square.
 
     Args:
@@ -498,7 +534,7 @@ def average_noise(kept: Any, odd: Any, even: Any, time_range: Any, first_moment:
 
 
 @cached_kernel(SOURCES, **OPTIONS)
-def project_noise(kept: Any, centre: Any, along: Any, across: Any) -> None:
+def project_noise(kept: FloatArray, centre: FloatArray, along: FloatArray, across: FloatArray) -> None:
     """Inner products of every draw with a direction, and with that direction turned by 90 degrees.
 
     Args:

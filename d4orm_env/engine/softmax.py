@@ -6,8 +6,6 @@ exponential depend on the processor.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
@@ -32,7 +30,7 @@ _NOTHING = np.float32(-np.inf)
 
 
 @compiled
-def _exponential(x: Any) -> Any:
+def _exponential(x: np.float32) -> np.float32:
     """``exp(x)`` of ``x`` from -87 to 0, and zero below."""
     n = np.floor(x * _ONE_OVER_LN2 + _HALF)
     r = (x - n * _LN2_HIGH) - n * _LN2_LOW
@@ -42,7 +40,7 @@ def _exponential(x: Any) -> Any:
 
 
 @compiled
-def _total(values: Any, sums: Any) -> Any:
+def _total(values: FloatArray, sums: FloatArray) -> np.float32:
     """The sum of ``values``, lane by lane and then by halves; ``sums`` ``(LANES,)`` is overwritten."""
     for lane in range(LANES):
         sums[lane] = ZERO
@@ -61,7 +59,7 @@ def _total(values: Any, sums: Any) -> Any:
 
 
 @compiled
-def _largest(values: Any) -> Any:
+def _largest(values: FloatArray) -> np.float32:
     """The largest of ``values``, or zero where none is more than minus infinity."""
     best = _NOTHING
     for i in range(values.shape[0]):
@@ -70,7 +68,7 @@ def _largest(values: Any) -> Any:
 
 
 @compiled
-def _spread(rewards: Any, row: Any, sums: Any) -> Any:
+def _spread(rewards: FloatArray, row: FloatArray, sums: FloatArray) -> np.float32:
     """Standard deviation of the rewards that are more than minus infinity; ``row`` is overwritten."""
     count = np.float32(0)
     for i in range(row.shape[0]):
@@ -86,7 +84,9 @@ def _spread(rewards: Any, row: Any, sums: Any) -> Any:
 
 
 @compiled
-def _weigh(rewards: Any, log_ratio: Any, scale: Any, cutoff: Any, row: Any, sums: Any) -> None:
+def _weigh(
+    rewards: FloatArray, log_ratio: FloatArray, scale: np.float32, cutoff: np.float32, row: FloatArray, sums: FloatArray
+) -> None:
     """Fill ``row`` with the weights of one row of rewards, whose logarithms are ``scale`` times them."""
     best = _largest(rewards)
     for i in range(row.shape[0]):
@@ -106,14 +106,18 @@ def _weigh(rewards: Any, log_ratio: Any, scale: Any, cutoff: Any, row: Any, sums
 
 
 @cached_kernel(fingerprint((tiles,)), **OPTIONS)
-def _softmax(rewards: Any, log_ratio: Any, temperature: Any, cutoff: Any, weights: Any) -> None:
+def _softmax(
+    rewards: FloatArray, log_ratio: FloatArray, temperature: np.float32, cutoff: np.float32, weights: FloatArray
+) -> None:
     sums = np.empty(LANES, np.float32)
     for k in range(rewards.shape[0]):
         scale = ONE / (temperature * _spread(rewards[k], weights[k], sums))
         _weigh(rewards[k], log_ratio[min(k, log_ratio.shape[0] - 1)], scale, cutoff, weights[k], sums)
 
 
-def softmax_weights(rewards: Any, temperature: float, cutoff: float, log_ratio: Any = None) -> FloatArray:
+def softmax_weights(
+    rewards: FloatArray, temperature: float, cutoff: float, log_ratio: FloatArray | None = None
+) -> FloatArray:
     """``exp(reward / (temperature * standard deviation) + log_ratio)``, normalised to sum to one.
 
     Args:

@@ -11,9 +11,11 @@ from collections.abc import Callable
 from functools import lru_cache
 from queue import SimpleQueue
 from threading import Thread
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
+
+from d4orm_env.core.arrays import IntArray
 
 
 def available_cores() -> int:
@@ -30,19 +32,23 @@ def available_cores() -> int:
     return int(wanted)
 
 
+Task: TypeAlias = tuple[Callable[[IntArray], None], IntArray, SimpleQueue[BaseException | None]]
+"""What is to be done, for which part, and where to say that it is, or what went wrong."""
+
+
 @lru_cache(maxsize=8)
-def _queue(num_threads: int, process: int) -> SimpleQueue[Any]:
+def _queue(num_threads: int, process: int) -> SimpleQueue[Task]:
     """What threads shared by all engines of a process wait for work at; a forked child gets its own.
 
     A denoising step hands out work twice, and an executor takes twice as long to.
     """
-    todo: SimpleQueue[Any] = SimpleQueue()
+    todo: SimpleQueue[Task] = SimpleQueue()
     for _ in range(num_threads):
         Thread(target=_work, args=(todo,), name="d4orm", daemon=True).start()
     return todo
 
 
-def _work(todo: SimpleQueue[Any]) -> None:
+def _work(todo: SimpleQueue[Task]) -> None:
     while True:
         work, part, done = todo.get()
         error = None
@@ -62,7 +68,7 @@ class Threads:
     def __init__(self, num_threads: int) -> None:
         self.num_threads = num_threads
 
-    def over(self, count: int, work: Callable[[Any], None]) -> None:
+    def over(self, count: int, work: Callable[[IntArray], None]) -> None:
         """Call ``work(array([first, last]))`` on parts that together make up ``range(count)``, and wait for all."""
         parts = min(self.num_threads, count)
         if parts <= 1:

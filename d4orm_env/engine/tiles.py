@@ -10,18 +10,31 @@ Who is near what is kept apart, in ``near`` ``(K, 2)``: a bit for every world.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
-from typing import Any
+from typing import Any, Protocol, TypeAlias, TypeVar
 
 import numba
 import numpy as np
 from numba.extending import register_jitable
 from numba.np.unsafe import ndarray
+from numpy.typing import NDArray
 
 from d4orm_env.core import collision, reward, robot_model, transition
+from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.dynamics import COMMON, MODEL_CODES, MODELS, model_digest
-from d4orm_env.core.robot_model import MOVED, Model, ModelFunctions, Ops, RungeKutta, runge_kutta
+from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.core.robot_model import (
+    MOVED,
+    Model,
+    ModelFunction,
+    ModelFunctions,
+    Ops,
+    RungeKutta,
+    TimeStep,
+    Vector,
+    runge_kutta,
+)
 from d4orm_env.engine.lanes import TILE, at_most, use_wide_registers, within_2, within_3
 
 ZERO = np.float32(0)
@@ -36,23 +49,41 @@ STRIDE = ROWS * TILE
 ROBOT, OBSTACLE = 0, 1
 NOWHERE = np.uint64(0)
 
+Row: TypeAlias = tuple[np.float32, ...]
+"""A state, a control, limits, a place or a velocity of one robot in one world."""
+Docking: TypeAlias = tuple[np.float32, np.float32, np.bool_]
+"""Squares of the goal radius and of the goal speed, and whether who has arrived stands there for ever."""
+Mover: TypeAlias = Callable[[bool, Row, Row, Row, TimeStep], Row]
+Docker: TypeAlias = Callable[[bool, Row, Row, Row, Row, Docking], tuple[Row, np.float32, bool]]
+RobotMover: TypeAlias = Callable[[ProblemArrays, int, FloatArray], None]
+MotionReader: TypeAlias = Callable[[ProblemArrays, int, int, FloatArray, FloatArray, FloatArray], None]
+
+F = TypeVar("F", bound=Callable[..., object])
+
+
+class Compiler(Protocol):
+    """A decorator that compiles a function, which otherwise stays what it is."""
+
+    def __call__(self, function: F, /) -> F: ...
+
+
 OPTIONS: dict[str, Any] = {"error_model": "numpy"}
 """No fast mathematics: only what IEEE 754 defines to the bit, in the order in which it is written. Multiply-adds do not
 fuse, sums are not regrouped, nothing is estimated; so a kernel gives the same bits on every processor, however wide its
 registers. What it costs is measured in docs/performance.md."""
 
-UNCOUNTED: dict[str, Any] = OPTIONS | {"_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+UNCOUNTED = OPTIONS | {"_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 """For everything that kernels call: without numba's reference counts, which would cost more than the sums they
 surround, and without what Python would call them by, which takes a fifth to a third of the time of compiling. Such
 functions cannot make arrays, and a call from Python ends the process: tests call them from compiled functions."""
 
-compiled = numba.njit(nogil=True, **UNCOUNTED)
+compiled: Compiler = numba.njit(nogil=True, **UNCOUNTED)
 
-INLINED: dict[str, Any] = UNCOUNTED | {"forceinline": True}
+INLINED = UNCOUNTED | {"forceinline": True}
 """For functions that take functions (a model, ``Ops``): inlining leaves no function pointer behind, so that numba can
 keep the kernels on disk. And for those that take a problem's arrays, which are a long argument to pass by value."""
 
-inlined = numba.njit(nogil=True, **INLINED)
+inlined: Compiler = numba.njit(nogil=True, **INLINED)
 
 for _function in (
     robot_model.norm_scale,
@@ -78,12 +109,12 @@ for _function in (
     register_jitable(**INLINED)(_function)
 
 
-to_fixed_tuple: Any = ndarray.to_fixed_tuple
+to_fixed_tuple: Callable[..., Row] = ndarray.to_fixed_tuple
 """Its calls in compiled code lack the first argument, which type checkers cannot know."""
 
 
 @register_jitable(nogil=True, **OPTIONS)
-def aligned_zeros(size: Any) -> Any:
+def aligned_zeros(size: int) -> FloatArray:
     """A flat float32 array that begins with a cache line, so that no vector load touches two."""
     space = np.zeros(size + 16, np.float32)
     first = np.int64(-(space.ctypes.data // 4) % 16)
@@ -91,17 +122,17 @@ def aligned_zeros(size: Any) -> Any:
 
 
 @compiled
-def _sqrt(x: Any) -> Any:
+def _sqrt(x: float) -> float:
     return math.sqrt(x)
 
 
 @compiled
-def _minimum(a: Any, b: Any) -> Any:
+def _minimum(a: np.float32, b: np.float32) -> np.float32:
     return a if a < b else b
 
 
 @compiled
-def _maximum(a: Any, b: Any) -> Any:
+def _maximum(a: np.float32, b: np.float32) -> np.float32:
     return a if a > b else b
 
 
@@ -116,7 +147,7 @@ _C1, _C2, _C3 = np.float32(4.166664568298827e-2), np.float32(-1.388731625493765e
 
 
 @compiled
-def _shifted_sine(x: Any, quarters: Any) -> Any:
+def _shifted_sine(x: np.float32, quarters: np.int32) -> np.float32:
     """``sin(x + quarters * pi / 2)``."""
     nearest = np.floor(x * _TWO_OVER_PI + _HALF)
     r = (x - nearest * _HALF_PI_HIGH) - nearest * _HALF_PI_LOW
@@ -129,12 +160,12 @@ def _shifted_sine(x: Any, quarters: Any) -> Any:
 
 
 @compiled
-def sine(x: Any) -> Any:
+def sine(x: np.float32) -> np.float32:
     return _shifted_sine(x, np.int32(0))
 
 
 @compiled
-def cosine(x: Any) -> Any:
+def cosine(x: np.float32) -> np.float32:
     return _shifted_sine(x, np.int32(1))
 
 
@@ -144,7 +175,7 @@ _A1, _A2, _A3, _A4 = (np.float32(a) for a in (-3.33329491539e-1, 1.99777106478e-
 
 
 @compiled
-def arctan2(y: Any, x: Any) -> Any:
+def arctan2(y: np.float32, x: np.float32) -> np.float32:
     """Angle of the point ``(x, y)`` to 3e-7 (Cephes, atanf); zero for the origin."""
     wide, tall = abs(x), abs(y)
     larger, smaller = max(wide, tall), min(wide, tall)
@@ -160,7 +191,7 @@ def arctan2(y: Any, x: Any) -> Any:
 
 
 @compiled
-def _where(condition: Any, a: Any, b: Any) -> Any:
+def _where(condition: bool, a: np.float32, b: np.float32) -> np.float32:
     return a if condition else b
 
 
@@ -172,103 +203,103 @@ OPS = Ops(cosine, sine, _sqrt, _minimum, _maximum, arctan2, _where)
 
 
 @compiled
-def _read2(w: Any, o: Any, s: Any) -> Any:
+def _read2(w: FloatArray, o: int, s: int) -> Row:
     return (w[o + s], w[o + TILE + s])
 
 
 @compiled
-def _read3(w: Any, o: Any, s: Any) -> Any:
+def _read3(w: FloatArray, o: int, s: int) -> Row:
     return (w[o + s], w[o + TILE + s], w[o + 2 * TILE + s])
 
 
 @compiled
-def _read4(w: Any, o: Any, s: Any) -> Any:
+def _read4(w: FloatArray, o: int, s: int) -> Row:
     return _read2(w, o, s) + _read2(w, o + 2 * TILE, s)
 
 
 @compiled
-def _read5(w: Any, o: Any, s: Any) -> Any:
+def _read5(w: FloatArray, o: int, s: int) -> Row:
     return _read2(w, o, s) + _read3(w, o + 2 * TILE, s)
 
 
 @compiled
-def _read6(w: Any, o: Any, s: Any) -> Any:
+def _read6(w: FloatArray, o: int, s: int) -> Row:
     return _read3(w, o, s) + _read3(w, o + 3 * TILE, s)
 
 
 @compiled
-def _write2(w: Any, o: Any, s: Any, x: Any) -> None:
+def _write2(w: FloatArray, o: int, s: int, x: Row) -> None:
     w[o + s] = x[0]
     w[o + TILE + s] = x[1]
 
 
 @compiled
-def _write3(w: Any, o: Any, s: Any, x: Any) -> None:
+def _write3(w: FloatArray, o: int, s: int, x: Row) -> None:
     _write2(w, o, s, x)
     w[o + 2 * TILE + s] = x[2]
 
 
 @compiled
-def _write4(w: Any, o: Any, s: Any, x: Any) -> None:
+def _write4(w: FloatArray, o: int, s: int, x: Row) -> None:
     _write3(w, o, s, x)
     w[o + 3 * TILE + s] = x[3]
 
 
 @compiled
-def _write5(w: Any, o: Any, s: Any, x: Any) -> None:
+def _write5(w: FloatArray, o: int, s: int, x: Row) -> None:
     _write4(w, o, s, x)
     w[o + 4 * TILE + s] = x[4]
 
 
 @compiled
-def _write6(w: Any, o: Any, s: Any, x: Any) -> None:
+def _write6(w: FloatArray, o: int, s: int, x: Row) -> None:
     _write4(w, o, s, x)
     w[o + 4 * TILE + s] = x[4]
     w[o + 5 * TILE + s] = x[5]
 
 
 @compiled
-def _pick2(first: Any, x: Any, y: Any) -> Any:
+def _pick2(first: bool, x: Row, y: Row) -> Row:
     return (x[0] if first else y[0], x[1] if first else y[1])
 
 
 @compiled
-def _pick3(first: Any, x: Any, y: Any) -> Any:
+def _pick3(first: bool, x: Row, y: Row) -> Row:
     return (x[0] if first else y[0], x[1] if first else y[1], x[2] if first else y[2])
 
 
 @compiled
-def _pick4(first: Any, x: Any, y: Any) -> Any:
+def _pick4(first: bool, x: Row, y: Row) -> Row:
     return _pick2(first, x, y) + _pick2(first, (x[2], x[3]), (y[2], y[3]))
 
 
 @compiled
-def _pick5(first: Any, x: Any, y: Any) -> Any:
+def _pick5(first: bool, x: Row, y: Row) -> Row:
     return _pick2(first, x, y) + _pick3(first, (x[2], x[3], x[4]), (y[2], y[3], y[4]))
 
 
 @compiled
-def _pick6(first: Any, x: Any, y: Any) -> Any:
+def _pick6(first: bool, x: Row, y: Row) -> Row:
     return _pick3(first, x, y) + _pick3(first, (x[3], x[4], x[5]), (y[3], y[4], y[5]))
 
 
 @compiled
-def _squared_norm2(v: Any) -> Any:
+def _squared_norm2(v: Row) -> np.float32:
     return v[0] * v[0] + v[1] * v[1]
 
 
 @compiled
-def _squared_norm3(v: Any) -> Any:
+def _squared_norm3(v: Row) -> np.float32:
     return v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
 
 
 @compiled
-def _squared_gap2(x: Any, y: Any) -> Any:
+def _squared_gap2(x: Row, y: Row) -> np.float32:
     return _squared_norm2((x[0] - y[0], x[1] - y[1]))
 
 
 @compiled
-def _squared_gap3(x: Any, y: Any) -> Any:
+def _squared_gap3(x: Row, y: Row) -> np.float32:
     return _squared_norm3((x[0] - y[0], x[1] - y[1], x[2] - y[2]))
 
 
@@ -279,13 +310,13 @@ _SQUARED_NORM = {2: _squared_norm2, 3: _squared_norm3}
 SQUARED_GAP = {2: _squared_gap2, 3: _squared_gap3}
 
 
-def _integrator(function: Any) -> Any:
+def _integrator(function: ModelFunction) -> ModelFunction:
     """The function itself, or in scalar style what :class:`RungeKutta` computes."""
     if not isinstance(function, RungeKutta):
         return function
     derivative, moved = inlined(function.derivative), inlined(MOVED[function.state_size])
 
-    def integrate(x: Any, u: Any, limits: Any, h: Any, ops: Any) -> Any:
+    def integrate(x: Vector, u: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
         return runge_kutta(derivative, moved, x, u, limits, h, ops)
 
     return integrate
@@ -309,7 +340,7 @@ def models_key(sources: str, names: tuple[str, ...]) -> str:
     return f"{sources} {[(name, MODEL_CODES[name], model_digest(MODELS[name])) for name in names]}"
 
 
-def make_stepper(model: Model) -> tuple[Any, Any]:
+def make_stepper(model: Model) -> tuple[Mover, Docker]:
     """The two halves of the compiled step of one robot of this model in one world, for a control within its limits.
 
     ``move(standing, x, u, limits, h) -> x`` and ``dock(standing, x, u, limits, goal, docking) -> (x, squared distance
@@ -320,11 +351,11 @@ def make_stepper(model: Model) -> tuple[Any, Any]:
     squared_norm, squared_gap = _SQUARED_NORM[model.dimension], SQUARED_GAP[model.dimension]
 
     @inlined
-    def move(standing: Any, x: Any, u: Any, limits: Any, h: Any) -> Any:
+    def move(standing: bool, x: Row, u: Row, limits: Row, h: TimeStep) -> Row:
         return pick_x(standing, x, transition.advance(functions, x, u, limits, h, OPS))
 
     @inlined
-    def dock(standing: Any, x: Any, u: Any, limits: Any, goal: Any, docking: Any) -> Any:
+    def dock(standing: bool, x: Row, u: Row, limits: Row, goal: Row, docking: Docking) -> tuple[Row, np.float32, bool]:
         gap2 = squared_gap(x, goal)
         speed2 = squared_norm(functions.velocity(x, u, limits, OPS))
         arrives = transition.arrives(gap2, speed2, docking[0], docking[1])
@@ -334,7 +365,7 @@ def make_stepper(model: Model) -> tuple[Any, Any]:
     return move, dock
 
 
-def _mover(model: Model) -> Any:
+def _mover(model: Model) -> Callable[..., None]:
     """The compiled step of one robot of this model in every world of a tile.
 
     It is one long chain of dependent operations. Cut into loops, a core works on more worlds at the same time.
@@ -347,7 +378,7 @@ def _mover(model: Model) -> Any:
     no_control, num_limits = (ZERO,) * model.control_size, len(model.limit_names)
 
     @compiled
-    def run(all_limits: Any, h: Any, docking: Any, w: Any) -> None:
+    def run(all_limits: FloatArray, h: TimeStep, docking: Docking, w: FloatArray) -> None:
         use_wide_registers()
         limits = to_fixed_tuple(all_limits, num_limits)
         for s in range(TILE):
@@ -369,7 +400,7 @@ def _mover(model: Model) -> Any:
     return run
 
 
-def dispatch(branches: Mapping[str, Any]) -> Any:
+def dispatch(branches: Mapping[str, Callable[..., None]]) -> Callable[..., None]:
     """``call(code, *arguments)``: the compiled function of the model with that code, of a table by models' names.
 
     The codes are those of :data:`~d4orm_env.core.dynamics.MODEL_CODES`. Nothing is done for one not in the table, so
@@ -380,7 +411,7 @@ def dispatch(branches: Mapping[str, Any]) -> Any:
     if not others:
 
         @inlined
-        def call_only(code: Any, *arguments: Any) -> None:
+        def call_only(code: int, *arguments: object) -> None:
             if code == own_code:
                 branch(*arguments)
 
@@ -388,7 +419,7 @@ def dispatch(branches: Mapping[str, Any]) -> Any:
     rest = dispatch(dict(others))
 
     @inlined
-    def call(code: Any, *arguments: Any) -> None:
+    def call(code: int, *arguments: object) -> None:
         if code == own_code:
             branch(*arguments)
         else:
@@ -398,7 +429,7 @@ def dispatch(branches: Mapping[str, Any]) -> Any:
 
 
 @cache
-def robot_mover(names: tuple[str, ...]) -> Any:
+def robot_mover(names: tuple[str, ...]) -> RobotMover:
     """``move_robot(arrays, k, w)`` for robots of these models.
 
     It moves robot ``k`` one step in every world of the tile; its control rows hold the executed control afterwards.
@@ -406,7 +437,7 @@ def robot_mover(names: tuple[str, ...]) -> Any:
     move = dispatch({name: _mover(MODELS[name]) for name in names})
 
     @inlined
-    def move_robot(arrays: Any, k: Any, w: Any) -> None:
+    def move_robot(arrays: ProblemArrays, k: int, w: FloatArray) -> None:
         h = transition.TimeStep(arrays.time_step[0], arrays.time_step[1], arrays.time_step[2], arrays.time_step[3])
         docking = (arrays.squared_goal_radius, arrays.squared_goal_speed, arrays.docks)
         move(arrays.model_codes[k], arrays.limits[k], h, docking, w[k * STRIDE : (k + 1) * STRIDE])
@@ -415,7 +446,7 @@ def robot_mover(names: tuple[str, ...]) -> Any:
 
 
 @inlined
-def measure_goal_distance(num_robots: Any, dimension: Any, w: Any) -> None:
+def measure_goal_distance(num_robots: int, dimension: int, w: FloatArray) -> None:
     """Fill the squared distance to the goal from places."""
     for k in range(num_robots):
         robot = w[k * STRIDE : (k + 1) * STRIDE]
@@ -428,7 +459,7 @@ def measure_goal_distance(num_robots: Any, dimension: Any, w: Any) -> None:
 
 
 @inlined
-def near_pair(reach: Any, a: Any, b: Any, dimension: Any, w: Any) -> Any:
+def near_pair(reach: np.float32, a: int, b: int, dimension: int, w: FloatArray) -> np.uint64:
     """Where two centres, in the rows of ``w`` from ``a`` and from ``b`` on, are within ``reach`` of each other."""
     if dimension == 2:
         return within_2(w, a, b, reach * reach)
@@ -436,7 +467,7 @@ def near_pair(reach: Any, a: Any, b: Any, dimension: Any, w: Any) -> Any:
 
 
 @inlined
-def mark_pairs(arrays: Any, extra: Any, w: Any, near: Any) -> None:
+def mark_pairs(arrays: ProblemArrays, extra: np.float32, w: FloatArray, near: NDArray[np.uint64]) -> None:
     """Flag every two robots closer than their radii plus ``extra``."""
     for k in range(1, arrays.radius.shape[0]):
         for other in range(k):
@@ -447,7 +478,7 @@ def mark_pairs(arrays: Any, extra: Any, w: Any, near: Any) -> None:
 
 
 @inlined
-def near_round(reach: Any, centre: Any, axes: Any, places: Any, spare: Any) -> Any:
+def near_round(reach: np.float32, centre: FloatArray, axes: int, places: FloatArray, spare: FloatArray) -> np.uint64:
     """Where the first rows of ``places`` are within ``reach`` of a centre, over two or three axes.
 
     ``spare`` is a row to overwrite.
@@ -463,13 +494,13 @@ def near_round(reach: Any, centre: Any, axes: Any, places: Any, spare: Any) -> A
     return at_most(spare, 0, reach * reach)
 
 
-def _motion_reader(model: Model) -> Any:
+def _motion_reader(model: Model) -> Callable[..., None]:
     velocity_of = inlined(model.functions.velocity)
     read_x, read_u = READ[model.state_size], READ[model.control_size]
     dimension, num_limits = model.dimension, len(model.limit_names)
 
     @compiled
-    def read(all_limits: Any, o: Any, s: Any, w: Any, velocity: Any) -> None:
+    def read(all_limits: FloatArray, o: int, s: int, w: FloatArray, velocity: FloatArray) -> None:
         limits = to_fixed_tuple(all_limits, num_limits)
         v = velocity_of(read_x(w, o + STATE * TILE, s), read_u(w, o + CONTROL * TILE, s), limits, OPS)
         for axis in range(dimension):
@@ -479,7 +510,7 @@ def _motion_reader(model: Model) -> Any:
 
 
 @cache
-def motion_reader(names: tuple[str, ...]) -> Any:
+def motion_reader(names: tuple[str, ...]) -> MotionReader:
     """``read_motion(arrays, k, s, w, velocity, heading)`` for robots of these models.
 
     It fills the velocity ``(d,)`` and the heading's cosine and sine ``(2,)`` of robot ``k`` in world ``s``.
@@ -491,7 +522,9 @@ def motion_reader(names: tuple[str, ...]) -> Any:
         headings[MODEL_CODES[name]] = -1 if index is None else index
 
     @inlined
-    def read_motion(arrays: Any, k: Any, s: Any, w: Any, velocity: Any, heading: Any) -> None:
+    def read_motion(
+        arrays: ProblemArrays, k: int, s: int, w: FloatArray, velocity: FloatArray, heading: FloatArray
+    ) -> None:
         code = arrays.model_codes[k]
         read_velocity(code, arrays.limits[k], k * STRIDE, s, w, velocity)
         index = headings[code]

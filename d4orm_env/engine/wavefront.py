@@ -15,10 +15,11 @@ Worlds of the plane are treated as spatial ones without end in z.
 from __future__ import annotations
 
 import heapq
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Ints, Whole
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine import tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
@@ -34,6 +35,8 @@ of it each time, so as to end in the middle of narrow gaps."""
 _TOLERANCE = 1e-6
 """Rounding of clearances [m]."""
 _NOBODY = np.int32(-1)
+
+Place: TypeAlias = tuple[float, float, float]
 
 
 class Space(NamedTuple):
@@ -55,18 +58,18 @@ class Space(NamedTuple):
         pad: How far from the obstacles the index reaches at least [m].
     """
 
-    low: Any
+    low: Floats
     cell: float
     scale: float
-    size: Any
+    size: IntArray
     rounding: float
-    clearance: Any
-    first: Any
-    items: Any
-    boxes: Any
-    triangles: Any
-    bounds: Any
-    extent: Any
+    clearance: FloatArray
+    first: Ints
+    items: Ints
+    boxes: Floats
+    triangles: Floats
+    bounds: Floats
+    extent: Floats
     pad: float
 
 
@@ -82,12 +85,12 @@ class Lattice(NamedTuple):
         free: ``(N,)`` bool.
     """
 
-    low: Any
+    low: Floats
     step: float
-    size: Any
-    moves: Any
-    places: Any
-    free: Any
+    size: IntArray
+    moves: IntArray
+    places: Floats
+    free: BoolArray
 
 
 class Front(NamedTuple):
@@ -100,10 +103,10 @@ class Front(NamedTuple):
         parents: ``(A,)`` int32 the anchor that comes next on that way; -1 for the goal.
     """
 
-    anchor: Any
-    points: Any
-    values: Any
-    parents: Any
+    anchor: Ints
+    points: Floats
+    values: Floats
+    parents: Ints
 
 
 def make_space(problem: Problem) -> Space:
@@ -135,14 +138,14 @@ def make_space(problem: Problem) -> Space:
     )
 
 
-def _endless(corners: Any) -> Any:
+def _endless(corners: Floats) -> Floats:
     """Lower and upper corners ``(2, ..., d)`` in three dimensions."""
     end = np.full((*corners.shape[1:-1], 3 - corners.shape[-1]), np.inf)
     return np.stack([np.concatenate([corner, side * end], axis=-1) for side, corner in zip((-1, 1), corners)])
 
 
 @inlined
-def _box_distance(boxes: Any, i: Any, x: Any, y: Any, z: Any) -> Any:
+def _box_distance(boxes: Floats, i: int, x: float, y: float, z: float) -> float:
     gx = max(boxes[i, 0] - x, x - boxes[i, 3])
     gy = max(boxes[i, 1] - y, y - boxes[i, 4])
     gz = max(boxes[i, 2] - z, z - boxes[i, 5])
@@ -152,7 +155,7 @@ def _box_distance(boxes: Any, i: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 @compiled
-def _triangle_distance(triangles: Any, i: Any, x: Any, y: Any) -> Any:
+def _triangle_distance(triangles: Floats, i: int, x: float, y: float) -> float:
     nearest, inside = np.inf, True
     for edge in range(3):
         after = 2 * edge + 2 if edge < 2 else 0
@@ -167,21 +170,21 @@ def _triangle_distance(triangles: Any, i: Any, x: Any, y: Any) -> Any:
 
 
 @inlined
-def _to_bounds(space: Any, x: Any, y: Any, z: Any) -> Any:
+def _to_bounds(space: Space, x: float, y: float, z: float) -> float:
     low, high = space.bounds[0], space.bounds[1]
     room = min(min(x - low[0], high[0] - x), min(y - low[1], high[1] - y))
     return min(room, min(z - low[2], high[2] - z))
 
 
 @inlined
-def _to_extent(space: Any, x: Any, y: Any, z: Any) -> Any:
+def _to_extent(space: Space, x: float, y: float, z: float) -> float:
     low, high = space.extent[0], space.extent[1]
     gx, gy, gz = max(low[0] - x, x - high[0], 0.0), max(low[1] - y, y - high[1], 0.0), max(low[2] - z, z - high[2], 0.0)
     return np.sqrt(gx * gx + gy * gy + gz * gz)
 
 
 @inlined
-def _cell(space: Any, x: Any, y: Any, z: Any) -> Any:
+def _cell(space: Space, x: float, y: float, z: float) -> tuple[int, float, float, float]:
     """Number of the cell of a place, of the outermost one beyond the index, and offsets from its centre in cells."""
     low, scale, size = space.low, space.scale, space.size
     x, y, z = (x - low[0]) * scale, (y - low[1]) * scale, (z - low[2]) * scale
@@ -192,7 +195,7 @@ def _cell(space: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 @compiled
-def _to_obstacles(space: Any, x: Any, y: Any, z: Any) -> Any:
+def _to_obstacles(space: Space, x: float, y: float, z: float) -> float:
     """Distance to the nearest obstacle, exact up to ``pad`` and never too large."""
     cell, dx, dy, dz = _cell(space, x, y, z)
     nearest = np.inf
@@ -208,26 +211,26 @@ def _to_obstacles(space: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 @inlined
-def _about_to_obstacles(space: Any, x: Any, y: Any, z: Any) -> Any:
+def _about_to_obstacles(space: Space, x: float, y: float, z: float) -> float:
     """The same, found quickly and too small by a cell or two."""
     cell, dx, dy, dz = _cell(space, x, y, z)
     return space.clearance[cell] - np.sqrt(dx * dx + dy * dy + dz * dz) * space.cell - space.rounding
 
 
 @inlined
-def clearance_at(space: Any, x: Any, y: Any, z: Any) -> Any:
+def clearance_at(space: Space, x: float, y: float, z: float) -> float:
     """Distance of a place from the nearest obstacle or bound, negative inside [m]."""
     return min(_to_obstacles(space, x, y, z), _to_bounds(space, x, y, z))
 
 
 @inlined
-def _distance(a: Any, b: Any) -> Any:
+def _distance(a: Place, b: Place) -> float:
     dx, dy, dz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     return np.sqrt(dx * dx + dy * dy + dz * dz)
 
 
 @compiled
-def _sees(space: Any, reach: Any, a: Any, own_a: Any, b: Any, own_b: Any) -> Any:
+def _sees(space: Space, reach: float, a: Place, own_a: float, b: Place, own_b: float) -> bool:
     """Whether a line is free.
 
     ``own_a`` and ``own_b`` are the clearances at the ends: a place that lies nearer to something than ``reach`` is left
@@ -258,19 +261,19 @@ def _sees(space: Any, reach: Any, a: Any, own_a: Any, b: Any, own_b: Any) -> Any
 
 
 @inlined
-def _indices(lattice: Any, n: Any) -> Any:
+def _indices(lattice: Lattice, n: Whole) -> tuple[int, int, int]:
     """Steps to a node along each axis."""
     size = lattice.size
     return n // (size[2] * size[1]), n // size[2] % size[1], n % size[2]
 
 
 @inlined
-def _place(rows: Any, n: Any) -> Any:
+def _place(rows: Floats, n: Whole) -> Place:
     return (rows[n, 0], rows[n, 1], rows[n, 2])
 
 
 @inlined
-def _corner(lattice: Any, q: Any) -> Any:
+def _corner(lattice: Lattice, q: Place) -> tuple[int, int, int]:
     """Steps along each axis to the node below a place, or to the outermost one."""
     low, step, size = lattice.low, lattice.step, lattice.size
     i = min(max(np.int64((q[0] - low[0]) / step), 0), size[0] - 1)
@@ -279,22 +282,22 @@ def _corner(lattice: Any, q: Any) -> Any:
 
 
 @inlined
-def _neighbour(lattice: Any, move: Any, i: Any, j: Any, k: Any) -> Any:
+def _neighbour(lattice: Lattice, move: int, i: int, j: int, k: int) -> np.int64:
     """The number of a neighbour; -1 beyond the lattice."""
     ni, nj, nk = i + lattice.moves[move, 0], j + lattice.moves[move, 1], k + lattice.moves[move, 2]
     size = lattice.size
     if ni < 0 or nj < 0 or nk < 0 or ni >= size[0] or nj >= size[1] or nk >= size[2]:
-        return -1
+        return np.int64(-1)
     return (ni * size[1] + nj) * size[2] + nk
 
 
 @inlined
-def _between(a: Any, b: Any, share: Any) -> Any:
+def _between(a: Place, b: Place, share: float) -> Place:
     return (a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]), a[2] + share * (b[2] - a[2]))
 
 
 @compiled
-def _turned(space: Any, reach: Any, a: Any, own: Any, p: Any, q: Any) -> Any:
+def _turned(space: Space, reach: float, a: Place, own: float, p: Place, q: Place) -> tuple[Place, Place]:
     """Two places to go round on the way from ``a`` to ``q``, which it does not see and ``p`` beside it does."""
     low, high = 0.0, 1.0
     for _ in range(_HALVINGS):
@@ -319,7 +322,7 @@ def _turned(space: Any, reach: Any, a: Any, own: Any, p: Any, q: Any) -> Any:
 
 
 @compiled
-def _settled(space: Any, lattice: Any, reach: Any, place: Any) -> Any:
+def _settled(space: Space, lattice: Lattice, reach: float, place: Place) -> tuple[Place, bool]:
     """The place, or if a body of this reach does not fit there one less than half a step away where it does.
 
     And whether it does.
@@ -346,7 +349,7 @@ def _settled(space: Any, lattice: Any, reach: Any, place: Any) -> Any:
 
 
 @cached_kernel(SOURCES, variant="settle", **OPTIONS)
-def settle_nodes(space: Any, lattice: Any, reach: Any) -> None:
+def settle_nodes(space: Space, lattice: Lattice, reach: float) -> None:
     """Put the nodes of a lattice where a body of this reach fits, if that is less than half a step away."""
     low, step = lattice.low, lattice.step
     for n in range(lattice.free.shape[0]):
@@ -375,24 +378,31 @@ class _Nodes(NamedTuple):
         tried: ``(M,)`` int32 scratch.
     """
 
-    value: Any
-    anchor: Any
-    hidden: Any
-    tested: Any
-    done: Any
-    tried: Any
+    value: Floats
+    anchor: Ints
+    hidden: Ints
+    tested: BoolArray
+    done: BoolArray
+    tried: Ints
 
 
 @inlined
-def _kept(anchor: Any, own_goal: Any, reach: Any) -> Any:
+def _kept(anchor: Whole, own_goal: float, reach: float) -> float:
     """What is kept around an anchor: all but the goal are clear."""
     return own_goal if anchor == 0 else reach
 
 
 @compiled
 def _seen_anchor(
-    space: Any, lattice: Any, reach: Any, own_goal: Any, nodes: Any, points: Any, values: Any, n: Any
-) -> Any:
+    space: Space,
+    lattice: Lattice,
+    reach: float,
+    own_goal: float,
+    nodes: _Nodes,
+    points: Floats,
+    values: Floats,
+    n: Whole,
+) -> tuple[np.int32, float]:
     """The best anchor of the neighbours of a node that it sees, and the way by it; -1 for none."""
     (i, j, k), q, tried = _indices(lattice, n), _place(lattice.places, n), nodes.tried
     best, chosen, count = np.inf, _NOBODY, 0
@@ -416,7 +426,9 @@ def _seen_anchor(
 
 
 @compiled
-def _way_round(space: Any, lattice: Any, reach: Any, nodes: Any, n: Any, q: Any) -> Any:
+def _way_round(
+    space: Space, lattice: Lattice, reach: float, nodes: _Nodes, n: Whole, q: Place
+) -> tuple[np.int64, float, Place]:
     """The best neighbour to go on from to a node at ``q``, -1 for none, the way by it, and where it bends.
 
     In a narrow gap neighbours may see each other by way of a place between them only; elsewhere it is ``q``.
@@ -442,14 +454,14 @@ def _way_round(space: Any, lattice: Any, reach: Any, nodes: Any, n: Any, q: Any)
 
 
 @compiled
-def _add_anchor(points: Any, values: Any, parents: Any, number: Any, place: Any, parent: Any) -> None:
+def _add_anchor(points: Floats, values: Floats, parents: Ints, number: int, place: Place, parent: int) -> None:
     points[number, 0], points[number, 1], points[number, 2] = place
     values[number] = values[parent] + _distance(place, _place(points, parent))
     parents[number] = parent
 
 
 @cached_kernel(SOURCES, variant="wave", **OPTIONS)
-def _spread(space: Any, lattice: Any, reach: Any, goal: Any, nodes: Any) -> Any:
+def _spread(space: Space, lattice: Lattice, reach: float, goal: Floats, nodes: _Nodes) -> tuple[Floats, Floats, Ints]:
     """See :func:`spread`; anchors, their values and their parents."""
     count, size = lattice.free.shape[0], lattice.size
     value, anchor, hidden = nodes.value, nodes.anchor, nodes.hidden
@@ -459,7 +471,7 @@ def _spread(space: Any, lattice: Any, reach: Any, goal: Any, nodes: Any) -> Any:
     at = _place(points, 0)
     own_goal = clearance_at(space, at[0], at[1], at[2])
     heap = [(0.0, np.int64(0)) for _ in range(0)]
-    around = 2 + np.int64(2 * max(0.0, reach - own_goal) / lattice.step)
+    around = 2 + int(2 * max(0.0, reach - own_goal) / lattice.step)
     low_i, low_j, low_k = _corner(lattice, at)
     for i in range(max(0, low_i - around), min(size[0], low_i + around + 1)):
         for j in range(max(0, low_j - around), min(size[1], low_j + around + 1)):
@@ -519,7 +531,7 @@ def _spread(space: Any, lattice: Any, reach: Any, goal: Any, nodes: Any) -> Any:
     return points[:used].copy(), values[:used].copy(), parents[:used].copy()
 
 
-def spread(space: Space, lattice: Lattice, reach: float, goal: Any) -> Front:
+def spread(space: Space, lattice: Lattice, reach: float, goal: Floats) -> Front:
     """The wavefront of a body of this reach from its goal ``(3,)``."""
     count = len(lattice.free)
     nodes = _Nodes(
@@ -534,7 +546,16 @@ def spread(space: Space, lattice: Lattice, reach: float, goal: Any) -> Front:
 
 
 @cached_kernel(SOURCES, variant="look", **OPTIONS)
-def look(space: Any, lattice: Any, reach: Any, front: Any, places: Any, target: Any, length: Any, anchor: Any) -> None:
+def look(
+    space: Space,
+    lattice: Lattice,
+    reach: float,
+    front: Front,
+    places: Floats,
+    target: Floats,
+    length: Floats,
+    anchor: Ints,
+) -> None:
     """The ways from places of a body of this reach.
 
     Args:
@@ -589,7 +610,7 @@ def look(space: Any, lattice: Any, reach: Any, front: Any, places: Any, target: 
 
 
 @compiled
-def is_free_line(space: Any, reach: Any, tail: Any, head: Any) -> Any:
+def is_free_line(space: Space, reach: float, tail: Floats, head: Floats) -> bool:
     """Whether a body of this reach moves freely straight from one place to another.
 
     An end that lies nearer than that to something is left and reached on a line that comes no nearer.
@@ -599,7 +620,7 @@ def is_free_line(space: Any, reach: Any, tail: Any, head: Any) -> Any:
 
 
 @cached_kernel(SOURCES, variant="lines", **OPTIONS)
-def free_lines(space: Any, reach: Any, tails: Any, heads: Any, free: Any) -> None:
+def free_lines(space: Space, reach: float, tails: Floats, heads: Floats, free: BoolArray) -> None:
     """:func:`is_free_line` of many, from ``tails`` ``(Q, 3)`` to ``heads`` ``(Q, 3)``; ``free`` ``(Q,)`` is output."""
     for b in range(tails.shape[0]):
         free[b] = is_free_line(space, reach, tails[b], heads[b])

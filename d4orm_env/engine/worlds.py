@@ -7,16 +7,20 @@ is a batch of one.
 from __future__ import annotations
 
 from functools import cache, lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numba
 import numpy as np
 from numba.extending import register_jitable
+from numpy.typing import NDArray
 
 from d4orm_env.core import collision, observation, reward, robot_model, transition
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Whole
 from d4orm_env.core.dynamics import COMMON, names_of_codes
+from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine import lanes, obstacles, tiles
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.base import Sight
+from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
 from d4orm_env.engine.lanes import TILE, use_wide_registers
 from d4orm_env.engine.tiles import (
     CONTROL,
@@ -34,6 +38,8 @@ from d4orm_env.engine.tiles import (
     STATE,
     STRIDE,
     ZERO,
+    MotionReader,
+    RobotMover,
     compiled,
     inlined,
     models_key,
@@ -75,21 +81,21 @@ class Worlds(NamedTuple):
         rewards: ``(B, K)`` of each robot where it stands.
     """
 
-    goal: Any
-    inverse: Any
-    state: Any
-    control: Any
-    docked: Any
-    collided: Any
-    violated: Any
-    rewards: Any
+    goal: FloatArray
+    inverse: FloatArray
+    state: FloatArray
+    control: FloatArray
+    docked: BoolArray
+    collided: BoolArray
+    violated: BoolArray
+    rewards: FloatArray
 
 
 # ``worlds`` is a Worlds or has its attributes among others, as a WorldBatch does.
 
 
 @inlined
-def _load_world(worlds: Any, b: Any, s: Any, w: Any) -> None:
+def _load_world(worlds: Worlds | Sight | WorldBatch, b: int, s: Whole, w: FloatArray) -> None:
     """Put world ``b`` into lane ``s`` of a tile."""
     own = min(b, worlds.goal.shape[0] - 1)
     for k in range(worlds.state.shape[1]):
@@ -104,14 +110,14 @@ def _load_world(worlds: Any, b: Any, s: Any, w: Any) -> None:
 
 
 @compiled
-def _load(worlds: Any, first: Any, w: Any) -> None:
+def _load(worlds: Worlds | Sight | WorldBatch, first: int, w: FloatArray) -> None:
     """Put worlds from number ``first`` on into the lanes of a tile."""
     for s in range(min(TILE, worlds.state.shape[0] - first)):
         _load_world(worlds, first + s, s, w)
 
 
 @compiled
-def _store_world(worlds: Any, b: Any, s: Any, w: Any) -> None:
+def _store_world(worlds: Worlds | WorldBatch, b: int, s: Whole, w: FloatArray) -> None:
     """The reverse of :func:`_load_world`, for what a step changes."""
     for k in range(worlds.state.shape[1]):
         o = k * STRIDE + s
@@ -123,12 +129,14 @@ def _store_world(worlds: Any, b: Any, s: Any, w: Any) -> None:
 
 
 @inlined
-def _bit(mask: Any, s: Any) -> Any:
+def _bit(mask: np.uint64, s: int) -> np.uint64:
     return (mask >> np.uint64(s)) & np.uint64(1)
 
 
 @compiled
-def _judge(arrays: Any, worlds: Any, first: Any, w: Any, near: Any) -> None:
+def _judge(
+    arrays: ProblemArrays, worlds: Worlds | WorldBatch, first: int, w: FloatArray, near: NDArray[np.uint64]
+) -> None:
     """Flag contacts and margin violations of the worlds of a tile, and compute rewards."""
     num_robots = arrays.radius.shape[0]
     for k in range(num_robots):
@@ -155,7 +163,7 @@ def _judge(arrays: Any, worlds: Any, first: Any, w: Any, near: Any) -> None:
 
 
 @cache
-def roll_out_kernel(names: tuple[str, ...]) -> Any:
+def roll_out_kernel(names: tuple[str, ...]) -> Kernel[[ProblemArrays, Worlds], None]:
     """A kernel that steps one world through the rows of ``moments.control``, keeping every moment.
 
     ``moments`` is a :class:`Worlds` of ``H+1`` rows, of which the first is the start and has no control. The motion
@@ -164,7 +172,7 @@ def roll_out_kernel(names: tuple[str, ...]) -> Any:
     move_robot = robot_mover(names)
 
     @cached_kernel(models_key(SOURCES, names), variant="_".join(names), **OPTIONS)
-    def roll_out(arrays: Any, moments: Any) -> None:
+    def roll_out(arrays: ProblemArrays, moments: Worlds) -> None:
         use_wide_registers()
         num_robots, dimension = arrays.goal.shape
         w = tiles.aligned_zeros(num_robots * STRIDE)
@@ -190,7 +198,9 @@ def roll_out_kernel(names: tuple[str, ...]) -> Any:
 
 
 @numba.njit(nogil=True, **OPTIONS)
-def _allocate_sensed(num_robots: Any, num_bodies: Any, dimension: Any, num_neighbors: Any, num_obstacles: Any) -> Any:
+def _allocate_sensed(
+    num_robots: int, num_bodies: int, dimension: int, num_neighbors: int, num_obstacles: int
+) -> observation.Sensed:
     everybody = num_robots + num_bodies
     return observation.Sensed(
         np.empty((everybody, dimension), np.float32), np.empty((everybody, dimension), np.float32),
@@ -208,13 +218,13 @@ class View(NamedTuple):
         num_obstacles: Obstacles in it.
     """
 
-    bounds: Any
-    num_neighbors: Any
-    num_obstacles: Any
+    bounds: FloatArray
+    num_neighbors: int
+    num_obstacles: int
 
 
 @compiled
-def _sense_bodies(bodies: Any, num_robots: Any, sensed: Any) -> None:
+def _sense_bodies(bodies: FloatArray, num_robots: int, sensed: observation.Sensed) -> None:
     """Put ``bodies`` ``(N, 2 d + 1)``, position, velocity and radius, behind the robots; no radius is an unseen one."""
     dimension = (bodies.shape[1] - 1) // 2
     for body in range(bodies.shape[0]):
@@ -227,7 +237,15 @@ def _sense_bodies(bodies: Any, num_robots: Any, sensed: Any) -> None:
 
 @inlined
 def _observe(
-    read_motion: Any, arrays: Any, worlds: Any, b: Any, time_left: Any, w: Any, bounds: Any, sensed: Any, out: Any
+    read_motion: MotionReader,
+    arrays: ProblemArrays,
+    worlds: Worlds | Sight | WorldBatch,
+    b: int,
+    time_left: np.float32,
+    w: FloatArray,
+    bounds: FloatArray,
+    sensed: observation.Sensed,
+    out: FloatArray,
 ) -> None:
     """Fill ``out`` ``(K, D)`` with what the robots of world ``b`` of a loaded tile see, inside ``bounds``."""
     (num_robots, dimension), s = arrays.goal.shape, b % TILE
@@ -250,7 +268,9 @@ def _observe(
 
 
 @cache
-def observe_worlds_kernel(names: tuple[str, ...]) -> Any:
+def observe_worlds_kernel(
+    names: tuple[str, ...],
+) -> Kernel[[ProblemArrays, Sight, View, IntArray, FloatArray], None]:
     """A kernel that fills ``out`` ``(B, K, D)`` with what every robot of every world sees.
 
     Args:
@@ -263,7 +283,7 @@ def observe_worlds_kernel(names: tuple[str, ...]) -> Any:
     read_motion = motion_reader(names)
 
     @cached_kernel(models_key(SOURCES, names), variant="_".join(names), **OPTIONS)
-    def observe_worlds(arrays: Any, sight: Any, view: Any, tile_range: Any, out: Any) -> None:
+    def observe_worlds(arrays: ProblemArrays, sight: Sight, view: View, tile_range: IntArray, out: FloatArray) -> None:
         num_robots, dimension = arrays.goal.shape
         w = tiles.aligned_zeros(num_robots * STRIDE)
         sensed = _allocate_sensed(num_robots, sight.bodies.shape[1], dimension, view.num_neighbors, view.num_obstacles)
@@ -305,27 +325,27 @@ class WorldBatch(NamedTuple):
         violations: ``(B, K)`` int64 steps within the margin.
     """
 
-    start: Any
-    goal: Any
-    inverse: Any
-    state: Any
-    control: Any
-    docked: Any
-    steps: Any
-    distance: Any
-    collided: Any
-    violated: Any
-    rewards: Any
-    reward: Any
-    terminated: Any
-    truncated: Any
-    total_reward: Any
-    arrival: Any
-    contacts: Any
-    violations: Any
+    start: FloatArray
+    goal: FloatArray
+    inverse: FloatArray
+    state: FloatArray
+    control: FloatArray
+    docked: BoolArray
+    steps: IntArray
+    distance: FloatArray
+    collided: BoolArray
+    violated: BoolArray
+    rewards: FloatArray
+    reward: Floats
+    terminated: BoolArray
+    truncated: BoolArray
+    total_reward: Floats
+    arrival: IntArray
+    contacts: IntArray
+    violations: IntArray
 
     @classmethod
-    def of(cls, start: Any, goal: Any, inverse: Any, control_size: int) -> WorldBatch:
+    def of(cls, start: FloatArray, goal: FloatArray, inverse: FloatArray, control_size: int) -> WorldBatch:
         """Worlds with these starts and goals, all values but those still to be set by a reset."""
         worlds, robots = inverse.shape
         flags, counts = np.zeros((worlds, robots), np.bool_), np.zeros((worlds, robots), np.int64)
@@ -352,7 +372,7 @@ class WorldBatch(NamedTuple):
 
 
 @compiled
-def _restart(batch: Any, b: Any) -> None:
+def _restart(batch: WorldBatch, b: int) -> None:
     for k in range(batch.docked.shape[1]):
         for i in range(batch.state.shape[2]):
             batch.state[b, k, i] = batch.start[b, k, i]
@@ -366,7 +386,7 @@ def _restart(batch: Any, b: Any) -> None:
 
 
 @compiled
-def _restart_tile(batch: Any, orders: Any, first: Any, count: Any) -> Any:
+def _restart_tile(batch: WorldBatch, orders: NDArray[np.uint8], first: int, count: int) -> tuple[bool, bool]:
     """Reset the worlds of a tile that are to be reset, and say whether any is to be stepped, or not to be skipped."""
     moving, busy = False, False
     for b in range(first, first + count):
@@ -378,7 +398,7 @@ def _restart_tile(batch: Any, orders: Any, first: Any, count: Any) -> Any:
 
 
 @compiled
-def _tally(batch: Any, max_cycles: Any, b: Any) -> None:
+def _tally(batch: WorldBatch, max_cycles: int, b: int) -> None:
     """Count the step that world ``b`` has just taken, and see whether its episode has ended."""
     num_robots = batch.docked.shape[1]
     batch.steps[b] += 1
@@ -399,7 +419,15 @@ def _tally(batch: Any, max_cycles: Any, b: Any) -> None:
 
 
 @inlined
-def _move_tile(move_robot: Any, arrays: Any, batch: Any, orders: Any, first: Any, count: Any, w: Any) -> None:
+def _move_tile(
+    move_robot: RobotMover,
+    arrays: ProblemArrays,
+    batch: WorldBatch,
+    orders: NDArray[np.uint8],
+    first: int,
+    count: int,
+    w: FloatArray,
+) -> None:
     """Step the worlds of a tile that are to be stepped; the others wait as if all their robots had docked."""
     num_robots = batch.docked.shape[1]
     for s in range(count):
@@ -417,7 +445,9 @@ def _move_tile(move_robot: Any, arrays: Any, batch: Any, orders: Any, first: Any
 
 
 @cache
-def advance_worlds_kernel(names: tuple[str, ...]) -> Any:
+def advance_worlds_kernel(
+    names: tuple[str, ...],
+) -> Kernel[[ProblemArrays, View, int, NDArray[np.uint8], WorldBatch, IntArray, FloatArray], None]:
     """A kernel that steps, resets and observes worlds, each as it is ordered to.
 
     Args:
@@ -436,7 +466,13 @@ def advance_worlds_kernel(names: tuple[str, ...]) -> Any:
 
     @cached_kernel(models_key(SOURCES, names), variant="_".join(names), **OPTIONS)
     def advance_worlds(
-        arrays: Any, view: Any, max_cycles: Any, orders: Any, batch: Any, tile_range: Any, out: Any
+        arrays: ProblemArrays,
+        view: View,
+        max_cycles: int,
+        orders: NDArray[np.uint8],
+        batch: WorldBatch,
+        tile_range: IntArray,
+        out: FloatArray,
     ) -> None:
         use_wide_registers()
         num_robots, dimension = arrays.goal.shape
@@ -471,9 +507,9 @@ def advance_worlds_kernel(names: tuple[str, ...]) -> Any:
 class WorldKernels(NamedTuple):
     """The kernels that step and observe teams of some models."""
 
-    roll_out: Any
-    observe_worlds: Any
-    advance_worlds: Any
+    roll_out: Kernel[[ProblemArrays, Worlds], None]
+    observe_worlds: Kernel[[ProblemArrays, Sight, View, IntArray, FloatArray], None]
+    advance_worlds: Kernel[[ProblemArrays, View, int, NDArray[np.uint8], WorldBatch, IntArray, FloatArray], None]
 
 
 def world_kernels(models: tuple[str, ...]) -> WorldKernels:

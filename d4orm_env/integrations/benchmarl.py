@@ -8,12 +8,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from d4orm_env.integrations.torchrl import GROUP, TorchRLNavigation
 
 try:
     from benchmarl.environments.common import TaskClass
+    from tensordict import TensorDictBase
     from torchrl.data import Composite
 except ModuleNotFoundError as error:
     missing = (error.name or "benchmarl").partition(".")[0]
@@ -39,7 +39,7 @@ class NavigationTask(TaskClass):
     """
 
     def get_env_fun(
-        self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any
+        self, num_envs: int, continuous_actions: bool, seed: int | None, device: str
     ) -> Callable[[], TorchRLNavigation]:
         """What makes the environment; see BenchMARL."""
         config = dict(self.config)
@@ -80,7 +80,7 @@ class NavigationTask(TaskClass):
         return "d4orm"
 
     @staticmethod
-    def log_info(batch: Any) -> dict[str, float]:
+    def log_info(batch: TensorDictBase) -> dict[str, float]:
         """The success rate of the episodes that end in a batch."""
         ended = batch["next", "done"][..., 0]
         if not ended.any():

@@ -26,7 +26,7 @@ except ModuleNotFoundError as error:
 
 __all__ = ["JaxMARLNavigation"]
 
-ByAgent = dict[str, Any]
+ByAgent = dict[str, jax.Array]
 
 
 class JaxMARLNavigation(MultiAgentEnv):
@@ -67,7 +67,7 @@ class JaxMARLNavigation(MultiAgentEnv):
 
     def step_env(
         self, key: jax.Array, state: EnvState, actions: ByAgent
-    ) -> tuple[ByAgent, EnvState, ByAgent, ByAgent, dict[str, Any]]:
+    ) -> tuple[ByAgent, EnvState, ByAgent, ByAgent, dict[str, jax.Array]]:
         """One step without auto-reset, which ``step`` adds; ``actions`` are controls ``(m,)`` by agent."""
         controls = jnp.stack([actions[agent] for agent in self.agents])
         state, moment = self.world.advance(key, state, controls)

@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.scenarios.problems import ScenarioLike
@@ -70,7 +71,7 @@ class TorchRLNavigation(EnvBase):
         num_robots: int | None = None,
         *,
         seed: int | None = None,
-        device: Any = "cpu",
+        device: torch.device | str = "cpu",
         **options: Any,
     ) -> None:
         self.worlds = NavigationVectorEnv(num_worlds, scenario, num_robots, autoreset_mode="Disabled", **options)
@@ -103,16 +104,16 @@ class TorchRLNavigation(EnvBase):
         ends = (torch.as_tensor(np.broadcast_to(end, shape).copy(), device=self.device) for end in (low, high))
         return Bounded(*ends, shape, device=self.device, dtype=torch.float32)
 
-    def _composite(self, parts: dict[str, Any]) -> Composite:
+    def _composite(self, parts: dict[str, object]) -> Composite:
         return Composite(parts, shape=self._shape, device=self.device)
 
-    def _of_robots(self, parts: dict[str, Any]) -> Composite:
+    def _of_robots(self, parts: dict[str, object]) -> Composite:
         return Composite({GROUP: self._composite(parts)}, shape=self.batch_size, device=self.device)
 
     def _set_seed(self, seed: int | None) -> None:
         self._seed_at_reset = seed
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **options: Any) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None = None, **options: object) -> TensorDictBase:
         mask = np.ones(self._shape[0], np.bool_)
         asked = None if tensordict is None else tensordict.get("_reset", None)
         if asked is not None:
@@ -149,11 +150,11 @@ class TorchRLNavigation(EnvBase):
         rows = {name: self._tensor(values)[:, None] for name, values in ends.items()}
         return TensorDict({GROUP: robots, **rows}, self.batch_size, device=self.device)
 
-    def _tensor(self, values: Any) -> Any:
+    def _tensor(self, values: ArrayLike) -> torch.Tensor:
         """Of the values as they are now."""
         return torch.as_tensor(np.array(values), device=self.device)
 
-    def close(self, **options: Any) -> None:
+    def close(self, **options: object) -> None:
         """Close the environment."""
         self.worlds.close()
         super().close(**options)

@@ -13,6 +13,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -95,7 +96,7 @@ def view_limits(problem: Problem, points: ArrayLike = ()) -> Array:
     return limits
 
 
-def make_axes(figure: Figure, place: int, view: str) -> Any:
+def make_axes(figure: Figure, place: int, view: str) -> Axes:
     """Axes of a figure for a view: ``"space"``, or flat for ``"plane"`` and ``"above"``."""
     return figure.add_subplot(place, projection="3d" if view == "space" else None)
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from html import escape
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.colors import to_hex
@@ -42,7 +41,7 @@ class ReplayMotion:
         content: What the page reads: lists, numbers and texts only.
     """
 
-    content: dict[str, Any]
+    content: dict[str, object]
 
 
 def motion(
@@ -159,7 +158,7 @@ class Replay:
         return f'<iframe sandbox="allow-scripts" style="{style}" srcdoc="{escape(self.html)}"></iframe>'
 
 
-def rounded(array: ArrayLike) -> dict[str, Any]:
+def rounded(array: ArrayLike) -> dict[str, object]:
     """Numbers ``(..., c)`` as 16-bit ones between the least and the most of each of the ``c`` components."""
     values = np.asarray(array, np.float64)
     flat = values.reshape(-1, values.shape[-1])
@@ -169,7 +168,7 @@ def rounded(array: ArrayLike) -> dict[str, Any]:
     return {"low": low.tolist(), "step": step.tolist(), "data": _text(data)}
 
 
-def _setting(problem: Problem) -> dict[str, Any]:
+def _setting(problem: Problem) -> dict[str, object]:
     """Team and world, which do not change."""
     models = problem.team.robot_models
     return {
@@ -185,7 +184,7 @@ def _setting(problem: Problem) -> dict[str, Any]:
     }
 
 
-def _denoising(denoising: Denoising) -> dict[str, Any]:
+def _denoising(denoising: Denoising) -> dict[str, object]:
     samples, kept = denoising.samples, denoising.samples.shape[1]
     return {
         "labels": list(denoising.labels),
@@ -198,7 +197,7 @@ def _denoising(denoising: Denoising) -> dict[str, Any]:
     }
 
 
-def _bodies(problem: Problem, bodies: FloatArray, steps: int, end: int) -> dict[str, Any]:
+def _bodies(problem: Problem, bodies: FloatArray, steps: int, end: int) -> dict[str, object]:
     """Where what is no robot is, and its radius."""
     d = problem.dimension
     if bodies.ndim != 3 or len(bodies) != steps or bodies.shape[2] != 2 * d + 1 or not np.isfinite(bodies).all():
@@ -216,12 +215,12 @@ def _end(problem: Problem, trajectory: Trajectory) -> int:
     return last + 1 if np.isinf(everyone) else min(last, round((everyone + _AFTERMATH) / problem.dt)) + 1
 
 
-def _clearance(problem: Problem, positions: FloatArray) -> dict[str, Any]:
+def _clearance(problem: Problem, positions: FloatArray) -> dict[str, object]:
     clearance = problem.world.clearance(positions)
     return rounded(np.where(np.isfinite(clearance), clearance, _NO_CLEARANCE)[..., None])
 
 
-def _obstacles(problem: Problem) -> dict[str, Any]:
+def _obstacles(problem: Problem) -> dict[str, object]:
     world = problem.world
     return {
         "balls": world.balls.tolist(),
@@ -235,7 +234,7 @@ def _in_space(limits: list[list[float]]) -> list[list[float]]:
     return [[*corner, 0.0][:3] for corner in limits]
 
 
-def _text(array: NDArray[Any]) -> str:
+def _text(array: NDArray[np.generic]) -> str:
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
 
 

@@ -10,10 +10,11 @@ coefficients follow from one linear system; with coefficients held, directions a
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from d4orm_env.core.arrays import BoolArray, Floats, Whole
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS, compiled
 
@@ -39,11 +40,11 @@ class Method(NamedTuple):
         tolerance: Largest violation, and change of a place, at which it ends, in SI units.
     """
 
-    place: Any
-    velocity: Any
-    acceleration: Any
-    squares: Any
-    goal: Any
+    place: Floats
+    velocity: Floats
+    acceleration: Floats
+    squares: Floats
+    goal: Floats
     barrier: float
     lookout: float
     penalty: float
@@ -63,31 +64,33 @@ class Bodies(NamedTuple):
         bounds: ``(2, d)`` of the world, infinite where open [m].
     """
 
-    paths: Any
-    radius: Any
+    paths: Floats
+    radius: Floats
     margin: float
-    boxes: Any
-    bounds: Any
+    boxes: Floats
+    bounds: Floats
 
 
 class Guess(NamedTuple):
     """Samples of a motion at steps 1 to T, each ``(T, d)``: places [m], velocities [m/s], accelerations [m/s^2]."""
 
-    place: Any
-    velocity: Any
-    acceleration: Any
+    place: Floats
+    velocity: Floats
+    acceleration: Floats
 
 
 class Targets(NamedTuple):
     """What directions and lengths make of a :class:`Guess`: the sums over all constraints, each ``(T, d)``."""
 
-    place: Any
-    velocity: Any
-    acceleration: Any
+    place: Floats
+    velocity: Floats
+    acceleration: Floats
 
 
 @cached_kernel(fingerprint(()), **OPTIONS)
-def alternate(method: Any, bodies: Any, robot: Any, limits: Any, goal: Any, fixed: Any, motion: Any, guess: Any) -> Any:
+def alternate(
+    method: Method, bodies: Bodies, robot: Whole, limits: Floats, goal: Floats, fixed: int, motion: Floats, guess: Guess
+) -> float:
     """Alternate until no constraint is violated and no place moves, to the tolerance, or as often as may be.
 
     Args:
@@ -130,7 +133,7 @@ def alternate(method: Any, bodies: Any, robot: Any, limits: Any, goal: Any, fixe
 
 
 @compiled
-def _raise_multiplier(squares: Any, motion: Any, right: Any, penalty: Any, multiplier: Any) -> None:
+def _raise_multiplier(squares: Floats, motion: Floats, right: Floats, penalty: float, multiplier: Floats) -> None:
     """Add to the multiplier ``(n+1, d)`` what the constraints are violated by."""
     size, d = motion.shape
     for i in range(size):
@@ -142,7 +145,7 @@ def _raise_multiplier(squares: Any, motion: Any, right: Any, penalty: Any, multi
 
 
 @compiled
-def _mind(method: Any, bodies: Any, robot: Any, guess: Any, minded: Any) -> Any:
+def _mind(method: Method, bodies: Bodies, robot: Whole, guess: Guess, minded: BoolArray) -> int:
     """Mark the bodies that come near the guess; how many there are."""
     robots, d, count = len(bodies.radius), bodies.paths.shape[2], 0
     for body in range(len(minded)):
@@ -171,8 +174,15 @@ def _mind(method: Any, bodies: Any, robot: Any, guess: Any, minded: Any) -> Any:
 
 @compiled
 def _project(
-    method: Any, bodies: Any, robot: Any, limits: Any, minded: Any, here: Any, guess: Any, targets: Any
-) -> Any:
+    method: Method,
+    bodies: Bodies,
+    robot: Whole,
+    limits: Floats,
+    minded: BoolArray,
+    here: Floats,
+    guess: Guess,
+    targets: Targets,
+) -> float:
     """The nearest places, velocities and accelerations that the constraints allow, summed over constraints.
 
     Args:
@@ -212,7 +222,7 @@ def _project(
 
 
 @compiled
-def _stay_within(bounds: Any, radius: Any, limits: Any, guess: Any, targets: Any) -> Any:
+def _stay_within(bounds: Floats, radius: float, limits: Floats, guess: Guess, targets: Targets) -> float:
     """Write the targets of the bounds and of the limits of speed and acceleration; return the largest violation."""
     (steps, d), worst = guess.place.shape, 0.0
     for step in range(steps):
@@ -227,7 +237,7 @@ def _stay_within(bounds: Any, radius: Any, limits: Any, guess: Any, targets: Any
 
 
 @compiled
-def _gap(place: Any, low: Any, high: Any) -> Any:
+def _gap(place: Floats, low: Floats, high: Floats) -> float:
     """How far a place is from a box, zero within."""
     square = 0.0
     for axis in range(len(place)):
@@ -237,7 +247,7 @@ def _gap(place: Any, low: Any, high: Any) -> Any:
 
 
 @compiled
-def _push(place: Any, low: Any, high: Any, least: Any, target: Any) -> Any:
+def _push(place: Floats, low: Floats, high: Floats, least: float, target: Floats) -> float:
     """Add to ``target`` the point nearest to ``place`` that is ``least`` from a box, which may be a point.
 
     Returns:
@@ -262,7 +272,7 @@ def _push(place: Any, low: Any, high: Any, least: Any, target: Any) -> Any:
 
 
 @compiled
-def _shorten(vector: Any, most: Any, target: Any) -> Any:
+def _shorten(vector: Floats, most: float, target: Floats) -> float:
     """Write to ``target`` the vector no longer than ``most`` nearest to it; return by how much it is too long."""
     square = 0.0
     for axis in range(len(vector)):
@@ -275,7 +285,7 @@ def _shorten(vector: Any, most: Any, target: Any) -> Any:
 
 
 @compiled
-def _accumulate(method: Any, targets: Any, bends: Any, right: Any) -> None:
+def _accumulate(method: Method, targets: Targets, bends: float, right: Floats) -> None:
     """What the targets ask of the coefficients: ``F^T`` of them, into ``right`` ``(n+1, d)``."""
     (steps, size), d = method.place.shape, right.shape[1]
     for i in range(size):
@@ -289,7 +299,7 @@ def _accumulate(method: Any, targets: Any, bends: Any, right: Any) -> None:
 
 
 @compiled
-def _solve(matrix: Any, right: Any, fixed: Any, motion: Any) -> None:
+def _solve(matrix: Floats, right: Floats, fixed: int, motion: Floats) -> None:
     """The free coefficients of a positive definite system, by Cholesky's method; overwrites its arguments."""
     size, d = motion.shape
     for i in range(fixed, size):
@@ -313,7 +323,7 @@ def _solve(matrix: Any, right: Any, fixed: Any, motion: Any) -> None:
 
 
 @compiled
-def _sample(method: Any, motion: Any, guess: Any) -> Any:
+def _sample(method: Method, motion: Floats, guess: Guess) -> float:
     """Make the guess the samples of a motion; return how far a place moved at most along an axis [m]."""
     (steps, size), d, change = method.place.shape, motion.shape[1], 0.0
     for step in range(steps):

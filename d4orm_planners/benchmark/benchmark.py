@@ -14,7 +14,8 @@ from pydantic import Field
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.dynamics import COMMON, get_model
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances import Delay, Disturbance, Dropout, StateNoise
+from d4orm_env.disturbances import Delay, Dropout, StateNoise
+from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.engine.base import SamplingTask
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.scenarios import make_problem
@@ -117,7 +118,7 @@ QUICK: Mapping[str, object] = {
 FIRST_STEPS = 5
 """Steps at the largest noise that are run together to time one."""
 
-DISTURBANCES: tuple[Disturbance[Any], ...] = (Delay(2), Dropout(0.3), StateNoise(0.02, 0.05))
+DISTURBANCES: tuple[AnyDisturbance, ...] = (Delay(2), Dropout(0.3), StateNoise(0.02, 0.05))
 """With what environments are stepped beside those that nothing disturbs."""
 
 RIGID = ("holonomic2d", "differential_drive")
@@ -255,7 +256,7 @@ def _measure_obstacles(settings: BenchmarkSettings, num_boxes: int, where: Where
     return measure_obstacles(iterate, num_boxes, where, settings.repetitions, settings.time_limit)
 
 
-def _measure_env(settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[Disturbance[Any]] = ()) -> Row:
+def _measure_env(settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[AnyDisturbance] = ()) -> Row:
     """One PettingZoo environment of 8 robots under random controls, resets included."""
     from d4orm_env import navigation_v0
 
@@ -291,7 +292,7 @@ def _measure_steps(settings: BenchmarkSettings, env: ParallelEnv, count: int) ->
     return spread.times(1 / count)
 
 
-def _measure_worlds(settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[Disturbance[Any]] = ()) -> Row:
+def _measure_worlds(settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[AnyDisturbance] = ()) -> Row:
     """The batched environment of 8 robots per world under random controls, auto-reset included."""
     import gymnasium
 
@@ -330,7 +331,7 @@ def _measure_functional(settings: BenchmarkSettings) -> Row:
     env = FunctionalEnv(problem=boxed_problem(0, "near"))
     limits, begin = env.action_limits, jax.jit(jax.vmap(env.reset))
 
-    def move(carry: tuple[EnvState, Any], key: Any) -> Any:
+    def move(carry: tuple[EnvState, Any], key: jax.Array) -> tuple[tuple[EnvState, Any], None]:
         (state, total), keys = carry, jax.random.split(key, 1 + size)
         controls = jax.random.uniform(keys[0], (size, *limits.shape), minval=-limits, maxval=limits)
         state, moment = jax.vmap(env.step)(keys[1:], state, controls)
@@ -338,7 +339,7 @@ def _measure_functional(settings: BenchmarkSettings) -> Row:
         return (state, total + moment.rewards.sum() + moment.observations.sum()), None
 
     @jax.jit
-    def steps(state: EnvState, key: Any) -> Any:
+    def steps(state: EnvState, key: jax.Array) -> tuple[EnvState, float]:
         return jax.lax.scan(move, (state, 0.0), jax.random.split(key, calls))[0]
 
     state, _ = begin(jax.random.split(jax.random.key(0), size))
@@ -349,7 +350,7 @@ def _measure_functional(settings: BenchmarkSettings) -> Row:
 
 
 def _rate(
-    environment: str, num_worlds: int, num_boxes: int, disturbances: Sequence[Disturbance[Any]], seconds: Spread
+    environment: str, num_worlds: int, num_boxes: int, disturbances: Sequence[AnyDisturbance], seconds: Spread
 ) -> Row:
     """Seconds per environment step, and steps per second at the median."""
     return {

@@ -9,11 +9,13 @@ engines: agreement says something about both, and the benchmark has something to
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.dynamics import COMMON
@@ -23,20 +25,20 @@ from d4orm_env.core.problem import Problem
 class PlainTeam(NamedTuple):
     """A problem of one robot model, as arrays; obstacles and bounds as in :class:`~d4orm_env.core.world.World`."""
 
-    start: Any  # (K, n)
-    goal: Any  # (K, d)
-    radius: Any  # (K,)
-    max_speed: Any  # (K,)
-    max_acceleration: Any  # (K,)
-    max_turn_rate: Any  # (K,)
-    balls: Any  # (., d + 1) centre and radius of circles or spheres
-    cylinders: Any  # (., 3) axis and radius of vertical cylinders
-    boxes: Any  # (., 2 d) lower and upper corner
-    bounds: Any  # (2, d)
-    dt: Any
-    margin: Any
-    goal_radius: Any
-    goal_speed: Any  # infinite without a limit
+    start: Array  # (K, n)
+    goal: Array  # (K, d)
+    radius: Array  # (K,)
+    max_speed: Array  # (K,)
+    max_acceleration: Array  # (K,)
+    max_turn_rate: Array  # (K,)
+    balls: Array  # (., d + 1) centre and radius of circles or spheres
+    cylinders: Array  # (., 3) axis and radius of vertical cylinders
+    boxes: Array  # (., 2 d) lower and upper corner
+    bounds: Array  # (2, d)
+    dt: Array
+    margin: Array
+    goal_radius: Array
+    goal_speed: Array  # infinite without a limit
 
 
 def plain_team(problem: Problem) -> tuple[str, PlainTeam]:
@@ -51,26 +53,15 @@ def plain_team(problem: Problem) -> tuple[str, PlainTeam]:
     if models[0] not in COMMON:
         raise ValueError(f"the plain formulation has {', '.join(COMMON)}, not {models[0]}; use an engine")
     team, world = problem.team, problem.world
-    arrays = PlainTeam(
-        start=problem.start,
-        goal=problem.goal,
-        radius=team.radius,
-        max_speed=team.max_speed,
-        max_acceleration=team.max_acceleration,
-        max_turn_rate=team.max_turn_rate,
-        balls=world.balls,
-        cylinders=world.cylinders,
-        boxes=world.boxes,
-        bounds=world.bounds,
-        dt=problem.dt,
-        margin=problem.margin,
-        goal_radius=problem.goal_radius,
-        goal_speed=jnp.inf if problem.goal_speed is None else problem.goal_speed,
-    )
-    return models[0], jax.tree.map(partial(jnp.asarray, dtype=jnp.float32), arrays)
+    numbers = (
+        problem.start, problem.goal, team.radius, team.max_speed, team.max_acceleration, team.max_turn_rate,
+        world.balls, world.cylinders, world.boxes, world.bounds, problem.dt, problem.margin, problem.goal_radius,
+        jnp.inf if problem.goal_speed is None else problem.goal_speed,
+    )  # fmt: skip
+    return models[0], PlainTeam(*(jnp.asarray(number, jnp.float32) for number in numbers))
 
 
-def _derivative(model: str, x: Any, u: Any) -> Any:
+def _derivative(model: str, x: Array, u: Array) -> Array:
     """``dx/dt`` of one robot, from its state ``(n,)`` and control ``(m,)``."""
     if model == "velocity2d":
         return u
@@ -80,13 +71,13 @@ def _derivative(model: str, x: Any, u: Any) -> Any:
     return jnp.concatenate([x[size:], u])
 
 
-def _shorten(vector: Any, limit: Any) -> Any:
+def _shorten(vector: Array, limit: Array) -> Array:
     """``vector`` at no more than the length ``limit``."""
     length = jnp.linalg.norm(vector)
     return jnp.where(length > limit, vector * (limit / jnp.where(length > 0, length, 1.0)), vector)
 
 
-def _step_robot(model: str, dt: Any, limits: Any, x: Any, u: Any) -> tuple[Any, Any]:
+def _step_robot(model: str, dt: Array, limits: tuple[Array, Array, Array], x: Array, u: Array) -> tuple[Array, Array]:
     """State after one step and speed of one robot: clip, RK4, speed limit."""
     speed, acceleration, turn_rate = limits
     if model == "differential_drive":
@@ -109,21 +100,21 @@ def _step_robot(model: str, dt: Any, limits: Any, x: Any, u: Any) -> tuple[Any, 
     return x, jnp.linalg.norm(x[size:])
 
 
-def _at_rest(model: str, x: Any) -> Any:
+def _at_rest(model: str, x: Array) -> Array:
     """``(K, n)`` states standing still."""
     if model == "velocity2d":
         return x
     return x.at[:, 3:].set(0.0) if model != "holonomic2d" else x.at[:, 2:].set(0.0)
 
 
-def _near_robot(team: PlainTeam, place: Any) -> Any:
+def _near_robot(team: PlainTeam, place: Array) -> Array:
     """``(K,)`` bool from the full distance matrix."""
     distance = jnp.linalg.norm(place[:, None] - place[None, :], axis=-1)
     distance = distance + jnp.diag(jnp.full(len(place), jnp.inf))
     return (distance <= team.radius[:, None] + team.radius[None, :] + team.margin).any(axis=1)
 
 
-def _near_obstacle(team: PlainTeam, place: Any) -> Any:
+def _near_obstacle(team: PlainTeam, place: Array) -> Array:
     """``(K,)`` bool: within the margin of an obstacle or the bounds."""
     dimension = place.shape[1]
     reach = team.radius + team.margin
@@ -136,14 +127,14 @@ def _near_obstacle(team: PlainTeam, place: Any) -> Any:
     return near | (jnp.linalg.norm(outside, axis=-1) <= reach[:, None]).any(axis=1)
 
 
-def team_rewards(model: str, collisions: bool, team: PlainTeam, controls: Any) -> Any:
+def team_rewards(model: str, collisions: bool, team: PlainTeam, controls: Array) -> Array:
     """``(K,)`` mean reward over time of one team under ``controls`` ``(H, K, m)``."""
     dimension = team.goal.shape[1]
     limits = (team.max_speed, team.max_acceleration, team.max_turn_rate)
     distance_at_start = jnp.linalg.norm(team.start[:, :dimension] - team.goal, axis=1)
     scale = jnp.maximum(distance_at_start, team.goal_radius)
 
-    def advance(carry: Any, control: Any) -> Any:
+    def advance(carry: tuple[Array, Array], control: Array) -> tuple[tuple[Array, Array], Array]:
         x, docked = carry
         y, speed = jax.vmap(partial(_step_robot, model, team.dt))(limits, x, control)
         arrives = jnp.linalg.norm(y[:, :dimension] - team.goal, axis=1) <= team.goal_radius
@@ -161,12 +152,12 @@ def team_rewards(model: str, collisions: bool, team: PlainTeam, controls: Any) -
 
 
 @partial(jax.jit, static_argnames=("model", "collisions"))
-def score(model: str, team: PlainTeam, controls: Any, collisions: bool = True) -> Any:
+def score(model: str, team: PlainTeam, controls: Array, collisions: bool = True) -> Array:
     """``(M, K)`` mean rewards of ``M`` teams under ``controls`` ``(M, H, K, m)``."""
     return jax.vmap(partial(team_rewards, model, collisions, team))(controls)
 
 
-def softmax_mean(rewards: Any, samples: Any, temperature: float) -> Any:
+def softmax_mean(rewards: Array, samples: Array, temperature: float) -> Array:
     """Mean of ``samples`` ``(M, ...)``, weighted by the softmax of the normalised ``rewards`` ``(M,)`` of the teams."""
     normalised = (rewards - rewards.mean()) / jnp.maximum(rewards.std(), 1e-6)
     return jnp.tensordot(jax.nn.softmax(normalised / temperature), samples, axes=1)
@@ -176,13 +167,13 @@ def softmax_mean(rewards: Any, samples: Any, temperature: float) -> Any:
 def denoise(
     model: str,
     team: PlainTeam,
-    mean: Any,
-    noise_scale: Any,
-    key: Any,
+    mean: Array,
+    noise_scale: Array,
+    key: Array,
     num_samples: int,
     temperature: float,
     collisions: bool = True,
-) -> Any:
+) -> Array:
     """One denoising run with team weights (paper, Algorithm 1).
 
     Args:
@@ -199,7 +190,7 @@ def denoise(
         ``(H, K, m)`` the last weighted mean.
     """
 
-    def update(mean: Any, xs: Any) -> Any:
+    def update(mean: Array, xs: tuple[Array, Array]) -> tuple[Array, Array]:
         sigma, step_key = xs
         samples = mean[None] + sigma * jax.random.normal(step_key, (num_samples, *mean.shape))
         rewards = score(model, team, samples, collisions).mean(axis=1)
@@ -209,7 +200,7 @@ def denoise(
 
 
 def denoise_around_rest(
-    problem: Problem, noise_scale: Any, num_samples: int, temperature: float, seed: int, collisions: bool = True
+    problem: Problem, noise_scale: ArrayLike, num_samples: int, temperature: float, seed: int, collisions: bool = True
 ) -> FloatArray:
     """:func:`denoise` of a problem from zero controls, back on the host.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -75,7 +75,7 @@ class DatasetOptions:
         if is_scenario_file(self.scenario):
             reason = f"does not go with a scenario file; change it in {self.scenario}"
             refuse_options(self.context, ("num_robots", "model", "scenario_settings"), reason)
-        environment: dict[str, Any] = {"scenario": self.scenario, **own}
+        environment: dict[str, object] = {"scenario": self.scenario, **own}
         for name in ("num_robots", "model"):
             if name in own:
                 raise ValueError(f"--scenario-set {name} is said by --{name.replace('_', '-')}; use that")

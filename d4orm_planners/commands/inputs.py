@@ -22,7 +22,7 @@ def parse_settings(settings: list[str] | None, option: str = "--set") -> dict[st
     Raises:
         ValueError: If a text has another form, or gives a name again.
     """
-    values: dict[str, Any] = {}
+    values: dict[str, object] = {}
     for setting in settings or []:
         name, separator, text = setting.partition("=")
         if not separator or not name:
@@ -51,7 +51,7 @@ def parse_levels(texts: list[str] | None) -> dict[str, list[Any]] | None:
     return levels
 
 
-def single_levels(texts: list[str] | None) -> dict[str, Any]:
+def single_levels(texts: list[str] | None) -> dict[str, object]:
     """The same where every name has one level.
 
     Raises:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from d4orm_env.core.summary import count
+from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_planners.commands.dataclass_options import takes
 from d4orm_planners.commands.inputs import check_target, names, refuse_options, single_levels
 from d4orm_planners.commands.options import Physics, PictureOptions, ProblemOptions
@@ -17,7 +18,6 @@ from d4orm_planners.commands.outputs import episode_rows, print_table
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
-    from d4orm_env.disturbances import Disturbance
     from d4orm_planners.episode import Episode
     from d4orm_planners.policy import Policy
 
@@ -44,7 +44,7 @@ class RunOptions(PictureOptions, ProblemOptions):
         typer.Option("--disturb", help="A disturbance at a level, as delay=2 or push.speed=0.3; repeatable."),
     ] = None
 
-    def disturbances(self) -> tuple[Disturbance[Any], ...]:
+    def disturbances(self) -> tuple[AnyDisturbance, ...]:
         """What goes wrong.
 
         Raises:
@@ -54,7 +54,7 @@ class RunOptions(PictureOptions, ProblemOptions):
 
         return disturbances_at(single_levels(self.disturb))
 
-    def execute(self, problem: Problem, policy: Policy, disturbances: Sequence[Disturbance[Any]]) -> Episode:
+    def execute(self, problem: Problem, policy: Policy, disturbances: Sequence[AnyDisturbance]) -> Episode:
         """An episode of a policy on a problem."""
         from d4orm_planners.episode import open_env, run_episode
 

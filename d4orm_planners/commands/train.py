@@ -11,7 +11,7 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -119,7 +119,7 @@ def _imitation(options: TrainOptions) -> Callable[..., TrainingResult]:
     return partial(imitation.imitate, settings)
 
 
-def _practice(options: TrainOptions) -> dict[str, Any]:
+def _practice(options: TrainOptions) -> dict[str, object]:
     """What both have in common."""
     return {
         **{name: getattr(options, name) for name in ("scenario", "num_robots", "seed", "model")},

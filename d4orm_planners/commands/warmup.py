@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,11 +24,14 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.engine.base import SamplingRules, SamplingTask
-from d4orm_env.engine.caching import has_to_be_compiled
+from d4orm_env.engine.caching import Kernel, has_to_be_compiled
 from d4orm_env.engine.choice import get_engine
 from d4orm_planners.registry import make_planner
 from d4orm_planners.sampling.weights import SoftmaxWeights
 from d4orm_planners.search import Search
+
+if TYPE_CHECKING:
+    from numba.core.dispatcher import Dispatcher
 
 
 @dataclass(frozen=True)
@@ -139,8 +142,9 @@ def warm_up() -> WarmupReport:
     compiled = [kernel for kernel in kernels if kernel.stats.cache_misses or kernel in missing]
     loaded = [kernel for kernel in kernels if kernel not in compiled]
     return WarmupReport(
-        seconds, tuple(kernel.__name__ for kernel in compiled), tuple(kernel.__name__ for kernel in loaded),
-        tuple(sorted({Path(kernel.stats.cache_path) for kernel in kernels})),
+        seconds,
+        tuple(kernel.py_func.__name__ for kernel in compiled), tuple(kernel.py_func.__name__ for kernel in loaded),
+        tuple(sorted({Path(path) for kernel in kernels if (path := kernel.stats.cache_path)})),
     )  # fmt: skip
 
 
@@ -185,7 +189,7 @@ def _step_environments() -> None:
     vector_env.close()
 
 
-def _kernels() -> list[Any]:
+def _kernels() -> list[Dispatcher[Callable[..., object]]]:
     """The kernels of the engines that are kept on disk."""
     from numba.core.dispatcher import Dispatcher
 
@@ -199,6 +203,11 @@ def _kernels() -> list[Any]:
                if module.name != "jax"]  # fmt: skip
     found = {name: value for module in modules for name, value in vars(module).items() if isinstance(value, Dispatcher)}
     worlds = {kernel for models in TEAMS for kernel in world_kernels(models)}
-    kernels = [*found.values(), *worlds, *map(score_kernel, TEAMS), *map(drive_kernel, COMMON)]
+    kernels: list[Kernel[..., object]] = [
+        *found.values(),
+        *worlds,
+        *map(score_kernel, TEAMS),
+        *map(drive_kernel, COMMON),
+    ]
     kernels += map(search_kernel, COMMON)
-    return [kernel for kernel in kernels if kernel.stats.cache_path is not None]
+    return [kernel for kernel in kernels if isinstance(kernel, Dispatcher) and kernel.stats.cache_path is not None]

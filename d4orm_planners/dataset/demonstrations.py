@@ -49,7 +49,7 @@ class Demonstrations:
     """
 
     policy: PolicyLike = "d4orm-c2f"
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, object] = field(default_factory=dict)
     environment: Mapping[str, Any] = field(default_factory=dict)
     seeds: Iterable[int] = range(100)
     agents: str = "team"
@@ -89,7 +89,7 @@ class Demonstrations:
         return policy if isinstance(policy, str) else getattr(policy, "__name__", type(policy).__name__)
 
     @cached_property
-    def identity(self) -> dict[str, Any]:
+    def identity(self) -> dict[str, object]:
         """All that an episode depends on beside its seed, as JSON has it.
 
         Raises:

@@ -11,13 +11,18 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
 from d4orm_env.core.arrays import BoolArray
 from d4orm_planners.dataset.recorded_episode import RecordedEpisode
+
+if TYPE_CHECKING:
+    from minari.data_collector import EpisodeBuffer
+    from minari.dataset.minari_storage import MinariStorage
 
 MAIN, METADATA = "main_data.hdf5", "metadata.json"
 
@@ -35,9 +40,9 @@ class DatasetFiles:
     """
 
     folder: Path
-    observation_space: gymnasium.Space[Any]
-    action_space: gymnasium.Space[Any]
-    env_spec: Any
+    observation_space: gymnasium.Space[object]
+    action_space: gymnasium.Space[object]
+    env_spec: EnvSpec | None
     agents: str
 
     @property
@@ -65,7 +70,7 @@ class DatasetFiles:
         storage.update_metadata({"recorded_seeds": [int(episode.metadata["seed"]) for episode in episodes]})
         partial.rename(final)
 
-    def write_main(self, metadata: Mapping[str, Any]) -> None:
+    def write_main(self, metadata: Mapping[str, object]) -> None:
         """Write the main file and the metadata anew, for the shards that are there."""
         import h5py
 
@@ -89,7 +94,7 @@ class DatasetFiles:
             (partial / name).replace(self.folder / name)
         partial.rmdir()
 
-    def _storage(self, folder: Path) -> Any:
+    def _storage(self, folder: Path) -> MinariStorage:
         from minari.dataset.minari_storage import MinariStorage
 
         return MinariStorage.new(folder, self.observation_space, self.action_space, self.env_spec, "hdf5")
@@ -121,7 +126,7 @@ class _Part:
 
     steps: int
     pick: Callable[[np.ndarray], np.ndarray]
-    extra: Mapping[str, Any]
+    extra: Mapping[str, object]
     together: bool
 
 
@@ -137,7 +142,7 @@ def _robots(episode: RecordedEpisode) -> Iterator[_Part]:
 _PARTS: Mapping[str, Callable[[RecordedEpisode], Iterable[_Part]]] = {"team": _team, "robot": _robots}
 
 
-def _buffer(episode: RecordedEpisode, part: _Part) -> Any:
+def _buffer(episode: RecordedEpisode, part: _Part) -> EpisodeBuffer:
     """An episode as Minari takes it."""
     from minari.data_collector import EpisodeBuffer
 

@@ -6,12 +6,13 @@ import copy
 import importlib.metadata
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import gymnasium
+from gymnasium.envs.registration import EnvSpec
 
 from d4orm_env.core.arrays import whole_number
 from d4orm_env.joint_env import ENV_ID, JointNavigationEnv
@@ -108,7 +109,7 @@ def dataset_files(demonstrations: Demonstrations, folder: Path) -> DatasetFiles:
     return DatasetFiles(folder, team.observation_space, team.action_space, _spec(demonstrations.environment), "team")
 
 
-def _spec(environment: Any) -> Any:
+def _spec(environment: Mapping[str, object]) -> EnvSpec | None:
     """From which Gymnasium makes the joint environment again; ``None`` if its arguments have no form in JSON."""
     spec = copy.deepcopy(gymnasium.spec(ENV_ID))
     spec.kwargs = dict(environment)
@@ -145,7 +146,7 @@ def _pack(recording: Recording, files: DatasetFiles, shard_size: int) -> None:
             recording.forget(seed)
 
 
-def _metadata(demonstrations: Demonstrations, dataset_id: str, dropped: int) -> dict[str, Any]:
+def _metadata(demonstrations: Demonstrations, dataset_id: str, dropped: int) -> dict[str, object]:
     """What the dataset says about itself."""
     identity = demonstrations.identity
     return {

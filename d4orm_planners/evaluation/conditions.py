@@ -6,15 +6,16 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from d4orm_env.core.arrays import positive_number, shown
 from d4orm_env.disturbances import Disturbance
+from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.disturbances.registry import attributes_of, disturbance_at, name_of
 from d4orm_env.disturbances.selection import checked_disturbances
 from d4orm_planners.references import source_digest
 
-Levels: TypeAlias = Iterable[Any]
+Levels: TypeAlias = Iterable[object]
 DisturbanceLevels: TypeAlias = Mapping[str, Levels]
 """Levels by name, as ``{"delay": [0, 1, 2], "push.speed": [0.2, 0.5]}``, or disturbances by any label, as
 ``{"wind": [Wind(0.1), Wind(0.2)], "both": [[], [Delay(2), Wind(0.1)]]}``."""
@@ -33,7 +34,7 @@ class Condition:
     """
 
     control_noise_std: float = 0.0
-    disturbances: tuple[Disturbance[Any], ...] = ()
+    disturbances: tuple[AnyDisturbance, ...] = ()
     name: str = ""
     level: float | None = None
     physics: str = "model"
@@ -84,7 +85,7 @@ def conditions(
     )
 
 
-Varied: TypeAlias = tuple[str, tuple[Disturbance[Any], ...], float]
+Varied: TypeAlias = tuple[str, tuple[AnyDisturbance, ...], float]
 
 
 def _varied(name: str, levels: Levels) -> list[Varied]:
@@ -106,7 +107,7 @@ def _holds(given: object) -> bool:
     return isinstance(given, Disturbance) or all(isinstance(one, Disturbance) for one in given)  # type: ignore[attr-defined] # a sequence
 
 
-def _told(chosen: Sequence[tuple[Disturbance[Any], ...]]) -> list[float]:
+def _told(chosen: Sequence[tuple[AnyDisturbance, ...]]) -> list[float]:
     """The levels of disturbances that were given themselves: the number in which they differ, or their places."""
     if all(len(one) == 1 and type(one[0]) is type(chosen[0][0]) for one in chosen):
         values = [attributes_of(one[0]) for one in chosen]
@@ -120,7 +121,7 @@ def _number(level: object, place: int) -> float:
     return float(level) if isinstance(level, int | float) else float(place)
 
 
-def _attributes(one: Disturbance[Any]) -> dict[str, object]:
+def _attributes(one: AnyDisturbance) -> dict[str, object]:
     attributes = attributes_of(one)
     foreign = type(one).__module__.partition(".")[0] != "d4orm_env"
     return {**attributes, "source": source_digest(type(one))} if foreign else attributes

@@ -5,13 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from d4orm_planners.evaluation.report import panels
 from d4orm_planners.evaluation.summary import SuccessRate
 from d4orm_planners.evaluation.tolerance import THRESHOLD
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 def draw_noise(path: Path, rates: Sequence[SuccessRate]) -> None:
@@ -75,7 +80,7 @@ def draw_map(path: Path, rates: Sequence[SuccessRate]) -> None:
     figure.savefig(path, dpi=150)
 
 
-def _draw_cells(ax: Any, group: Sequence[SuccessRate]) -> None:
+def _draw_cells(ax: Axes, group: Sequence[SuccessRate]) -> None:
     columns = list(dict.fromkeys((rate.disturbance, rate.level) for rate in group))
     labels = list(dict.fromkeys(rate.label for rate in group))
     shares = np.full((len(labels), len(columns)), np.nan)
@@ -106,7 +111,7 @@ def _panels(rates: Sequence[SuccessRate]) -> dict[str, list[SuccessRate]]:
     return groups
 
 
-def _figure(count: int, width: float, height: float, across: int = 3) -> tuple[Any, Any]:
+def _figure(count: int, width: float, height: float, across: int = 3) -> tuple[Figure, NDArray[np.object_]]:
     """A figure made without pyplot, which would keep state and want a display, and its axes."""
     from matplotlib.figure import Figure
 

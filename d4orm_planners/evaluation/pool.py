@@ -180,7 +180,7 @@ class ProcessPool:
         run: What they do with a job; by default they run its trials.
     """
 
-    def __init__(self, size: int, threads: int = 1, run: Callable[[Any], Iterator[Any]] = run_job) -> None:
+    def __init__(self, size: int, threads: int = 1, run: Callable[[Any], Iterator[object]] = run_job) -> None:
         self._size, self._threads, self._run = size, threads, run
         self._context = multiprocessing.get_context("spawn")
         # Nobody else holds the sending end: when this process dies, the workers notice.
@@ -191,7 +191,7 @@ class ProcessPool:
     def free(self) -> bool:
         return len(self._workers) < self._size or any(worker.ticket is None for worker in self._workers)
 
-    def start(self, job: Any) -> int:
+    def start(self, job: object) -> int:
         idle = (worker for worker in self._workers if worker.ticket is None)
         worker = next(idle, None) or self._new()
         worker.ticket = next(self._tickets)
@@ -259,7 +259,7 @@ class ProcessPool:
         return Lost(f"ChildProcessError: the worker process died ({how})")
 
 
-def _work(pipe: Connection, parent: Connection, threads: int, run: Callable[[Any], Iterator[Any]]) -> None:
+def _work(pipe: Connection, parent: Connection, threads: int, run: Callable[[Any], Iterator[object]]) -> None:
     """Run jobs until the parent is gone; Ctrl-C is for the parent, who decides."""
     os.environ.update(D4ORM_NUM_THREADS=str(threads), OMP_NUM_THREADS=str(threads))
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -160,7 +160,7 @@ def _outcome(policy: _TimedPolicy, job: Job, condition: Condition) -> dict[str, 
     }
 
 
-def _verdict(problem: Problem, episode: Episode) -> dict[str, Any]:
+def _verdict(problem: Problem, episode: Episode) -> dict[str, object]:
     """What the judge says of the executed controls."""
     # It looks at the whole horizon; an episode ends earlier when everyone has docked.
     executed = episode.trajectory.controls

@@ -7,17 +7,17 @@ before the next such stretch. Corners are rounded as far as the slack allows, an
 from __future__ import annotations
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from d4orm_env.core import robot_model, transition
-from d4orm_env.core.arrays import LARGEST, FloatArray
+from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, Floats, IntArray
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_model import ACCELERATION, SPEED, TURN_RATE
 from d4orm_env.engine import lanes, tiles
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS, ZERO, make_stepper, models_key, to_fixed_tuple
 from d4orm_planners.guidance import pursuit
 from d4orm_planners.guidance.pursuit import lookaheads, point_ahead, point_reached, square_to, steering
@@ -46,11 +46,11 @@ class Progress(NamedTuple):
         pace: ``(K,)`` float32 how fast [m/s].
     """
 
-    at: Any
-    waits: Any
-    targets: Any
-    room: Any
-    pace: Any
+    at: IntArray
+    waits: IntArray
+    targets: FloatArray
+    room: FloatArray
+    pace: FloatArray
 
     @classmethod
     def of(cls, routes: Routes) -> Progress:
@@ -72,17 +72,28 @@ class Part(NamedTuple):
         goals: ``(B, d)`` [m].
     """
 
-    time_step: Any
-    docking: Any
-    docks: Any
-    robots: Any
-    limits: Any
-    goals: Any
+    time_step: FloatArray
+    docking: FloatArray
+    docks: np.bool_
+    robots: IntArray
+    limits: FloatArray
+    goals: FloatArray
+
+
+Drive: TypeAlias = Kernel[[Part, Progress, FloatArray, BoolArray, FloatArray], None]
+"""A kernel of :func:`drive_kernel`."""
 
 
 @cached_kernel(SOURCES, variant="direct", **OPTIONS)
 def direct(
-    routes: Any, paces: Any, sights: Any, dt: Any, beyond: Any, positions: Any, standing: Any, progress: Any
+    routes: Routes,
+    paces: Floats,
+    sights: Floats,
+    dt: float,
+    beyond: float,
+    positions: Floats,
+    standing: BoolArray,
+    progress: Progress,
 ) -> None:
     """Say where everybody is to drive next.
 
@@ -120,7 +131,7 @@ def direct(
 
 
 @cached_kernel(SOURCES, variant="paces", **OPTIONS)
-def fill_paces(arcs: Any, dt: Any, corner: Any, speed: Any, braking: Any, paces: Any) -> None:
+def fill_paces(arcs: Floats, dt: float, corner: Floats, speed: float, braking: float, paces: Floats) -> None:
     """How fast every point of a route may be passed.
 
     Args:
@@ -141,7 +152,7 @@ def fill_paces(arcs: Any, dt: Any, corner: Any, speed: Any, braking: Any, paces:
 
 
 @cache
-def drive_kernel(name: str) -> Any:
+def drive_kernel(name: str) -> Drive:
     """One compiled step of the robots of the model with this name that drive to where they are directed.
 
     Args of the kernel: the :class:`Part`, the whole team's :class:`Progress`, ``states`` ``(K, n)`` and ``docked``
@@ -152,7 +163,7 @@ def drive_kernel(name: str) -> Any:
     n, m, d, num_limits = robot.state_size, robot.control_size, robot.dimension, len(robot.limit_names)
 
     @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
-    def drive(part: Any, progress: Any, states: Any, docked: Any, controls: Any) -> None:
+    def drive(part: Part, progress: Progress, states: FloatArray, docked: BoolArray, controls: FloatArray) -> None:
         h = transition.TimeStep(part.time_step[0], part.time_step[1], part.time_step[2], part.time_step[3])
         docks, rules = part.docks, (part.docking[0], part.docking[1], part.docks)
         for b in range(part.robots.shape[0]):
@@ -171,7 +182,7 @@ def drive_kernel(name: str) -> Any:
     return drive
 
 
-def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[FloatArray, Any, Any]:
+def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[FloatArray, Floats, IntArray]:
     """Drive the team along its routes until everybody has arrived, or for ``most_steps``.
 
     Args:
@@ -208,7 +219,7 @@ def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[Floa
         steps += 1
 
 
-def _parts(problem: Problem) -> list[tuple[Any, Part]]:
+def _parts(problem: Problem) -> list[tuple[Drive, Part]]:
     """The robots by model, with what drives them."""
     arrays, models, parts = problem.arrays, np.array(problem.team.models), []
     docking = np.array([arrays.squared_goal_radius, arrays.squared_goal_speed])
@@ -219,7 +230,7 @@ def _parts(problem: Problem) -> list[tuple[Any, Part]]:
     return parts
 
 
-def paces_along(problem: Problem, robot: int, arcs: Any, bends: Any, share: float = BRAKING) -> Any:
+def paces_along(problem: Problem, robot: int, arcs: Floats, bends: Floats, share: float = BRAKING) -> Floats:
     """``(P,)`` how fast a robot may pass each point of its route [m/s], from their places along it and their bends.
 
     It counts on that share of its acceleration.

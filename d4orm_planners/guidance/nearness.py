@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from d4orm_env.core.arrays import Floats, IntArray, Ints, Whole
 from d4orm_env.engine import tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS, compiled, inlined
@@ -25,15 +26,15 @@ class Cells(NamedTuple):
         items: ``(N,)`` int64 numbers of the points, cell by cell.
     """
 
-    points: Any
-    low: Any
-    size: Any
+    points: Floats
+    low: Floats
+    size: IntArray
     width: float
-    first: Any
-    items: Any
+    first: IntArray
+    items: IntArray
 
 
-def sort_into_cells(points: Any, width: float) -> Cells:
+def sort_into_cells(points: Floats, width: float) -> Cells:
     """Cells of this width, or larger ones where there would be many more of them than points.
 
     Args:
@@ -52,15 +53,17 @@ def sort_into_cells(points: Any, width: float) -> Cells:
 
 
 @inlined
-def cell_range(cells: Any, axis: Any, lowest: Any, highest: Any) -> Any:
+def cell_range(cells: Cells, axis: int, lowest: float, highest: float) -> tuple[int, int]:
     """The first cell along an axis that a stretch touches, and the one after its last."""
-    first = np.int64(np.floor((lowest - cells.low[axis]) / cells.width))
-    last = np.int64(np.floor((highest - cells.low[axis]) / cells.width))
+    first = int(np.floor((lowest - cells.low[axis]) / cells.width))
+    last = int(np.floor((highest - cells.low[axis]) / cells.width))
     return max(first, 0), min(last, cells.size[axis] - 1) + 1
 
 
 @inlined
-def cells_about(cells: Any, tail: Any, head: Any, reach: Any) -> Any:
+def cells_about(
+    cells: Cells, tail: Floats, head: Floats, reach: float
+) -> tuple[tuple[int, int], tuple[int, int], tuple[int, int]]:
     """Along each axis the range of cells with all that may be within ``reach`` of the line between two places [m]."""
     return (
         cell_range(cells, 0, min(tail[0], head[0]) - reach, max(tail[0], head[0]) + reach),
@@ -70,7 +73,7 @@ def cells_about(cells: Any, tail: Any, head: Any, reach: Any) -> Any:
 
 
 @compiled
-def squared_gap(points: Any, u: Any, tails: Any, v: Any, heads: Any, w: Any) -> Any:
+def squared_gap(points: Floats, u: Whole, tails: Floats, v: Whole, heads: Floats, w: Whole) -> float:
     """Squared distance of point ``u`` to the line from ``tails[v]`` to ``heads[w]``."""
     ax, ay, az = heads[w, 0] - tails[v, 0], heads[w, 1] - tails[v, 1], heads[w, 2] - tails[v, 2]
     ox, oy, oz = points[u, 0] - tails[v, 0], points[u, 1] - tails[v, 1], points[u, 2] - tails[v, 2]
@@ -83,7 +86,9 @@ def squared_gap(points: Any, u: Any, tails: Any, v: Any, heads: Any, w: Any) -> 
 
 
 @cached_kernel(SOURCES, variant="near", **OPTIONS)
-def near_lines(cells: Any, tails: Any, heads: Any, reach: Any, first: Any, items: Any, after: Any) -> Any:
+def near_lines(
+    cells: Cells, tails: Floats, heads: Floats, reach: float, first: IntArray, items: Ints, after: bool
+) -> int:
     """Which points come within ``reach`` of lines.
 
     Args:
@@ -120,7 +125,7 @@ def near_lines(cells: Any, tails: Any, heads: Any, reach: Any, first: Any, items
     return count
 
 
-def find_near(cells: Cells, tails: Any, heads: Any, reach: float, after: bool = False) -> tuple[Any, Any]:
+def find_near(cells: Cells, tails: Floats, heads: Floats, reach: float, after: bool = False) -> tuple[IntArray, Ints]:
     """``(first, items)`` of :func:`near_lines`."""
     first, room = np.empty(len(tails) + 1, np.int64), 16 * len(tails)
     while True:

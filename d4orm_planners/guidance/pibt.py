@@ -9,14 +9,17 @@ robots may have any size and nodes lie anywhere, and the sequence says who goes 
 from __future__ import annotations
 
 import heapq
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Ints, Whole
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS, compiled
 from d4orm_planners.guidance import nearness
 from d4orm_planners.guidance.nearness import squared_gap
+from d4orm_planners.guidance.roadmap import Roadmap
 
 SOURCES = fingerprint((nearness,))
 
@@ -42,15 +45,15 @@ class Bodies(NamedTuple):
         costs: ``(K, N)`` float32 length of the way from every node to each robot's goal [m].
     """
 
-    radius: Any
-    reach: Any
+    radius: Floats
+    reach: Floats
     margin: float
     slack: float
     docked: float
     docks: bool
-    starts: Any
-    goals: Any
-    costs: Any
+    starts: IntArray
+    goals: IntArray
+    costs: FloatArray
 
 
 class Scratch(NamedTuple):
@@ -68,24 +71,26 @@ class Scratch(NamedTuple):
         moves: ``(K, 2)`` int64 robot and edge of each move, in their order.
     """
 
-    state: Any
-    may_dock: Any
-    who: Any
-    robots: Any
-    edges: Any
-    tried: Any
-    options: Any
-    worth: Any
-    moves: Any
+    state: NDArray[np.int8]
+    may_dock: BoolArray
+    who: Ints
+    robots: IntArray
+    edges: IntArray
+    tried: IntArray
+    options: IntArray
+    worth: Floats
+    moves: IntArray
 
 
 @compiled
-def _gap(points: Any, u: Any, v: Any) -> Any:
+def _gap(points: Floats, u: Whole, v: Whole) -> float:
     return np.sqrt(squared_gap(points, u, points, v, points, v))
 
 
 @compiled
-def _too_near(roadmap: Any, bodies: Any, k: Any, tail: Any, head: Any, i: Any, u: Any, gap: Any) -> Any:
+def _too_near(
+    roadmap: Roadmap, bodies: Bodies, k: Whole, tail: Whole, head: Whole, i: Whole, u: Whole, gap: float
+) -> bool:
     """Whether robot ``k`` passes robot ``i`` at node ``u`` too near, ``gap``, on its way from one node to another.
 
     Starts and goals may be nearer to each other than robots keep: then it may leave its own, and come to its own, if it
@@ -104,7 +109,7 @@ def _too_near(roadmap: Any, bodies: Any, k: Any, tail: Any, head: Any, i: Any, u
 
 
 @compiled
-def closed(roadmap: Any, bodies: Any, docked: Any, k: Any, tail: Any, e: Any) -> Any:
+def closed(roadmap: Roadmap, bodies: Bodies, docked: Ints, k: Whole, tail: Whole, e: Whole) -> bool:
     """Whether a robot can never take an edge, because it would dock in passing, or of somebody who has docked.
 
     ``docked`` ``(N,)`` is the robot docked at each node, -1 for none.
@@ -127,7 +132,7 @@ def closed(roadmap: Any, bodies: Any, docked: Any, k: Any, tail: Any, e: Any) ->
 
 
 @cached_kernel(SOURCES, variant="costs", **OPTIONS)
-def fill_costs(roadmap: Any, bodies: Any, docked: Any, k: Any, end: Any, costs: Any) -> None:
+def fill_costs(roadmap: Roadmap, bodies: Bodies, docked: Ints, k: Whole, end: Whole, costs: FloatArray) -> None:
     """Length of a robot's shortest way from every node to one; ``costs`` ``(N,)`` is output."""
     costs[:] = np.inf
     heap = [(0.0, np.int64(end))]
@@ -146,7 +151,7 @@ def fill_costs(roadmap: Any, bodies: Any, docked: Any, k: Any, end: Any, costs: 
 
 
 @cached_kernel(SOURCES, variant="open", **OPTIONS)
-def is_open(roadmap: Any, bodies: Any, docked: Any, k: Any, at: Any, costs: Any) -> Any:
+def is_open(roadmap: Roadmap, bodies: Bodies, docked: Ints, k: Whole, at: Whole, costs: FloatArray) -> bool:
     """Whether nobody who has docked closes the way that a robot at a node would take by these costs."""
     if not costs[at] < np.inf:
         return False
@@ -162,7 +167,7 @@ def is_open(roadmap: Any, bodies: Any, docked: Any, k: Any, at: Any, costs: Any)
 
 
 @compiled
-def _mixed(a: Any, b: Any) -> Any:
+def _mixed(a: np.uint64, b: np.uint64) -> float:
     """A number from 0 to 1 that looks random (after splitmix64)."""
     z = np.uint64(a) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(b) * np.uint64(0xD1B54A32D192ED03)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -171,7 +176,9 @@ def _mixed(a: Any, b: Any) -> Any:
 
 
 @compiled
-def _rank_options(roadmap: Any, bodies: Any, scratch: Any, depth: Any, k: Any, at: Any, pushed: Any, seed: Any) -> None:
+def _rank_options(
+    roadmap: Roadmap, bodies: Bodies, scratch: Scratch, depth: int, k: Whole, at: Whole, pushed: bool, seed: int
+) -> None:
     """Sort the edges that a robot may take, the best first, with staying among them unless it is pushed."""
     options, worth, count = scratch.options[depth], scratch.worth, 0
     costs = bodies.costs[k]
@@ -197,7 +204,9 @@ def _rank_options(roadmap: Any, bodies: Any, scratch: Any, depth: Any, k: Any, a
 
 
 @compiled
-def _in_the_way(roadmap: Any, bodies: Any, scratch: Any, positions: Any, k: Any, e: Any, depth: Any) -> Any:
+def _in_the_way(
+    roadmap: Roadmap, bodies: Bodies, scratch: Scratch, positions: IntArray, k: Whole, e: Whole, depth: int
+) -> Whole:
     """The first robot that has to make way before ``k`` takes an edge; -1 for none, -2 where that cannot be."""
     nodes, head, at = roadmap.nodes, np.int64(roadmap.heads[e]), positions[k]
     found = -1
@@ -227,8 +236,15 @@ def _in_the_way(roadmap: Any, bodies: Any, scratch: Any, positions: Any, k: Any,
 
 @compiled
 def _move(
-    roadmap: Any, bodies: Any, scratch: Any, positions: Any, root: Any, forced: Any, seed: Any, count: Any
-) -> Any:
+    roadmap: Roadmap,
+    bodies: Bodies,
+    scratch: Scratch,
+    positions: IntArray,
+    root: Whole,
+    forced: Whole,
+    seed: int,
+    count: int,
+) -> int:
     """Let a robot move, and before it those that are in its way; how many moves there are then.
 
     Args:
@@ -285,8 +301,15 @@ def _move(
 
 @cached_kernel(SOURCES, variant="step", **OPTIONS)
 def step_team(
-    roadmap: Any, bodies: Any, scratch: Any, order: Any, robots: Any, places: Any, seed: Any, positions: Any
-) -> Any:
+    roadmap: Roadmap,
+    bodies: Bodies,
+    scratch: Scratch,
+    order: IntArray,
+    robots: IntArray,
+    places: IntArray,
+    seed: int,
+    positions: IntArray,
+) -> int:
     """Let the whole team move.
 
     Args:

@@ -7,16 +7,25 @@ turning circle takes (R. C. Coulter, *Implementation of the pure pursuit path tr
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import Floats
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.robot_model import Model
-from d4orm_env.engine.tiles import ONE, OPS, ZERO, compiled, inlined
+from d4orm_env.core.robot_model import Model, TimeStep
+from d4orm_env.engine.tiles import ONE, OPS, ZERO, Row, compiled, cosine, inlined, sine
+
+if TYPE_CHECKING:
+    from d4orm_planners.guidance.routes import Routes
+    from d4orm_planners.guidance.timed_drive import Timed
+
+Length: TypeAlias = Callable[[Row], np.float32]
+Steering: TypeAlias = Callable[[Row, Row, np.float32, np.float32, bool, Row, TimeStep], Row]
+Turning: TypeAlias = Callable[[Row, Row, Row, np.float32, bool, Row], tuple[Row, np.float32]]
 
 LOOKAHEAD = 0.05
 """Of the point of its route that a robot heads for, beyond what it drives in a step and a half [m]."""
@@ -38,20 +47,20 @@ BACKING = np.float32(0.5)
 """Share of its pace at which a robot backs up."""
 
 
-def lookaheads(problem: Problem) -> FloatArray:
+def lookaheads(problem: Problem) -> Floats:
     """``(K,)`` how far ahead of them robots look at least [m]."""
     return np.maximum(LOOKAHEAD, CIRCLES * problem.team.turning_radius.astype(np.float64))
 
 
 @compiled
-def square_to(points: Any, i: Any, place: Any) -> Any:
+def square_to(points: Floats, i: int, place: Floats) -> float:
     """Squared distance of a point from a place."""
     dx, dy, dz = points[i, 0] - place[0], points[i, 1] - place[1], points[i, 2] - place[2]
     return dx * dx + dy * dy + dz * dz
 
 
 @compiled
-def point_reached(points: Any, arcs: Any, at: Any, last: Any, place: Any) -> Any:
+def point_reached(points: Floats, arcs: Floats, at: int, last: int, place: Floats) -> int:
     """The point that a robot has come to that was at ``at``: as far on as each next one is nearer, or reached."""
     following = at
     while following < last:
@@ -66,7 +75,9 @@ def point_reached(points: Any, arcs: Any, at: Any, last: Any, place: Any) -> Any
 
 
 @inlined
-def point_ahead(route: Any, paces: Any, at: Any, last: Any, stop: Any, sight: Any, place: Any) -> Any:
+def point_ahead(
+    route: Routes | Timed, paces: Floats, at: int, last: int, stop: float, sight: tuple[float, float], place: Floats
+) -> int:
     """The point that a robot at point ``at`` heads for.
 
     The slower it must be there, the less far ahead it looks. A sharp corner is driven to before it is turned, and left
@@ -96,7 +107,7 @@ def point_ahead(route: Any, paces: Any, at: Any, last: Any, stop: Any, sight: An
 
 
 @cache
-def steering(name: str) -> Any:
+def steering(name: str) -> Steering:
     """Compiled control of a robot of the model with this name towards a target.
 
     ``(state, target, room, pace, backs_up, limits, h) -> control`` drives as fast as ``pace`` allows, and so as to be
@@ -108,7 +119,9 @@ def steering(name: str) -> Any:
     limit_control, turned = inlined(robot.functions.limit_control), _turning(robot, length)
 
     @inlined
-    def steer(state: Any, target: Any, room: Any, pace: Any, backs_up: Any, limits: Any, h: Any) -> Any:
+    def steer(
+        state: Row, target: Row, room: np.float32, pace: np.float32, backs_up: bool, limits: Row, h: TimeStep
+    ) -> Row:
         gap = between(state, target)
         distance = length(gap)
         # As fast as it could drive to a point straight ahead that is as far off as its room goes, towards its target.
@@ -125,55 +138,61 @@ def steering(name: str) -> Any:
     return steer
 
 
-def _vectors(dimension: int) -> tuple[Any, Any, Any]:
+def _vectors(dimension: int) -> tuple[Callable[[Row, Row, np.float32], Row], Length, Callable[[Row, Row], Row]]:
     """``origin + step * factor``, the length of a step, and the step from a state to a place."""
     if dimension == 2:
 
         @inlined
-        def scaled(origin: Any, step: Any, factor: Any) -> Any:
+        def scaled(origin: Row, step: Row, factor: np.float32) -> Row:
             return (origin[0] + step[0] * factor, origin[1] + step[1] * factor)
 
         @inlined
-        def length(step: Any) -> Any:
+        def length(step: Row) -> np.float32:
             return np.sqrt(step[0] * step[0] + step[1] * step[1])
 
         @inlined
-        def between(state: Any, target: Any) -> Any:
+        def between(state: Row, target: Row) -> Row:
             return (target[0] - state[0], target[1] - state[1])
     else:
 
         @inlined
-        def scaled(origin: Any, step: Any, factor: Any) -> Any:
+        def scaled(origin: Row, step: Row, factor: np.float32) -> Row:
             return (origin[0] + step[0] * factor, origin[1] + step[1] * factor, origin[2] + step[2] * factor)
 
         @inlined
-        def length(step: Any) -> Any:
+        def length(step: Row) -> np.float32:
             return np.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
 
         @inlined
-        def between(state: Any, target: Any) -> Any:
+        def between(state: Row, target: Row) -> Row:
             return (target[0] - state[0], target[1] - state[1], target[2] - state[2])
 
     return scaled, length, between
 
 
-def _turning(robot: Model, length: Any) -> Any:
+def _turning(robot: Model, length: Length) -> Turning:
     """What a robot makes of a velocity towards a point that is so far off, and of its pace, in order to face it."""
-    heading, velocity = robot.heading_index, inlined(robot.functions.velocity)
+    heading, velocity = -1 if robot.heading_index is None else robot.heading_index, inlined(robot.functions.velocity)
     at_rest = (ZERO,) * robot.control_size
 
     @inlined
-    def needs_not(state: Any, gap: Any, wanted: Any, pace: Any, backs_up: Any, limits: Any) -> Any:
+    def needs_not(
+        state: Row, gap: Row, wanted: Row, pace: np.float32, backs_up: bool, limits: Row
+    ) -> tuple[Row, np.float32]:
         return wanted, pace
 
     @inlined
-    def in_place(state: Any, gap: Any, wanted: Any, pace: Any, backs_up: Any, limits: Any) -> Any:
-        facing = (OPS.cos(state[heading]) * gap[0] + OPS.sin(state[heading]) * gap[1]) / length(gap)
+    def in_place(
+        state: Row, gap: Row, wanted: Row, pace: np.float32, backs_up: bool, limits: Row
+    ) -> tuple[Row, np.float32]:
+        facing = (cosine(state[heading]) * gap[0] + sine(state[heading]) * gap[1]) / length(gap)
         return wanted, pace * min(max((facing - FACING) / (ONE - FACING), CREEP), ONE)
 
     @inlined
-    def as_it_drives(state: Any, gap: Any, wanted: Any, pace: Any, backs_up: Any, limits: Any) -> Any:
-        x, y, distance = OPS.cos(state[heading]), OPS.sin(state[heading]), length(gap)
+    def as_it_drives(
+        state: Row, gap: Row, wanted: Row, pace: np.float32, backs_up: bool, limits: Row
+    ) -> tuple[Row, np.float32]:
+        x, y, distance = cosine(state[heading]), sine(state[heading]), length(gap)
         along, across = (x * gap[0] + y * gap[1]) / distance, (x * gap[1] - y * gap[0]) / distance
         own = velocity(state, at_rest, limits, OPS)
         gear = gear_towards(along, across, x * own[0] + y * own[1], backs_up)
@@ -184,13 +203,13 @@ def _turning(robot: Model, length: Any) -> Any:
         speed = min(length(wanted), pace)
         return ((x * along - y * across) * speed, (y * along + x * across) * speed), pace
 
-    if heading is None:
+    if heading < 0:
         return needs_not
     return in_place if robot.turns_in_place or robot.dimension == 3 else as_it_drives
 
 
 @inlined
-def gear_towards(along: Any, across: Any, speed: Any, backs_up: Any) -> Any:
+def gear_towards(along: np.float32, across: np.float32, speed: np.float32, backs_up: bool) -> np.float32:
     """1 to drive forwards, -1 in reverse.
 
     Args:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import heapq
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba.extending import register_jitable
 
+from d4orm_env.core.arrays import Floats, IntArray, Ints, Whole
 from d4orm_env.engine import wavefront
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS, compiled
-from d4orm_env.engine.wavefront import is_free_line
+from d4orm_env.engine.wavefront import Space, is_free_line
 from d4orm_planners.guidance import nearness, pibt
-from d4orm_planners.guidance.nearness import cells_about
+from d4orm_planners.guidance.nearness import Cells, cells_about
+from d4orm_planners.guidance.pibt import Bodies
+from d4orm_planners.guidance.roadmap import Roadmap
 
 SOURCES = fingerprint((nearness, pibt, wavefront))
 
@@ -30,12 +33,12 @@ class Others(NamedTuple):
         need: ``(K,)`` how far the robot that is replanned keeps from each [m].
     """
 
-    positions: Any
-    need: Any
+    positions: Floats
+    need: Floats
 
 
 @compiled
-def _is_clear(others: Any, k: Any, step: Any, x: Any, y: Any, z: Any) -> Any:
+def _is_clear(others: Others, k: Whole, step: Whole, x: float, y: float, z: float) -> bool:
     """Whether nobody is near a place at a step."""
     row = min(step, others.positions.shape[0] - 1)
     for i in range(others.positions.shape[1]):
@@ -47,7 +50,7 @@ def _is_clear(others: Any, k: Any, step: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 @compiled
-def _fill_boxes(others: Any, boxes: Any) -> None:
+def _fill_boxes(others: Others, boxes: Floats) -> None:
     """The lowest and highest places of everybody in every block of steps; ``boxes`` ``(B, K, 6)`` is output."""
     positions, num_robots = others.positions, others.positions.shape[1]
     for block in range(boxes.shape[0]):
@@ -61,7 +64,9 @@ def _fill_boxes(others: Any, boxes: Any) -> None:
 
 
 @compiled
-def _is_line_free(others: Any, boxes: Any, k: Any, tail: Any, head: Any, depart: Any, arrive: Any) -> Any:
+def _is_line_free(
+    others: Others, boxes: Floats, k: Whole, tail: Floats, head: Floats, depart: Whole, arrive: Whole
+) -> bool:
     """:func:`_is_line_clear`, looking only at those who are about."""
     for block in range((depart + 1) // BLOCK, arrive // BLOCK + 1):
         first, last = max(depart + 1, block * BLOCK), min(arrive + 1, (block + 1) * BLOCK)
@@ -88,7 +93,7 @@ def _is_line_free(others: Any, boxes: Any, k: Any, tail: Any, head: Any, depart:
 
 
 @compiled
-def _is_line_clear(others: Any, k: Any, tail: Any, head: Any, depart: Any, arrive: Any) -> Any:
+def _is_line_clear(others: Others, k: Whole, tail: Floats, head: Floats, depart: Whole, arrive: Whole) -> bool:
     """Whether nobody is near a robot that drives straight from one place to another between two steps."""
     for step in range(depart + 1, arrive + 1):
         share = (step - depart) / (arrive - depart)
@@ -99,7 +104,9 @@ def _is_line_clear(others: Any, k: Any, tail: Any, head: Any, depart: Any, arriv
 
 
 @cached_kernel(SOURCES, variant="straighten", **OPTIONS)
-def straighten(roadmap: Any, bodies: Any, space: Any, others: Any, k: Any, reach: Any, way: Any) -> Any:
+def straighten(
+    roadmap: Roadmap, bodies: Bodies, space: Space | None, others: Others, k: Whole, reach: float, way: IntArray
+) -> int:
     """Leave out nodes of a way where the straight line is free of obstacles and of others.
 
     Args:
@@ -136,7 +143,7 @@ def straighten(roadmap: Any, bodies: Any, space: Any, others: Any, k: Any, reach
 
 
 @cached_kernel(SOURCES, variant="touches", **OPTIONS)
-def touches(others: Any, k: Any, places: Any) -> Any:
+def touches(others: Others, k: Whole, places: Floats) -> bool:
     """Whether a robot at places ``(T + 1, 3)`` comes nearer to any other than it may, after the start."""
     for step in range(1, places.shape[0]):
         if not _is_clear(others, k, step, places[step, 0], places[step, 1], places[step, 2]):
@@ -145,7 +152,7 @@ def touches(others: Any, k: Any, places: Any) -> Any:
 
 
 @compiled
-def _close_nodes(cells: Any, others: Any, k: Any, begins: Any) -> None:
+def _close_nodes(cells: Cells, others: Others, k: Whole, begins: Ints) -> None:
     """Mark with -1 in ``begins`` ``(N, T + 1)`` when somebody is near each node."""
     nodes, steps, rows = cells.points, begins.shape[1], others.positions.shape[0]
     for i in range(others.positions.shape[1]):
@@ -173,7 +180,7 @@ def _close_nodes(cells: Any, others: Any, k: Any, begins: Any) -> None:
 
 
 @compiled
-def _fill_begins(begins: Any, ends: Any) -> None:
+def _fill_begins(begins: Ints, ends: Ints) -> None:
     """Say of every node and step when the free interval around it begins, and of every beginning when it ends.
 
     Steps at which a node is not free know the next one at which it is, as its complement.
@@ -205,13 +212,13 @@ class Trip(NamedTuple):
     """
 
     stride: float
-    launch: Any
+    launch: float
     latest: int
     linger: int
 
 
 @register_jitable(nogil=True, **OPTIONS)
-def _followed_back(path: Any, entry: Any) -> Any:
+def _followed_back(path: IntArray, entry: Whole) -> IntArray:
     """``(n, 3)`` the way that ends with an entry."""
     count, walk = 0, entry
     while walk >= 0:
@@ -225,7 +232,7 @@ def _followed_back(path: Any, entry: Any) -> Any:
 
 
 @cached_kernel(SOURCES, variant="way", **OPTIONS)
-def find_way(roadmap: Any, cells: Any, bodies: Any, others: Any, k: Any, trip: Any) -> Any:
+def find_way(roadmap: Roadmap, cells: Cells, bodies: Bodies, others: Others, k: Whole, trip: Trip) -> IntArray:
     """The soonest way of a robot to its goal among all others: safe interval path planning.
 
     After M. Phillips and M. Likhachev, *SIPP: safe interval path planning for dynamic environments* (ICRA 2011).

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Ints
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS
@@ -44,16 +45,16 @@ class Roadmap(NamedTuple):
         goals: ``(K,)`` int64 nodes.
     """
 
-    nodes: Any
-    first: Any
-    heads: Any
-    lengths: Any
-    room: Any
-    near_first: Any
-    near: Any
-    gaps: Any
-    starts: Any
-    goals: Any
+    nodes: Floats
+    first: IntArray
+    heads: Ints
+    lengths: Floats
+    room: Floats
+    near_first: IntArray
+    near: Ints
+    gaps: Floats
+    starts: IntArray
+    goals: IntArray
 
 
 def lay_roadmap(problem: Problem, fineness: float = 1.0) -> Roadmap:
@@ -82,7 +83,7 @@ def lay_roadmap(problem: Problem, fineness: float = 1.0) -> Roadmap:
     return _assembled(problem, nodes, one, other, room, spread + problem.goal_radius)
 
 
-def _assembled(problem: Problem, nodes: Any, one: Any, other: Any, room: Any, reach: float) -> Roadmap:
+def _assembled(problem: Problem, nodes: Floats, one: IntArray, other: IntArray, room: Floats, reach: float) -> Roadmap:
     """The roadmap of nodes and undirected edges."""
     tails, heads = np.concatenate([one, other]), np.concatenate([other, one])
     order = np.lexsort((heads, tails))
@@ -106,20 +107,20 @@ def _assembled(problem: Problem, nodes: Any, one: Any, other: Any, room: Any, re
     )
 
 
-def _numbers(nodes: Any, places: Any) -> Any:
+def _numbers(nodes: Floats, places: FloatArray) -> IntArray:
     """``(K,)`` the nodes that are at places ``(K, d)``."""
     wanted = in_space(places.astype(np.float64))
     return np.array([int(np.flatnonzero((nodes == place).all(axis=1))[-1]) for place in wanted], np.int64)
 
 
-def _lattice_nodes(problem: Problem, space: Space | None, reach: float, step: float) -> Any:
+def _lattice_nodes(problem: Problem, space: Space | None, reach: float, step: float) -> Floats:
     """``(N, 3)`` free places of a lattice wherever ways may lead."""
     most = min(MAX_NODES, MAX_CELLS // max(problem.num_robots, problem.horizon))
     lattice = lay_lattice(problem, space, reach, step, most, pad=PAD * step)
     return lattice.places[lattice.free]
 
 
-def _room(problem: Problem, space: Space | None, reaches: Any, tails: Any, heads: Any) -> Any:
+def _room(problem: Problem, space: Space | None, reaches: Floats, tails: Floats, heads: Floats) -> Floats:
     """``(Q,)`` the largest of the ``reaches`` that passes on lines; zero where none does."""
     room = np.zeros(len(tails))
     for reach in reaches:
@@ -132,7 +133,9 @@ def _room(problem: Problem, space: Space | None, reaches: Any, tails: Any, heads
 
 
 @cached_kernel(SOURCES, variant="gaps", **OPTIONS)
-def measure_gaps(nodes: Any, tails: Any, heads: Any, near_first: Any, near: Any, gaps: Any) -> None:
+def measure_gaps(
+    nodes: Floats, tails: IntArray, heads: IntArray, near_first: IntArray, near: Ints, gaps: Floats
+) -> None:
     """How near to edges nodes are: ``gaps`` is output, all others as in :class:`Roadmap`."""
     for e in range(tails.shape[0]):
         for number in range(near_first[e], near_first[e + 1]):

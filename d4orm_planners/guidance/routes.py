@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -47,9 +47,9 @@ class Route(NamedTuple):
             corners.
     """
 
-    points: Any
-    times: Any
-    bends: Any
+    points: Floats
+    times: Floats
+    bends: Floats
 
 
 class Routes(NamedTuple):
@@ -67,15 +67,15 @@ class Routes(NamedTuple):
         wait_until: ... has come to this point of its own.
     """
 
-    points: Any
-    times: Any
-    bends: Any
-    first: Any
-    arcs: Any
-    wait_first: Any
-    wait_at: Any
-    wait_for: Any
-    wait_until: Any
+    points: Floats
+    times: Floats
+    bends: Floats
+    first: IntArray
+    arcs: Floats
+    wait_first: IntArray
+    wait_at: IntArray
+    wait_for: IntArray
+    wait_until: IntArray
 
     def each(self) -> list[slice]:
         """The rows of every robot."""
@@ -92,10 +92,10 @@ class Stops(NamedTuple):
         arrives: ``(C,)`` float64 when it gets there.
     """
 
-    places: Any
-    begin: Any
-    departs: Any
-    arrives: Any
+    places: Floats
+    begin: IntArray
+    departs: Floats
+    arrives: Floats
 
 
 def stops_of(roadmap: Roadmap, moves: IntArray, num_robots: int) -> Stops:
@@ -142,12 +142,12 @@ class Bends(NamedTuple):
         sine: ``(C,)``.
     """
 
-    corners: Any
-    before: Any
-    after: Any
-    straight: Any
-    cosine: Any
-    sine: Any
+    corners: Floats
+    before: Floats
+    after: Floats
+    straight: Floats
+    cosine: Floats
+    sine: Floats
 
 
 def _bends_at(corners: Floats, inner: IntArray) -> Bends:
@@ -191,7 +191,7 @@ def _corner_radii(problem: Problem, corners: Floats, owner: IntArray, cut: float
             reach = np.asarray(problem.team.radius, np.float64)[owner[inner]] + problem.margin + ARC_SLACK
             arcs = _arcs(bends, radius, ARC_CHECKS)[..., : problem.dimension]
             room = problem.world.clearance(arcs.reshape(-1, problem.dimension)).reshape(len(inner), ARC_CHECKS)
-            fits = (room > reach[:, None]).all(axis=1)
+            fits = room.min(axis=1) > reach
         rounded = fits & (radius > SHARPEST)
         radii[inner[rounded]] = radius[rounded]
         inner = inner[~fits]
@@ -236,7 +236,7 @@ def _rounded(stops: Stops, radii: Floats) -> tuple[Floats, IntArray, Floats, Flo
     return points, first, times, inside
 
 
-def _find_waits(cells: Cells, first: IntArray, times: Floats, radius: Any, margin: float) -> tuple[Any, ...]:
+def _find_waits(cells: Cells, first: IntArray, times: Floats, radius: Floats, margin: float) -> tuple[IntArray, ...]:
     room, num_robots = 8 * len(times), len(first) - 1
     owner = np.repeat(np.arange(num_robots), np.diff(first))
     wait_first = np.empty(num_robots + 1, np.int64)
@@ -250,8 +250,15 @@ def _find_waits(cells: Cells, first: IntArray, times: Floats, radius: Any, margi
 
 @cached_kernel(SOURCES, variant="waits", **OPTIONS)
 def find_waits(
-    cells: Any, first: Any, owner: Any, times: Any, radius: Any, margin: Any, wait_first: Any, waits: Any
-) -> Any:
+    cells: Cells,
+    first: IntArray,
+    owner: IntArray,
+    times: Floats,
+    radius: Floats,
+    margin: float,
+    wait_first: IntArray,
+    waits: IntArray,
+) -> int:
     """Whom robots have to let pass; see :class:`Routes`.
 
     ``owner`` ``(T,)`` is the robot of each point, and ``waits`` ``(room, 3)`` is at which point, for whom and until it

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from d4orm_env.core import transition
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
 from d4orm_env.engine.drives import LoneRobot
 from d4orm_env.engine.tiles import OPTIONS, ZERO, inlined, make_stepper, models_key, to_fixed_tuple
 from d4orm_planners.guidance import execution, pursuit
@@ -40,19 +40,19 @@ class Timed(NamedTuple):
         beyond: How far it may plan to drive beyond its goal, which stops it [m].
     """
 
-    points: Any
-    arcs: Any
-    paces: Any
-    bends: Any
-    corners: Any
-    departs: Any
-    arrives: Any
-    sight: Any
-    beyond: Any
+    points: Floats
+    arcs: Floats
+    paces: Floats
+    bends: Floats
+    corners: Floats
+    departs: Floats
+    arrives: Floats
+    sight: float
+    beyond: np.float32
 
 
 @inlined
-def stop_before(route: Any, step: Any, at: Any, corner: Any, stride: Any) -> Any:
+def stop_before(route: Timed, step: int, at: int, corner: int, stride: float) -> float:
     """Length of the route up to where a robot at point ``at`` has to be able to stop [m]; ``stride`` in a step [m].
 
     It stays where it waits until it may set out, and stops there only if it has to.
@@ -68,7 +68,7 @@ def stop_before(route: Any, step: Any, at: Any, corner: Any, stride: Any) -> Any
 
 
 @inlined
-def pace_to(route: Any, step: Any, at: Any, corner: Any, stop: Any, dt: Any) -> Any:
+def pace_to(route: Timed, step: int, at: int, corner: int, stop: float, dt: np.float32) -> np.float32:
     """How fast it should be, in order to come to the next corner at its time [m/s]."""
     pace, time = np.float32(route.paces[at]), route.arrives[corner] - step
     if time > 1.0 and stop >= route.corners[corner]:
@@ -77,7 +77,7 @@ def pace_to(route: Any, step: Any, at: Any, corner: Any, stop: Any, dt: Any) -> 
 
 
 @cache
-def timed_kernel(name: str) -> Any:
+def timed_kernel(name: str) -> Kernel[[LoneRobot, Timed, bool, FloatArray, Floats], int]:
     """The compiled drive of a robot of the model with this name along a :class:`Timed` route.
 
     Args of the kernel: the :class:`~d4orm_env.engine.drives.LoneRobot`, the route, whether the robot backs up, see
@@ -89,7 +89,7 @@ def timed_kernel(name: str) -> Any:
     n, m, d, num_limits = model.state_size, model.control_size, model.dimension, len(model.limit_names)
 
     @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
-    def drive(robot: Any, route: Any, backs_up: Any, controls: Any, places: Any) -> Any:
+    def drive(robot: LoneRobot, route: Timed, backs_up: bool, controls: FloatArray, places: Floats) -> int:
         dt, docks, rules = robot.time_step, robot.docks, (robot.docking[0], robot.docking[1], robot.docks)
         h, own = transition.TimeStep(dt[0], dt[1], dt[2], dt[3]), to_fixed_tuple(robot.limits, num_limits)
         goal, x = to_fixed_tuple(robot.goal, d), to_fixed_tuple(robot.start, n)
@@ -142,7 +142,7 @@ def drive_by_clock(
     *,
     hurrying: bool = False,
     backs_up: bool = False,
-) -> tuple[FloatArray, Any, int]:
+) -> tuple[FloatArray, Floats, int]:
     """``(controls (T, m), places (T + 1, 3), arrival)`` of one robot along its route.
 
     Args:

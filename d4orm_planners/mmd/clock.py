@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from d4orm_env.core.arrays import Floats
 from d4orm_env.engine.tiles import compiled
 
 SHARE = 0.7
@@ -13,7 +12,9 @@ SHARE = 0.7
 
 
 @compiled
-def fill_clock(points: Any, duration: Any, speed: Any, acceleration: Any, paces: Any, times: Any) -> None:
+def fill_clock(
+    points: Floats, duration: float, speed: float, acceleration: float, paces: Floats, times: Floats
+) -> None:
     """Fill ``times`` ``(N + 1,)`` with when a robot that starts from rest is at each point [s].
 
     Points follow each other at equal times, but for bends that are driven slower than that, and braking before them.
@@ -48,6 +49,6 @@ def fill_clock(points: Any, duration: Any, speed: Any, acceleration: Any, paces:
 
 
 @compiled
-def _length(points: Any, i: Any) -> Any:
+def _length(points: Floats, i: int) -> float:
     dx, dy, dz = points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1], points[i + 1, 2] - points[i, 2]
     return np.sqrt(dx * dx + dy * dy + dz * dz)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from d4orm_env.core.arrays import Floats, IntArray, Whole
 from d4orm_env.engine import tiles
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS
 
 
 @cached_kernel(fingerprint((tiles,)), variant="count", **OPTIONS)
-def count_conflicts(places: Any, others: Any, distances: Any, counts: Any) -> None:
+def count_conflicts(places: Floats, others: Floats, distances: Floats, counts: IntArray) -> None:
     """Fill ``counts`` ``(B, 2)`` int64 with how many others each of some ways conflicts with, and at how many steps.
 
     Args:
@@ -38,7 +37,7 @@ def count_conflicts(places: Any, others: Any, distances: Any, counts: Any) -> No
 
 
 @cached_kernel(fingerprint((tiles,)), variant="first", **OPTIONS)
-def first_conflict(places: Any, distances: Any) -> Any:
+def first_conflict(places: Floats, distances: Floats) -> tuple[Whole, Whole, Whole, Whole]:
     """``(pairs, step, robot, robot)``: how many pairs conflict, and the earliest conflict; robots are -1 if none does.
 
     Args:

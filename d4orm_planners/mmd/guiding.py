@@ -7,18 +7,19 @@ prior's metric (Kaczmarz's method), so that what is pushed stays like what was l
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba.extending import register_jitable
 
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
 from d4orm_env.engine import tiles, wavefront
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.tiles import OPTIONS, compiled
-from d4orm_env.engine.wavefront import clearance_at
+from d4orm_env.engine.wavefront import Space, clearance_at
 from d4orm_planners.mmd import clock, way_frame
 from d4orm_planners.mmd.clock import fill_clock
-from d4orm_planners.mmd.way_frame import locate, trace
+from d4orm_planners.mmd.way_frame import WayFrame, locate, trace
 
 _PROBE = 1e-3
 """Distance over which the slope of the clearance is measured [m]."""
@@ -41,18 +42,18 @@ class Surroundings(NamedTuple):
         pull: Share of a soft violation that a step takes away; of hard ones it takes away all.
     """
 
-    space: Any
+    space: Space
     clearance: float
     dt: float
-    spheres: Any
-    spans: Any
-    others: Any
-    radii: Any
+    spheres: Floats
+    spans: IntArray
+    others: Floats
+    radii: Floats
     pull: float
 
 
 @register_jitable(nogil=True, **OPTIONS)
-def _point_variance(sines: Any, deviation: Any) -> Any:
+def _point_variance(sines: Floats, deviation: Floats) -> Floats:
     """``(N + 1, 2)`` how much each point varies among the examples, ahead and aside."""
     points, modes = sines.shape
     variance = np.zeros((points, 2))
@@ -65,7 +66,15 @@ def _point_variance(sines: Any, deviation: Any) -> Any:
 
 
 @cached_kernel(fingerprint((tiles, wavefront, clock, way_frame)), variant="guide", **OPTIONS)
-def guide(frame: Any, sines: Any, deviation: Any, surroundings: Any, durations: Any, steps: Any, motions: Any) -> None:
+def guide(
+    frame: WayFrame,
+    sines: Floats,
+    deviation: Floats,
+    surroundings: Surroundings,
+    durations: Floats,
+    steps: int,
+    motions: FloatArray,
+) -> None:
     """Change motions so that they violate less.
 
     Args:
@@ -107,7 +116,7 @@ def guide(frame: Any, sines: Any, deviation: Any, surroundings: Any, durations: 
 
 
 @compiled
-def _violation(surroundings: Any, step: Any, spot: Any, push: Any) -> Any:
+def _violation(surroundings: Surroundings, step: Whole, spot: Floats, push: Floats) -> bool:
     """Fill ``push`` ``(3,)`` with what would end a place's violations at a step [m]; whether there are any."""
     push[:] = 0.0
     place, aside = spot[0], spot[2]
@@ -124,7 +133,7 @@ def _violation(surroundings: Any, step: Any, spot: Any, push: Any) -> Any:
 
 
 @compiled
-def _push_clear(space: Any, clearance: Any, spot: Any, push: Any) -> Any:
+def _push_clear(space: Space, clearance: float, spot: Floats, push: Floats) -> bool:
     """Add to ``push`` what brings a place out of obstacles, on the side where the way is; whether it is too near."""
     x, y, z = spot[0, 0], spot[0, 1], spot[0, 2]
     missing = clearance - clearance_at(space, x, y, z)
@@ -148,7 +157,7 @@ def _push_clear(space: Any, clearance: Any, spot: Any, push: Any) -> Any:
 
 
 @compiled
-def _push_out(centre: Any, radius: Any, share: Any, aside: Any, place: Any, push: Any) -> Any:
+def _push_out(centre: Floats, radius: float, share: float, aside: Floats, place: Floats, push: Floats) -> bool:
     """Add to ``push`` that share of what brings a place out of a sphere; whether it is in it."""
     dx, dy, dz = place[0] - centre[0], place[1] - centre[1], place[2] - centre[2]
     square = dx * dx + dy * dy + dz * dz

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -107,7 +107,7 @@ def posterior(now: float, then: float) -> tuple[float, float, float]:
 
 
 @cached_kernel(fingerprint((tiles,)), variant="tell", **OPTIONS)
-def tell(prior: Any, features: Any, told: Any) -> None:
+def tell(prior: Prior, features: FloatArray, told: FloatArray) -> None:
     """Fill ``told`` ``(P, W)`` with what features ``(P, FEATURES)`` add to the first layer, its bias included."""
     for p in range(features.shape[0]):
         told[p] = prior.into_bias
@@ -118,7 +118,9 @@ def tell(prior: Any, features: Any, told: Any) -> None:
 
 
 @cached_kernel(fingerprint((tiles,)), variant="predict", **OPTIONS)
-def predict(prior: Any, told: Any, level: Any, signal: Any, noisy: Any, clean: Any) -> None:
+def predict(
+    prior: Prior, told: FloatArray, level: FloatArray, signal: FloatArray, noisy: FloatArray, clean: FloatArray
+) -> None:
     """Fill ``clean`` ``(B, SIZE)`` with what the network takes noisy motions ``(B, SIZE)`` to be without their noise.
 
     Args:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from d4orm_env.core import robot_model, transition
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine import lanes, tiles, wavefront
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
 from d4orm_env.engine.drives import LoneRobot
 from d4orm_env.engine.tiles import OPS, OPTIONS, ZERO, compiled, inlined, make_stepper, models_key, to_fixed_tuple
-from d4orm_env.engine.wavefront import clearance_at
+from d4orm_env.engine.wavefront import Space, clearance_at
 from d4orm_planners.mmd import clock, way_frame
 from d4orm_planners.mmd.clock import fill_clock
 from d4orm_planners.mmd.way_frame import WayFrame, trace
@@ -35,14 +36,16 @@ class Tracked(NamedTuple):
         clearances: ``(B,)`` least distance of the centre from obstacles and bounds [m].
     """
 
-    controls: Any
-    places: Any
-    arrivals: Any
-    clearances: Any
+    controls: FloatArray
+    places: Floats
+    arrivals: IntArray
+    clearances: Floats
 
 
 @compiled
-def _catch_up(points: Any, times: Any, i: Any, time: Any, dt: Any, place: Any, wanted: Any) -> None:
+def _catch_up(
+    points: Floats, times: Floats, i: int, time: float, dt: np.float32, place: Floats, wanted: FloatArray
+) -> None:
     """Fill ``wanted`` ``(d,)`` with the velocity from a place to where the motion is a step later [m/s]."""
     for axis in range(wanted.shape[0]):
         pace = (points[i + 1, axis] - points[i, axis]) / (times[i + 1] - times[i])
@@ -52,7 +55,9 @@ def _catch_up(points: Any, times: Any, i: Any, time: Any, dt: Any, place: Any, w
 
 
 @cache
-def tracking_kernel(name: str) -> Any:
+def tracking_kernel(
+    name: str,
+) -> Kernel[[LoneRobot, WayFrame, Floats, Floats, Space, Floats, FloatArray, Tracked], None]:
     """The compiled drives of a robot of the model with this name; see :func:`drive_along`."""
     model = MODELS[name]
     move, dock = make_stepper(model)
@@ -62,7 +67,14 @@ def tracking_kernel(name: str) -> Any:
 
     @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
     def drive(
-        robot: Any, frame: Any, sines: Any, deviation: Any, space: Any, durations: Any, motions: Any, driven: Any
+        robot: LoneRobot,
+        frame: WayFrame,
+        sines: Floats,
+        deviation: Floats,
+        space: Space,
+        durations: Floats,
+        motions: FloatArray,
+        driven: Tracked,
     ) -> None:
         dt, docks, docking = robot.time_step, robot.docks, (robot.docking[0], robot.docking[1], robot.docks)
         h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])
@@ -106,7 +118,14 @@ def tracking_kernel(name: str) -> Any:
 
 
 def drive_along(
-    problem: Problem, robot: int, frame: WayFrame, sines: Any, deviation: Any, space: Any, durations: Any, motions: Any
+    problem: Problem,
+    robot: int,
+    frame: WayFrame,
+    sines: Floats,
+    deviation: Floats,
+    space: Space,
+    durations: Floats,
+    motions: FloatArray,
 ) -> Tracked:
     """Drive a robot along each of some motions, as if it were alone: by the clock, and then straight to its goal.
 

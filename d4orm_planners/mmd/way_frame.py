@@ -7,11 +7,11 @@ directions, and a robot that waits or hurries stays on its way.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.arrays import Floats
+from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.portable import sin
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_model import ACCELERATION, SPEED
@@ -54,15 +54,15 @@ class WayFrame(NamedTuple):
         features: ``(P, FEATURES)`` what the model is told, per axis.
     """
 
-    reference: Any
-    tangents: Any
-    axes: Any
+    reference: Floats
+    tangents: Floats
+    axes: Floats
     length: float
     reach: float
     speed: float
     acceleration: float
     quickest: float
-    features: Any
+    features: FloatArray
 
 
 def sine_table() -> Floats:
@@ -155,7 +155,7 @@ def _unit(vector: Floats, otherwise: Floats) -> Floats:
 
 
 @cached_kernel(SOURCES, variant="resample", **OPTIONS)
-def resample(way: Any, reference: Any) -> Any:
+def resample(way: Floats, reference: Floats) -> float:
     """Fill ``reference`` ``(N + 1, 3)`` with places equally far apart on the way ``(w, 3)``; its length."""
     last = reference.shape[0] - 1
     total = 0.0
@@ -176,7 +176,7 @@ def resample(way: Any, reference: Any) -> Any:
 
 
 @cached_kernel(SOURCES, variant="tangents", **OPTIONS)
-def round_tangents(reference: Any, tangents: Any) -> None:
+def round_tangents(reference: Floats, tangents: Floats) -> None:
     """Fill ``tangents`` ``(N + 1, 3)`` with the mean direction of the way about each point."""
     last = reference.shape[0] - 1
     for i in range(last + 1):
@@ -190,7 +190,9 @@ def round_tangents(reference: Any, tangents: Any) -> None:
 
 
 @compiled
-def locate(frame: Any, axis: Any, sines: Any, deviation: Any, motion: Any, i: Any, spot: Any) -> None:
+def locate(
+    frame: WayFrame, axis: Floats, sines: Floats, deviation: Floats, motion: FloatArray, i: int, spot: Floats
+) -> None:
     """Fill ``spot`` ``(4, 3)``: a motion's point [m], directions ahead and aside there, its place on the way [m].
 
     Args:
@@ -220,7 +222,9 @@ def locate(frame: Any, axis: Any, sines: Any, deviation: Any, motion: Any, i: An
 
 
 @inlined
-def trace(frame: Any, axis: Any, sines: Any, deviation: Any, motion: Any, spot: Any, points: Any) -> None:
+def trace(
+    frame: WayFrame, axis: Floats, sines: Floats, deviation: Floats, motion: FloatArray, spot: Floats, points: Floats
+) -> None:
     """Fill ``points`` ``(N + 1, 3)`` with those of a motion [m]; all else as of :func:`locate`, ``spot`` as scratch."""
     for i in range(points.shape[0]):
         locate(frame, axis, sines[i], deviation, motion, i, spot)
@@ -229,7 +233,7 @@ def trace(frame: Any, axis: Any, sines: Any, deviation: Any, motion: Any, spot: 
 
 
 @compiled
-def _gap(way: Any, corner: Any) -> Any:
+def _gap(way: Floats, corner: int) -> float:
     dx, dy, dz = (
         way[corner, 0] - way[corner - 1, 0],
         way[corner, 1] - way[corner - 1, 1],
@@ -239,7 +243,9 @@ def _gap(way: Any, corner: Any) -> Any:
 
 
 @cached_kernel(SOURCES, variant="describe", **OPTIONS)
-def describe(space: Any, reference: Any, along: Any, across: Any, length: Any, reach: Any, features: Any) -> None:
+def describe(
+    space: Space, reference: Floats, along: Floats, across: Floats, length: float, reach: float, features: FloatArray
+) -> None:
     """Fill in where the way leads and how much room is on it and on either side of it.
 
     Args:

@@ -69,7 +69,7 @@ class Dials:
         for dial in DIALS:
             self.sliders[dial.name].value = self._session.levels.get(dial.name, dial.off)
 
-    def _turn_by(self, event: Any) -> None:
+    def _turn_by(self, event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
         if event.client is not None:  # somebody's hand, not this program's
             self._turn()
 

@@ -6,7 +6,6 @@ All raise a ``ValueError`` of one line where the scene would make no sense; it t
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -159,7 +158,7 @@ def _places(problem: Problem) -> tuple[FloatArray, FloatArray]:
     return np.array(problem.start), np.array(problem.goal)
 
 
-def _with_world(problem: Problem, **changes: Any) -> Problem:
+def _with_world(problem: Problem, **changes: object) -> Problem:
     changed = problem.resumed_at(problem.start, problem.goal, world=problem.world.replace(**changes))
     _check_world(changed)
     return changed

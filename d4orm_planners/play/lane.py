@@ -5,14 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances import Disturbance
+from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_planners.play.frame import Frame, Moment, closest_approach, guidance
 from d4orm_planners.play.recording import Recording
@@ -34,7 +33,7 @@ class Terms:
 
     seed: int = 0
     lifelong: bool = False
-    disturbances: Sequence[Disturbance[Any]] = ()
+    disturbances: Sequence[AnyDisturbance] = ()
 
 
 class Lane:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+import trimesh
 import viser
 from numpy.typing import NDArray
 
@@ -112,7 +113,7 @@ class LaneView:
         if self._shown["margins"]:
             nodes["margins"].batched_positions = places
         nodes["subgoals"].visible = self._shown["subgoals"] and frame.subgoals is not None
-        if nodes["subgoals"].visible:
+        if frame.subgoals is not None and nodes["subgoals"].visible:
             nodes["subgoals"].batched_positions = in_space(frame.subgoals)
         if now - self._lines_at > LINES_EVERY:
             self._lines_at = now
@@ -154,7 +155,7 @@ class LaneView:
             self._add_many("bodies", mesh, places, np.stack([radius, radius, high], axis=1), np.array(BODY), 1.0)
 
     def _add_many(
-        self, name: str, mesh: Any, places: Points, scales: FloatArray, colors: FloatArray, opacity: float
+        self, name: str, mesh: trimesh.Trimesh, places: Points, scales: FloatArray, colors: FloatArray, opacity: float
     ) -> None:
         self._nodes[name] = self._scene.add_batched_meshes_simple(
             f"{self._root}/{name}", np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32),
@@ -188,7 +189,7 @@ class LaneView:
         grips: dict[int, tuple[Points, Points]] = {}
 
         @node.on_drag("left")
-        def _(event: Any) -> None:
+        def _(event: viser.SceneNodeDragEvent[viser.SceneNodeHandle]) -> None:
             index, frame = event.instance_index or 0, self._frame
             if event.phase == "start":
                 at = self._place_of(kind, index, frame)
@@ -221,7 +222,7 @@ class LaneView:
             return in_space(frame.goals)[index]
         return np.asarray(self._nodes[kind].position, np.float32)
 
-    def _pointed(self, event: Any, at: Points) -> Points:
+    def _pointed(self, event: viser.SceneNodeDragEvent[viser.SceneNodeHandle], at: Points) -> Points:
         """Where the pointer is: on the plane that planar robots drive on, or as far from the camera as the shape."""
         end = np.asarray(event.end_position, np.float64)
         if self._frame.problem.dimension == 3:

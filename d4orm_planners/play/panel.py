@@ -91,7 +91,7 @@ class Panel:
         self.paused.on_update(lambda _: self._session.pause(self.paused.value))
         step, reset = self._gui.add_button("Step"), self._gui.add_button("Reset")
 
-        def one_step(_: Any) -> None:
+        def one_step(_: object) -> None:
             self.paused.value = True
             self._session.step()
 
@@ -113,7 +113,7 @@ class Panel:
         horizon = self._gui.add_slider("Look ahead", 5, 50, 1, 20, hint="Steps that D4orm-C2F predicts.")
         horizon.on_update(lambda _: self._session.set_horizon(int(horizon.value)))
 
-    def _choose(self, event: Any) -> None:
+    def _choose(self, event: viser.GuiEvent[viser.GuiCheckboxHandle]) -> None:
         if event.client is not None:  # somebody's hand, not this program's
             self._session.choose(*(name for name, box in self._drivers.items() if box.value))
 
@@ -148,7 +148,7 @@ class Panel:
         model = self._gui.add_dropdown("Model", MODELS)
         seed = self._gui.add_number("Seed", 0, min=0, max=2**31 - 1, step=1)
 
-        def load(_: Any) -> None:
+        def load(_: object) -> None:
             chosen = None if model.value == OWN_MODEL else model.value
             make = partial(make_problem, scenario.value, int(robots.value), int(seed.value), model=chosen)
             self._session.load(make, int(seed.value))
@@ -160,9 +160,9 @@ class Panel:
             self._add_choice(name)
 
     def _add_choice(self, name: str) -> None:
-        box: Any = self._gui.add_checkbox(name.capitalize(), self._view.shown[name])
+        box = self._gui.add_checkbox(name.capitalize(), self._view.shown[name])
 
-        def choose(_: Any) -> None:
+        def choose(_: object) -> None:
             self._view.shown[name] = box.value
             self._gui.configure_theme(dark_mode=self._view.shown["dark"], **THEME)
 

@@ -6,21 +6,21 @@ Few triangles and cheap materials: where a browser has no graphics processor, th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.polygon import triangulate
 
 Points = NDArray[np.float32]
 Colors = NDArray[np.uint8]
+Numbers = NDArray[np.number]
 
 NO_LINES: tuple[Points, Colors] = np.zeros((0, 2, 3), np.float32), np.zeros((0, 2, 3), np.uint8)
 
 
-def in_space(points: Any) -> Points:
+def in_space(points: ArrayLike) -> Points:
     """Points ``(..., d)`` as new ones ``(..., 3)``."""
     given = np.asarray(points, np.float32)
     places = np.zeros((*given.shape[:-1], 3), np.float32)
@@ -28,12 +28,12 @@ def in_space(points: Any) -> Points:
     return places
 
 
-def linear(colors: NDArray[Any]) -> Colors:
+def linear(colors: Numbers) -> Colors:
     """Colours as the page reads those of many things at once: proportional to the light."""
     return np.round(255 * (colors / 255) ** 2.2).astype(np.uint8)
 
 
-def puck(sections: int, height: float = 1.0) -> Any:
+def puck(sections: int, height: float = 1.0) -> trimesh.Trimesh:
     """What stands for something in the plane: a flat prism of radius 1 about the origin, open below."""
     mesh = trimesh.creation.cylinder(1.0, height, sections=sections)
     mesh.update_faces(mesh.face_normals[:, 2] > -0.5)
@@ -41,12 +41,14 @@ def puck(sections: int, height: float = 1.0) -> Any:
     return mesh
 
 
-def ball(subdivisions: int) -> Any:
+def ball(subdivisions: int) -> trimesh.Trimesh:
     """What stands for something in space: a sphere of radius 1 about the origin."""
     return trimesh.creation.icosphere(subdivisions=subdivisions)
 
 
-def solid(kind: str, shape: NDArray[np.float64], dimension: int, floor: float, top: float) -> tuple[Any, Points]:
+def solid(
+    kind: str, shape: NDArray[np.float64], dimension: int, floor: float, top: float
+) -> tuple[trimesh.Trimesh, Points]:
     """An obstacle's mesh about its centre, and the centre."""
     tall, middle = top - floor, (top + floor) / 2
     if kind == "spheres":
@@ -63,7 +65,7 @@ def solid(kind: str, shape: NDArray[np.float64], dimension: int, floor: float, t
     return _prism(shape - centre, tall), np.array([*centre, middle], np.float32)
 
 
-def _prism(corners: NDArray[np.float64], tall: float) -> Any:
+def _prism(corners: NDArray[np.float64], tall: float) -> trimesh.Trimesh:
     """A polygon as a solid of some height."""
     count, top = len(corners), np.array(triangulate(corners.astype(np.float32)))
     ring = np.arange(count)
@@ -84,7 +86,7 @@ def edges(bounds: Points) -> Points:
 
 
 def polylines(
-    path: NDArray[Any], colors: NDArray[Any], paper: int, shares: tuple[float, float], knots: Sequence[NDArray[np.intp]]
+    path: Numbers, colors: Numbers, paper: int, shares: tuple[float, float], knots: Sequence[NDArray[np.intp]]
 ) -> tuple[Points, Colors]:
     """Segments along the ways of a team.
 
@@ -107,7 +109,7 @@ def polylines(
     return np.concatenate(points), linear(np.concatenate(tones))
 
 
-def bends(way: NDArray[Any], tolerance: float) -> NDArray[np.intp]:
+def bends(way: Numbers, tolerance: float) -> NDArray[np.intp]:
     """Indices of a few points that tell a way ``(T, d)`` to within a tolerance [m] (Ramer, Douglas and Peucker)."""
     kept, open_parts = {0, len(way) - 1}, [(0, len(way) - 1)]
     while open_parts:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from d4orm_env.core.errors import first_line
 from d4orm_planners.rl.samples import Samples
 
 if TYPE_CHECKING:
+    from minari import MinariDataset
     from pettingzoo import ParallelEnv
 
 
@@ -49,7 +51,7 @@ def dataset_samples(path: str, model: str, size: int) -> list[Samples]:
     return episodes
 
 
-def _dataset(path: str) -> Any:
+def _dataset(path: str) -> MinariDataset:
     try:
         import minari
     except ModuleNotFoundError as error:
@@ -67,7 +69,7 @@ def _dataset(path: str) -> Any:
         ) from None
 
 
-def _environment(dataset: Any, path: str) -> tuple[ParallelEnv, Any]:
+def _environment(dataset: MinariDataset, path: str) -> tuple[ParallelEnv, Mapping[str, object]]:
     """An environment with the dataset's teams, and what it says about itself."""
     told = dataset.storage.metadata.get("demonstrations")
     try:

@@ -15,13 +15,14 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import Field
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
 from d4orm_env import navigation_v0
+from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.seeds import Stream, derived_seed, generator
 from d4orm_planners.registry import make_policy, setting_names
 from d4orm_planners.rl.algorithms import ALGORITHMS
@@ -68,7 +69,7 @@ class ImitationSettings(Practice):
     """
 
     expert: str = "d4orm-c2f"
-    expert_settings: Mapping[str, Any] = field(default_factory=dict)
+    expert_settings: Mapping[str, object] = field(default_factory=dict)
     dataset: PathText | None = None
     episodes: Annotated[Many, Field(ge=2)] = 100
     rounds: Annotated[Count, Field(le=1000)] = 5
@@ -79,7 +80,7 @@ class ImitationSettings(Practice):
         make_policy(self.expert, **self.expert_settings)
 
     @property
-    def all_expert_settings(self) -> dict[str, Any]:
+    def all_expert_settings(self) -> dict[str, object]:
         """What the expert is made with."""
         own = {name: value for name, value in OTHERS_DRIVE.items() if name in setting_names(self.expert)}
         return own | dict(self.expert_settings)
@@ -154,7 +155,13 @@ class _Run:
         self._conclude(index, self._network(index), len(known[0]), held, begin, recorded)
 
     def _conclude(
-        self, index: int, network: Network, steps: int, held: tuple[Any, Any], begin: float, recorded: float
+        self,
+        index: int,
+        network: Network,
+        steps: int,
+        held: tuple[FloatArray, FloatArray],
+        begin: float,
+        recorded: float,
     ) -> None:
         """Judge what has been learned, and keep it."""
         seconds = time.perf_counter() - begin
@@ -191,7 +198,7 @@ class _Run:
         record_samples(env, expert, seed, self._network(index).controls if index else None).save(path)
         env.close()
 
-    def _samples(self, last: int) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+    def _samples(self, last: int) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
         """Inputs and targets of all rounds so far: those to learn from, and those held out."""
         recorded = self.settings.episodes
         episodes = [*(self._given or ())]

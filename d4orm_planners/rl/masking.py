@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -29,7 +28,7 @@ class _MaskedBuffer(BaseBuffer):
         """``(T, B)`` which robots acted in which steps."""
         return np.zeros((self.buffer_size, self.n_envs), np.bool_)
 
-    def add(self, *args: Any, **kwargs: Any) -> None:
+    def add(self, *args: object, **kwargs: object) -> None:
         self.acted[self.pos] = self.source.acted
         super().add(*args, **kwargs)
 

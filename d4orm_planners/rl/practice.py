@@ -43,7 +43,7 @@ class Practice(CheckedSettings):
     seed: Seed = 0
     model: str | None = None
     validation_worlds: Many = 100
-    scenario_settings: Mapping[str, Any] = field(default_factory=dict)
+    scenario_settings: Mapping[str, object] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()

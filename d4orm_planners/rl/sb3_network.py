@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from d4orm_planners.rl.network import FORMAT, Header, Network
 
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
 START_COUNT = 1e6
 """How many observations the normalisation of a network that learns on counts for: what it knows is not forgotten."""
 
 
-def network_of(header: Mapping[str, Any], model: Any, normalization: Any) -> Network:
+def network_of(header: Mapping[str, Any], model: BaseAlgorithm, normalization: Any) -> Network:
     """The deterministic policy of a Stable-Baselines3 model.
 
     Args:
@@ -36,7 +39,7 @@ def network_of(header: Mapping[str, Any], model: Any, normalization: Any) -> Net
     return Network(full, {name: np.array(value, np.float32) for name, value in arrays.items()})
 
 
-def set_network(model: Any, normalization: Any, network: Network) -> None:
+def set_network(model: BaseAlgorithm, normalization: Any, network: Network) -> None:
     """Have a model act as a network does, in its own normalisation; what it thinks of states is left as it is.
 
     Args:
@@ -64,17 +67,17 @@ def set_network(model: Any, normalization: Any, network: Network) -> None:
     seen.count = START_COUNT
 
 
-def _squashed(model: Any) -> bool:
+def _squashed(model: BaseAlgorithm) -> bool:
     return hasattr(model.policy, "actor")
 
 
-def _actor(model: Any) -> list[Any]:
+def _actor(model: BaseAlgorithm) -> list[torch.nn.Module]:
     """What a model acts by, in order."""
-    policy = model.policy
+    policy: Any = model.policy
     if _squashed(model):
         return [*policy.actor.latent_pi, policy.actor.mu]
     return [*policy.mlp_extractor.policy_net, policy.action_net]
 
 
-def _layers(model: Any) -> list[torch.nn.Linear]:
+def _layers(model: BaseAlgorithm) -> list[torch.nn.Linear]:
     return [layer for layer in _actor(model) if isinstance(layer, torch.nn.Linear)]
