@@ -11,9 +11,11 @@ pass through. It would drive straight, or among walls along the shortest free wa
 from __future__ import annotations
 
 import time
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from outputs import argument_parser, count, save_gif, save_table
 
 from d4orm_env import Problem, make_problem, navigation_v0
@@ -40,6 +42,52 @@ def least_times(problem: Problem, joint: JointState) -> np.ndarray:
     return accelerating + np.maximum(way - to_top_speed, 0) / speed
 
 
+class Drive(NamedTuple):
+    """What came of driving a team from goal to goal."""
+
+    seconds: float
+    metrics: Mapping[str, float]
+    bounds: list[float]
+    act_times: list[float]
+    robots_that_touched: int
+    replanned: int
+    frames: list[NDArray[np.uint8]]
+
+
+def drive(problem: Problem, seed: int, minutes: float, film: float) -> Drive:
+    """Drive for so many minutes, and film the first seconds."""
+    env = navigation_v0.parallel_env(problem=problem, lifelong=True)
+    env.max_cycles = max(round(60 * minutes / problem.dt), 1)
+    observations, _ = env.reset(seed=seed)
+    policy: Any = make_policy("d4orm-c2f")
+    policy.reset(env, seed=seed)
+
+    joint = split_state(problem, env.state())
+    bounds = list(least_times(problem, joint))
+    nobody = np.zeros(problem.num_robots, bool)
+    trail, frames, act_times, touched = [joint.states[:, :2]], [], [], nobody
+    # With a view of all places that a goal may come to lie.
+    renderer = FrameRenderer(problem, (520, 540), goal_region(problem))
+    while env.agents:
+        begin = time.perf_counter()
+        actions = policy.act(observations, env.state())
+        act_times.append(time.perf_counter() - begin)
+        observations, _, _, _, infos = env.step(actions)
+        before, joint = joint, split_state(problem, env.state())
+        bounds.extend(least_times(problem, joint)[(joint.goals != before.goals).any(axis=1)])
+        collided = np.array([infos[agent]["collided"] for agent in env.possible_agents])
+        touched = touched | collided
+        trail = [*trail[-30:], joint.states[:, :2]]
+        seconds = joint.steps * problem.dt
+        if seconds <= film:
+            caption = f"{seconds:.1f} s    {len(bounds) - problem.num_robots} goals reached"
+            frames.append(renderer.draw(joint.states, nobody, collided, joint.goals, np.stack(trail), caption=caption))
+    renderer.close()
+    metrics, replanned = env.unwrapped.metrics(), sum(loop.replanned for loop in policy.loops)
+    env.close()
+    return Drive(seconds, metrics, bounds, act_times, int(touched.sum()), replanned, frames)
+
+
 def main() -> None:
     """Run the loop, print the throughput and write the table and the animation."""
     parser = argument_parser(__doc__)
@@ -54,56 +102,26 @@ def main() -> None:
         num_robots, minutes, film = 4, 0.1, 2.0
 
     problem = make_problem(arguments.scenario, num_robots=num_robots, seed=arguments.seed)
-    env = navigation_v0.parallel_env(problem=problem, lifelong=True)
-    env.max_cycles = max(round(60 * minutes / problem.dt), 1)
-    observations, _ = env.reset(seed=arguments.seed)
-    policy: Any = make_policy("d4orm-c2f")
-    policy.reset(env, seed=arguments.seed)
-
-    joint = split_state(problem, env.state())
-    bounds = list(least_times(problem, joint))
-    trail, frames, act_times, touched = [joint.states[:, :2]], [], [], np.zeros(num_robots, bool)
-    # With a view of all places that a goal may come to lie.
-    renderer = FrameRenderer(problem, (520, 540), goal_region(problem))
-    while env.agents:
-        begin = time.perf_counter()
-        actions = policy.act(observations, env.state())
-        act_times.append(time.perf_counter() - begin)
-        observations, _, _, _, infos = env.step(actions)
-        before, joint = joint, split_state(problem, env.state())
-        new = (joint.goals != before.goals).any(axis=1)
-        bounds.extend(least_times(problem, joint)[new])
-        collided = np.array([infos[agent]["collided"] for agent in env.possible_agents])
-        touched |= collided
-        trail = [*trail[-30:], joint.states[:, :2]]
-        seconds = joint.steps * problem.dt
-        if seconds <= film:
-            caption = f"{seconds:.1f} s    {len(bounds) - num_robots} goals reached"
-            arrived = np.zeros(num_robots, bool)
-            frames.append(renderer.draw(joint.states, arrived, collided, joint.goals, np.stack(trail), caption=caption))
-    renderer.close()
-
-    metrics = env.unwrapped.metrics()
-    rate, bound = metrics["goals_per_robot_minute"], 60 / float(np.mean(bounds))
-    loops = 1000 * np.array(act_times)
+    driven = drive(problem, arguments.seed, minutes, film)
+    rate, bound = driven.metrics["goals_per_robot_minute"], 60 / float(np.mean(driven.bounds))
+    loops = 1000 * np.array(driven.act_times)
     row = {
         "scenario": arguments.scenario,
         "robots": num_robots,
-        "simulated [s]": f"{joint.steps * problem.dt:.1f}",
-        "goals reached": int(metrics["goals_reached"]),
+        "simulated [s]": f"{driven.seconds:.1f}",
+        "goals reached": int(driven.metrics["goals_reached"]),
         "goals per robot-minute": f"{rate:.2f}",
         "bound": f"{bound:.2f}",
         "share of the bound": f"{rate / bound:.0%}",
-        "robots that touched": int(touched.sum()),
-        "robot-steps in contact": int(metrics["collisions"]),
+        "robots that touched": driven.robots_that_touched,
+        "robot-steps in contact": int(driven.metrics["collisions"]),
         "loop, median [ms]": f"{np.median(loops):.0f}",
         "loop, 95th percentile [ms]": f"{np.percentile(loops, 95):.0f}",
         "loop, slowest [ms]": f"{loops.max():.0f}",
-        "guidance planned anew": sum(loop.replanned for loop in policy.loops),
+        "guidance planned anew": driven.replanned,
     }
     save_table([row], arguments.out / "lifelong.csv")
-    save_gif(frames, arguments.out / "lifelong.gif", problem.dt)
-    env.close()
+    save_gif(driven.frames, arguments.out / "lifelong.gif", problem.dt)
 
 
 if __name__ == "__main__":

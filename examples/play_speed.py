@@ -19,9 +19,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from outputs import require
 
 require("viz", "viser")
@@ -97,15 +98,25 @@ def looking(address: str, in_browser: bool) -> Iterator[Client | Browser]:
         yield Browser(page, address)
 
 
-def watch(session: Session, seconds: float) -> list[float]:
-    """The control loops of so many seconds [s]."""
-    loops, last, end = [], session.frame.moment.time, time.perf_counter() + seconds
+class Watched(NamedTuple):
+    """What was seen of the control loops, one after the other."""
+
+    milliseconds: NDArray[np.float64]
+    megabytes: NDArray[np.float64]
+    in_contact: NDArray[np.int64]
+
+
+def watch(session: Session, seconds: float) -> Watched:
+    """The control loops of so many seconds."""
+    seen: list[tuple[float, float, int]] = []
+    last, end = session.frame.moment.time, time.perf_counter() + seconds
     while time.perf_counter() < end:
-        if (moment := session.frame.moment).time != last:
+        if (moment := (frame := session.frame).moment).time != last:
             last = moment.time
-            loops.append(session.frame.loop)
+            seen.append((1e3 * frame.loop, memory(), int(frame.collided.sum())))
         time.sleep(0.005)
-    return loops
+    loops, held, contacts = zip(*seen)
+    return Watched(np.array(loops), np.array(held), np.array(contacts))
 
 
 def drop(session: Session, random: np.random.Generator) -> float:
@@ -139,8 +150,8 @@ def measure(arguments: argparse.Namespace) -> None:
         with looking(playground.address, arguments.browser) as somebody:
             watch(session, arguments.warmup)
             seconds = 60 * arguments.minutes or arguments.seconds
-            before, held, begin = somebody.frames(), memory(), time.perf_counter()
-            loops = 1e3 * np.array(watch(session, seconds))
+            before, begin = somebody.frames(), time.perf_counter()
+            loops, held, contacts = watch(session, seconds)
             passed, after = time.perf_counter() - begin, somebody.frames()
             drops = [drop(session, np.random.default_rng(seed)) for seed in range(arguments.drops)]
             print(f"{problem.name}, {problem.num_robots} robots, {', '.join(session.policies)}: {passed:.0f} s")
@@ -153,7 +164,9 @@ def measure(arguments: argparse.Namespace) -> None:
                 f"{100 * np.mean(loops > step):.1f}% over {step:.0f} ms"
             )
             print(f"from a drop to the new plan: median {np.nanmedian(drops):.2f} s, most {np.nanmax(drops):.2f} s")
-            print(f"memory: {held:.0f} to {memory():.0f} MB; contacts now: {int(session.frame.collided.sum())}")
+            quarters = held[np.linspace(0, len(held) - 1, 5).astype(int)]
+            print(f"memory, every quarter of that: {', '.join(f'{size:.0f}' for size in quarters)} MB")
+            print(f"steps in which anybody touched anything: {int((contacts > 0).sum())}")
     finally:
         playground.stop()
         thread.join()

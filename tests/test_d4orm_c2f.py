@@ -257,7 +257,7 @@ def test_the_guidance_is_planned_anew_for_robots_pushed_away() -> None:
             # Somebody else has the robots' controls.
             actions = {agent: -action for agent, action in actions.items()}
         observations = env.step(actions)[0]
-    assert any(loop.replanned for loop in policy.loops[10:])
+    assert any(loop.replanned for loop in list(policy.loops)[10:])
 
 
 def test_refined_guidance_is_one_plan_from_beginning_to_end() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
 
 GAP = 0.4
 """Share of the margin that is kept in the last resort."""
+
+REMEMBERED = 10_000
+"""Control loops; an episode with ever new goals has no end."""
 
 NEARLY = 1e-3
 """Velocities that differ by no more are the same [m/s]."""
@@ -63,7 +67,7 @@ class D4ormC2F(StatePolicy):
 
     Attributes:
         config: The settings.
-        loops: A :class:`LoopRecord` per control loop of the present episode.
+        loops: A :class:`LoopRecord` per control loop of the present episode, of the last :data:`REMEMBERED`.
         coarse_time: Time that the first coarse plan took [s].
         subgoals: ``(K, d)`` where the last control loop headed for [m]; the start before the first.
     """
@@ -95,7 +99,8 @@ class D4ormC2F(StatePolicy):
         self._random = generator(seed, Stream.CONTROLLER_NOISE)
         self._refinement.forget()
         self._control.forget()
-        self.loops: list[LoopRecord] = []
+        self.loops: deque[LoopRecord] = deque(maxlen=REMEMBERED)
+        self._begun = 0
         joint = split_state(self.problem, env.state())
         lifelong = env.unwrapped.lifelong
         self._window = Window(self.problem, self.config, self._engine, docks=not lifelong)
@@ -175,7 +180,8 @@ class D4ormC2F(StatePolicy):
         begin = time.perf_counter()
         guide, docked = self._guide, self._docked
         replanned = guide.replan_if_needed(joint, docked)
-        refined = not replanned and guide.refine(joint.steps, due=len(self.loops) % self.config.refine_every == 0)
+        refined = not replanned and guide.refine(joint.steps, due=self._begun % self.config.refine_every == 0)
+        self._begun += 1
         targets = guide.subgoals(joint, docked)
         self.subgoals = subgoals = guide.guidance.path[targets, np.arange(len(targets))]
         left, base = self._plan[self._next :], self._base(joint)
