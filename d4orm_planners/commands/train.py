@@ -24,7 +24,10 @@ if TYPE_CHECKING:
 
 
 IMITATION = "imitation"
-_REINFORCEMENT_ONLY = ("steps", "num_envs", "curriculum", "lessons", "start_from")
+_REINFORCEMENT_ONLY = (
+    "steps", "num_envs", "curriculum", "lessons", "start_from", "network", "observed_robots", "learning_rate",
+    "reward_settings", "mixture",
+)  # fmt: skip
 _IMITATION_ONLY = ("expert", "expert_settings", "dataset", "episodes", "rounds", "epochs")
 
 
@@ -47,6 +50,26 @@ class TrainOptions:
     start_from: Annotated[
         Path | None, typer.Option("--start-from", help="A policy file of the same algorithm that learns on.")
     ] = None
+    network: Annotated[
+        str, typer.Option("--network", help="flat, or sets: neighbours in any order and number; for ppo.")
+    ] = "flat"
+    observed_robots: Annotated[int, typer.Option("--observed-robots", help="Neighbours in observations.")] = 4
+    learning_rate: Annotated[
+        float | None, typer.Option("--learning-rate", help="At the beginning; it falls to a tenth. 3e-4 for ppo.")
+    ] = None
+    reward_settings: Annotated[
+        list[str] | None,
+        typer.Option("--reward-set", help="A weight of the reward to learn from, as contact=5; repeatable."),
+    ] = None
+    mixture: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--mixture",
+            help="A scenario, team size and settings to practise with others at once, as 'random 8 size=4', or the "
+            "name of a mixture, crowds; repeatable.",
+        ),
+    ] = None
+    validation_worlds: Annotated[int, typer.Option("--validation-worlds", help="Episodes per evaluation.")] = 100
     expert: Annotated[str, typer.Option("--expert", help="Imitation: whom to imitate.")] = "d4orm-c2f"
     expert_settings: Annotated[
         list[str] | None,
@@ -103,9 +126,13 @@ def _reinforcement(options: TrainOptions) -> Callable[..., TrainingResult]:
     steps = options.steps
     if not (math.isfinite(steps) and steps == int(steps) >= 1):
         raise ValueError(f"--steps is {steps:g}; it must be a whole number of at least 1")
-    same = ("algorithm", "num_envs", "curriculum", "lessons", "start_from")
+    same = (
+        "algorithm", "num_envs", "curriculum", "lessons", "start_from", "network", "observed_robots", "learning_rate"
+    )  # fmt: skip
     own = {name: getattr(options, name) for name in same}
-    settings = training.TrainingSettings(**_practice(options), **own, steps=int(steps))
+    own |= {"steps": int(steps), "mixture": tuple(options.mixture or ())}
+    own["reward_settings"] = parse_settings(options.reward_settings, "--reward-set")
+    settings = training.TrainingSettings(**_practice(options), **own)
     return partial(training.train, settings)
 
 
@@ -122,7 +149,7 @@ def _imitation(options: TrainOptions) -> Callable[..., TrainingResult]:
 def _practice(options: TrainOptions) -> dict[str, object]:
     """What both have in common."""
     return {
-        **{name: getattr(options, name) for name in ("scenario", "num_robots", "seed", "model")},
+        **{name: getattr(options, name) for name in ("scenario", "num_robots", "seed", "model", "validation_worlds")},
         "scenario_settings": parse_settings(options.scenario_settings, "--scenario-set"),
     }
 

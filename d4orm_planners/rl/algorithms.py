@@ -9,12 +9,16 @@ from typing import ClassVar
 
 import numpy as np
 import stable_baselines3
+import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import FloatSchedule, set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
+from d4orm_planners.rl.features import Features
 from d4orm_planners.rl.masking import MaskedReplayBuffer, MaskedRolloutBuffer
+from d4orm_planners.rl.mixture import MixedVecEnv
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
+from d4orm_planners.rl.sb3_sets import SetExtractor
 
 
 @dataclass(frozen=True)
@@ -35,20 +39,25 @@ class Algorithm:
     learning_rate: ClassVar[float] = 3e-4
     gamma: ClassVar[float] = 0.99
 
-    def make(self, env: VecNormalize) -> BaseAlgorithm:
-        """A new model, whose first weights are drawn from the global random state."""
+    def make(self, env: VecNormalize, sets: Features | None = None) -> BaseAlgorithm:
+        """A new model, whose first weights are drawn from the global random state.
+
+        Args:
+            env: What it learns from.
+            sets: What it sees, for a network that pools neighbours and obstacles; ``None`` makes a flat one.
+        """
         raise NotImplementedError
 
-    def prepare(self, model: BaseAlgorithm, robots: RobotVecEnv, seed: int) -> None:
+    def prepare(self, model: BaseAlgorithm, robots: RobotVecEnv | MixedVecEnv, seed: int) -> None:
         """Tell the model's buffer which robots act, and seed whatever the model draws."""
         set_random_seed(seed)
         model.action_space.seed(seed)
         buffer = getattr(model, self.buffer)
         buffer.source, buffer.random = robots, np.random.default_rng(seed)
 
-    def set_learning_rate(self, model: BaseAlgorithm, remaining: float) -> None:
-        """For the share of the training that remains, 1 to 0."""
-        model.lr_schedule = FloatSchedule(self.learning_rate * (0.1 + 0.9 * remaining))
+    def set_learning_rate(self, model: BaseAlgorithm, remaining: float, first: float | None = None) -> None:
+        """For the share of the training that remains, 1 to 0, where it began with ``first``, by default its own."""
+        model.lr_schedule = FloatSchedule((first or self.learning_rate) * (0.1 + 0.9 * remaining))
 
 
 def _batch_size(steps: int, num_envs: int) -> int:
@@ -64,7 +73,11 @@ class _PPO(Algorithm):
     num_envs = 1024
     steps_per_update = 32
 
-    def make(self, env: VecNormalize) -> BaseAlgorithm:
+    def make(self, env: VecNormalize, sets: Features | None = None) -> BaseAlgorithm:
+        network: dict[str, object] = {"net_arch": [128, 128], "log_std_init": -0.5}
+        if sets is not None:
+            extractor = {"features_extractor_class": SetExtractor, "features_extractor_kwargs": {"features": sets}}
+            network |= {**extractor, "activation_fn": torch.nn.ReLU}
         return stable_baselines3.PPO(
             "MlpPolicy",
             env,
@@ -74,7 +87,7 @@ class _PPO(Algorithm):
             n_epochs=4,
             gamma=self.gamma,
             gae_lambda=0.95,
-            policy_kwargs={"net_arch": [128, 128], "log_std_init": -0.5},
+            policy_kwargs=network,
             rollout_buffer_class=MaskedRolloutBuffer,
             device="cpu",
         )
@@ -86,7 +99,8 @@ class _SAC(Algorithm):
     steps_per_update = 1
     learning_rate = 1e-3
 
-    def make(self, env: VecNormalize) -> BaseAlgorithm:
+    def make(self, env: VecNormalize, sets: Features | None = None) -> BaseAlgorithm:
+        assert sets is None, "settings refuse that"
         return stable_baselines3.SAC(
             "MlpPolicy",
             env,

@@ -6,12 +6,22 @@ import csv
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from d4orm_env.core.files import replaced_when_done
+from d4orm_planners.rl.mixture import MixedVecEnv
 from d4orm_planners.rl.network import Network
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
+
+
+class Outcome(NamedTuple):
+    """Success rate, mean travel time [s], and the success rates of the parts of a mixture."""
+
+    success_rate: float
+    travel_time: float
+    parts: list[float]
 
 
 @dataclass(frozen=True)
@@ -28,6 +38,7 @@ class Evaluation:
         env_share: Share of it that went into stepping the environment; in an imitation, into recording.
         imitation_error: Root mean square of the actions less those of the expert, in units of the limits, in episodes
             that were not learned from; ``None`` without an expert.
+        parts: Success rates of the parts of a mixture, in their order, of which ``success_rate`` is the mean.
     """
 
     steps: int
@@ -38,6 +49,7 @@ class Evaluation:
     seconds: float
     env_share: float
     imitation_error: float | None = None
+    parts: Sequence[float] | None = None
 
     @property
     def rank(self) -> tuple[float, float]:
@@ -45,10 +57,12 @@ class Evaluation:
         return self.success_rate, -self.travel_time
 
 
-def evaluate_network(network: Network, worlds: RobotVecEnv, seed: int) -> tuple[float, float]:
-    """Success rate and mean travel time [s] of one episode in every world, without exploring."""
-    success, travel_time = (float(np.mean(values)) for values in zip(*run_worlds(network, worlds, seed)))
-    return success, travel_time
+def evaluate_network(network: Network, worlds: RobotVecEnv | MixedVecEnv, seed: int) -> Outcome:
+    """How the worlds end in one episode each, without exploring; of a mixture, the mean of its parts."""
+    parts = worlds.parts if isinstance(worlds, MixedVecEnv) else (worlds,)
+    means = [np.mean(run_worlds(network, part, seed), axis=0) for part in parts]
+    success, travel_time = (float(np.mean(values)) for values in zip(*means))
+    return Outcome(success, travel_time, [float(mean[0]) for mean in means])
 
 
 def run_worlds(network: Network, worlds: RobotVecEnv, seed: int) -> list[tuple[bool, float]]:

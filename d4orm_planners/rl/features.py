@@ -7,7 +7,8 @@ scales that resolve it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,9 @@ from d4orm_env.core.observation_layout import ObservationSlices
 
 TURNED_MODELS = frozenset({"holonomic2d", "holonomic3d", "velocity2d"})
 """Models whose controls are vectors of the world."""
+
+Array: TypeAlias = Any
+"""Of NumPy or of torch."""
 
 _HORIZON = 5.0
 """Seconds ahead beyond which meetings do not matter."""
@@ -49,8 +53,49 @@ class Features:
     @property
     def size(self) -> int:
         """Number of features ``F``."""
-        d = self.slices.dimension
-        return 2 * d + 7 + self.slices.num_neighbors * (2 * d + 5) + self.slices.num_obstacles * (d + 3)
+        slices = self.slices
+        return self.own_size + slices.num_neighbors * self.neighbor_size + slices.num_obstacles * self.obstacle_size
+
+    @property
+    def own_size(self) -> int:
+        """Number of those of the robot itself, which come first."""
+        return 2 * self.slices.dimension + 7
+
+    @property
+    def neighbor_size(self) -> int:
+        """Number of those of each neighbour, presence first."""
+        return 2 * self.slices.dimension + 5
+
+    @property
+    def obstacle_size(self) -> int:
+        """Number of those of each obstacle, likewise."""
+        return self.slices.dimension + 3
+
+    def parts(self, features: Array) -> tuple[Array, Array, Array]:
+        """Features ``(N, F)`` of the robot ``(N, .)``, of its neighbours and of obstacles ``(N, rows, .)``."""
+        own, slices, count = self.own_size, self.slices, len(features)
+        end = own + slices.num_neighbors * self.neighbor_size
+        neighbors = features[:, own:end].reshape(count, slices.num_neighbors, self.neighbor_size)
+        obstacles = features[:, end:].reshape(count, slices.num_obstacles, self.obstacle_size)
+        return features[:, :own], neighbors, obstacles
+
+    def of_size(self, size: int) -> Features:
+        """The same with as many neighbours as ``size`` features have.
+
+        Raises:
+            ValueError: If no number of neighbours has so many.
+        """
+        rows, rest = divmod(size - self.size, self.neighbor_size)
+        number = self.slices.num_neighbors + rows
+        if rest or number < 0:
+            raise ValueError(f"{size} features are not those of any number of neighbours")
+        return replace(self, slices=replace(self.slices, num_neighbors=number))
+
+    def of_observation_size(self, size: int) -> Features | None:
+        """The same with as many neighbours as observations of ``size`` numbers have; ``None`` if none does."""
+        rows, rest = divmod(size - self.slices.size, self.slices.neighbor[-1].stop)
+        number = self.slices.num_neighbors + rows
+        return None if rest or number < 0 else replace(self, slices=replace(self.slices, num_neighbors=number))
 
     def encode(self, observations: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Features of ``N`` robots.

@@ -167,7 +167,7 @@ class _Run:
         seconds = time.perf_counter() - begin
         evaluation = Evaluation(
             steps, self.settings.num_robots, self.settings.scenario,
-            *evaluate_network(network, self._validation, VALIDATION_SEED), seconds, recorded / seconds,
+            *evaluate_network(network, self._validation, VALIDATION_SEED)[:2], seconds, recorded / seconds,
             imitation_error(network, *held),
         )  # fmt: skip
         self.evaluations = [*self.evaluations, evaluation]

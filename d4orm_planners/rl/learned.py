@@ -106,11 +106,12 @@ class _NetworkActor:
                 f"the policy in {self.path.name} was trained for {header.model} robots, and this team has "
                 f"{', '.join(sorted(set(problem.team.models)))}; train one for them with 'd4orm train --model'"
             )
-        if observation_shape != (features.slices.size,):
+        if len(observation_shape) != 1 or self.network.features_for(observation_shape[0]) is None:
+            robots = f"observed_robots={header.num_neighbors}" if header.encoder is None else "any observed_robots"
             raise ValueError(
                 f"the policy in {self.path.name} was trained for observations of {features.slices.size} numbers, "
-                f"and this environment's have shape {observation_shape}; make it with observed_robots="
-                f"{header.num_neighbors}, observed_obstacles={header.num_obstacles}, and do not wrap its observations"
+                f"and this environment's have shape {observation_shape}; make it with {robots}, "
+                f"observed_obstacles={header.num_obstacles}, and do not wrap its observations"
             )
 
     def controls(self, observations: FloatArray, limits: FloatArray) -> FloatArray:

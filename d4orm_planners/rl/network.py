@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -17,6 +18,7 @@ from d4orm_env.core.dynamics import get_model
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.observation_layout import ObservationSlices
 from d4orm_planners.rl.features import Features
+from d4orm_planners.rl.sets import array_shapes, encode, encoded_size
 
 FORMAT = 1
 EPSILON = 0.1
@@ -41,7 +43,9 @@ class Header(BaseModel):
         num_obstacles: Obstacles in an observation.
         activation: Between the layers.
         squashed: Whether the output goes through tanh.
-        layers: Number of layers.
+        layers: Number of layers; those of sets come before them and are not counted.
+        encoder: ``"sets"`` if neighbours and obstacles are pooled first, see :mod:`d4orm_planners.rl.sets`. Such a
+            policy acts for any number of observed robots.
         training: The command and its settings, for people.
     """
 
@@ -56,7 +60,12 @@ class Header(BaseModel):
     activation: str
     squashed: bool
     layers: int = Field(ge=1, le=16)
+    encoder: Literal["sets"] | None = None
     training: dict[str, object]
+
+    def text(self) -> str:
+        """As JSON; a flat network's is as it was before there were others, and earlier versions read it."""
+        return self.model_dump_json(exclude={"encoder"} if self.encoder is None else None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +76,7 @@ class Network:
         header: What it is.
         arrays: ``weight_i`` ``(out, in)`` and ``bias_i`` ``(out,)`` of each layer, and the normalisation:
             ``observation_mean`` and ``observation_variance`` ``(F,)``, and ``reward_variance`` ``()``, which only
-            further training needs.
+            further training needs. With sets, the arrays of those, and no normalisation of observations.
     """
 
     header: Header
@@ -81,8 +90,7 @@ class Network:
 
     def __call__(self, features: FloatArray) -> FloatArray:
         """``(N, m)`` most likely actions in ``[-1, 1]`` for ``(N, F)`` features."""
-        mean, variance = self.arrays["observation_mean"], self.arrays["observation_variance"]
-        hidden = np.clip((features - mean) / np.sqrt(variance + EPSILON), -CLIP, CLIP)
+        hidden = self._inputs(features)
         activation = _ACTIVATIONS[self.header.activation]
         for layer in range(self.header.layers):
             hidden = hidden @ self.arrays[f"weight_{layer}"].T + self.arrays[f"bias_{layer}"]
@@ -92,9 +100,29 @@ class Network:
         return actions
 
     def controls(self, observations: FloatArray, limits: FloatArray) -> FloatArray:
-        """``(N, m)`` most likely controls for ``(N, D)`` observations of robots with limits ``(N, m)``."""
-        features, frames = self.features.encode(observations)
-        return self.features.decode(self(features), frames, limits)
+        """``(N, m)`` most likely controls for ``(N, D)`` observations of robots with limits ``(N, m)``.
+
+        Raises:
+            ValueError: If the observations have another size than the policy takes.
+        """
+        features = self.features_for(observations.shape[1])
+        if features is None:
+            raise ValueError(f"observations have {observations.shape[1]} numbers; the policy was trained for others")
+        seen, frames = features.encode(observations)
+        return features.decode(self(seen), frames, limits)
+
+    def features_for(self, size: int) -> Features | None:
+        """What it sees of observations of ``size`` numbers; ``None`` if it cannot act by those."""
+        if self.header.encoder is None:
+            return self.features if size == self.features.slices.size else None
+        return self.features.of_observation_size(size)
+
+    def _inputs(self, features: FloatArray) -> FloatArray:
+        """Of the first layer."""
+        if self.header.encoder == "sets":
+            return encode(self.features, self.arrays, np.clip(features, -CLIP, CLIP))
+        mean, variance = self.arrays["observation_mean"], self.arrays["observation_variance"]
+        return np.clip((features - mean) / np.sqrt(variance + EPSILON), -CLIP, CLIP)
 
     def save(self, path: str | Path) -> None:
         """Write a policy file.
@@ -107,7 +135,7 @@ class Network:
 
         with replaced_when_done(Path(path), (SUFFIX,)) as temporary:
             # As bytes, because the library's own files are for the owner's eyes only.
-            temporary.write_bytes(save(dict(self.arrays), metadata={"d4orm": self.header.model_dump_json()}))
+            temporary.write_bytes(save(dict(self.arrays), metadata={"d4orm": self.header.text()}))
 
 
 def load_network(path: str | Path) -> Network:
@@ -158,13 +186,15 @@ def _header(path: Path, text: str) -> Header:
 
 def _checked(path: Path, header: Header, arrays: dict[str, np.ndarray]) -> dict[str, FloatArray]:
     """The arrays, if they are those of the header's network."""
-    size = Network(header, {}).features.size
-    shapes: dict[str, tuple[int | None, ...]] = {
-        "observation_mean": (size,),
-        "observation_variance": (size,),
-        "reward_variance": (),
-    }
-    width: int | None = size
+    features = Network(header, {}).features
+    width: int | None
+    shapes: dict[str, tuple[int | None, ...]] = {"reward_variance": ()}
+    if header.encoder == "sets":
+        shapes |= array_shapes(features, arrays)
+        width = encoded_size(features, arrays)
+    else:
+        width = features.size
+        shapes |= {"observation_mean": (width,), "observation_variance": (width,)}
     for layer in range(header.layers):
         weight = arrays.get(f"weight_{layer}")
         shapes[f"weight_{layer}"] = (None, width)
@@ -182,6 +212,6 @@ def _checked(path: Path, header: Header, arrays: dict[str, np.ndarray]) -> dict[
             raise ValueError(
                 f"policy file {path}: {name} is {array.dtype} {array.shape}; expected finite float32 of shape {shape}"
             )
-    if (arrays["observation_variance"] < 0).any():
+    if (arrays.get("observation_variance", np.zeros(1)) < 0).any():
         raise ValueError(f"policy file {path}: observation_variance is negative in places; it must not be")
     return arrays

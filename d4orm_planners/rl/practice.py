@@ -11,6 +11,7 @@ from pydantic import Field
 from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios import make_problem
 from d4orm_env.scenarios.problems import unknown_argument
+from d4orm_planners.rl.mixture import MixedVecEnv
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 from d4orm_planners.settings import CheckedSettings, Count, Whole
 
@@ -72,8 +73,11 @@ class Practice(CheckedSettings):
         first, second = (make_problem(**self.arguments(scenario), num_robots=num_robots, seed=seed) for seed in (0, 1))
         return first != second
 
-    def validation(self) -> RobotVecEnv:
+    def validation(self, **options: Any) -> RobotVecEnv | MixedVecEnv:
         """Worlds to judge by.
+
+        Args:
+            **options: Further arguments of the environments.
 
         Raises:
             ValueError: If one policy cannot be learned for the team.
@@ -81,9 +85,9 @@ class Practice(CheckedSettings):
         drawn = self.draws(self.scenario, self.num_robots)
         arguments = self.arguments(self.scenario) | ({"randomize_instance": True} if drawn else {})
         count = self.validation_worlds if drawn else 1
-        return RobotVecEnv(count, self.num_robots, seed=VALIDATION_SEED, **arguments)
+        return RobotVecEnv(count, self.num_robots, seed=VALIDATION_SEED, **arguments, **options)
 
-    def header(self, algorithm: str, worlds: RobotVecEnv, **training: object) -> dict[str, object]:
+    def header(self, algorithm: str, worlds: RobotVecEnv | MixedVecEnv, **training: object) -> dict[str, object]:
         """Of a policy file: what a model does not tell."""
         slices = worlds.features.slices
         return {

@@ -37,6 +37,7 @@ class RobotVecEnv(VecEnv):
         scenario: As for :class:`d4orm_env.navigation_v0.parallel_env`, like ``**kwargs``. One model for all robots.
         seed: Of the first world.
         reward: The reward to learn from, as in :class:`~d4orm_env.options.EnvOptions`.
+        sight: How many of the observed robots are shown at most, the others being marked absent; ``None`` is all.
         **kwargs: Further arguments of :class:`d4orm_env.vector_env.NavigationVectorEnv`.
 
     Attributes:
@@ -58,6 +59,7 @@ class RobotVecEnv(VecEnv):
         *,
         seed: int = 0,
         reward: str | RewardFunction = "training",
+        sight: int | None = None,
         **kwargs: Any,
     ) -> None:
         kwargs |= {"reward": reward, "autoreset_mode": "SameStep"}
@@ -74,6 +76,7 @@ class RobotVecEnv(VecEnv):
             )
         self.features = Features.of(self._env.layout, problem.team.models[0])
         self.num_worlds = num_worlds
+        self._sight = sight
         self._shape = (num_worlds, problem.num_robots)
         count = num_worlds * problem.num_robots
         self._limits = np.tile(problem.team.control_limits, (num_worlds, 1))
@@ -132,7 +135,10 @@ class RobotVecEnv(VecEnv):
         """Features of what the robots see now, and of what those whose episodes have ended saw last."""
         count = self.num_envs
         seen = observations.reshape(count, -1)
-        features, frames = self.features.encode(np.concatenate([seen, last]) if last else seen)
+        seen = np.concatenate([seen, last]) if last else seen
+        if self._sight is not None:
+            self.features.slices.neighbors(seen)[:, self._sight :] = 0
+        features, frames = self.features.encode(seen)
         self._frames = frames[:count]
         features[:count][~self._acting.ravel()] = 0
         return features[:count], features[count:]

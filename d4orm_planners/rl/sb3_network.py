@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from d4orm_planners.rl.network import FORMAT, Header, Network
+from d4orm_planners.rl.sb3_sets import SetExtractor
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -25,17 +26,20 @@ def network_of(header: Mapping[str, Any], model: BaseAlgorithm, normalization: A
         model: A PPO or SAC model with fully connected layers.
         normalization: Its ``VecNormalize``.
     """
-    layers = _layers(model)
-    arrays = {
-        "observation_mean": normalization.obs_rms.mean,
-        "observation_variance": normalization.obs_rms.var,
-        "reward_variance": normalization.ret_rms.var,
-    }
+    layers, sets = _layers(model), _sets(model)
+    arrays = {"reward_variance": normalization.ret_rms.var}
+    if sets is None:
+        arrays |= {"observation_mean": normalization.obs_rms.mean, "observation_variance": normalization.obs_rms.var}
+    else:
+        arrays |= {name: array.detach().numpy() for name, array in sets.items()}
     for index, layer in enumerate(layers):
         arrays[f"weight_{index}"] = layer.weight.detach().numpy()
         arrays[f"bias_{index}"] = layer.bias.detach().numpy()
     activation = "relu" if any(isinstance(layer, torch.nn.ReLU) for layer in _actor(model)) else "tanh"
-    full = Header(format=FORMAT, activation=activation, squashed=_squashed(model), layers=len(layers), **header)
+    full = Header(
+        format=FORMAT, activation=activation, squashed=_squashed(model), layers=len(layers),
+        encoder=None if sets is None else "sets", **header,
+    )  # fmt: skip
     return Network(full, {name: np.array(value, np.float32) for name, value in arrays.items()})
 
 
@@ -50,9 +54,18 @@ def set_network(model: BaseAlgorithm, normalization: Any, network: Network) -> N
     Raises:
         ValueError: If it is another kind of network; the message says which is wanted.
     """
-    layers, arrays = _layers(model), network.arrays
+    layers, arrays, sets = _layers(model), network.arrays, _sets(model) or {}
+    if (network.header.encoder is None) != (not sets):
+        theirs_kind, mine_kind = network.header.encoder or "flat", "sets" if sets else "flat"
+        raise ValueError(
+            f"the policy to start from is a {theirs_kind} network, and a {mine_kind} one is wanted; give "
+            f"network={theirs_kind!r}, or another policy"
+        )
     mine = [tuple(layer.weight.shape) for layer in layers]
     theirs = [arrays[f"weight_{index}"].shape for index in range(network.header.layers)]
+    for name, parameter in sets.items():
+        mine.append(tuple(parameter.shape))
+        theirs.append(arrays[name].shape)
     if mine != theirs or network.header.squashed != _squashed(model):
         raise ValueError(
             f"the policy to start from is a network of {network.header.algorithm} with layers {theirs}, and {mine} are "
@@ -62,6 +75,10 @@ def set_network(model: BaseAlgorithm, normalization: Any, network: Network) -> N
         for index, layer in enumerate(layers):
             layer.weight.copy_(torch.as_tensor(arrays[f"weight_{index}"]))
             layer.bias.copy_(torch.as_tensor(arrays[f"bias_{index}"]))
+        for name, parameter in sets.items():
+            parameter.copy_(torch.as_tensor(arrays[name]))
+    if sets:
+        return
     seen = normalization.obs_rms
     seen.mean, seen.var = (arrays[f"observation_{part}"].astype(np.float64) for part in ("mean", "variance"))
     seen.count = START_COUNT
@@ -81,3 +98,9 @@ def _actor(model: BaseAlgorithm) -> list[torch.nn.Module]:
 
 def _layers(model: BaseAlgorithm) -> list[torch.nn.Linear]:
     return [layer for layer in _actor(model) if isinstance(layer, torch.nn.Linear)]
+
+
+def _sets(model: Any) -> dict[str, torch.Tensor] | None:
+    """Parameters of a network of sets; ``None`` of another."""
+    extractor = getattr(model.policy, "features_extractor", None)
+    return extractor.arrays() if isinstance(extractor, SetExtractor) else None

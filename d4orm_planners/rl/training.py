@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
@@ -22,19 +23,29 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
 from d4orm_env.core.seeds import Stream, derived_seed
+from d4orm_env.rewards import TrainingReward
 from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm
 from d4orm_planners.rl.checkpoints import Checkpoints
 from d4orm_planners.rl.curriculum import Lesson, common_batch, make_lessons, team_sizes
 from d4orm_planners.rl.curve import Evaluation, evaluate_network, write_curve
+from d4orm_planners.rl.mixture import Exercise, MixedVecEnv, parse_mixture
 from d4orm_planners.rl.network import CLIP, EPSILON, Network, load_network
 from d4orm_planners.rl.practice import VALIDATION_SEED, Many, Practice
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 from d4orm_planners.rl.sb3_network import network_of, set_network
-from d4orm_planners.settings import Count, PathText, one_of
+from d4orm_planners.rl.sb3_sets import leave_as_they_are
+from d4orm_planners.settings import Count, Number, PathText, Positive, Whole, one_of
 
 Progress = Callable[[str, int, int], object]
 _INSTANCES = 256
 """Drawn for each lesson, at most."""
+NETWORKS = ("flat", "sets")
+MIXTURE = "mixture"
+"""Stands for the scenario of lessons that are about several."""
+
+
+def _as_tuple(value: object) -> object:
+    return tuple(value) if isinstance(value, list) else value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +59,15 @@ class TrainingSettings(Practice):
         curriculum: Whether smaller teams come first.
         lessons: Parts of the training, each with a checkpoint and an evaluation at its end.
         start_from: A policy file of the same algorithm, whose network learns on; ``None`` begins with nothing.
+        network: ``"flat"``, fully connected from all that is observed; or for PPO ``"sets"``, which pools neighbours
+            and obstacles, see :mod:`d4orm_planners.rl.sets`.
+        observed_robots: In observations.
+        learning_rate: At the beginning; ``None`` is the algorithm's own. It falls linearly to a tenth.
+        reward_settings: Weights of the :class:`~d4orm_env.rewards.TrainingReward` to learn from, where they are others.
+        mixture: Scenarios and team sizes to be practised all at once, in place of ``scenario`` and ``num_robots``:
+            texts as :meth:`~d4orm_planners.rl.mixture.Exercise.parse` takes them, or names of
+            :data:`~d4orm_planners.rl.mixture.MIXTURES`. Each has as many robots, as nearly as whole worlds allow, and
+            as many validation worlds as any other.
 
     Raises:
         ValueError: If a value makes no sense; the message names it.
@@ -59,12 +79,87 @@ class TrainingSettings(Practice):
     curriculum: bool = False
     lessons: Annotated[Count, Field(le=1000)] = 50
     start_from: PathText | None = None
+    network: Annotated[str, one_of(NETWORKS)] = "flat"
+    observed_robots: Annotated[Whole, Field(ge=0, le=1000)] = 4
+    learning_rate: Annotated[Positive, Field(le=1)] | None = None
+    reward_settings: Mapping[str, Number] = field(default_factory=dict)
+    mixture: Annotated[tuple[str, ...], BeforeValidator(_as_tuple)] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.network == "sets" and self.algorithm != "ppo":
+            raise ValueError(f"network 'sets' is for ppo, not for {self.algorithm}; leave it out")
+        known = TrainingReward.term_names
+        for name in self.reward_settings:
+            if name not in known:
+                raise ValueError(f"reward_settings has {name!r}; the reward takes {', '.join(known)}")
+        if not self.mixture:
+            return
+        for name in ("scenario", "num_robots", "curriculum", "scenario_settings"):
+            given = getattr(self, name)
+            if given != getattr(TrainingSettings, name, {}):
+                raise ValueError(f"{name} is {given!r} beside a mixture, whose parts say all that; leave one out")
+        self.exercises  # noqa: B018 - refuses what is none
+
+    @cached_property
+    def exercises(self) -> tuple[Exercise, ...]:
+        """The parts of the mixture."""
+        return parse_mixture(self.mixture)
+
+    @property
+    def reward(self) -> TrainingReward:
+        """What is learned from."""
+        return TrainingReward(**self.reward_settings)
+
+    @property
+    def worlds_of_exercises(self) -> tuple[int, ...]:
+        """How many worlds each part of the mixture has."""
+        share = (self.num_envs or ALGORITHMS[self.algorithm].num_envs) / max(len(self.exercises), 1)
+        return tuple(max(round(share / exercise.num_robots), 1) for exercise in self.exercises)
 
     @property
     def batch(self) -> int:
         """Robots that act at once."""
+        if self.mixture:
+            return sum(worlds * part.num_robots for worlds, part in zip(self.worlds_of_exercises, self.exercises))
         sizes = team_sizes(self.num_robots) if self.curriculum else (self.num_robots,)
         return common_batch(sizes, self.num_envs or ALGORITHMS[self.algorithm].num_envs)
+
+    def worlds(self, lesson: Lesson, seed: int) -> RobotVecEnv | MixedVecEnv:
+        """Worlds for a lesson."""
+        if self.mixture:
+            counted = enumerate(zip(self.worlds_of_exercises, self.exercises, strict=True))
+            parts = [
+                part.worlds(
+                    count,
+                    derived_seed(seed, Stream.TRAINING_WORLDS, index),
+                    min(_INSTANCES, 2 * count),
+                    **self._options,
+                )
+                for index, (count, part) in counted
+            ]
+            return MixedVecEnv(parts)
+        count, arguments = self.batch // lesson.num_robots, self.arguments(lesson.scenario)
+        if self.draws(lesson.scenario, lesson.num_robots):
+            arguments |= {"randomize_instance": True, "num_instances": min(_INSTANCES, 2 * count)}
+        arguments |= {"observed_robots": self.observed_robots, "reward": self.reward}
+        return RobotVecEnv(count, lesson.num_robots, seed=seed, **arguments)
+
+    def validation(self, **options: Any) -> RobotVecEnv | MixedVecEnv:
+        """Worlds to judge by.
+
+        Raises:
+            ValueError: If one policy cannot be learned for the team.
+        """
+        if not self.mixture:
+            return super().validation(observed_robots=self.observed_robots, **options)
+        count, options = -(-self.validation_worlds // len(self.exercises)), {**self._options, **options}
+        return MixedVecEnv([part.worlds(count, VALIDATION_SEED, None, **options) for part in self.exercises])
+
+    @property
+    def _options(self) -> dict[str, Any]:
+        """Of the environments of a mixture."""
+        return {"model": self.model, "observed_robots": self.observed_robots, "reward": self.reward}
 
 
 @dataclass(frozen=True)
@@ -117,6 +212,9 @@ class _Run:
         self.lessons = make_lessons(
             settings.num_robots, settings.scenario, settings.steps, unit, settings.lessons, settings.curriculum
         )
+        if settings.mixture:
+            largest = max(exercise.num_robots for exercise in settings.exercises)
+            self.lessons = tuple(Lesson(largest, MIXTURE, lesson.steps) for lesson in self.lessons)
         self._total = sum(lesson.steps for lesson in self.lessons)
         self._model: BaseAlgorithm | None = None
         # First of all, because it refuses what cannot be learned, and nothing is to be written then.
@@ -128,14 +226,16 @@ class _Run:
 
     def learn(self, index: int) -> None:
         """One lesson, its evaluation and its checkpoint."""
-        begin, lesson = time.perf_counter(), self.lessons[index]
+        begin, lesson, settings = time.perf_counter(), self.lessons[index], self.settings
         done = sum(earlier.steps for earlier in self.lessons[:index])
         self._progress(_describe(lesson, self.evaluations), done, self._total)
-        robots = self._worlds(lesson, derived_seed(self.settings.seed, Stream.TRAINING_WORLDS, index))
+        robots = settings.worlds(lesson, derived_seed(settings.seed, Stream.TRAINING_WORLDS, index))
         normalized = VecNormalize(robots, clip_obs=CLIP, gamma=self._algorithm.gamma, epsilon=EPSILON)
+        if settings.network == "sets":
+            leave_as_they_are(normalized)
         model = self._model = self._restored(normalized)
         self._algorithm.prepare(model, robots, self._training_seed(index + 1))
-        self._algorithm.set_learning_rate(model, 1 - done / self._total)
+        self._algorithm.set_learning_rate(model, 1 - done / self._total, settings.learning_rate)
         watch = _Watch(lambda steps: self._progress(_describe(lesson, self.evaluations), done + steps, self._total))
         model.learn(lesson.steps, callback=watch, reset_num_timesteps=False)
         seconds = time.perf_counter() - begin
@@ -143,9 +243,10 @@ class _Run:
             self.settings.algorithm, self._validation, command=self._command, lesson=index + 1
         )
         network = network_of(header, model, normalized)
+        outcome = evaluate_network(network, self._validation, VALIDATION_SEED)
         evaluation = Evaluation(
-            done + lesson.steps, lesson.num_robots, lesson.scenario,
-            *evaluate_network(network, self._validation, VALIDATION_SEED), seconds, robots.seconds / seconds,
+            done + lesson.steps, lesson.num_robots, lesson.scenario, outcome.success_rate, outcome.travel_time,
+            seconds, robots.seconds / seconds, parts=outcome.parts if settings.mixture else None,
         )  # fmt: skip
         self.evaluations = [*self.evaluations, evaluation]
         self.checkpoints.keep_best(network, self.evaluations)
@@ -153,19 +254,13 @@ class _Run:
         write_curve(self._out, self.evaluations)
         robots.close()
 
-    def _worlds(self, lesson: Lesson, seed: int) -> RobotVecEnv:
-        settings, worlds = self.settings, self.settings.batch // lesson.num_robots
-        kwargs = settings.arguments(lesson.scenario)
-        if settings.draws(lesson.scenario, lesson.num_robots):
-            kwargs |= {"randomize_instance": True, "num_instances": min(_INSTANCES, 2 * worlds)}
-        return RobotVecEnv(worlds, lesson.num_robots, seed=seed, **kwargs)
-
     def _restored(self, env: VecNormalize) -> BaseAlgorithm:
         """The model with the state of the last checkpoint, in a new environment."""
         model, fresh = self._model, self._model is None
         if model is None:
             set_random_seed(self._training_seed(0))
-            model = self._algorithm.make(env)
+            features = self._validation.features if self.settings.network == "sets" else None
+            model = self._algorithm.make(env, features)
             model.set_logger(configure(str(self._out / "tensorboard"), ["tensorboard"]))
         else:
             model.set_env(env, force_reset=True)

@@ -1,0 +1,222 @@
+"""Several scenarios and team sizes practised at once, so that none is forgotten over another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
+
+from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.yaml_text import parse_yaml
+from d4orm_env.scenarios import make_problem
+from d4orm_env.scenarios.problems import unknown_argument
+from d4orm_env.team_step import Info
+from d4orm_planners.rl.robot_vec_env import RobotVecEnv
+
+_LOOSENED = "d4orm_planners.rl.exercises:loosened"
+_CLEARING = "d4orm_planners.rl.exercises:clearing"
+MIXTURES: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "crowds": (
+            "random 2",
+            "random 4",
+            "random 8",
+            "random 8 sight=4",
+            "random 16 size=7.07",
+            "random 16 size=7.07 sight=4",
+            "random 16",
+            "random 32 size=9",
+            f"{_LOOSENED} 4",
+            f"{_LOOSENED} 8",
+            f"{_LOOSENED} 8 shift=0.05",
+            f"{_LOOSENED} 12",
+            f"{_LOOSENED} 16 shrink=0.05 sight=4",
+            f"{_LOOSENED} 16 shrink=0",
+            "circle 8",
+            "circle 16",
+            f"{_LOOSENED} 8 base=four_obstacles",
+            f"{_LOOSENED} 8 base=four_obstacles shift=0.1 sight=4",
+            "four_obstacles 8",
+            f"{_LOOSENED} 12 base=swap",
+            f"{_CLEARING} 8",
+            f"{_CLEARING} 8 places=1 obstacles=10",
+        ),
+        "dense_crowds": (
+            "random 4 sight=4",
+            "random 8",
+            "random 8 sight=4",
+            "random 8 sight=4",
+            "random 16 size=7.07",
+            "random 16 size=7.07 sight=4",
+            "random 16 size=7.07 sight=4",
+            "random 16",
+            "random 32 size=9 sight=4",
+            f"{_LOOSENED} 8 sight=4",
+            f"{_LOOSENED} 16 shrink=0.05 sight=4",
+            "circle 8 sight=4",
+            "circle 16",
+            f"{_LOOSENED} 8 base=four_obstacles sight=4",
+            f"{_LOOSENED} 12 base=swap",
+            f"{_CLEARING} 8",
+            f"{_CLEARING} 8 places=1 obstacles=10",
+        ),
+    }
+)
+"""Mixtures by name."""
+
+
+@dataclass(frozen=True)
+class Exercise:
+    """One part of a mixture.
+
+    Attributes:
+        scenario: Name, file or import path.
+        num_robots: Size of its teams.
+        settings: Arguments of the scenario.
+        sight: How many of the observed robots are shown at most; ``None`` is all.
+    """
+
+    scenario: str
+    num_robots: int
+    settings: Mapping[str, Any]
+    sight: int | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> Exercise:
+        """From a scenario, a team size, and settings ``name=value``, separated by blanks; ``sight`` is one of them.
+
+        Raises:
+            ValueError: If it is something else.
+        """
+        scenario, *rest = text.split() or [""]
+        if not rest or not rest[0].isdecimal() or not 1 <= int(rest[0]) <= 1000:
+            raise ValueError(f"mixture has {text!r}; it must be a scenario and a team size, as 'random 8 size=4'")
+        settings: dict[str, Any] = {}
+        for word in rest[1:]:
+            name, separator, value = word.partition("=")
+            if not separator or not name or not value or name in settings:
+                raise ValueError(f"mixture has {text!r}, in which {word!r} is no new setting of the form name=value")
+            settings[name] = parse_yaml(value)
+        sight = settings.pop("sight", None)
+        if sight is not None and (not isinstance(sight, int) or sight < 0):
+            raise ValueError(f"mixture has {text!r}, in which sight must be a whole number of zero or more")
+        for name in ("num_robots", "seed", "model"):
+            if name in settings:
+                raise ValueError(f"mixture has {text!r}, in which {name!r} has no place")
+        complaint = unknown_argument(scenario, settings)
+        if complaint:
+            raise ValueError(f"mixture has {text!r}: {complaint}")
+        return cls(scenario, int(rest[0]), settings, sight)
+
+    def worlds(
+        self, count: int, seed: int, instances: int | None, model: str | None = None, **options: Any
+    ) -> RobotVecEnv:
+        """Worlds to practise in.
+
+        Args:
+            count: How many; one is enough for a single instance if ``instances`` is ``None``.
+            seed: Of the first.
+            instances: To draw at most; ``None`` draws a new one for every episode.
+            model: Robot model; ``None`` is the scenario's own.
+            **options: Further arguments of the environment.
+        """
+        arguments: dict[str, Any] = {"scenario": self.scenario, "model": model, **self.settings}
+        first, second = (make_problem(**arguments, num_robots=self.num_robots, seed=number) for number in (0, 1))
+        drawn = first != second
+        if drawn:
+            arguments["randomize_instance"] = True
+            if instances is not None:
+                arguments["num_instances"] = instances
+        count = count if drawn or instances is not None else 1
+        return RobotVecEnv(count, self.num_robots, seed=seed, sight=self.sight, **arguments, **options)
+
+
+def parse_mixture(texts: Sequence[str]) -> tuple[Exercise, ...]:
+    """The parts of a mixture: texts as :meth:`Exercise.parse` takes them, and names of :data:`MIXTURES`.
+
+    Raises:
+        ValueError: If one is neither.
+    """
+    named = [part for text in texts for part in MIXTURES.get(text.strip(), (text,))]
+    return tuple(Exercise.parse(text) for text in named)
+
+
+class MixedVecEnv(VecEnv):
+    """The robots of several :class:`RobotVecEnv` as one, in order; all else as there.
+
+    Args:
+        parts: With the same features and robots of one model.
+
+    Attributes:
+        parts: Them.
+        acted: Which robots acted in the last step.
+        finished: ``(world, success, travel_time)`` of the worlds that ended in the last step, worlds counted through.
+
+    Raises:
+        ValueError: If the parts do not go together.
+    """
+
+    render_mode = None
+
+    def __init__(self, parts: Sequence[RobotVecEnv]) -> None:
+        first, self.parts = parts[0], tuple(parts)
+        models = sorted({part.problem.team.models[0] for part in parts})
+        if len(models) > 1 or any(part.features != first.features for part in parts):
+            raise ValueError(f"the mixture has robots of {', '.join(models)}; one policy is learned for one model")
+        self.features, self.problem = first.features, first.problem
+        self.num_worlds = sum(part.num_worlds for part in parts)
+        self._splits = np.cumsum([part.num_envs for part in parts])[:-1]
+        super().__init__(sum(part.num_envs for part in parts), first.observation_space, first.action_space)
+
+    @property
+    def acted(self) -> BoolArray:
+        return np.concatenate([part.acted for part in self.parts])
+
+    @property
+    def finished(self) -> list[tuple[int, bool, float]]:
+        offsets = np.cumsum([0, *(part.num_worlds for part in self.parts)]).tolist()
+        return [(offset + world, *how) for offset, part in zip(offsets, self.parts) for world, *how in part.finished]
+
+    @property
+    def seconds(self) -> float:
+        """Time spent stepping so far."""
+        return sum(part.seconds for part in self.parts)
+
+    def reset(self) -> FloatArray:
+        return np.concatenate([part.reset() for part in self.parts])
+
+    def step_async(self, actions: FloatArray) -> None:
+        for part, own in zip(self.parts, np.split(np.asarray(actions), self._splits)):
+            part.step_async(own)
+
+    def step_wait(self) -> tuple[FloatArray, FloatArray, BoolArray, list[Info]]:
+        features, rewards, dones, infos = zip(*(part.step_wait() for part in self.parts))
+        told = [info for listed in infos for info in listed]
+        return np.concatenate(features), np.concatenate(rewards), np.concatenate(dones), told
+
+    def close(self) -> None:
+        for part in self.parts:
+            part.close()
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seed the worlds of every part at the next reset, alike."""
+        return [seed for part in self.parts for seed in part.seed(seed)]
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[object]:
+        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: object, indices: VecEnvIndices = None) -> None:
+        self.parts[0].set_attr(attr_name, value, indices)
+
+    def env_method(
+        self, method_name: str, *args: object, indices: VecEnvIndices = None, **kwargs: object
+    ) -> list[object]:
+        return self.parts[0].env_method(method_name, *args, indices=indices, **kwargs)
+
+    def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
+        return [False] * len(list(self._get_indices(indices)))
