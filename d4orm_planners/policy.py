@@ -73,7 +73,12 @@ class Policy(ABC):
         By default the settings in ``config``, if it has any, else its attributes that are numbers or text.
         """
         config = getattr(self, "config", None)
-        return config.keywords() if isinstance(config, CheckedSettings) else plain_attributes(self)
+        return self.identity_with(config) if isinstance(config, CheckedSettings) else plain_attributes(self)
+
+    @classmethod
+    def identity_with(cls, config: CheckedSettings) -> dict[str, object]:
+        """The same of an instance with these settings; more than they are where they name what may change."""
+        return config.keywords()
 
 
 def plain_attributes(thing: object) -> dict[str, object]:

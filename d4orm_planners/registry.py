@@ -188,7 +188,11 @@ def policy_settings(name: object, **config: Any) -> dict[str, object]:
         policy = _as_policy(kind, owner)
         settings = policy.identity() if isinstance(kind, Policy | Planner) else plain_attributes(kind)
     elif (config_class := getattr(kind, "config_class", None)) is not None:
-        settings = _policy_config(kind, config_class, config, owner).keywords()
+        checked = _policy_config(kind, config_class, config, owner)
+        if isinstance(kind, type) and issubclass(kind, Policy):
+            settings = kind.identity_with(checked)
+        else:
+            settings = checked.keywords()
     else:
         _check_keywords(kind, config, owner)
         settings = dict(config)

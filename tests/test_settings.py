@@ -15,6 +15,7 @@ import pytest
 from d4orm_env.core.arrays import positive_number, whole_number
 from d4orm_planners import list_policies, make_planner, make_policy
 from d4orm_planners.registry import PLANNERS, POLICIES, policy_settings, setting_names
+from d4orm_planners.rl.learned import SHIPPED
 from d4orm_planners.settings import CheckedSettings, UnknownKeywordError
 
 KINDS: dict[str, type[CheckedSettings]] = {
@@ -175,3 +176,14 @@ def test_numbers_are_refused_in_one_line(value: Any) -> None:
 def test_whole_numbers_are_refused_in_one_line() -> None:
     with pytest.raises(ValueError, match="x is about -1e5000; it must be at least 0"):
         whole_number(-(10**5000), "x", 0)
+
+
+def test_policies_are_told_by_the_file_that_they_act_by(tmp_path: Path) -> None:
+    shipped = policy_settings("ppo")
+    other = tmp_path / "other.safetensors"
+    other.write_bytes((SHIPPED / "ppo.safetensors").read_bytes())
+    assert policy_settings("ppo", path=str(other)) == {**shipped, "path": str(other)}
+    assert make_policy("ppo").identity() == shipped
+    other.write_bytes((SHIPPED / "sac.safetensors").read_bytes())
+    assert policy_settings("ppo", path=str(other))["file"] == policy_settings("sac")["file"] != shipped["file"]
+    assert policy_settings("ppo", path=str(tmp_path / "none.safetensors"))["file"] is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -57,9 +58,21 @@ class LearnedPolicy(Policy):
 
     def __init__(self, config: LearnedConfig | None = None) -> None:
         self.config = config or LearnedConfig()
-        path = Path(self.config.path or SHIPPED / f"{self.name}{SUFFIX}")
+        path = self._file(self.config)
         kind = _ZipActor if path.suffix == ".zip" else _NetworkActor
         self._actor: _NetworkActor | _ZipActor = kind(self.name, path)
+
+    @classmethod
+    def identity_with(cls, config: CheckedSettings) -> dict[str, object]:
+        """The settings, and the digest of the file: another training has other weights under the same name."""
+        assert isinstance(config, LearnedConfig)
+        file = cls._file(config)
+        # Where there is none, every trial will say so.
+        return {**config.keywords(), "file": hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None}
+
+    @classmethod
+    def _file(cls, config: LearnedConfig) -> Path:
+        return Path(config.path or SHIPPED / f"{cls.name}{SUFFIX}")
 
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:
         super().reset(env, seed)
