@@ -99,6 +99,21 @@ def test_index_finds_several_of_the_nearest(seed: int, dimension: int, count: in
         np.testing.assert_array_equal(np.sort(gaps[items])[:3], np.sort(gaps)[:3])
 
 
+@worlds
+@settings(max_examples=30, deadline=None)
+def test_no_obstacle_within_reach_is_left_out(seed: int, dimension: int, count: int, radius: float) -> None:
+    shapes, points = (
+        random_world(seed, dimension, count).shapes,
+        np.random.default_rng(seed).uniform(-5, 5, (20, dimension)),
+    )
+    found = np.zeros((20, shapes.count), bool)
+    found[shapes.within(points, radius)] = True
+    rows, items = (index.ravel() for index in np.indices(found.shape))
+    near = shapes.signed_distance(points[rows], items).reshape(found.shape) <= radius
+    assert not (near & ~found).any()
+    assert not len(shapes.within(points + 100, radius)[0])
+
+
 @ENGINES
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize(("seed", "count", "radius"), [(1, 1, 0.15), (2, 20, 0.01), (3, 20, 0.15), (4, 5, 1.0)])

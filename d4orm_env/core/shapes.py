@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,17 +36,38 @@ class Shapes:
         """How many there are."""
         return len(self.boxes) + len(self.triangles)
 
+    def corners(self) -> tuple[Floats, Floats]:
+        """``(S, d)`` lowest and highest corners of boxes around each [m]."""
+        d = self.dimension
+        boxes, triangles = self.boxes.astype(np.float64), self.triangles.astype(np.float64).reshape(-1, 3, 2)
+        low, high = boxes[:, :d] - boxes[:, 2 * d :], boxes[:, d : 2 * d] + boxes[:, 2 * d :]
+        if not len(triangles):
+            return low, high
+        return np.concatenate([low, triangles.min(axis=1)]), np.concatenate([high, triangles.max(axis=1)])
+
     def extent(self) -> tuple[Floats, Floats]:
         """Lowest and highest corner of all, zero along an axis where none of them ends; there must be some."""
-        d = self.dimension
-        boxes, triangles = self.boxes.astype(np.float64), self.triangles.astype(np.float64).reshape(-1, 2)
-        low, high = boxes[:, :d] - boxes[:, 2 * d :], boxes[:, d : 2 * d] + boxes[:, 2 * d :]
-        corners = np.concatenate([low, high, triangles]) if d == 2 else np.concatenate([low, high])
+        corners = np.concatenate(self.corners())
         finite = np.isfinite(corners)
         lowest = np.where(finite, corners, np.inf).min(axis=0)
         highest = np.where(finite, corners, -np.inf).max(axis=0)
         ends = finite.any(axis=0)
         return np.where(ends, lowest, 0.0), np.where(ends, highest, 0.0)
+
+    def within(self, points: Floats, reach: float) -> tuple[IntArray, IntArray]:
+        """Pairs ``(P,)``, ``(P,)`` of points and obstacles that may be within a distance of each other; all that are.
+
+        Args:
+            points: ``(N, d)``.
+            reach: The distance.
+        """
+        low, high = self.corners()
+        pairs = np.ones((len(points), len(low)), bool)
+        for axis in range(self.dimension):
+            place = points[:, axis, None]
+            pairs &= (place >= low[:, axis] - reach) & (place <= high[:, axis] + reach)
+        rows, items = pairs.nonzero()
+        return rows, items
 
     def signed_distance(self, points: Floats, items: NDArray[np.int64]) -> Floats:
         """``(N,)`` distance from each point to the surface of the obstacle of that number, negative inside [m].

@@ -168,7 +168,7 @@ def _walls(problem: Problem, places: Array, robots: list[int]) -> Iterator[tuple
     inward, sides = np.concatenate([axes, -axes]), np.concatenate([places - lower, upper - places], axis=1)
     for row, side in np.argwhere(sides < NEAR).tolist():
         yield robots[row], inward[side], float(sides[row, side])
-    rows, items = (index.ravel() for index in np.indices((len(places), shapes.count)))
+    rows, items = shapes.within(places, NEAR)
     away = shapes.signed_distance(places[rows], items)
     near = away < NEAR
     rows, items, away, at = rows[near], items[near], away[near], places[rows[near]]
