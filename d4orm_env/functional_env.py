@@ -8,11 +8,13 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import PyTreeDef
+from numpy.typing import ArrayLike
 
 from d4orm_env import functional
 from d4orm_env.core.arrays import whole_number
@@ -203,13 +205,13 @@ def _refuse(options: EnvOptions) -> None:
             raise ValueError(f"{name} is not possible in pure functions of JAX; use gymnasium.make_vec or parallel_env")
 
 
-def _stacked(problems: list[Problem]) -> tuple[dict[int, jax.Array], list[Any], Any]:
+def _stacked(problems: list[Problem]) -> tuple[dict[int, jax.Array], list[ArrayLike], PyTreeDef]:
     """Leaves that differ from instance to instance, stacked, by their place; those of the first; and the structure.
 
     Raises:
         ValueError: If the instances differ in shapes, or in what is not an array.
     """
-    flattened: list[tuple[list[Any], Any]] = [jax.tree.flatten(problem) for problem in problems]
+    flattened: list[tuple[list[ArrayLike], PyTreeDef]] = [jax.tree.flatten(problem) for problem in problems]
     common, structure = flattened[0]
     shapes = [np.shape(leaf) for leaf in common]
     if any(other != structure or [np.shape(leaf) for leaf in leaves] != shapes for leaves, other in flattened):

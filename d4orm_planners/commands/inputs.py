@@ -31,7 +31,7 @@ def parse_settings(settings: list[str] | None, option: str = "--set") -> dict[st
     return values
 
 
-def parse_levels(texts: list[str] | None) -> dict[str, list[Any]] | None:
+def parse_levels(texts: list[str] | None) -> dict[str, list[object]] | None:
     """``name=level,level`` texts of ``--disturb`` as levels by name, read as YAML 1.2; ``None`` stays.
 
     Raises:
@@ -39,15 +39,19 @@ def parse_levels(texts: list[str] | None) -> dict[str, list[Any]] | None:
     """
     if texts is None:
         return None
-    levels: dict[str, list[Any]] = {}
+    parsed: dict[str, object] = {}
+    levels: dict[str, list[object]] = {}
     for text in texts:
         brackets, closed, rest = text.rpartition(")")  # what is in them has equals signs of its own
         name, separator, listed = (part.strip() for part in rest.partition("="))
         name = brackets + closed + name
         if not separator or not name or not listed:
             raise ValueError(f"--disturb {text!r} is not of the form name=levels, as delay=0,1,2 or push.speed=0.2,0.5")
-        _add(levels, name, f"[{listed}]", "--disturb", f"{text!r}: the levels")
-        levels[name] = [math.inf if value == "inf" else value for value in levels[name]]
+        _add(parsed, name, f"[{listed}]", "--disturb", f"{text!r}: the levels")
+        values = parsed[name]
+        if not isinstance(values, list):
+            raise ValueError(f"--disturb {text!r} gives no list of levels; give some like delay=0,1,2")
+        levels[name] = [math.inf if value == "inf" else value for value in values]
     return levels
 
 
@@ -64,7 +68,7 @@ def single_levels(texts: list[str] | None) -> dict[str, object]:
     return {name: values[0] for name, values in levels.items()}
 
 
-def _add(values: dict[str, Any], name: str, text: str, option: str, what: str) -> None:
+def _add(values: dict[str, object], name: str, text: str, option: str, what: str) -> None:
     """Add a value read as YAML under a new name."""
     from d4orm_env.core.yaml_text import parse_yaml
 

@@ -172,10 +172,10 @@ class Panel:
         scene, replay = self._gui.add_button("Save scene"), self._gui.add_button("Save replay")
         load = self._gui.add_upload_button("Load scene", mime_type=".yaml,.yml")
 
-        def save_scene(event: Any) -> None:
+        def save_scene(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
             _send(event.client, "scene.yaml", scenario_text(edits.at_rest(self._session.scene)))
 
-        def save_replay(event: Any) -> None:
+        def save_replay(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
             _send(event.client, "replay.html", self._session.replay().html)
 
         scene.on_click(save_scene)
@@ -186,9 +186,10 @@ class Panel:
 THEME: dict[str, Any] = {"show_logo": False, "show_share_button": False, "control_width": "medium"}
 
 
-def _send(client: viser.ClientHandle, name: str, text: str) -> None:
-    """Let a browser save a file."""
-    client.send_file_download(name, text.encode(), save_immediately=True)
+def _send(client: viser.ClientHandle | None, name: str, text: str) -> None:
+    """Let a browser save a file, if it is still there."""
+    if client is not None:
+        client.send_file_download(name, text.encode(), save_immediately=True)
 
 
 def status_text(frames: Sequence[Frame]) -> str:

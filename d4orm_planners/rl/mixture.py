@@ -83,7 +83,7 @@ class Exercise:
 
     scenario: str
     num_robots: int
-    settings: Mapping[str, Any]
+    settings: Mapping[str, object]
     sight: int | None = None
 
     @classmethod
@@ -96,7 +96,7 @@ class Exercise:
         scenario, *rest = text.split() or [""]
         if not rest or not rest[0].isdecimal() or not 1 <= int(rest[0]) <= 1000:
             raise ValueError(f"mixture has {text!r}; it must be a scenario and a team size, as 'random 8 size=4'")
-        settings: dict[str, Any] = {}
+        settings: dict[str, object] = {}
         for word in rest[1:]:
             name, separator, value = word.partition("=")
             if not separator or not name or not value or name in settings:

@@ -100,7 +100,7 @@ def _layers(model: BaseAlgorithm) -> list[torch.nn.Linear]:
     return [layer for layer in _actor(model) if isinstance(layer, torch.nn.Linear)]
 
 
-def _sets(model: Any) -> dict[str, torch.Tensor] | None:
+def _sets(model: BaseAlgorithm) -> dict[str, torch.Tensor] | None:
     """Parameters of a network of sets; ``None`` of another."""
     extractor = getattr(model.policy, "features_extractor", None)
     return extractor.arrays() if isinstance(extractor, SetExtractor) else None
