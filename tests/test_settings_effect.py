@@ -13,7 +13,7 @@ import pytest
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances import LimitMismatch, Push, Stall, StateNoise
+from d4orm_env.disturbances import Dropout, LimitMismatch, Push, Stall, StateNoise
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import Search, make_planner, make_policy, run_episode
@@ -200,6 +200,8 @@ POLICY_CHANGES: dict[str, dict[str, tuple[Any, dict[str, Any]]]] = {
         "sight": (False, {"scenario": "maze", "max_cycles": 60}),
         "relative_distance": (True, {}),
         "safe_mix": (False, {"scenario": "circle", "max_cycles": 60, "disturbances": [Push(3.0, 0.5)]}),
+        "drive_home": (False, {"scenario": "circle", "max_cycles": 60}),
+        "expect_losses": (False, {"scenario": "circle", "max_cycles": 60, "disturbances": [Dropout(0.5)]}),
         "filter_states": (False, {"disturbances": [StateNoise(0.05, 0.05)], "max_cycles": 60}),
         "learn_limits": (False, {"disturbances": [LimitMismatch(0.6)]}),
         "stalls": (False, {"scenario": "circle", "max_cycles": 60, "disturbances": [Stall(1.0)]}),
