@@ -53,7 +53,7 @@ class Method(NamedTuple):
     tolerance: float
 
 
-class Bodies(NamedTuple):
+class Surroundings(NamedTuple):
     """What a team keeps clear of.
 
     Attributes:
@@ -89,13 +89,20 @@ class Targets(NamedTuple):
 
 @cached_kernel(fingerprint(()), **OPTIONS)
 def alternate(
-    method: Method, bodies: Bodies, robot: Whole, limits: Floats, goal: Floats, fixed: int, motion: Floats, guess: Guess
+    method: Method,
+    bodies: Surroundings,
+    robot: Whole,
+    limits: Floats,
+    goal: Floats,
+    fixed: int,
+    motion: Floats,
+    guess: Guess,
 ) -> float:
     """Alternate until no constraint is violated and no place moves, to the tolerance, or as often as may be.
 
     Args:
         method: :class:`Method`.
-        bodies: :class:`Bodies`.
+        bodies: :class:`Surroundings`.
         robot: Its number among them.
         limits: ``(2,)`` of speed and acceleration [m/s, m/s^2], infinite where there is none.
         goal: ``(d,)`` [m].
@@ -145,7 +152,7 @@ def _raise_multiplier(squares: Floats, motion: Floats, right: Floats, penalty: f
 
 
 @compiled
-def _mind(method: Method, bodies: Bodies, robot: Whole, guess: Guess, minded: BoolArray) -> int:
+def _mind(method: Method, bodies: Surroundings, robot: Whole, guess: Guess, minded: BoolArray) -> int:
     """Mark the bodies that come near the guess; how many there are."""
     robots, d, count = len(bodies.radius), bodies.paths.shape[2], 0
     for body in range(len(minded)):
@@ -175,7 +182,7 @@ def _mind(method: Method, bodies: Bodies, robot: Whole, guess: Guess, minded: Bo
 @compiled
 def _project(
     method: Method,
-    bodies: Bodies,
+    bodies: Surroundings,
     robot: Whole,
     limits: Floats,
     minded: BoolArray,
@@ -187,7 +194,7 @@ def _project(
 
     Args:
         method: :class:`Method`.
-        bodies: :class:`Bodies`.
+        bodies: :class:`Surroundings`.
         robot: Its number among them.
         limits: ``(2,)``.
         minded: ``(K + B,)`` bool.

@@ -11,7 +11,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine.base import Engine
-from d4orm_planners.amswarm.alternation import Bodies, Guess, Method, alternate
+from d4orm_planners.amswarm.alternation import Guess, Method, Surroundings, alternate
 from d4orm_planners.amswarm.bernstein import first_coefficients, sample_basis
 from d4orm_planners.steering import present_velocities, track_velocities
 
@@ -78,7 +78,7 @@ class Swarm:
         places, duration = states[:, : problem.dimension].astype(np.float64), config.lookahead * problem.dt
         moved = self._random.uniform(-config.perturbation, config.perturbation, self._guesses.place.shape)
         predicted = np.where(stands[:, None, None], places[:, None], self._guesses.place)
-        bodies = Bodies(predicted, self._radius, problem.margin + config.clearance, self._boxes, self._bounds)
+        bodies = Surroundings(predicted, self._radius, problem.margin + config.clearance, self._boxes, self._bounds)
         begins = first_coefficients(config.degree, duration, places, velocities, self._accelerations)
         guesses = Guess(predicted + moved, self._guesses.velocity.copy(), self._guesses.acceleration.copy())
         for robot in np.flatnonzero(~stands):

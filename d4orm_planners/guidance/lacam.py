@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, IntArray
 from d4orm_env.core.problem import Problem
-from d4orm_planners.guidance.pibt import Bodies, Scratch, fill_costs, is_open, step_team
+from d4orm_planners.guidance.pibt import Footprints, Workspace, fill_costs, is_open, step_team
 from d4orm_planners.guidance.roadmap import PAIR_SLACK, Roadmap
 
 
@@ -80,7 +80,7 @@ class Team:
     def __init__(self, problem: Problem, roadmap: Roadmap) -> None:
         self.roadmap, num_robots, num_nodes = roadmap, problem.num_robots, len(roadmap.nodes)
         radius = np.asarray(problem.team.radius, np.float64)
-        self.bodies = Bodies(
+        self.bodies = Footprints(
             radius=radius,
             reach=radius + problem.margin - 1e-9,
             margin=float(problem.margin),
@@ -151,7 +151,7 @@ class Team:
         return True
 
     def after(
-        self, here: Configuration, scratch: Scratch, seed: int, known: dict[bytes, Configuration]
+        self, here: Configuration, scratch: Workspace, seed: int, known: dict[bytes, Configuration]
     ) -> Configuration | None:
         """Where a step leads under the next constraint that is untried; ``None`` where that cannot be kept.
 
@@ -219,9 +219,9 @@ def find_moves(
     return _moves_to(best, team.arrived(best.positions))
 
 
-def _scratch(roadmap: Roadmap, num_robots: int) -> Scratch:
+def _scratch(roadmap: Roadmap, num_robots: int) -> Workspace:
     degree = int(np.diff(roadmap.first).max()) + 2
-    return Scratch(
+    return Workspace(
         state=np.zeros(num_robots, np.int8),
         may_dock=np.ones(num_robots, bool),
         who=np.zeros(len(roadmap.nodes), np.int32),

@@ -30,7 +30,7 @@ IDLE = 0.05
 """Detour that a robot rather makes than stay where it is [m]."""
 
 
-class Bodies(NamedTuple):
+class Footprints(NamedTuple):
     """The robots.
 
     Attributes:
@@ -56,7 +56,7 @@ class Bodies(NamedTuple):
     costs: FloatArray
 
 
-class Scratch(NamedTuple):
+class Workspace(NamedTuple):
     """What a step is worked out in.
 
     Attributes:
@@ -89,7 +89,7 @@ def _gap(points: Floats, u: Whole, v: Whole) -> float:
 
 @compiled
 def _too_near(
-    roadmap: Roadmap, bodies: Bodies, k: Whole, tail: Whole, head: Whole, i: Whole, u: Whole, gap: float
+    roadmap: Roadmap, bodies: Footprints, k: Whole, tail: Whole, head: Whole, i: Whole, u: Whole, gap: float
 ) -> bool:
     """Whether robot ``k`` passes robot ``i`` at node ``u`` too near, ``gap``, on its way from one node to another.
 
@@ -109,7 +109,7 @@ def _too_near(
 
 
 @compiled
-def closed(roadmap: Roadmap, bodies: Bodies, docked: Ints, k: Whole, tail: Whole, e: Whole) -> bool:
+def closed(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, tail: Whole, e: Whole) -> bool:
     """Whether a robot can never take an edge, because it would dock in passing, or of somebody who has docked.
 
     ``docked`` ``(N,)`` is the robot docked at each node, -1 for none.
@@ -132,7 +132,7 @@ def closed(roadmap: Roadmap, bodies: Bodies, docked: Ints, k: Whole, tail: Whole
 
 
 @cached_kernel(SOURCES, variant="costs", **OPTIONS)
-def fill_costs(roadmap: Roadmap, bodies: Bodies, docked: Ints, k: Whole, end: Whole, costs: FloatArray) -> None:
+def fill_costs(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, end: Whole, costs: FloatArray) -> None:
     """Length of a robot's shortest way from every node to one; ``costs`` ``(N,)`` is output."""
     costs[:] = np.inf
     heap = [(0.0, np.int64(end))]
@@ -151,7 +151,7 @@ def fill_costs(roadmap: Roadmap, bodies: Bodies, docked: Ints, k: Whole, end: Wh
 
 
 @cached_kernel(SOURCES, variant="open", **OPTIONS)
-def is_open(roadmap: Roadmap, bodies: Bodies, docked: Ints, k: Whole, at: Whole, costs: FloatArray) -> bool:
+def is_open(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, at: Whole, costs: FloatArray) -> bool:
     """Whether nobody who has docked closes the way that a robot at a node would take by these costs."""
     if not costs[at] < np.inf:
         return False
@@ -177,7 +177,7 @@ def _mixed(a: np.uint64, b: np.uint64) -> float:
 
 @compiled
 def _rank_options(
-    roadmap: Roadmap, bodies: Bodies, scratch: Scratch, depth: int, k: Whole, at: Whole, pushed: bool, seed: int
+    roadmap: Roadmap, bodies: Footprints, scratch: Workspace, depth: int, k: Whole, at: Whole, pushed: bool, seed: int
 ) -> None:
     """Sort the edges that a robot may take, the best first, with staying among them unless it is pushed."""
     options, worth, count = scratch.options[depth], scratch.worth, 0
@@ -205,7 +205,7 @@ def _rank_options(
 
 @compiled
 def _in_the_way(
-    roadmap: Roadmap, bodies: Bodies, scratch: Scratch, positions: IntArray, k: Whole, e: Whole, depth: int
+    roadmap: Roadmap, bodies: Footprints, scratch: Workspace, positions: IntArray, k: Whole, e: Whole, depth: int
 ) -> Whole:
     """The first robot that has to make way before ``k`` takes an edge; -1 for none, -2 where that cannot be."""
     nodes, head, at = roadmap.nodes, np.int64(roadmap.heads[e]), positions[k]
@@ -237,8 +237,8 @@ def _in_the_way(
 @compiled
 def _move(
     roadmap: Roadmap,
-    bodies: Bodies,
-    scratch: Scratch,
+    bodies: Footprints,
+    scratch: Workspace,
     positions: IntArray,
     root: Whole,
     forced: Whole,
@@ -302,8 +302,8 @@ def _move(
 @cached_kernel(SOURCES, variant="step", **OPTIONS)
 def step_team(
     roadmap: Roadmap,
-    bodies: Bodies,
-    scratch: Scratch,
+    bodies: Footprints,
+    scratch: Workspace,
     order: IntArray,
     robots: IntArray,
     places: IntArray,

@@ -15,7 +15,7 @@ from d4orm_env.engine.tiles import OPTIONS, compiled
 from d4orm_env.engine.wavefront import Space, is_free_line
 from d4orm_planners.guidance import nearness, pibt
 from d4orm_planners.guidance.nearness import Cells, cells_about
-from d4orm_planners.guidance.pibt import Bodies
+from d4orm_planners.guidance.pibt import Footprints
 from d4orm_planners.guidance.roadmap import Roadmap
 
 SOURCES = fingerprint((nearness, pibt, wavefront))
@@ -105,7 +105,7 @@ def _is_line_clear(others: Others, k: Whole, tail: Floats, head: Floats, depart:
 
 @cached_kernel(SOURCES, variant="straighten", **OPTIONS)
 def straighten(
-    roadmap: Roadmap, bodies: Bodies, space: Space | None, others: Others, k: Whole, reach: float, way: IntArray
+    roadmap: Roadmap, bodies: Footprints, space: Space | None, others: Others, k: Whole, reach: float, way: IntArray
 ) -> int:
     """Leave out nodes of a way where the straight line is free of obstacles and of others.
 
@@ -232,7 +232,7 @@ def _followed_back(path: IntArray, entry: Whole) -> IntArray:
 
 
 @cached_kernel(SOURCES, variant="way", **OPTIONS)
-def find_way(roadmap: Roadmap, cells: Cells, bodies: Bodies, others: Others, k: Whole, trip: Trip) -> IntArray:
+def find_way(roadmap: Roadmap, cells: Cells, bodies: Footprints, others: Others, k: Whole, trip: Trip) -> IntArray:
     """The soonest way of a robot to its goal among all others: safe interval path planning.
 
     After M. Phillips and M. Likhachev, *SIPP: safe interval path planning for dynamic environments* (ICRA 2011).

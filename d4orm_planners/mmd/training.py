@@ -25,7 +25,7 @@ _LEAST = 1e-4
 """Least deviation of a mode or a feature that it is divided by."""
 
 
-class Network(nn.Module):
+class DenoisingNetwork(nn.Module):
     """The network of :class:`~d4orm_planners.mmd.prior.Prior`, as torch trains it.
 
     Args:
@@ -74,7 +74,7 @@ def train(
     mean, spread = examples.features.mean(axis=0), np.maximum(examples.features.std(axis=0), _LEAST)
     motions, features = torch.tensor(flat / deviation), torch.tensor((examples.features - mean) / spread)
     levels, kept = torch.tensor(level_features(signal)), torch.tensor(signal.astype(np.float32))
-    network = Network(width, layers)
+    network = DenoisingNetwork(width, layers)
     average = torch.optim.swa_utils.AveragedModel(network)
     optimiser = torch.optim.AdamW(network.parameters(), 1e-3, weight_decay=0.01)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=steps)
@@ -93,14 +93,14 @@ def train(
     return _weights(network, deviation, mean, spread)
 
 
-def _loss(network: Network, clean: Tensor, share: Tensor, level: Tensor, features: Tensor) -> Any:
+def _loss(network: DenoisingNetwork, clean: Tensor, share: Tensor, level: Tensor, features: Tensor) -> Any:
     """Mean square error for motions of which that share of the variance is kept as noise is added."""
     noisy = share.sqrt() * clean + (1 - share).sqrt() * torch.randn(clean.shape)
     wanted = (clean - share.sqrt() * noisy) / (1 - share).sqrt()
     return ((network(noisy, level, features) - wanted) ** 2).mean()
 
 
-def _weights(network: Network, deviation: np.ndarray, mean: np.ndarray, spread: np.ndarray) -> Prior:
+def _weights(network: DenoisingNetwork, deviation: np.ndarray, mean: np.ndarray, spread: np.ndarray) -> Prior:
     """The network's weights as the planner reads them: what is multiplied from the left, first."""
     linear = [network.into, *network.hidden, network.out]
     into, *hidden, out = (layer.weight.detach().numpy().T for layer in linear)

@@ -19,7 +19,7 @@ from d4orm_env.core.observation_layout import ObservationSlices
 TURNED_MODELS = frozenset({"holonomic2d", "holonomic3d", "velocity2d"})
 """Models whose controls are vectors of the world."""
 
-Array: TypeAlias = Any
+ArrayOrTensor: TypeAlias = Any
 """Of NumPy or of torch."""
 
 _HORIZON = 5.0
@@ -71,7 +71,7 @@ class Features:
         """Number of those of each obstacle, likewise."""
         return self.slices.dimension + 3
 
-    def parts(self, features: Array) -> tuple[Array, Array, Array]:
+    def parts(self, features: ArrayOrTensor) -> tuple[ArrayOrTensor, ArrayOrTensor, ArrayOrTensor]:
         """Features ``(N, F)`` of the robot ``(N, .)``, of its neighbours and of obstacles ``(N, rows, .)``."""
         own, slices, count = self.own_size, self.slices, len(features)
         end = own + slices.num_neighbors * self.neighbor_size
