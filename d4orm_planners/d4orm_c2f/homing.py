@@ -43,6 +43,8 @@ def drive_home(window: Problem, engine: Engine, controls: FloatArray, near: Bool
         sooner = near & ~home & (_docking_times(window, engine, straight) <= latest)
         controls = np.where(sooner[:, None], straight, controls)
         home |= sooner
+        if not (near & ~home).any():
+            break
     return controls, home
 
 
