@@ -112,22 +112,22 @@ class Page:
         self.call("Input.dispatchKeyEvent", type="keyDown", key=key, **text)
         self.call("Input.dispatchKeyEvent", type="keyUp", key=key)
 
-    def mouse(self, kind: str, x: float, y: float) -> None:
-        """``"Pressed"``, ``"Moved"`` or ``"Released"`` at a place, with the left button."""
-        held = {"button": "left", "buttons": 1, "clickCount": 1} if kind != "Moved" else {"button": "none"}
-        self.call("Input.dispatchMouseEvent", type=f"mouse{kind}", x=x, y=y, **held)
+    def mouse(self, kind: str, x: float, y: float, shift: bool = False, held: bool = True) -> None:
+        """``"Pressed"``, ``"Moved"`` or ``"Released"`` at a place, with the left button, if held, and perhaps Shift."""
+        button = {"button": "left", "buttons": 1, "clickCount": int(kind != "Moved")} if held else {"button": "none"}
+        self.call("Input.dispatchMouseEvent", type=f"mouse{kind}", x=x, y=y, modifiers=8 * shift, **button)
 
-    def drag(self, start: tuple[float, float], end: tuple[float, float], moves: int = 10) -> None:
-        """Press at a place, move, and let go at another."""
-        self.mouse("Moved", *start)
+    def drag(self, start: tuple[float, float], end: tuple[float, float], moves: int = 10, shift: bool = False) -> None:
+        """Press at a place, move, and let go at another, perhaps with the Shift key held."""
+        self.mouse("Moved", *start, shift, held=False)
         # The page looks what the mouse is over when it draws.
         self.frames(8)
-        self.mouse("Pressed", *start)
+        self.mouse("Pressed", *start, shift)
         for move in range(1, moves + 1):
             x, y = (a + move / moves * (b - a) for a, b in zip(start, end))
-            self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y, button="left", buttons=1)
+            self.mouse("Moved", x, y, shift)
             self.frames(1)
-        self.mouse("Released", *end)
+        self.mouse("Released", *end, shift)
 
     def frames(self, count: int) -> None:
         """Wait until the page has drawn so many times."""

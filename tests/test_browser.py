@@ -234,6 +234,24 @@ def test_obstacles_are_dragged_and_scenes_and_replays_saved(page: Page, tmp_path
 
 
 @viser_leaves_loops
+def test_a_robot_that_is_dragged_with_shift_is_pushed(page: Page, tmp_path: Path) -> None:
+    with running(make_problem("circle", num_robots=3, seed=0), "goal") as playground:
+        session = playground.session
+        session.pause(True)
+        look_at(page, playground, "circle, 3 robots, goal: paused")
+        wait_for(lambda: len(playground.clients) == 1)
+        page.frames(8)
+        before = session.frame.states
+        begin = before[0, :2]
+        page.drag(pixel(playground, begin), pixel(playground, begin + np.array([0.4, 0.6])), shift=True)
+        wait_for(lambda: not np.array_equal(session.frame.states, before))
+        given = session.frame.states[0] - before[0]
+        np.testing.assert_array_equal(given[:2], 0, "it gets a velocity and is left where it is")
+        assert np.abs(given[2:] - [0.4, 0.6]).max() < 0.25
+        np.testing.assert_array_equal(session.frame.states[1:], before[1:])
+
+
+@viser_leaves_loops
 def test_goals_are_dragged_in_space(page: Page) -> None:
     with running(make_problem("sphere", num_robots=3, seed=0), "goal") as playground:
         session = playground.session

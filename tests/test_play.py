@@ -70,8 +70,6 @@ def test_a_robot_stands_where_it_is_put(scene: Problem) -> None:
     start[2, 2:] = 0.3
     moved = edits.move_robot(scene.resumed_at(start, scene.goal), 2, [0.1, 0.2])
     np.testing.assert_allclose(moved.start[2], [0.1, 0.2, 0, 0])
-    pushed = edits.push(moved, 2, [0.1, 0.0])
-    np.testing.assert_allclose(pushed.start[2], [0.2, 0.2, 0, 0], atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -158,6 +156,39 @@ def test_a_team_goes_on_from_where_it_is(session: Session) -> None:
     np.testing.assert_array_equal(session.frame.states, states)
     assert session.frame.moment.time == elapsed
     assert session.frame.replanned >= 0
+
+
+def test_a_robot_is_pushed_in_all_that_drive_and_nobody_plans_anew(session: Session) -> None:
+    session.choose("goal", "random")
+    session.pause(True)
+    until(lambda: len(session.frames) == 2 and session.frame.moment.state == "paused")
+    before, planned = session.frames, [frame.replanned for frame in session.frames]
+    session.push(1, [0.1, -0.2])
+    until(lambda: session.frame.moment.number > before[0].moment.number)
+    for old, new in zip(before, session.frames, strict=True):
+        np.testing.assert_allclose(new.states[1] - old.states[1], [0, 0, 0.1, -0.2], atol=1e-6)
+        np.testing.assert_array_equal(np.delete(new.states, 1, 0), np.delete(old.states, 1, 0))
+    assert [frame.replanned for frame in session.frames] == planned
+    session.push(1, [50.0, 0.0], lane=1)
+    until(lambda: session.frame.states[1, 2] > 0.5)
+    speeds = np.linalg.norm(session.frame.states[:, 2:], axis=1)
+    assert (speeds <= session.frame.problem.team.max_speed + 1e-5).all(), "none is faster than it may be"
+
+
+def test_who_is_farthest_from_its_goal_is_pushed_and_who_has_docked_is_not(session: Session) -> None:
+    session.set_speed(50)
+    until(lambda: session.frame.moment.state == "arrived")
+    session.push(0, [0.3, 0.0])
+    until(lambda: session.frame.moment.message)
+    assert "robot_0 of goal has docked" in session.frame.moment.message
+    session.edit(lambda scene: edits.move_goal(scene, 2, [0.7, 0.9]))
+    until(lambda: session.frame.moment.state == "running")
+    session.pause(True)
+    until(lambda: session.frame.moment.state == "paused")
+    before = session.frame
+    session.push(None, [0.0, 0.1])
+    until(lambda: session.frame.moment.number > before.moment.number)
+    assert np.flatnonzero((session.frame.states != before.states).any(axis=1)).tolist() == [2]
 
 
 def test_a_change_that_is_refused_leaves_the_scene_and_says_why(session: Session) -> None:

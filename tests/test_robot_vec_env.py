@@ -67,10 +67,22 @@ def test_literal_features_of_a_robot_on_its_way_past_a_neighbor_and_an_obstacle(
     )
 
 
-@given(angle=st.floats(-3.1, 3.1), seed=st.integers(0, 50))
-def test_a_turned_world_looks_the_same_and_is_answered_by_turned_controls(angle: float, seed: int) -> None:
+def test_robots_that_turn_see_the_world_along_their_heading() -> None:
+    # Faces left and drives backwards at half its speed limit, the goal 3 m up the y axis.
+    own = [0.5, 0, -1, 0, 0, 0, 3, 0.25, 0, 0.15, 1, 2]
+    neighbor = [1, 0, 1, 0, -0.5, 0.15]
+    features = Features.of(ObservationSlices(2, 1, 0), "differential_drive")
+    seen, frames = features.encode(np.array([own + neighbor], np.float32))
+    np.testing.assert_allclose(frames, [[-1, 0]], atol=1e-6)
+    np.testing.assert_allclose(seen[0, :6], [-0.5, 0, 1, 0, 0, -1], atol=1e-6, err_msg="the goal is on its right")
+    np.testing.assert_allclose(seen[0, 12:14], [0, -1], atol=1e-6, err_msg="and so is the neighbour")
+    assert Features.of(ObservationSlices(2, 1, 0), "holonomic2d").frame == "goal"
+
+
+@given(angle=st.floats(-3.1, 3.1), seed=st.integers(0, 50), along=st.sampled_from(["goal", "heading"]))
+def test_a_turned_world_looks_the_same_and_is_answered_by_turned_controls(angle: float, seed: int, along: str) -> None:
     rng = np.random.default_rng(seed)
-    features = Features(ObservationSlices(2, 2, 1), turned=True)
+    features = Features(ObservationSlices(2, 2, 1), turned=True, frame=along)
     observation = rng.normal(size=(1, features.slices.size)).astype(np.float32)
     observation[0, [10, 11]] = 1
     observation[0, [12, 18, 24]] = 1

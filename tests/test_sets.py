@@ -229,6 +229,22 @@ def test_a_policy_of_sets_learns_on_and_a_flat_one_is_refused(trained: Path, tmp
         train(replace(further, network="flat"), tmp_path / "flat")
 
 
+def test_a_policy_of_robots_that_turn_says_along_what_it_sees_and_learns_on_from_none_that_sees_otherwise(
+    trained: Path, tmp_path: Path
+) -> None:
+    turning = replace(TINY, model="differential_drive", lessons=1, steps=32)
+    network = train(turning, tmp_path / "first").network
+    assert load_network(tmp_path / "first" / "policy.safetensors").features.frame == network.header.frame == "heading"
+    assert load_network(trained / "policy.safetensors").features.frame == "goal"
+    earlier = replace(network, header=network.header.model_copy(update={"frame": None}))
+    earlier.save(tmp_path / "earlier.safetensors")
+    assert "frame" not in json.loads(earlier.header.text())
+    assert load_network(tmp_path / "earlier.safetensors").features.frame == "goal", "as it was trained"
+    with pytest.raises(ValueError, match=r"another frame \(goal\) than is trained for \(heading\); give a policy"):
+        train(replace(turning, start_from=str(tmp_path / "earlier.safetensors")), tmp_path / "second")
+    assert not (tmp_path / "second").exists()
+
+
 def test_every_part_of_a_mixture_has_its_worlds_robots_and_sight() -> None:
     parts = TINY.exercises
     assert parts == (Exercise("random", 2, {"size": 4}), Exercise("circle", 4, {}, sight=1))

@@ -70,15 +70,15 @@ class Push(Disturbance[Given]):
             directions = draws.of(worlds).direction(*memory.velocity.shape[1:])
             memory.velocity[worlds] = given = np.float32(self.speed) * directions * hit[worlds, :, None]
             states = states.copy()
-            states[worlds] = _pushed(scene.problem, states[worlds], given)
+            states[worlds] = pushed(scene.problem, states[worlds], given)
         return states, controls
 
     def effect(self, memory: Given, scene: Scene) -> Effect:
         return Effect(pushed=memory.velocity)
 
 
-def _pushed(problem: Problem, states: FloatArray, velocity: FloatArray) -> FloatArray:
-    """``states`` ``(B, K, n)``, changed in place, with velocities ``(B, K, d)`` given to the robots."""
+def pushed(problem: Problem, states: FloatArray, velocity: FloatArray) -> FloatArray:
+    """``states`` ``(B, K, n)``, changed in place, with velocities ``(B, K, d)`` given to robots."""
     slip, d = velocity.copy(), problem.dimension
     for robot in np.flatnonzero(velocity.any(axis=(0, 2))):
         model = problem.team.robot_models[robot]

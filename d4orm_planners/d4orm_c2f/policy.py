@@ -70,6 +70,7 @@ class D4ormC2F(StatePolicy):
         loops: A :class:`LoopRecord` per control loop of the present episode, of the last :data:`REMEMBERED`.
         coarse_time: Time that the first coarse plan took [s].
         subgoals: ``(K, d)`` where the last control loop headed for [m]; the start before the first.
+        predicted: ``(1 + T, K, d)`` where its plan led, robots that brake or evade in the last resort apart [m].
     """
 
     name = "d4orm-c2f"
@@ -107,6 +108,7 @@ class D4ormC2F(StatePolicy):
         self._window.prepare(joint)
         self._plan, self._next = self._window.no_controls(), 0
         self.subgoals: FloatArray = joint.states[:, : self.problem.dimension]
+        self.predicted: FloatArray = self.subgoals[None]
         self._homes = np.full_like(joint.goals, np.nan)
         self._see_docked(joint)
         begin = time.perf_counter()
@@ -200,7 +202,7 @@ class D4ormC2F(StatePolicy):
         else:
             result = self._control.run(predict, self.config.deadline - (time.perf_counter() - begin))
         if result is not None:
-            self._plan, self._next = result.controls, 0
+            self._plan, self._next, self.predicted = result.controls, 0, result.positions
         margin = float("nan") if result is None else result.gap
         used = time.perf_counter() - begin
         missed = result is None

@@ -28,10 +28,12 @@ class Prediction(NamedTuple):
 
     Attributes:
         controls: ``(H_predict + S, K, m)`` with the ``S`` steps that a stop may take.
+        positions: ``(1 + H_predict + S, K, d)`` where they lead, with the present place first [m].
         gap: Least gap between the surfaces of any two robots that they keep [m]; infinite for one robot.
     """
 
     controls: FloatArray
+    positions: FloatArray
     gap: float
 
 
@@ -104,7 +106,7 @@ class Window:
         truth = problem.resumed_at(joint.states, joint.goals, horizon=horizon, goal_radius=radius)
         if not config.safe_mix:
             positions = self._engine.rollout(truth, controls).positions
-            return Prediction(controls, least_gap(truth, positions[1:]))
+            return Prediction(controls, positions, least_gap(truth, positions[1:]))
         special = now.stuck
         if config.drive_home and self._docks:
             near = self._near_goals(now) & ~now.docked & ~now.stuck
@@ -199,7 +201,7 @@ class Window:
                 chosen = violating & (steps == number)
                 controls[:, chosen] = fewer[:, chosen]
             trajectory, violated = self._violations(window_to_rest, controls, now)
-        return Prediction(controls, least_gap(window, trajectory.positions[1:]))
+        return Prediction(controls, trajectory.positions, least_gap(window, trajectory.positions[1:]))
 
     def _violations(self, window: Problem, controls: FloatArray, now: Situation) -> tuple[Trajectory, BoolArray]:
         """The rollout, and ``(K,)`` who comes too near to anything in it.

@@ -56,11 +56,6 @@ def _stop(problem: Problem, states: FloatArray, robot: int) -> None:
     states[robot, : model.state_size] = model.functions.rest(own, 0.0)
 
 
-def push(problem: Problem, robot: int, shove: ArrayLike) -> Problem:
-    """Push a robot off its way by ``shove`` ``(d,)`` [m]; it comes to rest there."""
-    return move_robot(problem, robot, problem.start[robot, : problem.dimension] + np.asarray(shove, np.float32))
-
-
 def add_robot(problem: Problem, random: np.random.Generator) -> Problem:
     """One more robot, like the first, with a random start and goal."""
     count = problem.num_robots

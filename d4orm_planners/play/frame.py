@@ -52,7 +52,8 @@ class Frame:
         loop: Seconds that the policy took for this step.
         replanned: Seconds that it took to plan after the last change.
         closest: Least distance between surfaces [m], negative in contact.
-        guidance: ``(P, K, d)`` where the policy leads the team from here, if it says so.
+        plan: ``(P, K, d)`` where the policy has just planned to lead the team, if it says so.
+        guidance: ``(P, K, d)`` the coarse plan that it follows, likewise.
         subgoals: ``(K, d)`` what it heads for next, likewise.
         bodies: ``(N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves about and is no robot.
     """
@@ -69,6 +70,7 @@ class Frame:
     loop: float
     replanned: float
     closest: float
+    plan: FloatArray | None
     guidance: FloatArray | None
     subgoals: FloatArray | None
     bodies: FloatArray
@@ -98,9 +100,15 @@ def closest_approach(problem: Problem, states: FloatArray) -> float:
     return min(least, float(gaps.min()))
 
 
-def guidance(policy: object, steps: int) -> FloatArray | None:
-    """``(P, K, d)`` where a policy that follows a coarse plan, or executes one, leads the team after so many steps."""
-    coarse, plan = getattr(policy, "guidance", None), getattr(policy, "plan", None)
-    if coarse is not None:
-        return np.asarray(coarse.path, np.float32)
-    return None if plan is None else np.asarray(plan.trajectory.positions[steps:], np.float32)
+def plan(policy: object, steps: int) -> FloatArray | None:
+    """``(P, K, d)`` where a policy that predicts, or executes a plan, leads the team after so many steps."""
+    predicted, whole = getattr(policy, "predicted", None), getattr(policy, "plan", None)
+    if predicted is not None:
+        return np.asarray(predicted, np.float32)
+    return None if whole is None else np.asarray(whole.trajectory.positions[steps:], np.float32)
+
+
+def guidance(policy: object) -> FloatArray | None:
+    """``(P, K, d)`` of a policy that follows a coarse plan."""
+    coarse = getattr(policy, "guidance", None)
+    return None if coarse is None else np.asarray(coarse.path, np.float32)

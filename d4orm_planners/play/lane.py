@@ -9,11 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from d4orm_env import navigation_v0
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import AnyDisturbance
+from d4orm_env.disturbances.world import pushed
 from d4orm_env.joint_state import JointState, split_state
-from d4orm_planners.play.frame import Frame, Moment, closest_approach, guidance
+from d4orm_planners.play.frame import Frame, Moment, closest_approach, guidance, plan
 from d4orm_planners.play.recording import Recording
 from d4orm_planners.policy import Policy
 
@@ -77,6 +79,17 @@ class Lane:
         return not self._env.agents
 
     @property
+    def docked(self) -> BoolArray:
+        """``(K,)`` bool: who stands at the goal for good."""
+        return self._joint.arrived & self._scene.docks
+
+    @property
+    def farthest(self) -> int:
+        """Of the robots, from its goal."""
+        joint = self._joint
+        return int(np.argmax(np.linalg.norm(joint.goals - joint.states[:, : self._scene.dimension], axis=1)))
+
+    @property
     def scene(self) -> Problem:
         """The scene as it is now: where the robots are is where they start, at rest or under way."""
         joint = self._joint
@@ -95,6 +108,25 @@ class Lane:
         self._before = before
         self._remember()
 
+    def push(self, robot: int, velocity: FloatArray) -> None:
+        """Give a robot a velocity ``(d,)`` [m/s] on top of its own, which nobody tells the policy of.
+
+        As with :class:`~d4orm_env.disturbances.Push`, none becomes faster than it may be.
+
+        Raises:
+            ValueError: If it stands at its goal.
+        """
+        joint, problem = self._joint, self._scene
+        if self.docked[robot]:
+            raise ValueError(f"robot_{robot} of {self.name} has docked; push one that is under way")
+        given = np.zeros((1, problem.num_robots, problem.dimension), np.float32)
+        given[0, robot] = velocity
+        states = pushed(problem, joint.states[None].copy(), given)[0]
+        own, limits = tuple(states[robot]), tuple(problem.team.limits[robot])
+        within = problem.team.robot_models[robot].functions.limit_state(own, limits, NUMPY_OPS)
+        states[robot, : len(within)] = within
+        self._observations, _ = self._env.set_state(states)
+
     def frame(self, moment: Moment) -> Frame:
         """What is shown of the present."""
         joint = self._joint
@@ -111,7 +143,8 @@ class Lane:
             loop=self._loop,
             replanned=self._replanned,
             closest=closest_approach(self._scene, joint.states),
-            guidance=guidance(self._policy, joint.steps),
+            plan=plan(self._policy, joint.steps),
+            guidance=guidance(self._policy),
             subgoals=getattr(self._policy, "subgoals", None),
             bodies=self._bodies,
         )

@@ -42,6 +42,12 @@ TRAIL_SEGMENTS = 8
 PLAN_TOLERANCE = 0.1
 """How far the line of a way ahead may be off, in radii of a robot."""
 
+PUSH_PER_METER = 1.0
+"""Velocity that a robot gets for every metre of the arrow that pushes it [1/s]."""
+
+WIDTHS = {"guidance": 1.5, "plans": 4.0, "trails": 2.0}
+"""Of lines that fade, in pixels."""
+
 LINES_EVERY = 0.1
 """Seconds between new trails and plans."""
 
@@ -72,16 +78,16 @@ class LaneView:
         self._seen, self._lines_at = (-1, False), 0.0
         self._held: dict[tuple[str, int], Points] = {}
         self._trail: list[FloatArray] = []
-        self._plan: tuple[FloatArray, list[NDArray[np.intp]]] | None = None
+        self._knots: dict[str, tuple[FloatArray, list[NDArray[np.intp]]]] = {}
         self._colors = self._own_colors = 255 * robot_colors(frame.problem.num_robots)
         self._nodes: dict[str, Any] = {"": self._scene.add_frame(self._root, show_axes=False, position=place)}
         self._add_team(frame)
         self._add_world(frame.problem)
         self._add_bodies(frame)
-        for name in ("heading", "plans", "trails"):
+        for name, wide in {"heading": 2.0, **WIDTHS}.items():
+            color = INK if name == "heading" else NO_LINES[1]
             self._nodes[name] = self._scene.add_line_segments(
-                f"{self._root}/{name}", NO_LINES[0], INK if name == "heading" else NO_LINES[1],
-                thickness=2.0, thickness_units="screen",
+                f"{self._root}/{name}", NO_LINES[0], color, thickness=wide, thickness_units="screen",
             )  # fmt: skip
 
     def name(self, text: str, place: Points) -> None:
@@ -145,6 +151,7 @@ class LaneView:
             self._add_many(name, mesh, goals if name == "goals" else places, scales, colors, opacity)
         self._drag("robots", "robot", lambda index, place, _: lambda problem: edits.move_robot(problem, index, place))
         self._drag("goals", "goal", lambda index, place, _: lambda problem: edits.move_goal(problem, index, place))
+        self._drag_pushes()
 
     def _add_bodies(self, frame: Frame) -> None:
         """What moves about and is no robot."""
@@ -210,6 +217,21 @@ class LaneView:
             d = frame.problem.dimension
             self._session.edit(edit(index, moved[:d], (moved - at)[:d]), self._index)
 
+    def _drag_pushes(self) -> None:
+        """Let robots be pushed: the page draws an arrow, and where it is let go the robot gets its velocity."""
+        grips: dict[int, tuple[Points, Points]] = {}
+
+        @self._nodes["robots"].on_drag("left", modifier="shift")
+        def _(event: viser.SceneNodeDragEvent[viser.SceneNodeHandle]) -> None:
+            index, frame = event.instance_index or 0, self._frame
+            if event.phase == "start":
+                at = self._place_of("robot", index, frame)
+                grips[index] = (at, self._pointed(event, at))
+            elif event.phase == "end" and index in grips:
+                at, grip = grips.pop(index)
+                arrow = (self._pointed(event, at) - grip)[: frame.problem.dimension]
+                self._session.push(index, PUSH_PER_METER * arrow, self._index)
+
     @property
     def _frame(self) -> Frame:
         frames = self._session.frames
@@ -247,24 +269,27 @@ class LaneView:
         return 20 if self._shown["dark"] else 255
 
     def _draw_lines(self, frame: Frame) -> None:
-        lines = {"trails": NO_LINES, "plans": NO_LINES}
+        lines = dict.fromkeys(WIDTHS, NO_LINES)
         if len(self._trail) > 1 and self._shown["trails"]:
             trail = np.stack(self._trail)
             taken = np.linspace(0, len(trail) - 1, TRAIL_SEGMENTS + 1).round().astype(np.intp)
             knots = [np.unique(taken)] * trail.shape[1]
             lines["trails"] = polylines(trail, self._colors, self._paper, (0.2, 1.0), knots)
-        if frame.guidance is not None and len(frame.guidance) > 1 and self._shown["plans"]:
-            lines["plans"] = self._plan_lines(frame.guidance, frame.problem)
+        for name, path, shades in (("plans", frame.plan, (1.0, 0.4)), ("guidance", frame.guidance, (0.8, 0.25))):
+            if path is not None and len(path) > 1 and self._shown[name]:
+                lines[name] = self._way_lines(name, path, shades, frame.problem)
         for name, (points, colors) in lines.items():
             self._nodes[name].points, self._nodes[name].colors = points, colors
 
-    def _plan_lines(self, path: FloatArray, problem: Problem) -> tuple[Points, Colors]:
+    def _way_lines(
+        self, name: str, path: FloatArray, shades: tuple[float, float], problem: Problem
+    ) -> tuple[Points, Colors]:
         """Lines of the ways ahead, looked for only when these are others."""
-        if self._plan is None or not np.array_equal(self._plan[0], path):
+        if name not in self._knots or not np.array_equal(self._knots[name][0], path):
             tolerance = PLAN_TOLERANCE * np.asarray(problem.team.radius)
             knots = [bends(path[:, robot], float(tolerance[robot])) for robot in range(path.shape[1])]
-            self._plan = (path, knots)
-        return polylines(path, self._colors, self._paper, (0.8, 0.25), self._plan[1])
+            self._knots[name] = (path, knots)
+        return polylines(path, self._colors, self._paper, shades, self._knots[name][1])
 
     def _headings(self, frame: Frame, places: Points) -> Points:
         """``(N, 2, 3)`` lines from the centre to the front of robots that have one."""

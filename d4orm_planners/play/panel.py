@@ -36,8 +36,8 @@ MODELS = ("scenario's own", "holonomic2d", "velocity2d", "differential_drive", "
 OWN_MODEL = MODELS[0]
 STATUS_EVERY = 0.2
 LARGEST_UPLOAD = 2_000_000
-SHOVE = 0.25
-"""How far a push moves a robot [m]."""
+PUSH = 0.8
+"""Velocity that a push gives a robot [m/s]."""
 
 
 class Panel:
@@ -122,20 +122,25 @@ class Panel:
             box.value = name in self._session.policies
 
     def _add_edits(self) -> None:
-        self._gui.add_markdown("Drag robots, goals and obstacles.")
+        self._gui.add_markdown("Drag robots, goals and obstacles; drag a robot with Shift to push it.")
         changes: dict[str, edits.Edit] = {
             "Add robot": self._drawn(edits.add_robot),
             "Remove robot": edits.remove_robot,
             "Add disc": self._drawn(lambda scene, random: edits.add_obstacle(scene, "disc", random)),
             "Add box": self._drawn(lambda scene, random: edits.add_obstacle(scene, "box", random)),
             "Remove obstacle": edits.remove_obstacle,
-            "Push a robot": self._drawn(_push_somebody),
         }
         for name, change in changes.items():
             self._add_edit(name, change)
+        self._gui.add_button("Push a robot").on_click(lambda _: self._push_somebody())
 
     def _add_edit(self, name: str, change: edits.Edit) -> None:
         self._gui.add_button(name).on_click(lambda _: self._session.edit(change))
+
+    def _push_somebody(self) -> None:
+        """Push the robot that is farthest from its goal, any way."""
+        way = self._random.normal(size=self._session.frame.problem.dimension)
+        self._session.push(None, PUSH * way / np.linalg.norm(way))
 
     def _drawn(self, change: Callable[[Problem, np.random.Generator], Problem]) -> edits.Edit:
         """A change that draws at random, with other numbers each time."""
@@ -239,12 +244,3 @@ def read_scene(content: bytes) -> Problem:
     if problem.num_robots > edits.MOST_ROBOTS:
         raise ValueError(f"the scene has {problem.num_robots} robots; at most {edits.MOST_ROBOTS} can be played with")
     return problem
-
-
-def _push_somebody(scene: Problem, random: np.random.Generator) -> Problem:
-    """Push a robot that is under way, or any."""
-    d = scene.dimension
-    away = np.linalg.norm(scene.goal - scene.start[:, :d], axis=1) > scene.goal_radius
-    robot = int(random.choice(np.flatnonzero(away) if away.any() else scene.num_robots))
-    shove = random.normal(size=d)
-    return edits.push(scene, robot, SHOVE * shove / np.linalg.norm(shove))

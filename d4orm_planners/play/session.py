@@ -13,6 +13,9 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from d4orm_env.core.errors import first_line
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary import count
@@ -129,6 +132,29 @@ class Session:
                 for index, other in enumerate(before)
             ]
             self._begin(scenes, afresh=after.team is not before[0].team or after.world is not before[0].world)
+
+        self._post(make)
+
+    def push(self, robot: int | None, velocity: ArrayLike, lane: int = 0) -> None:
+        """Give a robot a velocity on top of its own at the next step's beginning, in all that drive side by side.
+
+        Nobody tells the policies, which have to find out.
+
+        Args:
+            robot: Which one; ``None`` is the one that is farthest from its goal.
+            velocity: ``(d,)`` [m/s].
+            lane: Whose robot has to be under way, and counts as the farthest.
+        """
+
+        def make() -> None:
+            given = np.asarray(velocity, np.float32)
+            leader = self._lanes[min(lane, len(self._lanes) - 1)]
+            chosen = leader.farthest if robot is None else robot
+            leader.push(chosen, given)
+            for other in self._lanes:
+                if other is not leader and not other.docked[chosen]:
+                    other.push(chosen, given)
+            self._show(self._state)
 
         self._post(make)
 

@@ -27,12 +27,20 @@ class View:
         session: What is shown, and changed by dragging.
 
     Attributes:
-        shown: Which of ``"plans"``, ``"trails"``, ``"subgoals"`` and ``"margins"`` are, and whether on ``"dark"``.
+        shown: Which of ``"plans"``, ``"guidance"``, ``"trails"``, ``"subgoals"`` and ``"margins"`` are, and whether on
+            ``"dark"``.
     """
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._server, self._session = server, session
-        self.shown = {"plans": True, "trails": True, "subgoals": False, "margins": False, "dark": False}
+        self.shown = {
+            "plans": True,
+            "guidance": True,
+            "trails": True,
+            "subgoals": False,
+            "margins": False,
+            "dark": False,
+        }
         self._camera = Camera(server)
         self._lanes: list[LaneView] = []
         self._built: object = None

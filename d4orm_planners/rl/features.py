@@ -1,19 +1,20 @@
 """What a learned policy sees of an observation: the same things, seen from the robot and in its own measure.
 
-A problem that is turned or moved as a whole is the same problem. Vectors are therefore given in a frame whose first
-axis points to the goal, and controls that are vectors of the world are turned back. What matters close by is given on
-scales that resolve it.
+A problem that is turned or moved as a whole is the same problem. Vectors are therefore given in a frame of the robot's
+own: its first axis points to the goal where controls are vectors of the world, which are turned back, and forward where
+a robot turns. What matters close by is given on scales that resolve it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.dynamics import get_model
 from d4orm_env.core.observation_layout import ObservationSlices
 
 TURNED_MODELS = frozenset({"holonomic2d", "holonomic3d", "velocity2d"})
@@ -21,6 +22,8 @@ TURNED_MODELS = frozenset({"holonomic2d", "holonomic3d", "velocity2d"})
 
 ArrayOrTensor: TypeAlias = Any
 """Of NumPy or of torch."""
+
+Frame: TypeAlias = Literal["goal", "heading"]
 
 _HORIZON = 5.0
 """Seconds ahead beyond which meetings do not matter."""
@@ -40,15 +43,18 @@ class Features:
     Attributes:
         slices: Where the parts of an observation lie.
         turned: Whether controls are vectors of the world.
+        frame: ``"goal"`` or ``"heading"``: where the first axis of a robot's frame points.
     """
 
     slices: ObservationSlices
     turned: bool
+    frame: Frame = "goal"
 
     @classmethod
     def of(cls, slices: ObservationSlices, model: str) -> Features:
         """For the observations of robots of a model."""
-        return cls(slices, model in TURNED_MODELS)
+        turns = get_model(model).heading_index is not None
+        return cls(slices, model in TURNED_MODELS, "heading" if turns else "goal")
 
     @property
     def size(self) -> int:
@@ -104,11 +110,11 @@ class Features:
             observations: ``(N, D)``.
 
         Returns:
-            Features ``(N, F)``, and frames ``(N, 2)``: cosine and sine of the direction to the goal.
+            Features ``(N, F)``, and frames ``(N, 2)``: cosine and sine of the direction of their first axis.
         """
         own, count = self.slices.own, len(observations)
         goal, max_speed = observations[:, own.goal], observations[:, own.max_speed]
-        frame = _unit(goal[:, :2])
+        frame = _unit(goal[:, :2] if self.frame == "goal" else observations[:, own.heading])
         # On the goal itself any direction will do.
         frame[(frame == 0).all(axis=1), 0] = 1
         parts = [

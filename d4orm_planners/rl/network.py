@@ -6,7 +6,7 @@ A policy file is a safetensors file: arrays, and a JSON text in its header. Noth
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -46,6 +46,7 @@ class Header(BaseModel):
         layers: Number of layers; those of sets come before them and are not counted.
         encoder: ``"sets"`` if neighbours and obstacles are pooled first, see :mod:`d4orm_planners.rl.sets`. Such a
             policy acts for any number of observed robots.
+        frame: Where the first axis of a robot's frame points; ``None`` is to the goal.
         training: The command and its settings, for people.
     """
 
@@ -61,11 +62,12 @@ class Header(BaseModel):
     squashed: bool
     layers: int = Field(ge=1, le=16)
     encoder: Literal["sets"] | None = None
+    frame: Literal["heading"] | None = None
     training: dict[str, object]
 
     def text(self) -> str:
-        """As JSON; a flat network's is as it was before there were others, and earlier versions read it."""
-        return self.model_dump_json(exclude={"encoder"} if self.encoder is None else None)
+        """As JSON, which earlier versions read where it says nothing that they do not know."""
+        return self.model_dump_json(exclude={name for name in ("encoder", "frame") if getattr(self, name) is None})
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +88,8 @@ class Network:
     def features(self) -> Features:
         """What it sees."""
         head = self.header
-        return Features.of(ObservationSlices(head.dimension, head.num_neighbors, head.num_obstacles), head.model)
+        features = Features.of(ObservationSlices(head.dimension, head.num_neighbors, head.num_obstacles), head.model)
+        return replace(features, frame=head.frame or "goal")
 
     def __call__(self, features: FloatArray) -> FloatArray:
         """``(N, m)`` most likely actions in ``[-1, 1]`` for ``(N, F)`` features."""

@@ -89,12 +89,13 @@ class Practice(CheckedSettings):
 
     def header(self, algorithm: str, worlds: RobotVecEnv | MixedVecEnv, **training: object) -> dict[str, object]:
         """Of a policy file: what a model does not tell."""
-        slices = worlds.features.slices
+        slices, frame = worlds.features.slices, worlds.features.frame
         return {
             "algorithm": algorithm,
             "model": worlds.problem.team.models[0],
             "dimension": slices.dimension,
             "num_neighbors": slices.num_neighbors,
             "num_obstacles": slices.num_obstacles,
+            "frame": None if frame == "goal" else frame,
             "training": {**training, **asdict(self)},
         }

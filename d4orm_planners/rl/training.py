@@ -219,10 +219,20 @@ class _Run:
         self._model: BaseAlgorithm | None = None
         # First of all, because it refuses what cannot be learned, and nothing is to be written then.
         self._validation = settings.validation()
-        self._start = None if settings.start_from is None else load_network(settings.start_from)
+        self._start = None if settings.start_from is None else self._first_network(settings.start_from)
         self.checkpoints = Checkpoints(out, asdict(settings))
         self._checkpoint = self.checkpoints.latest()
         self.evaluations: list[Evaluation] = [] if self._checkpoint is None else self._checkpoint.evaluations
+
+    def _first_network(self, path: str) -> Network:
+        """A policy that learns on."""
+        network, wanted = load_network(path), self._validation.features.frame
+        if network.features.frame != wanted:
+            raise ValueError(
+                f"start_from is {path}, which sees the world from another frame ({network.features.frame}) than is "
+                f"trained for ({wanted}); give a policy that was trained for robots of this model"
+            )
+        return network
 
     def learn(self, index: int) -> None:
         """One lesson, its evaluation and its checkpoint."""
