@@ -209,6 +209,9 @@ def test_after_a_warm_up_nothing_is_left_to_compile(tmp_path: Path) -> None:
     assert before
     run("-m", "d4orm_planners.cli", "plan", "--num-robots", "3", "--out", "plan.npz", "--quiet")
     run("-m", "d4orm_planners.cli", "run", "plan.npz", "--control-noise-std", "0.01", "--quiet")
+    run("-m", "d4orm_planners.cli", "run", "--policy", "d4orm-c2f", "--disturb", "control_noise=0.5", "--quiet")
+    walls = ("--scenario", "rooms", "--num-robots", "6", "--quiet")
+    run("-m", "d4orm_planners.cli", "run", "--policy", "d4orm-c2f", *walls)
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.nb*")} == before
     assert run("-m", "d4orm_planners.cli", "warmup").startswith("0 kernels compiled")
 

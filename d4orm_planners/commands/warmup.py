@@ -22,10 +22,11 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.dynamics import COMMON
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
-from d4orm_env.core.world import World
 from d4orm_env.engine.base import SamplingRules, SamplingTask
 from d4orm_env.engine.caching import Kernel, has_to_be_compiled
 from d4orm_env.engine.choice import get_engine
+from d4orm_env.joint_state import JointState
+from d4orm_env.scenarios import make_problem
 from d4orm_planners.registry import make_planner
 from d4orm_planners.sampling.weights import SoftmaxWeights
 from d4orm_planners.search import Search
@@ -80,7 +81,7 @@ def compile_for_planning(
 
 def _in_another_process(call: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
-        [sys.executable, "-c", f"from {__name__} import find_way, roll_out_once, sample_once; {call}"]
+        [sys.executable, "-c", f"from {__name__} import find_ways, roll_out_once, sample_once; {call}"]
     )
 
 
@@ -112,10 +113,11 @@ def sample_once(teams: tuple[tuple[str, ...], ...]) -> None:
         get_engine("cpu").prepare(task, _RULES, np.ones(1, np.float32), 2)
 
 
-def find_way() -> None:
-    """Find the shortest free way round an obstacle."""
-    problem = _smallest_problem(TEAMS[0])
-    problem.replace(world=World(circles=[(0.5, 5, 1)])).ways.distance(problem.goal)
+def find_ways() -> None:
+    """Find the shortest free ways among walls, and guide a team along them."""
+    problem = make_problem("doorway", num_robots=4)
+    problem.ways.distance(problem.goal)
+    make_planner("guided", engine="cpu").solve(problem, seed=0)
 
 
 def warm_up() -> WarmupReport:
@@ -127,7 +129,7 @@ def warm_up() -> WarmupReport:
     # Before anything runs: what the other process compiles is in the cache when it is needed here.
     missing = [kernel for kernel in _kernels() if has_to_be_compiled(kernel)]
     # The last kernel, for three models, takes as long as two others.
-    other = _in_another_process(f"roll_out_once({TEAMS[0]}); sample_once({TEAMS[1:-1]}); find_way()")
+    other = _in_another_process(f"roll_out_once({TEAMS[0]}); sample_once({TEAMS[1:-1]}); find_ways()")
     sample_once((TEAMS[0], TEAMS[-1]))
     for models in TEAMS[1:]:
         roll_out_once(models)
@@ -135,7 +137,8 @@ def warm_up() -> WarmupReport:
     other.wait()
     sample_once(TEAMS)
     roll_out_once(TEAMS[0])
-    find_way()
+    find_ways()
+    _evade()
     _plan()
     seconds = time.perf_counter() - begin
     kernels = [kernel for kernel in _kernels() if kernel.signatures]
@@ -169,6 +172,16 @@ def _plan() -> None:
         make_planner(name, engine="cpu", num_samples=32, num_steps=1).solve(problem, max_iterations=1)
 
 
+def _evade() -> None:
+    """Keep two robots apart, as D4orm-C2F does in the last resort."""
+    from d4orm_planners.d4orm_c2f.barrier import safe_velocities
+
+    problem = _smallest_problem(TEAMS[0])
+    colliding, everybody = 10 * (problem.start[::-1] - problem.start)[:, :2], np.ones(problem.num_robots, np.bool_)
+    joint = JointState(problem.start, problem.goal, _no_controls(problem)[0], ~everybody, 0)
+    safe_velocities(problem, joint, colliding, everybody, problem.margin)
+
+
 def _step_environments() -> None:
     from d4orm_env import navigation_v0
     from d4orm_env.disturbances import Dropout, Intruder, StateNoise
@@ -190,7 +203,7 @@ def _step_environments() -> None:
 
 
 def _kernels() -> list[Dispatcher[Callable[..., object]]]:
-    """The kernels of the engines that are kept on disk."""
+    """The kernels of engines, guided plans and D4orm-C2F that are kept on disk."""
     from numba.core.dispatcher import Dispatcher
 
     from d4orm_env import engine
@@ -198,9 +211,10 @@ def _kernels() -> list[Dispatcher[Callable[..., object]]]:
     from d4orm_env.engine.drives import drive_kernel
     from d4orm_env.engine.sampling import score_kernel
     from d4orm_env.engine.worlds import world_kernels
+    from d4orm_planners import d4orm_c2f, guidance
 
-    modules = [import_module(f"{engine.__name__}.{module.name}") for module in pkgutil.iter_modules(engine.__path__)
-               if module.name != "jax"]  # fmt: skip
+    modules = [import_module(f"{package.__name__}.{module.name}") for package in (engine, guidance, d4orm_c2f)
+               for module in pkgutil.iter_modules(package.__path__) if module.name != "jax"]  # fmt: skip
     found = {name: value for module in modules for name, value in vars(module).items() if isinstance(value, Dispatcher)}
     worlds = {kernel for models in TEAMS for kernel in world_kernels(models)}
     kernels: list[Kernel[..., object]] = [
