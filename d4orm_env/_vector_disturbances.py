@@ -16,7 +16,7 @@ from d4orm_env.simulation import Simulation
 
 if TYPE_CHECKING:
     from d4orm_env.engine.base import Sight
-    from d4orm_env.engine.worlds import WorldBatch
+    from d4orm_env.engine.episodes import WorldBatch
 
 Worlds = NDArray[np.intp]
 

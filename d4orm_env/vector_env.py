@@ -30,7 +30,7 @@ from d4orm_env.ways import observe_ways
 
 if TYPE_CHECKING:
     from d4orm_env.engine.base import WorldEngine
-    from d4orm_env.engine.worlds import WorldBatch
+    from d4orm_env.engine.episodes import WorldBatch
 
 __all__ = ["NavigationVectorEnv"]
 
@@ -114,7 +114,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
     def _make_worlds(self, num_threads: int | None) -> None:
         # Here, because importing the compiler takes longer than importing all the rest of the package.
         from d4orm_env.engine.cpu import CpuEngine
-        from d4orm_env.engine.worlds import WorldBatch
+        from d4orm_env.engine.episodes import WorldBatch
 
         problem, count = self.problem, self.num_envs
         threads = None if num_threads is None else whole_number(num_threads, "num_threads", 1)
@@ -165,7 +165,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
                 empty, or an option is unknown.
             RuntimeError: If the first reset leaves worlds out.
         """
-        from d4orm_env.engine.worlds import LOOK, RESET
+        from d4orm_env.engine.episodes import LOOK, RESET
 
         mask = reset_mask(options, self._running)
         seeds = world_seeds(seed, self.num_envs)
@@ -194,7 +194,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             RuntimeError: Before the first reset, or, without auto-reset, if an episode is over.
             ValueError: If the actions have another shape, or a value that is not finite or beyond 1e15.
         """
-        from d4orm_env.engine.worlds import RESET, SKIP, STEP
+        from d4orm_env.engine.episodes import RESET, SKIP, STEP
 
         self._require_episodes()
         controls = joint_controls(actions, self._action_shape, self.problem.num_robots)
@@ -230,7 +230,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             RuntimeError: Before the first reset.
             ValueError: If a state is none that the robot may be in; the message names it.
         """
-        from d4orm_env.engine.worlds import LOOK
+        from d4orm_env.engine.episodes import LOOK
 
         self._require_reset()
         worlds, bounds = self._worlds, self._template.state_bounds
@@ -283,7 +283,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
 
     def _advance(self, orders: NDArray[np.uint8], observations: FloatArray | None = None) -> FloatArray:
         """Carry out ``orders`` ``(B,)``, and return what is seen ``(B, K * D)``, in ``observations`` if given."""
-        from d4orm_env.engine.worlds import SKIP, STEP, WorldBatch
+        from d4orm_env.engine.episodes import SKIP, STEP, WorldBatch
 
         if observations is None:
             observations = np.empty_like(self._observations) if self._copy else self._observations

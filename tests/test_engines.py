@@ -20,7 +20,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.transition import TimeStep, advance
-from d4orm_env.engine import threads, tiles
+from d4orm_env.engine import elementary, threads, tiles
 from d4orm_env.engine.base import StepResult
 from d4orm_env.engine.caching import fingerprint
 from d4orm_env.engine.choice import ENGINES, get_engine
@@ -223,12 +223,12 @@ def test_contacts_of_a_standing_team() -> None:
 
 @numba.njit
 def _sine(x: Any) -> Any:
-    return tiles.sine(x)
+    return elementary.sine(x)
 
 
 @numba.njit
 def _cosine(x: Any) -> Any:
-    return tiles.cosine(x)
+    return elementary.cosine(x)
 
 
 def test_the_vectorised_sine_and_cosine() -> None:

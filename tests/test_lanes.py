@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from d4orm_env.engine import lanes
+from d4orm_env.engine.compiling import aligned_zeros
 from d4orm_env.engine.lanes import BLOCK, BOX, CHUNK, TILE
-from d4orm_env.engine.tiles import aligned_zeros
 
 
 @numba.njit

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from d4orm_env import make_problem, rollout
-from d4orm_env.engine import path_index, sampling, softmax, wavefront, worlds
+from d4orm_env.engine import averaging, path_index, sampling, softmax, wavefront, worlds
 from d4orm_env.engine.beam_search import search_kernel
+from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.engine.drives import drive_kernel
 from d4orm_env.engine.softmax import softmax_weights
-from d4orm_env.engine.tiles import OPTIONS
 from d4orm_planners.amswarm.alternation import alternate
 from d4orm_planners.commands.warmup import sample_once
 
@@ -52,8 +52,8 @@ def kernels() -> Iterator[tuple[str, Any]]:
     softmax_weights(np.zeros((1, 4)), 1.0, 0.0)
     make_problem("four_obstacles").check_reachable()
     yield "score", sampling.score_kernel(("differential_drive",))
-    yield "average", sampling.average_noise
-    yield "project", sampling.project_noise
+    yield "average", averaging.average_noise
+    yield "project", averaging.project_noise
     yield "softmax", softmax._softmax
     yield "spread", wavefront._spread
     yield "look", wavefront.look

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from d4orm_env import World, make_problem
 from d4orm_env.engine import proximity
+from d4orm_env.engine.compiling import aligned_zeros
 from d4orm_env.engine.lanes import BLOCK, TILE
 from d4orm_env.engine.proximity import bound_boxes, make_bodies, make_scratch
-from d4orm_env.engine.tiles import aligned_zeros
 
 
 @numba.njit

@@ -16,7 +16,7 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from d4orm_env.engine.worlds import WorldBatch
+    from d4orm_env.engine.episodes import WorldBatch
 
 __all__ = [
     "DenoisingStep", "Engine", "MovingObstacles", "SamplingResult", "SamplingRules", "SamplingTask", "StepResult",
@@ -274,7 +274,7 @@ class WorldEngine(Engine, Protocol):
             arrays: The problem that the worlds share; each has its own starts and goals.
             layout: Which components an observation has, and their bounds.
             max_cycles: Steps in an episode.
-            orders: ``(B,)`` one of :data:`~d4orm_env.engine.worlds.STEP` and its like for every world.
+            orders: ``(B,)`` one of :data:`~d4orm_env.engine.episodes.STEP` and its like for every world.
             batch: The worlds; ``batch.control`` holds what to do.
             out: ``(B, K, D)`` observations, output; those of skipped worlds are not written. ``(0, K, D)`` makes none.
         """

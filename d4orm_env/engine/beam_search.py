@@ -18,24 +18,16 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Whole
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.robot_model import SPEED, TimeStep
-from d4orm_env.engine import lanes, obstacles, path_index, tiles
+from d4orm_env.engine import obstacles, path_index, stepping
 from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
+from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, compiled, inlined, to_fixed_tuple
+from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.obstacles import is_closed, touches_static
 from d4orm_env.engine.path_index import PathTable, count_near, is_unsure, steps_of
-from d4orm_env.engine.tiles import (
-    ONE,
-    OPS,
-    OPTIONS,
-    ZERO,
-    Row,
-    compiled,
-    inlined,
-    make_stepper,
-    models_key,
-    to_fixed_tuple,
-)
+from d4orm_env.engine.rows import Row
+from d4orm_env.engine.stepping import make_stepper, models_key
 
-SOURCES = fingerprint((robot_model, transition, collision, lanes, obstacles, tiles, path_index))
+SOURCES = fingerprint((robot_model, transition, collision, obstacles, *stepping.PARTS, stepping, path_index))
 
 _FAR = np.float32(10)
 """How far ahead a robot that turns off looks, in seconds at full speed."""

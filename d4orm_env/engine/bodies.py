@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
-from d4orm_env.engine import tiles
+from d4orm_env.engine import compiling
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.tiles import OPTIONS
+from d4orm_env.engine.compiling import OPTIONS
 
-_SOURCES = fingerprint((tiles,))
+_SOURCES = fingerprint((compiling,))
 
 
 @cached_kernel(_SOURCES, **OPTIONS)

@@ -12,7 +12,7 @@ from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.engine import noise, sampling
+from d4orm_env.engine import averaging, noise, sampling
 from d4orm_env.engine.base import (
     WATCHED_SAMPLES,
     DenoisingStep,
@@ -25,11 +25,15 @@ from d4orm_env.engine.base import (
     StepWatcher,
     checked_controls,
 )
+from d4orm_env.engine.episodes import WorldBatch
 from d4orm_env.engine.lanes import TILE
 from d4orm_env.engine.noise import DRAWS, TURNS
+from d4orm_env.engine.observing import View
 from d4orm_env.engine.proximity import bound_boxes, make_bodies
+from d4orm_env.engine.sample_noise import Drawing
 from d4orm_env.engine.threads import Threads, available_cores
-from d4orm_env.engine.worlds import View, WorldBatch, WorldKernels, Worlds, kernels_of_codes
+from d4orm_env.engine.world_tiles import Worlds
+from d4orm_env.engine.worlds import WorldKernels, kernels_of_codes
 
 
 class CpuEngine:
@@ -96,7 +100,7 @@ class CpuEngine:
     def prepare(self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int) -> None:
         """See :meth:`d4orm_env.engine.base.Engine.prepare`; one compilation serves all teams of the same models."""
         del noise_scale, num_samples
-        if not (sampling.score_kernel(task.problem.team.models).signatures and sampling.average_noise.signatures):
+        if not (sampling.score_kernel(task.problem.team.models).signatures and averaging.average_noise.signatures):
             self.denoise(task, rules, task.base, np.ones(1, np.float32), TILE, 0)
 
     def denoise(
@@ -177,7 +181,7 @@ class Sampling:
         """Rewards of this step's samples, ``(M,)`` for team credit and ``(K, M)`` for robot credit."""
         num_tiles = -(-self.rewards.shape[1] // TILE)
         scale = np.ascontiguousarray(scale, np.float32)
-        drawing = sampling.Drawing(self.base + mean, scale, self.seed, step)
+        drawing = Drawing(self.base + mean, scale, self.seed, step)
         self.threads.over(
             num_tiles,
             lambda part: self.kernel(
@@ -193,7 +197,7 @@ class Sampling:
         centre[:, :, : mean.shape[2]] = (self.base + mean) / scale
         centre = centre.reshape(num_steps, num_robots, pairs, 2)
         along, across = np.empty((2, num_robots, len(self.kept), DRAWS), np.float32)
-        sampling.project_noise(self.kept, centre, along, across)
+        averaging.project_noise(self.kept, centre, along, across)
         turns = np.stack([along, -along, across, -across], axis=2)
         samples = turns.reshape(num_robots, -1)[:, : self.rewards.shape[1]]
         return -(samples.sum(axis=0, keepdims=True) if self.task.credit == "team" else samples)
@@ -211,7 +215,7 @@ class Sampling:
         odd, even = _by_counter(np.asarray(weights, np.float32))
         first = np.empty_like(self.base)
         second = np.empty_like(self.base) if with_second else np.empty((0, 0, 0), np.float32)
-        self.threads.over(num_steps, lambda part: sampling.average_noise(self.kept, odd, even, part, first, second))
+        self.threads.over(num_steps, lambda part: averaging.average_noise(self.kept, odd, even, part, first, second))
         return first, second
 
 

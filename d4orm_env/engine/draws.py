@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray, IntArray
-from d4orm_env.engine import noise, tiles
+from d4orm_env.engine import compiling, noise
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.sampling import BIT_OPS
-from d4orm_env.engine.tiles import OPTIONS
+from d4orm_env.engine.compiling import OPTIONS
+from d4orm_env.engine.sample_noise import BIT_OPS
 
-_SOURCES = fingerprint((noise, tiles))
+_SOURCES = fingerprint((noise, compiling))
 
 
 @cached_kernel(_SOURCES, **OPTIONS)

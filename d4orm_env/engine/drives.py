@@ -12,19 +12,14 @@ from d4orm_env.core import robot_model, transition
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine import lanes, tiles
+from d4orm_env.engine import stepping
 from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
-from d4orm_env.engine.tiles import (
-    OPS,
-    OPTIONS,
-    SQUARED_GAP,
-    inlined,
-    make_stepper,
-    models_key,
-    to_fixed_tuple,
-)
+from d4orm_env.engine.compiling import OPTIONS, inlined, to_fixed_tuple
+from d4orm_env.engine.elementary import OPS
+from d4orm_env.engine.rows import SQUARED_GAP
+from d4orm_env.engine.stepping import make_stepper, models_key
 
-SOURCES = fingerprint((robot_model, transition, lanes, tiles))
+SOURCES = fingerprint((robot_model, transition, *stepping.PARTS, stepping))
 
 
 class DriveRules(NamedTuple):

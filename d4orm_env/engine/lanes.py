@@ -41,6 +41,9 @@ BLOCK = 4
 BOX = 2 * (TILE + CHUNK)
 """Numbers it makes of them."""
 
+NOWHERE = np.uint64(0)
+"""The mask of what holds in no world."""
+
 _FLOATS = ir.VectorType(ir.FloatType(), CHUNK)
 _BITS = ir.IntType(CHUNK)
 _MASK = ir.IntType(TILE)

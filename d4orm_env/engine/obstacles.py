@@ -16,8 +16,9 @@ from d4orm_env.core import collision
 from d4orm_env.core.arrays import FloatArray, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.world_index import WorldIndex
-from d4orm_env.engine.lanes import CHUNK, TILE, at_most, use_wide_registers
-from d4orm_env.engine.tiles import NOWHERE, ONE, OPS, ZERO, compiled, inlined, to_fixed_tuple
+from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined, to_fixed_tuple
+from d4orm_env.engine.elementary import OPS
+from d4orm_env.engine.lanes import CHUNK, NOWHERE, TILE, at_most, use_wide_registers
 
 _HALF = np.float32(0.5)
 _BIT = np.uint64(1)

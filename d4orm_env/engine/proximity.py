@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray, Ints, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.engine import lanes, tiles
+from d4orm_env.engine import lanes
+from d4orm_env.engine.compiling import aligned_zeros, compiled, inlined
 from d4orm_env.engine.lanes import (
     BLOCK,
     BOX,
     CHUNK,
+    NOWHERE,
     TILE,
     chunk_within_2,
     chunk_within_3,
@@ -32,7 +34,7 @@ from d4orm_env.engine.lanes import (
     worlds_overlap_3,
 )
 from d4orm_env.engine.obstacles import may_touch
-from d4orm_env.engine.tiles import NOWHERE, compiled, inlined
+from d4orm_env.engine.tiles import near_round
 
 SLACK = np.float32(1e-4)
 """Allowance for rounding [m]."""
@@ -79,9 +81,9 @@ class Bodies(NamedTuple):
 def make_scratch(num_robots: int, dimension: int) -> Scratch:
     """Scratch for one thread."""
     return Scratch(
-        tiles.aligned_zeros(num_robots * dimension * BOX), np.empty(num_robots, np.int32),
+        aligned_zeros(num_robots * dimension * BOX), np.empty(num_robots, np.int32),
         np.empty((num_robots, num_robots), np.int32), np.empty((num_robots, BLOCK), np.uint64),
-        tiles.aligned_zeros(2 * TILE),
+        aligned_zeros(2 * TILE),
     )  # fmt: skip
 
 
@@ -209,9 +211,7 @@ def _mark_bodies(
                 reach = radius[k] + bodies.radius[body] + margin
                 for step in range(count):
                     rows = places[place_of(k, step, dimension) : place_of(k, step + 1, dimension)]
-                    s.near[k, step] |= tiles.near_round(
-                        reach, bodies.places[first + step, body], dimension, rows, s.spare
-                    )
+                    s.near[k, step] |= near_round(reach, bodies.places[first + step, body], dimension, rows, s.spare)
 
 
 @inlined

@@ -1,9 +1,10 @@
-"""The CPU engine's sampling kernels: perturb, roll out and score a tile of samples in one pass; average in a second.
+"""The CPU engine's first pass over samples: perturb, roll out and score a tile of them.
 
-The first pass makes the noise of a tile where it is used, moves the robots, checks contacts and adds up rewards, with
+It makes the noise of a tile where it is used, moves the robots, checks contacts and adds up rewards, with
 everything the tile needs in cache. It takes a block of steps at a time, robot by robot, so that a robot's rows stay in
-the first level of the cache, and checks contacts once all robots have moved. It keeps the noise for the second pass: a
-quarter of a number per sample and control, because samples share it, which is a third of the time of making it again.
+the first level of the cache, and checks contacts once all robots have moved. It keeps the noise for the second pass,
+which averages: a quarter of a number per sample and control, because samples share it, which is a third of the time of
+making it again.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from functools import cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from d4orm_env.core import collision, reward, robot_model, transition
@@ -21,43 +21,28 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.robot_model import TimeStep
-from d4orm_env.engine import lanes, noise, obstacles, proximity, tiles
+from d4orm_env.engine import noise, obstacles, proximity, sample_noise, tiles
 from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
-from d4orm_env.engine.lanes import (
-    BLOCK,
-    TILE,
-    add_turned,
-    add_turned_squares,
-    copy_chunk,
-    subtract_where,
-    use_wide_registers,
-)
+from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, aligned_zeros, compiled, inlined, to_fixed_tuple
+from d4orm_env.engine.elementary import OPS
+from d4orm_env.engine.lanes import BLOCK, NOWHERE, TILE, subtract_where, use_wide_registers
 from d4orm_env.engine.noise import DRAWS
 from d4orm_env.engine.proximity import Bodies, Scratch, enclose, make_scratch, mark_robots, near_static, place_of
-from d4orm_env.engine.tiles import (
-    INLINED,
-    NOWHERE,
-    ONE,
-    OPS,
-    OPTIONS,
-    READ,
-    WRITE,
-    ZERO,
-    Docking,
-    Row,
-    compiled,
-    inlined,
-    make_stepper,
-    models_key,
-    models_of_kernel,
-    to_fixed_tuple,
+from d4orm_env.engine.rows import READ, WRITE, Row
+from d4orm_env.engine.sample_noise import TURN, VECTOR, Drawing, draw_block, fill_keys
+from d4orm_env.engine.stepping import Docking, dispatch, make_stepper, models_key, models_of_kernel
+
+SOURCES = fingerprint(
+    (robot_model, transition, collision, reward, noise, sample_noise, obstacles, *tiles.PARTS, tiles, proximity)
 )
 
 # First rows of a robot in the workspace: see tiles, which has others because it keeps more of a robot.
 STATE, DOCKED, TOTAL, ROWS = 0, 6, 7, 9
 STRIDE = ROWS * TILE
-
 HALF = np.float32(0.5)
+
+CONTROL_ROWS = 3
+"""Rows of one step's controls."""
 
 
 class Workspace(NamedTuple):
@@ -100,22 +85,6 @@ class Scoring(NamedTuple):
     bounds: FloatArray
 
 
-class Drawing(NamedTuple):
-    """What the samples of a denoising step are drawn from.
-
-    Attributes:
-        offset: ``(H, K, m)`` base controls plus mean deformation.
-        scale: ``(H, K, m)`` standard deviation of the noise.
-        seed: Two uint32 words.
-        step: Number of the denoising step.
-    """
-
-    offset: FloatArray
-    scale: FloatArray
-    seed: NDArray[np.uint32]
-    step: int
-
-
 Score: TypeAlias = Kernel[[ProblemArrays, Scoring, Drawing, IntArray, Workspace, FloatArray, FloatArray], None]
 """A kernel of :func:`score_kernel`."""
 
@@ -124,135 +93,17 @@ def make_workspace(shape: tuple[int, ...], dimension: int) -> Workspace:
     """A workspace for controls of this shape, ``(H, K, m)``."""
     num_steps, num_robots, num_controls = shape
     return Workspace(
-        tiles.aligned_zeros(num_robots * STRIDE), tiles.aligned_zeros(num_robots * BLOCK * dimension * TILE),
-        tiles.aligned_zeros(BLOCK * 4 * DRAWS), tiles.aligned_zeros(BLOCK * CONTROL_ROWS * TILE),
+        aligned_zeros(num_robots * STRIDE), aligned_zeros(num_robots * BLOCK * dimension * TILE),
+        aligned_zeros(BLOCK * 4 * DRAWS), aligned_zeros(BLOCK * CONTROL_ROWS * TILE),
         np.empty((2, num_robots * num_steps * ((num_controls + 1) // 2)), np.uint32), np.empty(num_robots, np.bool_),
         make_scratch(num_robots, dimension),
     )  # fmt: skip
-
-
-CONTROL_ROWS = 3
-"""Rows of one step's controls."""
-
-SOURCES = fingerprint((robot_model, transition, collision, reward, noise, lanes, obstacles, tiles, proximity))
-for _function in (
-    noise.xor_shift,
-    noise.hash32,
-    noise.stream_key,
-    noise.normal_pair,
-    noise.unit_interval,
-    noise.quarter_sine,
-    noise.with_sign,
-    noise.log_unit,
-):
-    register_jitable(**INLINED)(_function)
-
-
-@compiled
-def _uint32(x: int) -> np.uint32:
-    return np.uint32(x)
-
-
-@compiled
-def _int32(x: int) -> np.int32:
-    return np.int32(x)
-
-
-@compiled
-def _to_float(x: np.int32) -> np.float32:
-    return np.float32(x)
-
-
-@compiled
-def _float_bits(x: np.float32) -> np.int32:
-    return np.float32(x).view(np.int32)
-
-
-@compiled
-def _bits_float(x: np.int32) -> np.float32:
-    return np.int32(x).view(np.float32)
-
-
-@compiled
-def _sqrt(x: np.float32) -> np.float32:
-    return np.sqrt(x)
-
-
-BIT_OPS = noise.BitOps(_uint32, _int32, _to_float, _float_bits, _bits_float, _sqrt)
-
-
-@compiled
-def _draw(key: tuple[np.uint32, np.uint32], first: int, draws: FloatArray) -> None:
-    """Fill two rows with normals, from counter number ``first`` on."""
-    use_wide_registers()
-    for s in range(DRAWS):
-        x, y = noise.normal_pair(np.uint32(first + s), key, BIT_OPS)
-        draws[s] = x
-        draws[DRAWS + s] = y
 
 
 @compiled
 def _copy(source: FloatArray, target: FloatArray) -> None:
     for i in range(target.shape[0]):
         target[i] = source[i]
-
-
-@inlined
-def _draw_block(
-    keys: NDArray[np.uint32], first: int, begin: int, count: int, num_pairs: int, kept: FloatArray, draws: FloatArray
-) -> None:
-    """Draw a robot's noise of a block of ``count`` steps.
-
-    Args:
-        keys: ``(2, K H P)`` see :func:`_fill_keys`.
-        first: The tile's first counter number.
-        begin: Number of the robot's stream at the first step.
-        count: Steps in the block.
-        num_pairs: ``P``, pairs of components.
-        kept: ``(T K H P 2 DRAWS,)`` where the noise is kept, output.
-        draws: ``(BLOCK 4 DRAWS,)`` the same noise, two rows for each of up to two pairs of components, output.
-    """
-    # Of all tiles before this one.
-    before = first // DRAWS * keys.shape[1]
-    for i in range(count):
-        for pair in range(num_pairs):
-            stream, row = begin + i * num_pairs + pair, (2 * i + pair) * 2 * DRAWS
-            _draw((keys[0, stream], keys[1, stream]), first, draws[row : row + 2 * DRAWS])
-            for half in range(2):
-                copy_chunk(draws, row + half * DRAWS, kept, (2 * (before + stream) + half) * DRAWS)
-
-
-# The four samples that share their draws, see :func:`noise.turned`, of which ``o`` is the mean and ``c`` the scale.
-
-
-@compiled
-def _turn2(o: Row, c: Row, d: FloatArray, s: int) -> tuple[Row, Row, Row, Row]:
-    x, y = d[s], d[DRAWS + s]
-    a, b, across, along = c[0] * x, c[1] * y, c[0] * y, c[1] * x
-    return (o[0] + a, o[1] + b), (o[0] - a, o[1] - b), (o[0] - across, o[1] + along), (o[0] + across, o[1] - along)
-
-
-@compiled
-def _turn3(o: Row, c: Row, d: FloatArray, s: int) -> tuple[Row, Row, Row, Row]:
-    first, second, third, fourth = _turn2(o, c, d, s)
-    # Of the second pair one component is left over.
-    a, across = c[2] * d[2 * DRAWS + s], c[2] * d[3 * DRAWS + s]
-    z = o[2]
-    return (*first, z + a), (*second, z - a), (*third, z - across), (*fourth, z + across)
-
-
-@compiled
-def _vector2(x: FloatArray) -> Row:
-    return (x[0], x[1])
-
-
-@compiled
-def _vector3(x: FloatArray) -> Row:
-    return (x[0], x[1], x[2])
-
-
-_TURN = {2: _turn2, 3: _turn3}
-_VECTOR = {2: _vector2, 3: _vector3}
 
 
 @cache
@@ -265,7 +116,7 @@ def _runner(name: str) -> Callable[..., None]:
     limit_control = inlined(model.functions.limit_control)
     read_x, write_x = READ[model.state_size], WRITE[model.state_size]
     read_u, write_u = READ[model.control_size], WRITE[model.control_size]
-    turn, vector, dimension = _TURN[model.control_size], _VECTOR[model.control_size], model.dimension
+    turn, vector, dimension = TURN[model.control_size], VECTOR[model.control_size], model.dimension
     num_limits = len(model.limit_names)
 
     @compiled
@@ -380,7 +231,7 @@ def _score_tile(
         for k in range(num_robots):
             # The noise of a robot that stands counts in the mean all the same.
             stream = (k * num_steps + first) * num_pairs
-            _draw_block(keys, counter, stream, count, num_pairs, kept, draws)
+            draw_block(keys, counter, stream, count, num_pairs, kept, draws)
             robot = w[k * STRIDE : (k + 1) * STRIDE]
             own_places = places[place_of(k, 0, dimension) : place_of(k + 1, 0, dimension)]
             if standing[k]:
@@ -412,22 +263,6 @@ def _score_tile(
             _punish_near(scratch.near, count, penalty, w)
 
 
-@compiled
-def _fill_keys(
-    seed: NDArray[np.uint32], step: int, num_robots: int, num_steps: int, num_pairs: int, keys: NDArray[np.uint32]
-) -> None:
-    """Fill ``keys`` ``(2, K H P)`` with those of the noise streams of a denoising step."""
-    for k in range(num_robots):
-        for pair in range(num_pairs):
-            for t in range(num_steps):
-                key = noise.stream_key(
-                    seed[0], seed[1], np.uint32(step), np.uint32(k), np.uint32(t), np.uint32(pair), BIT_OPS
-                )
-                stream = (k * num_steps + t) * num_pairs + pair
-                keys[0, stream] = key[0]
-                keys[1, stream] = key[1]
-
-
 def score_kernel(models: tuple[str, ...]) -> Score:
     """The first pass for a team of these models.
 
@@ -447,7 +282,7 @@ def score_kernel(models: tuple[str, ...]) -> Score:
 
 @cache
 def _score_kernel(models: tuple[str, ...]) -> Score:
-    run_robot = tiles.dispatch({name: _runner(name) for name in models})
+    run_robot = dispatch({name: _runner(name) for name in models})
 
     @cached_kernel(models_key(SOURCES, models), variant="_".join(models), **OPTIONS)
     def score_tiles(
@@ -461,7 +296,7 @@ def _score_kernel(models: tuple[str, ...]) -> Score:
     ) -> None:
         use_wide_registers()
         num_robots, num_samples = rewards.shape
-        _fill_keys(drawing.seed, drawing.step, num_robots, kept.shape[2], kept.shape[3], space.keys)
+        fill_keys(drawing.seed, drawing.step, num_robots, kept.shape[2], kept.shape[3], space.keys)
         for index in range(tile_range[0], tile_range[1]):
             first = index * TILE
             _score_tile(run_robot, arrays, scoring, drawing, index * DRAWS, kept.reshape(-1), space)
@@ -471,87 +306,3 @@ def _score_kernel(models: tuple[str, ...]) -> Score:
                     rewards[k, first + s] = space.w[k * STRIDE + TOTAL * TILE + s] / np.float32(kept.shape[2])
 
     return score_tiles
-
-
-@compiled
-def _sum_lanes(sums: FloatArray, time_range: IntArray, k: int, moment: FloatArray) -> None:
-    """Put the sums ``(T P 2 DRAWS,)`` of robot ``k`` over their lanes into ``moment`` ``(H, K, m)``."""
-    num_controls = moment.shape[2]
-    rows = num_controls + num_controls % 2
-    for t in range(time_range[0], time_range[1]):
-        for i in range(num_controls):
-            begin = ((t - time_range[0]) * rows + i) * DRAWS
-            # Halves upon halves: an order of summation that does not depend on the width of registers.
-            half = DRAWS // 2
-            while half > 0:
-                for lane in range(begin, begin + half):
-                    sums[lane] += sums[lane + half]
-                half //= 2
-            moment[t, k, i] = sums[begin]
-
-
-@cached_kernel(SOURCES, **OPTIONS)
-def average_noise(
-    kept: FloatArray,
-    odd: FloatArray,
-    even: FloatArray,
-    time_range: IntArray,
-    first_moment: FloatArray,
-    second_moment: FloatArray,
-) -> None:
-    """Weighted mean of the noise, and of its square.
-
-    Args:
-        kept: The noise that :func:`score_tiles` kept.
-        odd: ``(2, K, M / 4)`` weights summed over the samples that share a counter, times the cosine of their turn and
-            times its sine; ``(2, 1, M / 4)`` where all robots have the same weights.
-        even: As many with the squares of cosine and sine.
-        time_range: First time step and the one after the last.
-        first_moment: ``(H, K, m)``, output.
-        second_moment: ``(H, K, m)``, output, or an empty array to do without.
-    """
-    use_wide_registers()
-    num_tiles, num_robots, num_steps, num_pairs = kept.shape[0], kept.shape[1], kept.shape[2], kept.shape[3]
-    draws, count = kept.reshape(-1), (time_range[1] - time_range[0]) * num_pairs
-    sums = tiles.aligned_zeros(count * 2 * DRAWS)
-    squares = tiles.aligned_zeros(count * 2 * DRAWS if second_moment.size > 0 else 0)
-    for k in range(num_robots):
-        row = min(k, odd.shape[1] - 1)
-        sums[:] = ZERO
-        squares[:] = ZERO
-        for tile in range(num_tiles):
-            stream, lane = ((tile * num_robots + k) * num_steps + time_range[0]) * num_pairs, tile * DRAWS
-            for i in range(count):
-                begin = 2 * (stream + i) * DRAWS
-                add_turned(sums, 2 * i * DRAWS, draws, begin, odd[0, row], lane, odd[1, row], lane)
-            if second_moment.size > 0:
-                for i in range(count):
-                    begin = 2 * (stream + i) * DRAWS
-                    add_turned_squares(squares, 2 * i * DRAWS, draws, begin, even[0, row], lane, even[1, row], lane)
-        _sum_lanes(sums, time_range, k, first_moment)
-        if second_moment.size > 0:
-            _sum_lanes(squares, time_range, k, second_moment)
-
-
-@cached_kernel(SOURCES, **OPTIONS)
-def project_noise(kept: FloatArray, centre: FloatArray, along: FloatArray, across: FloatArray) -> None:
-    """Inner products of every draw with a direction, and with that direction turned by 90 degrees.
-
-    Args:
-        kept: The noise that :func:`score_tiles` kept.
-        centre: ``(H, K, P, 2)`` the direction.
-        along: ``(K, T, DRAWS)``, output.
-        across: ``(K, T, DRAWS)``, output.
-    """
-    num_tiles, num_robots, num_steps, num_pairs = kept.shape[0], kept.shape[1], kept.shape[2], kept.shape[3]
-    along[:] = ZERO
-    across[:] = ZERO
-    for k in range(num_robots):
-        for tile in range(num_tiles):
-            for t in range(num_steps):
-                for pair in range(num_pairs):
-                    x, y = centre[t, k, pair, 0], centre[t, k, pair, 1]
-                    for s in range(DRAWS):
-                        first, second = kept[tile, k, t, pair, 0, s], kept[tile, k, t, pair, 1, s]
-                        along[k, tile, s] += x * first + y * second
-                        across[k, tile, s] += y * first - x * second

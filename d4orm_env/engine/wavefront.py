@@ -21,11 +21,11 @@ import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Ints, Whole
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine import tiles
+from d4orm_env.engine import compiling
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.tiles import OPTIONS, compiled, inlined
+from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
 
-SOURCES = fingerprint((tiles,))
+SOURCES = fingerprint((compiling,))
 
 _HALVINGS = 6
 """Of the angle by which a blocked line is turned, and of the length by which a corner is cut."""

@@ -15,8 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, Floats, Whole
+from d4orm_env.engine import compiling
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.tiles import OPTIONS, compiled
+from d4orm_env.engine.compiling import OPTIONS, compiled
 
 MOST_PENALTY = 5e7
 """What the weight of the constraints grows to at most, as in the authors' code: it would overflow in the end."""
@@ -87,7 +88,7 @@ class Targets(NamedTuple):
     acceleration: Floats
 
 
-@cached_kernel(fingerprint(()), **OPTIONS)
+@cached_kernel(fingerprint((compiling,)), **OPTIONS)
 def alternate(
     method: Method,
     bodies: Surroundings,

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_model import ACCELERATION, SPEED
-from d4orm_env.engine import tiles
+from d4orm_env.engine import compiling
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.tiles import OPTIONS
+from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.joint_state import JointState
 
 NEAR = 1.5
@@ -129,7 +129,7 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
     )
 
 
-@cached_kernel(fingerprint((tiles,)), variant="nearest", **OPTIONS)
+@cached_kernel(fingerprint((compiling,)), variant="nearest", **OPTIONS)
 def find_nearest(one: Any, other: Any, normals: Any, least: Any, velocities: Any) -> Any:
     """Move ``velocities`` ``(K, d)`` to the nearest that keep to all barriers; whether any were found.
 

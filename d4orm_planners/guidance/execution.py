@@ -16,14 +16,15 @@ from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, Floats, IntArr
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_model import ACCELERATION, SPEED, TURN_RATE
-from d4orm_env.engine import lanes, tiles
+from d4orm_env.engine import stepping
 from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
-from d4orm_env.engine.tiles import OPTIONS, ZERO, make_stepper, models_key, to_fixed_tuple
+from d4orm_env.engine.compiling import OPTIONS, ZERO, to_fixed_tuple
+from d4orm_env.engine.stepping import make_stepper, models_key
 from d4orm_planners.guidance import pursuit
 from d4orm_planners.guidance.pursuit import lookaheads, point_ahead, point_reached, square_to, steering
 from d4orm_planners.guidance.routes import Routes
 
-SOURCES = fingerprint((robot_model, transition, lanes, tiles, pursuit))
+SOURCES = fingerprint((robot_model, transition, *stepping.PARTS, stepping, pursuit))
 
 BRAKING = 0.5
 """Share of its acceleration that a robot counts on before corners and in them."""

@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core.arrays import Floats, IntArray, Ints, Whole
-from d4orm_env.engine import tiles
+from d4orm_env.engine import compiling
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.tiles import OPTIONS, compiled, inlined
+from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
 
-SOURCES = fingerprint((tiles,))
+SOURCES = fingerprint((compiling,))
 
 
 class Cells(NamedTuple):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Ints, Whole
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.tiles import OPTIONS, compiled
+from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_planners.guidance import nearness
 from d4orm_planners.guidance.nearness import squared_gap
 from d4orm_planners.guidance.roadmap import Roadmap

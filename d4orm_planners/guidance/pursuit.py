@@ -17,7 +17,9 @@ from d4orm_env.core.arrays import Floats
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_model import Model, TimeStep
-from d4orm_env.engine.tiles import ONE, OPS, ZERO, Row, compiled, cosine, inlined, sine
+from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
+from d4orm_env.engine.elementary import OPS, cosine, sine
+from d4orm_env.engine.rows import Row
 
 if TYPE_CHECKING:
     from d4orm_planners.guidance.routes import Routes

@@ -11,7 +11,7 @@ from numba.extending import register_jitable
 from d4orm_env.core.arrays import Floats, IntArray, Ints, Whole
 from d4orm_env.engine import wavefront
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.tiles import OPTIONS, compiled
+from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_env.engine.wavefront import Space, is_free_line
 from d4orm_planners.guidance import nearness, pibt
 from d4orm_planners.guidance.nearness import Cells, cells_about

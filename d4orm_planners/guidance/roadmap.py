@@ -9,7 +9,7 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Ints
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.tiles import OPTIONS
+from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.engine.wavefront import Space, free_lines, make_space
 from d4orm_env.ways import in_space, lay_lattice
 from d4orm_planners.guidance import nearness

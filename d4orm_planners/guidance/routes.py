@@ -16,7 +16,7 @@ import numpy as np
 from d4orm_env.core.arrays import Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.tiles import OPTIONS
+from d4orm_env.engine.compiling import OPTIONS
 from d4orm_planners.guidance import nearness
 from d4orm_planners.guidance.nearness import Cells, cells_about, sort_into_cells
 from d4orm_planners.guidance.roadmap import Roadmap

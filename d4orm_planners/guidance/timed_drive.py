@@ -12,8 +12,9 @@ from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
+from d4orm_env.engine.compiling import OPTIONS, ZERO, inlined, to_fixed_tuple
 from d4orm_env.engine.drives import LoneRobot
-from d4orm_env.engine.tiles import OPTIONS, ZERO, inlined, make_stepper, models_key, to_fixed_tuple
+from d4orm_env.engine.stepping import make_stepper, models_key
 from d4orm_planners.guidance import execution, pursuit
 from d4orm_planners.guidance.execution import BEYOND, RESERVE
 from d4orm_planners.guidance.pursuit import point_ahead, point_reached, square_to, steering

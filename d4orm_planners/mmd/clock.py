@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from d4orm_env.core.arrays import Floats
-from d4orm_env.engine.tiles import compiled
+from d4orm_env.engine.compiling import compiled
 
 SHARE = 0.7
 """Of its acceleration that a robot counts on, so that it can make up for what it is off."""

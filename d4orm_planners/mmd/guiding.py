@@ -13,9 +13,9 @@ import numpy as np
 from numba.extending import register_jitable
 
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
-from d4orm_env.engine import tiles, wavefront
+from d4orm_env.engine import compiling, wavefront
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.tiles import OPTIONS, compiled
+from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_env.engine.wavefront import Space, clearance_at
 from d4orm_planners.mmd import clock, way_frame
 from d4orm_planners.mmd.clock import fill_clock
@@ -65,7 +65,7 @@ def _point_variance(sines: Floats, deviation: Floats) -> Floats:
     return variance
 
 
-@cached_kernel(fingerprint((tiles, wavefront, clock, way_frame)), variant="guide", **OPTIONS)
+@cached_kernel(fingerprint((compiling, wavefront, clock, way_frame)), variant="guide", **OPTIONS)
 def guide(
     frame: WayFrame,
     sines: Floats,

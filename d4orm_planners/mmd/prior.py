@@ -14,9 +14,9 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.portable import cos
-from d4orm_env.engine import tiles
+from d4orm_env.engine import compiling
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.tiles import OPTIONS
+from d4orm_env.engine.compiling import OPTIONS
 from d4orm_planners.mmd.way_frame import FEATURES, MODES
 
 WEIGHTS = Path(__file__).with_name("weights.npz")
@@ -106,7 +106,7 @@ def posterior(now: float, then: float) -> tuple[float, float, float]:
     return float(of_clean), float(of_noisy), float(np.sqrt((1 - then) / (1 - now) * (1 - ratio)))
 
 
-@cached_kernel(fingerprint((tiles,)), variant="tell", **OPTIONS)
+@cached_kernel(fingerprint((compiling,)), variant="tell", **OPTIONS)
 def tell(prior: Prior, features: FloatArray, told: FloatArray) -> None:
     """Fill ``told`` ``(P, W)`` with what features ``(P, FEATURES)`` add to the first layer, its bias included."""
     for p in range(features.shape[0]):
@@ -117,7 +117,7 @@ def tell(prior: Prior, features: FloatArray, told: FloatArray) -> None:
                 told[p, j] += value * prior.told[i, j]
 
 
-@cached_kernel(fingerprint((tiles,)), variant="predict", **OPTIONS)
+@cached_kernel(fingerprint((compiling,)), variant="predict", **OPTIONS)
 def predict(
     prior: Prior, told: FloatArray, level: FloatArray, signal: FloatArray, noisy: FloatArray, clean: FloatArray
 ) -> None:

@@ -11,16 +11,18 @@ from d4orm_env.core import robot_model, transition
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine import lanes, tiles, wavefront
+from d4orm_env.engine import stepping, wavefront
 from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
+from d4orm_env.engine.compiling import OPTIONS, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.drives import LoneRobot
-from d4orm_env.engine.tiles import OPS, OPTIONS, ZERO, compiled, inlined, make_stepper, models_key, to_fixed_tuple
+from d4orm_env.engine.elementary import OPS
+from d4orm_env.engine.stepping import make_stepper, models_key
 from d4orm_env.engine.wavefront import Space, clearance_at
 from d4orm_planners.mmd import clock, way_frame
 from d4orm_planners.mmd.clock import fill_clock
 from d4orm_planners.mmd.way_frame import WayFrame, trace
 
-SOURCES = fingerprint((robot_model, transition, lanes, tiles, wavefront, clock, way_frame))
+SOURCES = fingerprint((robot_model, transition, *stepping.PARTS, stepping, wavefront, clock, way_frame))
 
 GAIN = np.float32(1.5)
 """Share of its distance from the motion that a robot makes up for in a second [1/s]."""

@@ -15,12 +15,12 @@ from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.portable import sin
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_model import ACCELERATION, SPEED
-from d4orm_env.engine import tiles, wavefront
+from d4orm_env.engine import compiling, wavefront
 from d4orm_env.engine.caching import cached_kernel, fingerprint
-from d4orm_env.engine.tiles import OPTIONS, compiled, inlined
+from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
 from d4orm_env.engine.wavefront import Space, clearance_at, make_space
 
-SOURCES = fingerprint((tiles, wavefront))
+SOURCES = fingerprint((compiling, wavefront))
 
 POINTS = 64
 """Stretches of equal time that a motion is cut into, as in the publication."""

@@ -1,0 +1,74 @@
+"""How kernels are compiled, and what of :mod:`d4orm_env.core` they may call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol, TypeVar
+
+import numba
+import numpy as np
+from numba.extending import register_jitable
+from numba.np.unsafe import ndarray
+
+from d4orm_env.core import collision, reward, robot_model, transition
+from d4orm_env.core.arrays import FloatArray
+
+ZERO = np.float32(0)
+ONE = np.float32(1)
+F = TypeVar("F", bound=Callable[..., object])
+
+
+class Compiler(Protocol):
+    """A decorator that compiles a function, which otherwise stays what it is."""
+
+    def __call__(self, function: F, /) -> F: ...
+
+
+OPTIONS: dict[str, Any] = {"error_model": "numpy"}
+"""No fast mathematics: only what IEEE 754 defines to the bit, in the order in which it is written. Multiply-adds do not
+fuse, sums are not regrouped, nothing is estimated; so a kernel gives the same bits on every processor, however wide its
+registers. What it costs is measured in docs/performance.md."""
+
+UNCOUNTED = OPTIONS | {"_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+"""For everything that kernels call: without numba's reference counts, which would cost more than the sums they
+surround, and without what Python would call them by, which takes a fifth to a third of the time of compiling. Such
+functions cannot make arrays, and a call from Python ends the process: tests call them from compiled functions."""
+compiled: Compiler = numba.njit(nogil=True, **UNCOUNTED)
+
+INLINED = UNCOUNTED | {"forceinline": True}
+"""For functions that take functions (a model, ``Ops``): inlining leaves no function pointer behind, so that numba can
+keep the kernels on disk. And for those that take a problem's arrays, which are a long argument to pass by value."""
+inlined: Compiler = numba.njit(nogil=True, **INLINED)
+for _function in (
+    robot_model.norm_scale,
+    robot_model.control_scale,
+    robot_model.clip,
+    robot_model.stopping_speed,
+    robot_model.share,
+    robot_model.planar_approach,
+    robot_model.first_order_approach,
+    robot_model.turn_towards,
+    robot_model.runge_kutta,
+    transition.advance,
+    transition.arrives,
+    transition.stands,
+    collision.axis_gap,
+    collision.leaves,
+    collision.meets_edge,
+    collision.lies_left,
+    collision.meets_triangle,
+    reward.step_reward,
+):
+    # Lets compiled code call the core's plain Python functions, which stay as they are for everyone else.
+    register_jitable(**INLINED)(_function)
+
+to_fixed_tuple: Callable[..., tuple[np.float32, ...]] = ndarray.to_fixed_tuple
+"""Its calls in compiled code lack the first argument, which type checkers cannot know."""
+
+
+@register_jitable(nogil=True, **OPTIONS)
+def aligned_zeros(size: int) -> FloatArray:
+    """A flat float32 array that begins with a cache line, so that no vector load touches two."""
+    space = np.zeros(size + 16, np.float32)
+    first = np.int64(-(space.ctypes.data // 4) % 16)
+    return space[first : first + size]

@@ -1,0 +1,144 @@
+"""Kernels that observe many worlds of one problem at once."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numba
+import numpy as np
+from numba.extending import register_jitable
+
+from d4orm_env.core import collision, observation, reward, robot_model, transition
+from d4orm_env.core.arrays import FloatArray, IntArray
+from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.engine import world_tiles
+from d4orm_env.engine.base import Sight
+from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
+from d4orm_env.engine.compiling import INLINED, ONE, OPTIONS, ZERO, aligned_zeros, compiled, inlined
+from d4orm_env.engine.lanes import TILE
+from d4orm_env.engine.stepping import models_key
+from d4orm_env.engine.tiles import STATE, STRIDE, MotionReader, motion_reader
+from d4orm_env.engine.world_tiles import Worlds, load
+
+if TYPE_CHECKING:
+    from d4orm_env.engine.episodes import WorldBatch
+
+SOURCES = fingerprint((robot_model, transition, collision, reward, observation, *world_tiles.PARTS, world_tiles))
+
+
+for _function in (
+    observation.observe_robot,
+    observation._see_itself,
+    observation._see_robots,
+    observation._see_obstacles,
+    observation.insert_nearest,
+    observation._comes_before,
+    observation._find_nearest_robots,
+    observation._find_nearest_obstacles,
+    observation._list_of,
+    observation._point_to,
+    observation._distance_to_box,
+    observation._gap_to_triangle,
+):
+    register_jitable(**INLINED)(_function)
+
+
+@numba.njit(nogil=True, **OPTIONS)
+def allocate_sensed(
+    num_robots: int, num_bodies: int, dimension: int, num_neighbors: int, num_obstacles: int
+) -> observation.Sensed:
+    everybody = num_robots + num_bodies
+    return observation.Sensed(
+        np.empty((everybody, dimension), np.float32), np.empty((everybody, dimension), np.float32),
+        np.empty(everybody, np.float32), np.empty((num_robots, 2), np.float32), np.empty(num_robots, np.float32),
+        np.empty((num_neighbors, 2), np.float32), np.empty((num_obstacles, 2), np.float32),
+    )  # fmt: skip
+
+
+class View(NamedTuple):
+    """What an observation is made of, see :class:`~d4orm_env.core.observation_layout.ObservationLayout`.
+
+    Attributes:
+        bounds: ``(2, D)`` lowest and highest observation.
+        num_neighbors: Robots in it.
+        num_obstacles: Obstacles in it.
+    """
+
+    bounds: FloatArray
+    num_neighbors: int
+    num_obstacles: int
+
+
+@compiled
+def _sense_bodies(bodies: FloatArray, num_robots: int, sensed: observation.Sensed) -> None:
+    """Put ``bodies`` ``(N, 2 d + 1)``, position, velocity and radius, behind the robots; no radius is an unseen one."""
+    dimension = (bodies.shape[1] - 1) // 2
+    for body in range(bodies.shape[0]):
+        sensed.radius[num_robots + body] = bodies[body, 2 * dimension]
+        for axis in range(dimension):
+            unseen = bodies[body, 2 * dimension] <= ZERO
+            sensed.position[num_robots + body, axis] = np.float32(np.inf) if unseen else bodies[body, axis]
+            sensed.velocity[num_robots + body, axis] = bodies[body, dimension + axis]
+
+
+@inlined
+def observe(
+    read_motion: MotionReader,
+    arrays: ProblemArrays,
+    worlds: Worlds | Sight | WorldBatch,
+    b: int,
+    time_left: np.float32,
+    w: FloatArray,
+    bounds: FloatArray,
+    sensed: observation.Sensed,
+    out: FloatArray,
+) -> None:
+    """Fill ``out`` ``(K, D)`` with what the robots of world ``b`` of a loaded tile see, inside ``bounds``."""
+    (num_robots, dimension), s = arrays.goal.shape, b % TILE
+    for k in range(num_robots):
+        for axis in range(dimension):
+            sensed.position[k, axis] = w[k * STRIDE + (STATE + axis) * TILE + s]
+        read_motion(arrays, k, s, w, sensed.velocity[k], sensed.heading[k])
+        sensed.arrived[k] = ONE if worlds.docked[b, k] else ZERO
+        for axis in range(dimension):
+            if transition.stands(worlds.docked[b, k], arrays.docks):
+                sensed.velocity[k, axis] = ZERO
+        sensed.radius[k] = arrays.radius[k]
+    for k in range(num_robots):
+        row = out[k]
+        observation.observe_robot(k, arrays, worlds.goal[b], sensed, time_left, row)
+        for i in range(row.shape[0]):
+            value = row[i]
+            value = value if value > bounds[0, i] else bounds[0, i]
+            row[i] = value if value < bounds[1, i] else bounds[1, i]
+
+
+@cache
+def observe_worlds_kernel(
+    names: tuple[str, ...],
+) -> Kernel[[ProblemArrays, Sight, View, IntArray, FloatArray], None]:
+    """A kernel that fills ``out`` ``(B, K, D)`` with what every robot of every world sees.
+
+    Args:
+        names: Models that the kernel is for.
+        arrays: The problem that the worlds share; its starts and goals are not looked at.
+        sight: What there is to see, a :class:`~d4orm_env.engine.base.Sight`.
+        view: What an observation is made of, a :class:`View`.
+        tile_range: First tile of worlds and the one after the last.
+    """
+    read_motion = motion_reader(names)
+
+    @cached_kernel(models_key(SOURCES, names), variant="_".join(names), **OPTIONS)
+    def observe_worlds(arrays: ProblemArrays, sight: Sight, view: View, tile_range: IntArray, out: FloatArray) -> None:
+        num_robots, dimension = arrays.goal.shape
+        w = aligned_zeros(num_robots * STRIDE)
+        sensed = allocate_sensed(num_robots, sight.bodies.shape[1], dimension, view.num_neighbors, view.num_obstacles)
+        for index in range(tile_range[0], tile_range[1]):
+            first = index * TILE
+            load(sight, first, w)
+            for b in range(first, min(first + TILE, sight.state.shape[0])):
+                _sense_bodies(sight.bodies[b], num_robots, sensed)
+                observe(read_motion, arrays, sight, b, sight.time_left[b], w, view.bounds, sensed, out[b])
+
+    return observe_worlds

@@ -1,0 +1,159 @@
+"""The noise of a tile of samples: pairs of normals from counters, of which four samples each take a turn."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba.extending import register_jitable
+from numpy.typing import NDArray
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.engine import noise
+from d4orm_env.engine.compiling import INLINED, compiled, inlined
+from d4orm_env.engine.lanes import copy_chunk, use_wide_registers
+from d4orm_env.engine.noise import DRAWS
+from d4orm_env.engine.rows import Row
+
+
+class Drawing(NamedTuple):
+    """What the samples of a denoising step are drawn from.
+
+    Attributes:
+        offset: ``(H, K, m)`` base controls plus mean deformation.
+        scale: ``(H, K, m)`` standard deviation of the noise.
+        seed: Two uint32 words.
+        step: Number of the denoising step.
+    """
+
+    offset: FloatArray
+    scale: FloatArray
+    seed: NDArray[np.uint32]
+    step: int
+
+
+for _function in (
+    noise.xor_shift,
+    noise.hash32,
+    noise.stream_key,
+    noise.normal_pair,
+    noise.unit_interval,
+    noise.quarter_sine,
+    noise.with_sign,
+    noise.log_unit,
+):
+    register_jitable(**INLINED)(_function)
+
+
+@compiled
+def _uint32(x: int) -> np.uint32:
+    return np.uint32(x)
+
+
+@compiled
+def _int32(x: int) -> np.int32:
+    return np.int32(x)
+
+
+@compiled
+def _to_float(x: np.int32) -> np.float32:
+    return np.float32(x)
+
+
+@compiled
+def _float_bits(x: np.float32) -> np.int32:
+    return np.float32(x).view(np.int32)
+
+
+@compiled
+def _bits_float(x: np.int32) -> np.float32:
+    return np.int32(x).view(np.float32)
+
+
+@compiled
+def _sqrt(x: np.float32) -> np.float32:
+    return np.sqrt(x)
+
+
+BIT_OPS = noise.BitOps(_uint32, _int32, _to_float, _float_bits, _bits_float, _sqrt)
+
+
+@compiled
+def fill_keys(
+    seed: NDArray[np.uint32], step: int, num_robots: int, num_steps: int, num_pairs: int, keys: NDArray[np.uint32]
+) -> None:
+    """Fill ``keys`` ``(2, K H P)`` with those of the noise streams of a denoising step."""
+    for k in range(num_robots):
+        for pair in range(num_pairs):
+            for t in range(num_steps):
+                key = noise.stream_key(
+                    seed[0], seed[1], np.uint32(step), np.uint32(k), np.uint32(t), np.uint32(pair), BIT_OPS
+                )
+                stream = (k * num_steps + t) * num_pairs + pair
+                keys[0, stream] = key[0]
+                keys[1, stream] = key[1]
+
+
+@compiled
+def _draw(key: tuple[np.uint32, np.uint32], first: int, draws: FloatArray) -> None:
+    """Fill two rows with normals, from counter number ``first`` on."""
+    use_wide_registers()
+    for s in range(DRAWS):
+        x, y = noise.normal_pair(np.uint32(first + s), key, BIT_OPS)
+        draws[s] = x
+        draws[DRAWS + s] = y
+
+
+@inlined
+def draw_block(
+    keys: NDArray[np.uint32], first: int, begin: int, count: int, num_pairs: int, kept: FloatArray, draws: FloatArray
+) -> None:
+    """Draw a robot's noise of a block of ``count`` steps.
+
+    Args:
+        keys: ``(2, K H P)`` see :func:`fill_keys`.
+        first: The tile's first counter number.
+        begin: Number of the robot's stream at the first step.
+        count: Steps in the block.
+        num_pairs: ``P``, pairs of components.
+        kept: ``(T K H P 2 DRAWS,)`` where the noise is kept, output.
+        draws: ``(BLOCK 4 DRAWS,)`` the same noise, two rows for each of up to two pairs of components, output.
+    """
+    # Of all tiles before this one.
+    before = first // DRAWS * keys.shape[1]
+    for i in range(count):
+        for pair in range(num_pairs):
+            stream, row = begin + i * num_pairs + pair, (2 * i + pair) * 2 * DRAWS
+            _draw((keys[0, stream], keys[1, stream]), first, draws[row : row + 2 * DRAWS])
+            for half in range(2):
+                copy_chunk(draws, row + half * DRAWS, kept, (2 * (before + stream) + half) * DRAWS)
+
+
+@compiled
+def _turn2(o: Row, c: Row, d: FloatArray, s: int) -> tuple[Row, Row, Row, Row]:
+    x, y = d[s], d[DRAWS + s]
+    a, b, across, along = c[0] * x, c[1] * y, c[0] * y, c[1] * x
+    return (o[0] + a, o[1] + b), (o[0] - a, o[1] - b), (o[0] - across, o[1] + along), (o[0] + across, o[1] - along)
+
+
+@compiled
+def _turn3(o: Row, c: Row, d: FloatArray, s: int) -> tuple[Row, Row, Row, Row]:
+    first, second, third, fourth = _turn2(o, c, d, s)
+    # Of the second pair one component is left over.
+    a, across = c[2] * d[2 * DRAWS + s], c[2] * d[3 * DRAWS + s]
+    z = o[2]
+    return (*first, z + a), (*second, z - a), (*third, z - across), (*fourth, z + across)
+
+
+@compiled
+def _vector2(x: FloatArray) -> Row:
+    return (x[0], x[1])
+
+
+@compiled
+def _vector3(x: FloatArray) -> Row:
+    return (x[0], x[1], x[2])
+
+
+TURN = {2: _turn2, 3: _turn3}
+VECTOR = {2: _vector2, 3: _vector3}

@@ -1,0 +1,117 @@
+"""The compiled step of one robot in one world, for every model, and the choice between models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TypeAlias
+
+import numpy as np
+
+from d4orm_env.core import transition
+from d4orm_env.core.dynamics import COMMON, MODEL_CODES, MODELS, model_digest
+from d4orm_env.core.robot_model import (
+    MOVED,
+    Model,
+    ModelFunction,
+    ModelFunctions,
+    Ops,
+    RungeKutta,
+    TimeStep,
+    Vector,
+    runge_kutta,
+)
+from d4orm_env.engine import compiling, elementary, lanes, rows
+from d4orm_env.engine.compiling import ZERO, inlined
+from d4orm_env.engine.elementary import OPS
+from d4orm_env.engine.rows import PICK, SQUARED_GAP, SQUARED_NORM, Row
+
+PARTS = (lanes, compiling, elementary, rows)
+"""Modules that steps are made of, for fingerprints."""
+
+Docking: TypeAlias = tuple[np.float32, np.float32, np.bool_]
+"""Squares of the goal radius and of the goal speed, and whether who has arrived stands there for ever."""
+Mover: TypeAlias = Callable[[bool, Row, Row, Row, TimeStep], Row]
+Docker: TypeAlias = Callable[[bool, Row, Row, Row, Row, Docking], tuple[Row, np.float32, bool]]
+
+
+def models_of_kernel(models: tuple[str, ...]) -> tuple[str, ...]:
+    """Models that a kernel for a team of these is compiled for, in the order of their codes.
+
+    Every model has kernels of its own, because compiling takes seconds a model; mixed teams of common models share
+    those for all of these that have their dimension.
+    """
+    different = set(models)
+    if len(different) > 1 and different <= set(COMMON):
+        dimension = MODELS[models[0]].dimension
+        different = {name for name in COMMON if MODELS[name].dimension == dimension}
+    return tuple(sorted(different, key=MODEL_CODES.__getitem__))
+
+
+def models_key(sources: str, names: tuple[str, ...]) -> str:
+    """Key in the cache of a kernel made of these sources and models: the codes are in the kernel too."""
+    return f"{sources} {[(name, MODEL_CODES[name], model_digest(MODELS[name])) for name in names]}"
+
+
+def _integrator(function: ModelFunction) -> ModelFunction:
+    """The function itself, or in scalar style what :class:`RungeKutta` computes."""
+    if not isinstance(function, RungeKutta):
+        return function
+    derivative, moved = inlined(function.derivative), inlined(MOVED[function.state_size])
+
+    def integrate(x: Vector, u: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
+        return runge_kutta(derivative, moved, x, u, limits, h, ops)
+
+    return integrate
+
+
+def make_stepper(model: Model) -> tuple[Mover, Docker]:
+    """The two halves of the compiled step of one robot of this model in one world, for a control within its limits.
+
+    ``move(standing, x, u, limits, h) -> x`` and ``dock(standing, x, u, limits, goal, docking) -> (x, squared distance
+    to the goal, whether docked)``.
+    """
+    functions = ModelFunctions(*(inlined(_integrator(function)) for function in model.functions))
+    pick_x = PICK[model.state_size]
+    squared_norm, squared_gap = SQUARED_NORM[model.dimension], SQUARED_GAP[model.dimension]
+
+    @inlined
+    def move(standing: bool, x: Row, u: Row, limits: Row, h: TimeStep) -> Row:
+        return pick_x(standing, x, transition.advance(functions, x, u, limits, h, OPS))
+
+    @inlined
+    def dock(standing: bool, x: Row, u: Row, limits: Row, goal: Row, docking: Docking) -> tuple[Row, np.float32, bool]:
+        gap2 = squared_gap(x, goal)
+        speed2 = squared_norm(functions.velocity(x, u, limits, OPS))
+        arrives = transition.arrives(gap2, speed2, docking[0], docking[1])
+        docks = transition.stands(arrives, docking[2])
+        return pick_x(docks, functions.rest(x, ZERO), x), gap2, standing | arrives
+
+    return move, dock
+
+
+def dispatch(branches: Mapping[str, Callable[..., None]]) -> Callable[..., None]:
+    """``call(code, *arguments)``: the compiled function of the model with that code, of a table by models' names.
+
+    The codes are those of :data:`~d4orm_env.core.dynamics.MODEL_CODES`. Nothing is done for one not in the table, so
+    a kernel is chosen by the codes that it is called with.
+    """
+    (name, branch), *others = branches.items()
+    own_code = MODEL_CODES[name]
+    if not others:
+
+        @inlined
+        def call_only(code: int, *arguments: object) -> None:
+            if code == own_code:
+                branch(*arguments)
+
+        return call_only
+    rest = dispatch(dict(others))
+
+    @inlined
+    def call(code: int, *arguments: object) -> None:
+        if code == own_code:
+            branch(*arguments)
+        else:
+            rest(code, *arguments)
+
+    return call

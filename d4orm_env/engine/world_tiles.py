@@ -1,0 +1,127 @@
+"""Many worlds of one problem in tiles: loaded, stored and judged."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.core import reward
+from d4orm_env.core.arrays import BoolArray, FloatArray, Whole
+from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.engine import obstacles, tiles
+from d4orm_env.engine.base import Sight
+from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
+from d4orm_env.engine.lanes import NOWHERE, TILE
+from d4orm_env.engine.tiles import (
+    CONTROL,
+    DISTANCE2,
+    DOCKED,
+    GOAL,
+    OBSTACLE,
+    ROBOT,
+    ROWS,
+    SPARE,
+    STATE,
+    STRIDE,
+    mark_pairs,
+)
+
+if TYPE_CHECKING:
+    from d4orm_env.engine.episodes import WorldBatch
+
+PARTS = (*tiles.PARTS, tiles, obstacles)
+"""Modules that these are made of, for fingerprints."""
+
+
+class Worlds(NamedTuple):
+    """``B`` worlds, or ``B`` moments of one; kernels change them in place.
+
+    Attributes:
+        goal: ``(B, K, d)``, or ``(1, K, d)`` for all.
+        inverse: ``(B, K)`` one over the start distances, or ``(1, K)``.
+        state: ``(B, K, n)``.
+        control: ``(B, K, m)``; what to do goes in, what was executed comes out.
+        docked: ``(B, K)`` bool.
+        collided: ``(B, K)`` bool, hard contact.
+        violated: ``(B, K)`` bool, within the margin.
+        rewards: ``(B, K)`` of each robot where it stands.
+    """
+
+    goal: FloatArray
+    inverse: FloatArray
+    state: FloatArray
+    control: FloatArray
+    docked: BoolArray
+    collided: BoolArray
+    violated: BoolArray
+    rewards: FloatArray
+
+
+@inlined
+def load_world(worlds: Worlds | Sight | WorldBatch, b: int, s: Whole, w: FloatArray) -> None:
+    """Put world ``b`` into lane ``s`` of a tile."""
+    own = min(b, worlds.goal.shape[0] - 1)
+    for k in range(worlds.state.shape[1]):
+        o = k * STRIDE + s
+        for i in range(worlds.state.shape[2]):
+            w[o + (STATE + i) * TILE] = worlds.state[b, k, i]
+        for i in range(worlds.control.shape[2]):
+            w[o + (CONTROL + i) * TILE] = worlds.control[b, k, i]
+        for axis in range(worlds.goal.shape[2]):
+            w[o + (GOAL + axis) * TILE] = worlds.goal[own, k, axis]
+        w[o + DOCKED * TILE] = ONE if worlds.docked[b, k] else ZERO
+
+
+@compiled
+def load(worlds: Worlds | Sight | WorldBatch, first: int, w: FloatArray) -> None:
+    """Put worlds from number ``first`` on into the lanes of a tile."""
+    for s in range(min(TILE, worlds.state.shape[0] - first)):
+        load_world(worlds, first + s, s, w)
+
+
+@compiled
+def store_world(worlds: Worlds | WorldBatch, b: int, s: Whole, w: FloatArray) -> None:
+    """The reverse of :func:`load_world`, for what a step changes."""
+    for k in range(worlds.state.shape[1]):
+        o = k * STRIDE + s
+        for i in range(worlds.state.shape[2]):
+            worlds.state[b, k, i] = w[o + (STATE + i) * TILE]
+        for i in range(worlds.control.shape[2]):
+            worlds.control[b, k, i] = w[o + (CONTROL + i) * TILE]
+        worlds.docked[b, k] = w[o + DOCKED * TILE] > ZERO
+
+
+@inlined
+def _bit(mask: np.uint64, s: int) -> np.uint64:
+    return (mask >> np.uint64(s)) & np.uint64(1)
+
+
+@compiled
+def judge(
+    arrays: ProblemArrays, worlds: Worlds | WorldBatch, first: int, w: FloatArray, near: NDArray[np.uint64]
+) -> None:
+    """Flag contacts and margin violations of the worlds of a tile, and compute rewards."""
+    num_robots = arrays.radius.shape[0]
+    for k in range(num_robots):
+        near[k, ROBOT] = near[k, OBSTACLE] = NOWHERE
+    # Whatever is in contact is within the margin too, so the second level adds to the flags of the first.
+    for level in range(2):
+        extra = ZERO if level == 0 else arrays.margin
+        flags = worlds.collided if level == 0 else worlds.violated
+        mark_pairs(arrays, extra, w, near)
+        for k in range(num_robots):
+            robot = w[k * STRIDE : (k + 1) * STRIDE]
+            places, spare = robot[STATE * TILE : CONTROL * TILE], robot[SPARE * TILE : ROWS * TILE]
+            near[k, OBSTACLE] |= obstacles.near_obstacles(arrays, arrays.radius[k] + extra, places, spare)
+        for s in range(min(TILE, flags.shape[0] - first)):
+            for k in range(num_robots):
+                flags[first + s, k] = _bit(near[k, ROBOT] | near[k, OBSTACLE], s) != NOWHERE
+    for s in range(min(TILE, worlds.rewards.shape[0] - first)):
+        own = min(first + s, worlds.inverse.shape[0] - 1)
+        for k in range(num_robots):
+            worlds.rewards[first + s, k] = reward.step_reward(
+                np.sqrt(w[k * STRIDE + DISTANCE2 * TILE + s]), worlds.inverse[own, k],
+                np.float32(_bit(near[k, ROBOT], s)), np.float32(_bit(near[k, OBSTACLE], s)), ONE,
+            )  # fmt: skip
