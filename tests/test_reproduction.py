@@ -14,8 +14,9 @@ import pytest
 
 from d4orm_planners import list_planners
 from d4orm_planners.evaluation import evaluate
+from d4orm_planners.evaluation.report import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import Trial, TrialStore
-from d4orm_planners.reproduction.figure import Figure, Group, Section, reproduce
+from d4orm_planners.reproduction.figure import Figure, Group, Section, regrouped, reproduce
 from d4orm_planners.reproduction.numbers import METRICS, first_solution, measured
 from d4orm_planners.reproduction.paper import FIGURES, find_figure
 from d4orm_planners.reproduction.plots import PLOTS, best_reward
@@ -109,6 +110,37 @@ def test_what_a_figure_names_exists(name: str) -> None:
         for section in (*chosen.sections, *chosen.quick().sections):
             for study in section.studies(1):
                 assert len(study.configurations()) == len(section.policies)
+
+
+def test_a_figure_is_made_of_trials_of_other_times(d4orm, tmp_path: Path) -> None:
+    part = ("robustness", "--section", "2D Holonomic", "--policy", "d4orm-d, defaults")
+    status, out, err = d4orm(*part, "--seeds", "2", "--workers", "2")
+    assert status == 0, err
+    folder = tmp_path / "reproduction" / "robustness"
+    kept = folder / "trials.parquet"
+    assert str(Path("reproduction", "robustness", "trials.parquet")) in out
+    first = {name: (folder / f"robustness.{name}").read_text(encoding="utf-8") for name in ("csv", "md")}
+    earlier = read_parquet(kept)
+    # Settings that the defaults do not have any more.
+    write_parquet(kept, [replace(trial, config='{"num_samples": 3}') for trial in earlier])
+    status, out, err = d4orm("robustness", "--trials", str(kept), "--out", "again")
+    assert status == 0, err
+    again = tmp_path / "again" / "robustness"
+    assert {path.name for path in again.iterdir()} == {f"robustness.{kind}" for kind in ("csv", "md", "png")}
+    for name, text in first.items():
+        assert (again / f"robustness.{name}").read_text(encoding="utf-8") == text
+    few = [trial for trial in earlier if trial.control_noise_std == 0 and trial.seed == 1]
+    (group,) = regrouped(FIGURES["robustness"], few)
+    assert (group.section, group.label, list(group.trials)) == ("2D Holonomic", "d4orm-d, defaults", few)
+    for arguments, complaint in (
+        (("ipopt", "--trials", str(kept)), "none of the 14 trials is one of the figure 'ipopt'"),
+        (("robustness", "--trials", str(kept), "--seeds", "3"), "--seeds is about running trials"),
+        (("robustness", "--trials", str(folder / "robustness.md")), "is no Parquet file of trials"),
+        (("robustness", "--trials", "nowhere.parquet"), "nowhere.parquet"),
+    ):
+        status, out, err = d4orm(*arguments)
+        assert (status, out, err.count("\n")) == (2, "", 1)
+        assert complaint in err
 
 
 def test_a_call_that_was_broken_off_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

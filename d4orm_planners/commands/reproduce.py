@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from d4orm_planners.commands.dataclass_options import takes
 from d4orm_planners.commands.inputs import MOST_SEEDS, make_folder, refuse_options
 from d4orm_planners.commands.options import Quiet
+
+if TYPE_CHECKING:
+    from d4orm_planners.reproduction.figure import Figure
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +43,9 @@ class ReproduceOptions:
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Folder to make the figure's folder in, and to go on from.")
     ] = Path("reproduction")
+    trials: Annotated[
+        Path | None, typer.Option("--trials", help="Run nothing; make the figure of a Parquet file of its trials.")
+    ] = None
     quiet: Quiet = False
 
 
@@ -56,6 +62,9 @@ def reproduce(options: ReproduceOptions) -> None:
     from d4orm_planners.reproduction.report import markdown, write_reproduction
 
     figure = find_figure(options.figure).only(options.sections or (), options.policies or ())
+    if options.trials is not None:
+        _make_of_trials(figure, options)
+        return
     folder = options.out / (f"{figure.name}-quick" if options.quick else figure.name)
     make_folder(folder)
     if options.quick:
@@ -69,12 +78,31 @@ def reproduce(options: ReproduceOptions) -> None:
         tell_results(markdown(figure, groups), written)
 
 
+def _make_of_trials(figure: Figure, options: ReproduceOptions) -> None:
+    """A figure of trials that were made before."""
+    from d4orm_planners.commands.progress import tell_results
+    from d4orm_planners.evaluation.report import read_parquet
+    from d4orm_planners.reproduction.figure import regrouped
+    from d4orm_planners.reproduction.report import markdown, write_reproduction
+
+    refuse_options(
+        options.context, ("quick", "seeds", "workers"), "is about running trials; leave it out beside --trials"
+    )
+    assert options.trials is not None
+    groups = regrouped(figure, read_parquet(options.trials))
+    folder = options.out / figure.name
+    make_folder(folder)
+    written = write_reproduction(folder, figure, groups, trials=False)
+    if not options.quiet:
+        tell_results(markdown(figure, groups), written)
+
+
 def _list_figures(context: typer.Context) -> None:
     from d4orm_planners.reproduction.paper import FIGURES
 
     refuse_options(
         context,
-        ("figure", "quick", "sections", "policies", "seeds", "workers", "out", "quiet"),
+        ("figure", "quick", "sections", "policies", "seeds", "workers", "out", "trials", "quiet"),
         "does not go with the list of figures; give a figure, and leave out --list",
     )
     for figure in FIGURES.values():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -10,7 +11,7 @@ from typing import Literal
 
 from d4orm_env.core.arrays import whole_number
 from d4orm_planners.evaluation.evaluate import Progress, run_study
-from d4orm_planners.evaluation.store import Trial
+from d4orm_planners.evaluation.store import Trial, TrialKey
 from d4orm_planners.evaluation.study import Study
 
 PaperNumbers = Mapping[tuple[str, str, str], Mapping[str, str]]
@@ -178,8 +179,7 @@ def reproduce(
         ImportError: If a policy needs a library that is not installed.
         OSError: If the folder or the store cannot be used, or workers do not start.
     """
-    count = whole_number(figure.seeds if seeds is None else seeds, "seeds", 1)
-    studies = [(section.title, study) for section in figure.sections for study in section.studies(count)]
+    studies = _studies(figure, whole_number(figure.seeds if seeds is None else seeds, "seeds", 1))
     for _, study in studies:  # before the first of them runs for hours
         study.configurations()
     return [
@@ -187,3 +187,36 @@ def reproduce(
         for title, study in studies
         for label, trials, *_ in run_study(study, out, workers=workers, progress=progress)
     ]
+
+
+def regrouped(figure: Figure, trials: Sequence[Trial]) -> list[Group]:
+    """The groups of a figure among trials that were made before, whatever the policies' other settings were then.
+
+    Groups of which there are no trials are left out.
+
+    Raises:
+        ValueError: If none of the trials is one of the figure's.
+        ImportError: If a policy needs a library that is not installed.
+    """
+    there = {_place(trial.label, trial.key): trial for trial in trials}
+    groups = []
+    for title, study in _studies(figure, 1 + max((trial.seed for trial in trials), default=0)):
+        for jobs in study.groups():
+            label = jobs[0].policy.label
+            for condition in jobs[0].conditions:
+                places = [_place(label, job.key(condition)) for job in jobs]
+                if found := [there[place] for place in places if place in there]:
+                    groups.append(Group(title, label, found))
+    if not groups:
+        raise ValueError(f"none of the {len(trials)} trials is one of the figure {figure.name!r}; give it its own")
+    return groups
+
+
+def _studies(figure: Figure, seeds: int) -> list[tuple[str, Study]]:
+    """Title and study of everything in the figure."""
+    return [(section.title, study) for section in figure.sections for study in section.studies(seeds)]
+
+
+def _place(label: str, key: TrialKey) -> tuple[object, ...]:
+    """Where a trial stands in a figure."""
+    return label, json.loads(key.config).get("nodes"), *key[2:]

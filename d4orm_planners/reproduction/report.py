@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from d4orm_planners.evaluation.leaderboard import origin
-from d4orm_planners.evaluation.report import deadline_table, errors, table, target, write_csv
+from d4orm_planners.evaluation.report import deadline_table, errors, table, target, write_csv, write_parquet
 from d4orm_planners.evaluation.summary import SuccessWithin, success_by
 from d4orm_planners.reproduction.figure import Figure, Group
 from d4orm_planners.reproduction.numbers import METRICS, Measured, column, measured
@@ -83,13 +83,16 @@ def _deadlines(figure: Figure, groups: Sequence[Group]) -> list[str]:
     return [deadline_table(title, lines) for title, lines in blocks.items()]
 
 
-def write_reproduction(folder: str | os.PathLike[str], figure: Figure, groups: Sequence[Group]) -> list[Path]:
-    """Write ``NAME.csv``, ``NAME.md`` and ``NAME.png`` for the figure, and its trials as ``trials.csv``.
+def write_reproduction(
+    folder: str | os.PathLike[str], figure: Figure, groups: Sequence[Group], *, trials: bool = True
+) -> list[Path]:
+    """Write ``NAME.csv``, ``NAME.md`` and ``NAME.png`` for the figure, and its trials as ``trials.csv`` and as Parquet.
 
     Args:
         folder: Where to.
         figure: The figure.
         groups: What :func:`~d4orm_planners.reproduction.figure.reproduce` returned for it.
+        trials: Whether to write those too; ``trials.parquet`` only where pyarrow is installed.
 
     Returns:
         The paths.
@@ -98,12 +101,18 @@ def write_reproduction(folder: str | os.PathLike[str], figure: Figure, groups: S
         OSError: If the folder does not exist or cannot be written to.
     """
     rows = [measured(group) for group in groups]
-    paths = [Path(folder, name) for name in (*(f"{figure.name}.{kind}" for kind in ("csv", "md", "png")), "trials.csv")]
+    paths = [Path(folder, f"{figure.name}.{kind}") for kind in ("csv", "md", "png")]
     said = [{f"paper_{metric}": _said(figure, row, metric) for metric in figure.metrics} for row in rows]
     write_csv(paths[0], [{**vars(row), **beside} for row, beside in zip(rows, said)])
     with target(paths[1]) as temporary:
         temporary.write_text(markdown(figure, groups), encoding="utf-8")
     with target(paths[2]) as temporary:
         draw(temporary, figure, groups, rows)
-    write_csv(paths[3], [vars(trial) for group in groups for trial in group.trials])
+    if not trials:
+        return paths
+    each = [trial for group in groups for trial in group.trials]
+    paths.append(Path(folder, "trials.csv"))
+    write_csv(paths[-1], [vars(trial) for trial in each])
+    if write_parquet(Path(folder, "trials.parquet"), each):
+        paths.append(Path(folder, "trials.parquet"))
     return paths
