@@ -439,7 +439,7 @@ def test_a_disk_that_fills_up_while_exporting_is_one_line(
 
 def test_the_table_row_by_row(tmp_path: Path) -> None:
     rows = [
-        trial(0, wall_time=0.25, travel_time=4.0, stretch=1.25),
+        trial(0, wall_time=0.25, preparation=0.1, travel_time=4.0, stretch=1.25, training_time=1170.0),
         trial(1, travel_time=6.0, stretch=1.75),
         trial(2, success=False, verified=False, collided=2),
     ]
@@ -449,11 +449,11 @@ def test_the_table_row_by_row(tmp_path: Path) -> None:
         "### circle, 2 robots, holonomic2d",
         "",
         "| policy | noise | success | 95% interval | verified | contact | not in time | errors | travel time, s | "
-        "stretch | planning, s | computing per s of motion, s |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "stretch | planning, s | decision, ms | training, min | computing per s of motion, s |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
         # The interval of two values, 4 and 6: half of it is 12.7062 * sqrt(2) / sqrt(2).
         "| d4orm | 0 | 2 of 3 (67%) | 21% to 94% | 2 | 1 | 0 | 0 | 5.00 (-7.71 to 17.71) | 1.50 | 0.50 | "
-        "0.069 (0.010 to 0.129) |",
+        "2.50 | 20 | 0.069 (0.010 to 0.129) |",
     ]
 
 
@@ -490,12 +490,20 @@ def test_the_leaderboard_holds_everything_in_the_store(d4orm, tmp_path: Path) ->
     assert "- `orca`: ValueError: no" in page
     assert "- 5 trials" in page
     assert leaderboard(store.trials()).count("deadline") == 0
+    # The same from Parquet, and together with another store.
+    assert write_parquet(tmp_path / "trials.parquet", store.trials())
+    assert d4orm("leaderboard", "trials.parquet", "-o", "same.md", "--deadlines", "0.2,1")[0] == 0
+    assert (tmp_path / "same.md").read_text() == page
+    TrialStore(tmp_path / "more.sqlite").add(trial(0, policy="goal", label="goal"))
+    assert d4orm("leaderboard", "trials.parquet", "more.sqlite", "-o", "both.md")[0] == 0
+    assert "- 6 trials" in (tmp_path / "both.md").read_text()
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("missing",), "there is no store of trials at missing"),
+        (("missing.parquet",), "missing.parquet"),
         (("empty",), "there is no store of trials at empty"),
         ((".",), "the store holds no trials yet"),
         ((".", "--out", "page.html"), "must end in .md"),

@@ -213,6 +213,9 @@ def test_a_training_on_a_mixture_tells_how_each_part_goes(trained: Path, tmp_pat
         assert evaluation.parts is not None
         assert len(evaluation.parts) == 2
         assert evaluation.success_rate == pytest.approx(np.mean(evaluation.parts))
+    lessons = result.network.header.training["lesson"]
+    spent = sum(evaluation.seconds for evaluation in result.curve[:lessons])
+    assert result.network.training_time == pytest.approx(spent, abs=0.1), "up to the lesson that was best"
     again = train(TINY, tmp_path, command="d4orm train ...").network
     for name, array in load_network(trained / "policy.safetensors").arrays.items():
         np.testing.assert_array_equal(array, again.arrays[name])
@@ -225,6 +228,10 @@ def test_a_policy_of_sets_learns_on_and_a_flat_one_is_refused(trained: Path, tmp
     for name, array in load_network(path).arrays.items():
         if name != "reward_variance":
             np.testing.assert_allclose(array, learned.arrays[name], atol=1e-6)
+    before = load_network(path).training_time
+    assert before is not None
+    assert learned.training_time is not None
+    assert learned.training_time > before, "what it began with counts"
     with pytest.raises(ValueError, match="is a sets network, and a flat one is wanted; give network='sets'"):
         train(replace(further, network="flat"), tmp_path / "flat")
 

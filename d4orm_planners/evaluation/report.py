@@ -15,7 +15,8 @@ from d4orm_planners.evaluation.summary import SuccessRate, SuccessWithin
 
 PARQUET_HINT = 'trials.parquet is not written, which needs pyarrow; install it with pip install "d4orm-env[evaluate]"'
 HEADER = ("policy", "noise", "success", "95% interval", "verified", "contact", "not in time", "errors",
-          "travel time, s", "stretch", "planning, s", "computing per s of motion, s")  # fmt: skip
+          "travel time, s", "stretch", "planning, s", "decision, ms", "training, min",
+          "computing per s of motion, s")  # fmt: skip
 
 
 def write_results(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) -> list[Path]:
@@ -168,6 +169,8 @@ def _cells(rate: SuccessRate, disturbed: bool) -> tuple[str, ...]:
         _interval(rate.travel_time, rate.travel_time_lower, rate.travel_time_upper, 2),
         "-" if rate.stretch is None else f"{rate.stretch:.2f}",
         "-" if rate.wall_time is None else f"{rate.wall_time:.2f}",
+        "-" if rate.decision is None else f"{1e3 * rate.decision:.2f}",
+        "-" if rate.training_time is None else f"{rate.training_time / 60:.0f}",
         _interval(rate.compute, rate.compute_lower, rate.compute_upper, 3),
     )
 

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 APPLICATION_ID = 0x64346F72
 """Marks the file as one of ours, in its header ("d4or")."""
-VERSION = 7
-READABLE = (4, 5, 6, VERSION)
+VERSION = 8
+READABLE = (4, 5, 6, 7, VERSION)
 """Of versions before some columns have other names, and some are missing."""
 STORE = "trials.sqlite"
 """Name of the file in a folder of results."""
@@ -80,6 +80,8 @@ class Trial:
         wall_time: Seconds spent planning, or choosing actions.
         preparation: Those of ``wall_time`` before the first action: the whole solve of a plan, the coarse plan of a
             controller; ``None`` in rows that older versions wrote.
+        training_time: Seconds of training behind a learned policy, all before it included, where its file tells; else
+            ``None``.
         elapsed: Seconds that the trial took, with the environment and the judge.
         history: Times of the solve at which the best plan so far changed, as JSON: a list of
             ``[seconds, solved (0 or 1), mean reward]``; empty for a policy that executes no plan.
@@ -119,6 +121,7 @@ class Trial:
     status: str = ""
     wall_time: float | None = None
     preparation: float | None = None
+    training_time: float | None = None
     elapsed: float | None = None
     history: str = "[]"
     messages: int | None = None

@@ -104,6 +104,9 @@ class SuccessRate(Compared):
         travel_time_upper: Upper end.
         stretch: Mean over the successes of the way travelled over the shortest free way; ``None`` without any.
         wall_time: Median seconds of planning, or of choosing all actions, in a trial; ``None`` if all raised errors.
+        decision: Median seconds of choosing the actions of one step, without what came before the first one; ``None``
+            if all raised errors.
+        training_time: Seconds of training behind a learned policy, where its file tells; else ``None``.
         compute: Mean seconds of planning, or of choosing actions, per second of motion, likewise.
         compute_lower: Lower end of its interval (Student's t); ``None`` with fewer than two trials.
         compute_upper: Upper end.
@@ -117,6 +120,8 @@ class SuccessRate(Compared):
     travel_time_upper: float | None
     stretch: float | None
     wall_time: float | None
+    decision: float | None
+    training_time: float | None
     compute: float | None
     compute_lower: float | None
     compute_upper: float | None
@@ -200,6 +205,11 @@ def success_rate(trials: Sequence[Trial], label: str | None = None) -> SuccessRa
     stretch = [trial.stretch for trial in successes if trial.stretch is not None]
     timed = [(trial.wall_time, trial.steps * trial.dt) for trial in trials if trial.wall_time is not None]
     compute = mean_interval([seconds / motion for seconds, motion in timed if motion > 0])
+    choosing = [
+        (trial.wall_time - trial.preparation) / trial.steps
+        for trial in trials
+        if trial.wall_time is not None and trial.preparation is not None and trial.steps
+    ]
     return SuccessRate(
         **vars(Compared.of(trials, len(successes), trials[0].label if label is None else label)),
         verified=sum(trial.verified is True for trial in trials),
@@ -210,6 +220,8 @@ def success_rate(trials: Sequence[Trial], label: str | None = None) -> SuccessRa
         travel_time_upper=travel[2],
         stretch=float(np.mean(stretch)) if stretch else None,
         wall_time=float(np.median([seconds for seconds, _ in timed])) if timed else None,
+        decision=float(np.median(choosing)) if choosing else None,
+        training_time=max((trial.training_time for trial in trials if trial.training_time is not None), default=None),
         compute=compute[0],
         compute_lower=compute[1],
         compute_upper=compute[2],

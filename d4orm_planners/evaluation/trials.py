@@ -157,6 +157,7 @@ def _outcome(policy: _TimedPolicy, job: Job, condition: Condition) -> dict[str, 
         **{name: sent.get(name) for name in ("messages", "message_bytes", "waiting_share")},
         "wall_time": policy.wall_time,
         "preparation": policy.preparation,
+        "training_time": policy.training_time,
     }
 
 
@@ -187,6 +188,7 @@ class _TimedPolicy(Policy):
         self.wall_time = 0.0
         self.preparation = 0.0
         self.plan: Plan | None = None
+        self.training_time: float | None = getattr(policy, "training_time", None)
 
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:
         begin = time.perf_counter()

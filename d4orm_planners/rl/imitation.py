@@ -152,19 +152,13 @@ class _Run:
             self._model, self._env, *known, epochs=settings.epochs, random=random,
             report=lambda epoch: report(settings.episodes + epoch),
         )  # fmt: skip
-        self._conclude(index, self._network(index), len(known[0]), held, begin, recorded)
+        self._conclude(index, len(known[0]), held, time.perf_counter() - begin, recorded)
 
     def _conclude(
-        self,
-        index: int,
-        network: Network,
-        steps: int,
-        held: tuple[FloatArray, FloatArray],
-        begin: float,
-        recorded: float,
+        self, index: int, steps: int, held: tuple[FloatArray, FloatArray], seconds: float, recorded: float
     ) -> None:
         """Judge what has been learned, and keep it."""
-        seconds = time.perf_counter() - begin
+        network = self._network(index, seconds)
         evaluation = Evaluation(
             steps, self.settings.num_robots, self.settings.scenario,
             *evaluate_network(network, self._validation, VALIDATION_SEED)[:2], seconds, recorded / seconds,
@@ -179,8 +173,10 @@ class _Run:
     def _so_far(self) -> str:
         return f"; success {self.evaluations[-1].success_rate:.0%}" if self.evaluations else ""
 
-    def _network(self, index: int) -> Network:
-        told = {"command": self._command, "round": index + 1}
+    def _network(self, index: int, seconds: float = 0.0) -> Network:
+        """What has been learned by now, the last ``seconds`` in this round."""
+        spent = round(seconds + sum(earlier.seconds for earlier in self.evaluations), 1)
+        told = {"command": self._command, "round": index + 1, "training_time": spent}
         return network_of(self.settings.header(LEARNER, self._validation, **told), self._model, self._env)
 
     def _path(self, index: int, episode: int) -> Path:

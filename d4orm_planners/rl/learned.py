@@ -47,6 +47,9 @@ class LearnedConfig(CheckedSettings):
 class LearnedPolicy(Policy):
     """What PPO and SAC have in common: every robot by itself maps what it observes to its most likely control.
 
+    Attributes:
+        training_time: Seconds of training behind it, where its file tells; else ``None``.
+
     Raises:
         ValueError: If the file is no policy, or one of another algorithm.
         OSError: If it cannot be read.
@@ -61,6 +64,7 @@ class LearnedPolicy(Policy):
         path = self._file(self.config)
         kind = _ZipActor if path.suffix == ".zip" else _NetworkActor
         self._actor: _NetworkActor | _ZipActor = kind(self.name, path)
+        self.training_time = self._actor.network.training_time if isinstance(self._actor, _NetworkActor) else None
 
     @classmethod
     def identity_with(cls, config: CheckedSettings) -> dict[str, object]:

@@ -47,7 +47,7 @@ class Header(BaseModel):
         encoder: ``"sets"`` if neighbours and obstacles are pooled first, see :mod:`d4orm_planners.rl.sets`. Such a
             policy acts for any number of observed robots.
         frame: Where the first axis of a robot's frame points; ``None`` is to the goal.
-        training: The command and its settings, for people.
+        training: The command and its settings, for people, and the ``training_time`` [s].
     """
 
     model_config = ConfigDict(extra="forbid", strict=True)
@@ -90,6 +90,12 @@ class Network:
         head = self.header
         features = Features.of(ObservationSlices(head.dimension, head.num_neighbors, head.num_obstacles), head.model)
         return replace(features, frame=head.frame or "goal")
+
+    @property
+    def training_time(self) -> float | None:
+        """Seconds of training behind it, where the file tells."""
+        told = self.header.training.get("training_time")
+        return float(told) if isinstance(told, int | float) else None
 
     def __call__(self, features: FloatArray) -> FloatArray:
         """``(N, m)`` most likely actions in ``[-1, 1]`` for ``(N, F)`` features."""

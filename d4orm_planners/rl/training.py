@@ -249,9 +249,11 @@ class _Run:
         watch = _Watch(lambda steps: self._progress(_describe(lesson, self.evaluations), done + steps, self._total))
         model.learn(lesson.steps, callback=watch, reset_num_timesteps=False)
         seconds = time.perf_counter() - begin
+        before = 0.0 if self._start is None else self._start.training_time or 0.0
         header = self.settings.header(
-            self.settings.algorithm, self._validation, command=self._command, lesson=index + 1
-        )
+            self.settings.algorithm, self._validation, command=self._command, lesson=index + 1,
+            training_time=round(before + seconds + sum(earlier.seconds for earlier in self.evaluations), 1),
+        )  # fmt: skip
         network = network_of(header, model, normalized)
         outcome = evaluate_network(network, self._validation, VALIDATION_SEED)
         evaluation = Evaluation(
