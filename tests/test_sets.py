@@ -273,6 +273,26 @@ def test_every_part_of_a_mixture_has_its_worlds_robots_and_sight() -> None:
         both.close()
 
 
+def test_a_part_of_a_mixture_may_be_disturbed() -> None:
+    part = Exercise.parse("circle 2 disturb.delay=2 disturb.push.speed=0.5 sight=1")
+    assert part == Exercise("circle", 2, {}, sight=1, disturbances={"delay": 2, "push.speed": 0.5})
+    env = part.worlds(3, seed=1, instances=None)
+    assert env.num_worlds == 3, "what goes wrong differs, though places do not"
+    assert Exercise.parse("circle 2").worlds(3, seed=1, instances=None).num_worlds == 1
+    env.reset()
+    features = [env.step(np.full((6, 2), 1, np.float32))[0] for _ in range(2)]
+    # Nothing has been obeyed yet, but somebody may have been pushed.
+    speeds = np.linalg.norm(features[1][:, :2], axis=1)
+    assert set(np.round(speeds * env.problem.team.max_speed[0], 3)) <= {0.0, 0.5, 1.0}
+    for text, complaint in (
+        ("circle 2 disturb.nothing=1", "mixture has .*nothing"),
+        ("circle 2 disturb.delay=-1", "mixture has .*delay"),
+        ("circle 2 disturb.delay=soon", "mixture has .*delay"),
+    ):
+        with pytest.raises(ValueError, match=complaint):
+            Exercise.parse(text)
+
+
 def test_a_mixture_steps_its_parts_as_each_alone() -> None:
     kinds = (("random", 3, 2, 7), ("circle", 2, 4, 9))
     alone, together = ([RobotVecEnv(n, k, s, seed=seed, max_cycles=6) for s, n, k, seed in kinds] for _ in range(2))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.yaml_text import parse_yaml
+from d4orm_env.disturbances.registry import disturbances_at
 from d4orm_env.scenarios import make_problem
 from d4orm_env.scenarios.problems import unknown_argument
 from d4orm_env.team_step import Info
@@ -20,6 +21,7 @@ from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 
 _LOOSENED = "d4orm_planners.rl.exercises:loosened"
 _CLEARING = "d4orm_planners.rl.exercises:clearing"
+_DISTURB = "disturb."
 MIXTURES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "crowds": (
@@ -79,16 +81,20 @@ class Exercise:
         num_robots: Size of its teams.
         settings: Arguments of the scenario.
         sight: How many of the observed robots are shown at most; ``None`` is all.
+        disturbances: Levels by name, see :func:`~d4orm_env.disturbances.registry.disturbances_at`.
     """
 
     scenario: str
     num_robots: int
     settings: Mapping[str, object]
     sight: int | None = None
+    disturbances: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def parse(cls, text: str) -> Exercise:
-        """From a scenario, a team size, and settings ``name=value``, separated by blanks; ``sight`` is one of them.
+        """From a scenario, a team size, and settings ``name=value``, separated by blanks.
+
+        ``sight=4`` and ``disturb.delay=2``, with any disturbance's name and level, are among the settings.
 
         Raises:
             ValueError: If it is something else.
@@ -108,10 +114,17 @@ class Exercise:
         for name in ("num_robots", "seed", "model"):
             if name in settings:
                 raise ValueError(f"mixture has {text!r}, in which {name!r} has no place")
+        disturbances = {
+            name.removeprefix(_DISTURB): settings.pop(name) for name in list(settings) if name.startswith(_DISTURB)
+        }
+        try:
+            disturbances_at(disturbances)
+        except ValueError as error:
+            raise ValueError(f"mixture has {text!r}: {error}") from None
         complaint = unknown_argument(scenario, settings)
         if complaint:
             raise ValueError(f"mixture has {text!r}: {complaint}")
-        return cls(scenario, int(rest[0]), settings, sight)
+        return cls(scenario, int(rest[0]), settings, sight, disturbances)
 
     def worlds(
         self, count: int, seed: int, instances: int | None, model: str | None = None, **options: Any
@@ -119,7 +132,7 @@ class Exercise:
         """Worlds to practise in.
 
         Args:
-            count: How many; one is enough for a single instance if ``instances`` is ``None``.
+            count: How many; one is enough for a single undisturbed instance if ``instances`` is ``None``.
             seed: Of the first.
             instances: To draw at most; ``None`` draws a new one for every episode.
             model: Robot model; ``None`` is the scenario's own.
@@ -132,7 +145,9 @@ class Exercise:
             arguments["randomize_instance"] = True
             if instances is not None:
                 arguments["num_instances"] = instances
-        count = count if drawn or instances is not None else 1
+        if self.disturbances:
+            options["disturbances"] = disturbances_at(self.disturbances)
+        count = count if drawn or self.disturbances or instances is not None else 1
         return RobotVecEnv(count, self.num_robots, seed=seed, sight=self.sight, **arguments, **options)
 
 
