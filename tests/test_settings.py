@@ -180,10 +180,11 @@ def test_whole_numbers_are_refused_in_one_line() -> None:
 
 def test_policies_are_told_by_the_file_that_they_act_by(tmp_path: Path) -> None:
     shipped = policy_settings("ppo")
-    other = tmp_path / "other.safetensors"
-    other.write_bytes((SHIPPED / "ppo.safetensors").read_bytes())
-    assert policy_settings("ppo", path=str(other)) == {**shipped, "path": str(other)}
     assert make_policy("ppo").identity() == shipped
+    mine, other = tmp_path / "mine.safetensors", tmp_path / "other.safetensors"
+    for copy in (mine, other):
+        copy.write_bytes((SHIPPED / "ppo.safetensors").read_bytes())
+    assert policy_settings("ppo", path=str(other)) == {**policy_settings("ppo", path=str(mine)), "path": str(other)}
     other.write_bytes((SHIPPED / "sac.safetensors").read_bytes())
     assert policy_settings("ppo", path=str(other))["file"] == policy_settings("sac")["file"] != shipped["file"]
     assert policy_settings("ppo", path=str(tmp_path / "none.safetensors"))["file"] is None

@@ -188,7 +188,12 @@ class _TimedPolicy(Policy):
         self.wall_time = 0.0
         self.preparation = 0.0
         self.plan: Plan | None = None
-        self.training_time: float | None = getattr(policy, "training_time", None)
+
+    @property
+    def training_time(self) -> float | None:
+        """Of what acts, see :attr:`Trial.training_time`."""
+        time: float | None = getattr(self._policy, "training_time", None)
+        return time
 
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:
         begin = time.perf_counter()

@@ -30,7 +30,7 @@ class LearnedConfig(CheckedSettings):
         path: A ``.safetensors`` file of ``d4orm train``, or a ``.zip`` that Stable-Baselines3 saved after training on
             the environment's own observations and actions, as through SuperSuit. A zip holds pickled Python, which can
             run anything when it is loaded: give only one that you made yourself or trust. By default the policy that
-            comes with the package.
+            comes with the package for the robots' model.
 
     Raises:
         ValueError: If the path ends in something else.
@@ -48,7 +48,7 @@ class LearnedPolicy(Policy):
     """What PPO and SAC have in common: every robot by itself maps what it observes to its most likely control.
 
     Attributes:
-        training_time: Seconds of training behind it, where its file tells; else ``None``.
+        training_time: Seconds of training behind what acts now, where its file tells; else ``None``.
 
     Raises:
         ValueError: If the file is no policy, or one of another algorithm.
@@ -61,25 +61,35 @@ class LearnedPolicy(Policy):
 
     def __init__(self, config: LearnedConfig | None = None) -> None:
         self.config = config or LearnedConfig()
-        path = self._file(self.config)
+        self._use(self._files(self.config)[0])
+
+    @classmethod
+    def identity_with(cls, config: CheckedSettings) -> dict[str, object]:
+        """The settings, and the digest of the files: another training has other weights under the same name."""
+        assert isinstance(config, LearnedConfig)
+        # Where there is none, every trial will say so.
+        contents = [file.read_bytes() for file in cls._files(config) if file.is_file()]
+        return {**config.keywords(), "file": hashlib.sha256(b"".join(contents)).hexdigest() if contents else None}
+
+    @classmethod
+    def _files(cls, config: LearnedConfig) -> list[Path]:
+        """The one that is asked for, or all that come with the package; of these the first one is for most models."""
+        if config.path is not None:
+            return [Path(config.path)]
+        return [SHIPPED / f"{cls.name}{SUFFIX}", *sorted(SHIPPED.glob(f"{cls.name}-*{SUFFIX}"))]
+
+    def _use(self, path: Path) -> None:
         kind = _ZipActor if path.suffix == ".zip" else _NetworkActor
         self._actor: _NetworkActor | _ZipActor = kind(self.name, path)
         self.training_time = self._actor.network.training_time if isinstance(self._actor, _NetworkActor) else None
 
-    @classmethod
-    def identity_with(cls, config: CheckedSettings) -> dict[str, object]:
-        """The settings, and the digest of the file: another training has other weights under the same name."""
-        assert isinstance(config, LearnedConfig)
-        file = cls._file(config)
-        # Where there is none, every trial will say so.
-        return {**config.keywords(), "file": hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None}
-
-    @classmethod
-    def _file(cls, config: LearnedConfig) -> Path:
-        return Path(config.path or SHIPPED / f"{cls.name}{SUFFIX}")
-
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:
         super().reset(env, seed)
+        # The team may be another at every reset.
+        files = self._files(self.config)
+        own = SHIPPED / f"{self.name}-{self.problem.team.models[0]}{SUFFIX}"
+        if (path := own if own in files else files[0]) != self._actor.path:
+            self._use(path)
         agent = env.possible_agents[0]
         self._actor.check(self.problem, env.observation_space(agent).shape, env.action_space(agent).shape)
 
