@@ -394,6 +394,22 @@ def test_who_lost_the_guidance_begins_anew_straight_to_the_goals(monkeypatch: py
     assert all(anew.any() for anew in begun)
 
 
+def test_the_first_coarse_plan_may_begin_with_what_a_policy_does() -> None:
+    problem = make_problem("circle", num_robots=8)
+    env = navigation_v0.parallel_env(problem=problem)
+    env.reset(seed=0)
+    policy = make_policy("d4orm-c2f", first_guess="ppo", refine="off")
+    policy.reset(env, seed=0)
+    coarse = coarse_problem(problem, policy.config.coarse_factor)
+    episode = run_episode(navigation_v0.parallel_env(problem=coarse), "ppo", seed=0)
+    assert episode.metrics["success"], "so that there is nothing left to plan"
+    guided = policy.guidance.controls
+    np.testing.assert_array_equal(guided[: len(episode.controls)], episode.controls)
+    assert not guided[len(episode.controls) :].any()
+    with pytest.raises(ValueError, match="nobody"):
+        make_policy("d4orm-c2f", first_guess="nobody").reset(env, seed=0)
+
+
 def test_with_new_goals_for_some_the_others_keep_to_their_ways(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = make_problem("random", num_robots=3, seed=1)
     policy = controller(replan_distance=50.0, patience=1000, coarse_iterations=3, replan_iterations=2)

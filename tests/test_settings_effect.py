@@ -195,6 +195,7 @@ POLICY_CHANGES: dict[str, dict[str, tuple[Any, dict[str, Any]]]] = {
         "coarse_steps": (6, {}),
         "coarse_repair_steps": (6, {}),
         "coarse_preset": ("paper", {}),
+        "first_guess": ("goal", {}),
         "coarse_iterations": (1, {}),
         "max_lag": (0, {}),
         "sight": (False, {"scenario": "maze", "max_cycles": 60}),

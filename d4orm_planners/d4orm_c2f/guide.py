@@ -22,6 +22,7 @@ from d4orm_planners.d4orm_c2f.coarse import (
     rest_of,
     subgoal_indices,
 )
+from d4orm_planners.d4orm_c2f.first_guess import episode_of
 from d4orm_planners.d4orm_c2f.following import STUCK_AFTER, WAITING_WITHIN, Patience, keep_time
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.d4orm_c2f.sight import within_sight
@@ -79,8 +80,15 @@ class Guide:
         """Plan for the episode, in which those ``docked`` ``(K,)`` stay where they are."""
         everybody = np.ones(self.problem.num_robots, bool)
         self._patience, self.stuck = Patience(joint), ~everybody
-        self.guidance, self.index = self.plan(joint, docked, None, self._config.coarse_iterations), 0
+        self.guidance, self.index = self.plan(joint, docked, self._guess(joint), self._config.coarse_iterations), 0
         self._follow(joint, self._relayed(joint, everybody) or self.guidance, everybody)
+
+    def _guess(self, joint: JointState) -> FloatArray | None:
+        """``(H_c, K, m)`` what a policy does from where the team is, if the coarse plan is to begin with that."""
+        if self._config.first_guess is None:
+            return None
+        coarse = coarse_problem(self.problem.resumed_at(joint.states, joint.goals), self._config.coarse_factor)
+        return episode_of(self._config.first_guess, coarse, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps))
 
     def _follow(self, joint: JointState, guidance: Waypoints, anew: BoolArray) -> None:
         """Begin at the beginning of a guidance, which sends the robots ``anew`` ``(K,)`` another way than before."""

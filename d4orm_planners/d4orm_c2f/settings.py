@@ -52,6 +52,8 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
         coarse_steps: ``N`` of the coarse plan.
         coarse_repair_steps: The same of repairs of the coarse plan.
         coarse_preset: Preset of D4orm-D that plans coarsely: ``"paper"`` or, by default, ``None``.
+        first_guess: Name of a policy whose episode, in coarse steps, the first coarse plan begins with; ``None`` begins
+            as D4orm-D does.
         coarse_iterations: Iterations after which the coarse plan is taken as it is.
         replan_iterations: The same when only some robots have new goals.
         predict_horizon: ``H_predict``, steps that a control loop looks ahead.
@@ -103,6 +105,7 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
     coarse_steps: Steps = 50
     coarse_repair_steps: Steps = 20
     coarse_preset: CoarsePreset = None
+    first_guess: str | None = None
     coarse_iterations: Count = 20
     replan_iterations: Count = 2
     predict_horizon: Steps = 20
