@@ -45,6 +45,7 @@ results: $(DEV_STAMP) ## Make the tables and figures in docs/tables from the tri
 	$(BIN)/python examples/tune_rivals.py --trials data/tuning.parquet --out docs/tables
 	$(BIN)/python examples/credit_by_update.py --trials data/credit_by_update.parquet --out docs/tables
 	$(BIN)/python examples/disturbance_study.py --trials data/disturbance_study.parquet --out docs/tables
+	$(BIN)/d4orm leaderboard data/leaderboard.parquet --out docs/tables/leaderboard.md
 
 format: $(DEV_STAMP) ## Format the code and mend what ruff can
 	$(BIN)/ruff check --fix .
