@@ -79,10 +79,8 @@ def run(
     run_study(study, out, workers=workers, progress=tell)
     inside = tuple(scenario for scenario in scenarios if scenario != "rooms")
     for model in BODIES.values() if inside and find_spec("mujoco") else ():
-        # PPO was trained for one of the models only.
-        able = {name: given for name, given in policies.items() if (name, model) != ("ppo", "differential_drive")}
         study = Study(
-            policies=able, scenarios=inside, num_robots=ROBOTS, seeds=range(seeds), model=model, physics="mujoco"
+            policies=policies, scenarios=inside, num_robots=ROBOTS, seeds=range(seeds), model=model, physics="mujoco"
         )
         run_study(study, out, workers=workers, progress=tell)
 

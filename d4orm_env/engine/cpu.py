@@ -28,11 +28,11 @@ from d4orm_env.engine.base import (
 from d4orm_env.engine.episodes import WorldBatch
 from d4orm_env.engine.lanes import TILE
 from d4orm_env.engine.noise import DRAWS, TURNS
-from d4orm_env.engine.observing import View
+from d4orm_env.engine.observing import ObservationSpec
 from d4orm_env.engine.proximity import bound_boxes, make_bodies
 from d4orm_env.engine.sample_noise import Drawing
 from d4orm_env.engine.threads import Threads, available_cores
-from d4orm_env.engine.world_tiles import Worlds
+from d4orm_env.engine.world_tiles import WorldArrays
 from d4orm_env.engine.worlds import WorldKernels, kernels_of_codes
 
 
@@ -239,11 +239,11 @@ def _kernels(arrays: ProblemArrays) -> WorldKernels:
     return kernels_of_codes(arrays.model_codes.tobytes())
 
 
-def _view(layout: ObservationLayout) -> View:
-    return View(layout.bounds, layout.num_neighbors, layout.num_obstacles)
+def _view(layout: ObservationLayout) -> ObservationSpec:
+    return ObservationSpec(layout.bounds, layout.num_neighbors, layout.num_obstacles)
 
 
-def _rolled_out(arrays: ProblemArrays, states: FloatArray, docked: BoolArray, controls: FloatArray) -> Worlds:
+def _rolled_out(arrays: ProblemArrays, states: FloatArray, docked: BoolArray, controls: FloatArray) -> WorldArrays:
     """The ``H+1`` moments of a team from states ``(K, n)`` on under controls ``(H, K, m)``, clipped here."""
     arrays, rows = _typed(arrays), len(controls) + 1
     state = np.empty((rows, *states.shape), np.float32)
@@ -252,7 +252,7 @@ def _rolled_out(arrays: ProblemArrays, states: FloatArray, docked: BoolArray, co
     rewards = np.empty(arrived.shape, np.float32)
     state[0], arrived[0], control[1:] = states, docked, controls
     goal, inverse = arrays.goal[None], arrays.inverse_initial_distance[None]
-    moments = Worlds(goal, inverse, state, control, arrived, collided, violated, rewards)
+    moments = WorldArrays(goal, inverse, state, control, arrived, collided, violated, rewards)
     _kernels(arrays).roll_out(arrays, moments)
     return moments
 

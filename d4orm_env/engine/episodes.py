@@ -14,7 +14,7 @@ from d4orm_env.engine import observing
 from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
 from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, aligned_zeros, compiled, inlined
 from d4orm_env.engine.lanes import TILE, use_wide_registers
-from d4orm_env.engine.observing import View, allocate_sensed, observe
+from d4orm_env.engine.observing import ObservationSpec, allocate_sensed, observe
 from d4orm_env.engine.stepping import models_key
 from d4orm_env.engine.tiles import (
     DISTANCE2,
@@ -180,13 +180,13 @@ def _move_tile(
 @cache
 def advance_worlds_kernel(
     names: tuple[str, ...],
-) -> Kernel[[ProblemArrays, View, int, NDArray[np.uint8], WorldBatch, IntArray, FloatArray], None]:
+) -> Kernel[[ProblemArrays, ObservationSpec, int, NDArray[np.uint8], WorldBatch, IntArray, FloatArray], None]:
     """A kernel that steps, resets and observes worlds, each as it is ordered to.
 
     Args:
         names: Models that the kernel is for.
         arrays: The problem that the worlds share; its starts and goals are not looked at.
-        view: What an observation is made of, a :class:`View`.
+        view: What an observation is made of, a :class:`ObservationSpec`.
         max_cycles: Steps in an episode.
         orders: ``(B,)`` uint8, one of ``STEP``, ``RESET``, ``LOOK`` and ``SKIP`` for every world.
         batch: The worlds, a :class:`WorldBatch`.
@@ -200,7 +200,7 @@ def advance_worlds_kernel(
     @cached_kernel(models_key(SOURCES, names), variant="_".join(names), **OPTIONS)
     def advance_worlds(
         arrays: ProblemArrays,
-        view: View,
+        view: ObservationSpec,
         max_cycles: int,
         orders: NDArray[np.uint8],
         batch: WorldBatch,

@@ -19,7 +19,7 @@ from d4orm_env.engine.compiling import INLINED, ONE, OPTIONS, ZERO, aligned_zero
 from d4orm_env.engine.lanes import TILE
 from d4orm_env.engine.stepping import models_key
 from d4orm_env.engine.tiles import STATE, STRIDE, MotionReader, motion_reader
-from d4orm_env.engine.world_tiles import Worlds, load
+from d4orm_env.engine.world_tiles import WorldArrays, load
 
 if TYPE_CHECKING:
     from d4orm_env.engine.episodes import WorldBatch
@@ -56,7 +56,7 @@ def allocate_sensed(
     )  # fmt: skip
 
 
-class View(NamedTuple):
+class ObservationSpec(NamedTuple):
     """What an observation is made of, see :class:`~d4orm_env.core.observation_layout.ObservationLayout`.
 
     Attributes:
@@ -86,7 +86,7 @@ def _sense_bodies(bodies: FloatArray, num_robots: int, sensed: observation.Sense
 def observe(
     read_motion: MotionReader,
     arrays: ProblemArrays,
-    worlds: Worlds | Sight | WorldBatch,
+    worlds: WorldArrays | Sight | WorldBatch,
     b: int,
     time_left: np.float32,
     w: FloatArray,
@@ -117,20 +117,22 @@ def observe(
 @cache
 def observe_worlds_kernel(
     names: tuple[str, ...],
-) -> Kernel[[ProblemArrays, Sight, View, IntArray, FloatArray], None]:
+) -> Kernel[[ProblemArrays, Sight, ObservationSpec, IntArray, FloatArray], None]:
     """A kernel that fills ``out`` ``(B, K, D)`` with what every robot of every world sees.
 
     Args:
         names: Models that the kernel is for.
         arrays: The problem that the worlds share; its starts and goals are not looked at.
         sight: What there is to see, a :class:`~d4orm_env.engine.base.Sight`.
-        view: What an observation is made of, a :class:`View`.
+        view: What an observation is made of, a :class:`ObservationSpec`.
         tile_range: First tile of worlds and the one after the last.
     """
     read_motion = motion_reader(names)
 
     @cached_kernel(models_key(SOURCES, names), variant="_".join(names), **OPTIONS)
-    def observe_worlds(arrays: ProblemArrays, sight: Sight, view: View, tile_range: IntArray, out: FloatArray) -> None:
+    def observe_worlds(
+        arrays: ProblemArrays, sight: Sight, view: ObservationSpec, tile_range: IntArray, out: FloatArray
+    ) -> None:
         num_robots, dimension = arrays.goal.shape
         w = aligned_zeros(num_robots * STRIDE)
         sensed = allocate_sensed(num_robots, sight.bodies.shape[1], dimension, view.num_neighbors, view.num_obstacles)

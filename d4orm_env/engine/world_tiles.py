@@ -35,7 +35,7 @@ PARTS = (*tiles.PARTS, tiles, obstacles)
 """Modules that these are made of, for fingerprints."""
 
 
-class Worlds(NamedTuple):
+class WorldArrays(NamedTuple):
     """``B`` worlds, or ``B`` moments of one; kernels change them in place.
 
     Attributes:
@@ -60,7 +60,7 @@ class Worlds(NamedTuple):
 
 
 @inlined
-def load_world(worlds: Worlds | Sight | WorldBatch, b: int, s: Whole, w: FloatArray) -> None:
+def load_world(worlds: WorldArrays | Sight | WorldBatch, b: int, s: Whole, w: FloatArray) -> None:
     """Put world ``b`` into lane ``s`` of a tile."""
     own = min(b, worlds.goal.shape[0] - 1)
     for k in range(worlds.state.shape[1]):
@@ -75,14 +75,14 @@ def load_world(worlds: Worlds | Sight | WorldBatch, b: int, s: Whole, w: FloatAr
 
 
 @compiled
-def load(worlds: Worlds | Sight | WorldBatch, first: int, w: FloatArray) -> None:
+def load(worlds: WorldArrays | Sight | WorldBatch, first: int, w: FloatArray) -> None:
     """Put worlds from number ``first`` on into the lanes of a tile."""
     for s in range(min(TILE, worlds.state.shape[0] - first)):
         load_world(worlds, first + s, s, w)
 
 
 @compiled
-def store_world(worlds: Worlds | WorldBatch, b: int, s: Whole, w: FloatArray) -> None:
+def store_world(worlds: WorldArrays | WorldBatch, b: int, s: Whole, w: FloatArray) -> None:
     """The reverse of :func:`load_world`, for what a step changes."""
     for k in range(worlds.state.shape[1]):
         o = k * STRIDE + s
@@ -100,7 +100,7 @@ def _bit(mask: np.uint64, s: int) -> np.uint64:
 
 @compiled
 def judge(
-    arrays: ProblemArrays, worlds: Worlds | WorldBatch, first: int, w: FloatArray, near: NDArray[np.uint64]
+    arrays: ProblemArrays, worlds: WorldArrays | WorldBatch, first: int, w: FloatArray, near: NDArray[np.uint64]
 ) -> None:
     """Flag contacts and margin violations of the worlds of a tile, and compute rewards."""
     num_robots = arrays.radius.shape[0]

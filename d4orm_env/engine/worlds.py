@@ -20,23 +20,23 @@ from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, aligned_zeros
 from d4orm_env.engine.episodes import WorldBatch, advance_worlds_kernel
 from d4orm_env.engine.lanes import TILE, use_wide_registers
-from d4orm_env.engine.observing import SOURCES, View, observe_worlds_kernel
+from d4orm_env.engine.observing import SOURCES, ObservationSpec, observe_worlds_kernel
 from d4orm_env.engine.stepping import models_key, models_of_kernel
 from d4orm_env.engine.tiles import STRIDE, measure_goal_distance, robot_mover
-from d4orm_env.engine.world_tiles import Worlds, judge, load, load_world, store_world
+from d4orm_env.engine.world_tiles import WorldArrays, judge, load, load_world, store_world
 
 
 @cache
-def roll_out_kernel(names: tuple[str, ...]) -> Kernel[[ProblemArrays, Worlds], None]:
+def roll_out_kernel(names: tuple[str, ...]) -> Kernel[[ProblemArrays, WorldArrays], None]:
     """A kernel that steps one world through the rows of ``moments.control``, keeping every moment.
 
-    ``moments`` is a :class:`Worlds` of ``H+1`` rows, of which the first is the start and has no control. The motion
+    ``moments`` is a :class:`WorldArrays` of ``H+1`` rows, of which the first is the start and has no control. The motion
     comes first; then 64 moments at a time are judged, as if they were worlds.
     """
     move_robot = robot_mover(names)
 
     @cached_kernel(models_key(SOURCES, names), variant="_".join(names), **OPTIONS)
-    def roll_out(arrays: ProblemArrays, moments: Worlds) -> None:
+    def roll_out(arrays: ProblemArrays, moments: WorldArrays) -> None:
         use_wide_registers()
         num_robots, dimension = arrays.goal.shape
         w = aligned_zeros(num_robots * STRIDE)
@@ -64,9 +64,11 @@ def roll_out_kernel(names: tuple[str, ...]) -> Kernel[[ProblemArrays, Worlds], N
 class WorldKernels(NamedTuple):
     """The kernels that step and observe teams of some models."""
 
-    roll_out: Kernel[[ProblemArrays, Worlds], None]
-    observe_worlds: Kernel[[ProblemArrays, Sight, View, IntArray, FloatArray], None]
-    advance_worlds: Kernel[[ProblemArrays, View, int, NDArray[np.uint8], WorldBatch, IntArray, FloatArray], None]
+    roll_out: Kernel[[ProblemArrays, WorldArrays], None]
+    observe_worlds: Kernel[[ProblemArrays, Sight, ObservationSpec, IntArray, FloatArray], None]
+    advance_worlds: Kernel[
+        [ProblemArrays, ObservationSpec, int, NDArray[np.uint8], WorldBatch, IntArray, FloatArray], None
+    ]
 
 
 def world_kernels(models: tuple[str, ...]) -> WorldKernels:

@@ -58,7 +58,7 @@ def _groups(trials: Sequence[Trial]) -> dict[Key, list[Trial]]:
     labels = _labels(trials)
     groups: dict[Key, list[Trial]] = {}
     for trial in trials:
-        label = labels[trial.label, trial.config]
+        label = labels[trial.label, trial.model, trial.config]
         where = (trial.scenario, trial.num_robots, trial.model, trial.physics)
         groups.setdefault((label, *where, trial.control_noise_std, told(trial.disturbances)), []).append(trial)
     return {key: groups[key] for key in sorted(groups, key=lambda key: (*key[1:], key[0]))}
@@ -76,18 +76,18 @@ def _condition(rate: SuccessRate) -> tuple[float, str]:
     return rate.control_noise_std, rate.disturbance
 
 
-def _labels(trials: Iterable[Trial]) -> dict[tuple[str, str], str]:
-    """What to call each label and configuration: where one label stands for several, they say how they differ."""
-    configs: dict[str, dict[str, Mapping[str, object]]] = {}
+def _labels(trials: Iterable[Trial]) -> dict[tuple[str, str, str], str]:
+    """What to call each label, model and configuration: where one stands for several, they say how they differ."""
+    configs: dict[tuple[str, str], dict[str, Mapping[str, object]]] = {}
     for trial in trials:
-        configs.setdefault(trial.label, {}).setdefault(trial.config, json.loads(trial.config))
+        configs.setdefault((trial.label, trial.model), {}).setdefault(trial.config, json.loads(trial.config))
     names = {}
-    for label, variants in configs.items():
+    for (label, model), variants in configs.items():
         settings = sorted({name for values in variants.values() for name in values})
         telling = [name for name in settings if len({json.dumps(values.get(name)) for values in variants.values()}) > 1]
         for config, values in variants.items():
             said = ", ".join(f"{name}={json.dumps(values.get(name))}" for name in telling)
-            names[label, config] = f"{label} ({said})" if said else label
+            names[label, model, config] = f"{label} ({said})" if said else label
     return names
 
 

@@ -88,7 +88,7 @@ class Exercise:
     num_robots: int
     settings: Mapping[str, object]
     sight: int | None = None
-    disturbances: Mapping[str, float] = field(default_factory=dict)
+    disturbances: Mapping[str, object] = field(default_factory=dict)
 
     @classmethod
     def parse(cls, text: str) -> Exercise:
