@@ -30,8 +30,8 @@ from d4orm_env.engine.world_tiles import WorldArrays, judge, load, load_world, s
 def roll_out_kernel(names: tuple[str, ...]) -> Kernel[[ProblemArrays, WorldArrays], None]:
     """A kernel that steps one world through the rows of ``moments.control``, keeping every moment.
 
-    ``moments`` is a :class:`WorldArrays` of ``H+1`` rows, of which the first is the start and has no control. The motion
-    comes first; then 64 moments at a time are judged, as if they were worlds.
+    ``moments`` is a :class:`WorldArrays` of ``H+1`` rows, of which the first is the start and has no control. The
+    motion comes first; then 64 moments at a time are judged, as if they were worlds.
     """
     move_robot = robot_mover(names)
 
