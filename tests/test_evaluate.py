@@ -523,7 +523,7 @@ def test_bad_input_to_the_leaderboard(d4orm, tmp_path: Path, arguments: tuple[st
 
 
 def test_evaluating_nothing_but_errors_ends_with_status_one(d4orm, tmp_path: Path) -> None:
-    arguments = ("-k", "2", "-n", "2", "-j", "1", "-m", "differential_drive", "--out", "out")
+    arguments = ("-k", "2", "-n", "2", "-j", "1", "-m", "unicycle", "--out", "out")
     status, out, err = d4orm("evaluate", "-p", "ppo", *arguments)
     assert status == 1
     assert "ppo" in out

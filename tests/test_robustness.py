@@ -141,7 +141,7 @@ def test_the_table_is_that_of_the_files_that_are_out_there(tmp_path: Path) -> No
     for former, name in (("noise", "control_noise_std"), ("robots", "num_robots")):
         made = made.replace(name, former)
     # Files that lack these columns get them.
-    for column in (" stretch REAL,", " disturbances TEXT NOT NULL,", " physics TEXT NOT NULL,"):
+    for column in (" stretch REAL,", " disturbances TEXT NOT NULL,", " physics TEXT NOT NULL,", " training_time REAL,"):
         made = made.replace(column, "")
     assert made.replace("seed, disturbances, physics)", "seed)").split() == FIRST_SCHEMA.split()
 
@@ -167,7 +167,7 @@ def test_a_store_of_the_version_before_is_read_as_it_is_and_goes_on(tmp_path: Pa
     assert TrialStore.existing(path).trials() == [trial(), trial(1), trial(2)]
 
 
-LATER = ("stretch", "disturbances", "physics")
+LATER = ("stretch", "disturbances", "physics", "training_time")
 """Columns that version 4 had not."""
 
 FIRST_SCHEMA = """
@@ -452,7 +452,8 @@ def test_the_number_of_workers_makes_no_difference(tmp_path: Path) -> None:
     alone, together = (
         rates_of(["goal", "orca"], tmp_path / str(workers), **{**TINY, "workers": workers}) for workers in (1, 2)
     )
-    untimed: dict[str, Any] = {"wall_time": None, "compute": None, "compute_lower": None, "compute_upper": None}
+    times = ("wall_time", "decision", "compute", "compute_lower", "compute_upper")
+    untimed: dict[str, Any] = dict.fromkeys(times)
     assert [replace(row, **untimed) for row in alone] == [replace(row, **untimed) for row in together]
     # Workers of several have one thread each, which the description of the machine says.
     untimed = {"wall_time": None, "preparation": None, "elapsed": None, "date": "", "machine": ""}
@@ -525,7 +526,7 @@ def test_the_table_row_by_row(tmp_path: Path) -> None:
         "",
         f"| {' | '.join(HEADER)} |",
         f"|{'---|' * len(HEADER)}",
-        "| goal | 0.1 | 1 of 2 (50%) | 9% to 91% | 0 | 1 | 0 | 0 | 5.00 | - | 0.38 | 0.062 (-0.202 to 0.327) |",
+        "| goal | 0.1 | 1 of 2 (50%) | 9% to 91% | 0 | 1 | 0 | 0 | 5.00 | - | 0.38 | - | - | 0.062 (-0.202 to 0.327) |",
     ]
     paths = write_robustness(tmp_path, rates)
     assert sorted(path.name for path in paths) == sorted(path.name for path in tmp_path.iterdir())
