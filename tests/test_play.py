@@ -175,6 +175,19 @@ def test_a_robot_is_pushed_in_all_that_drive_and_nobody_plans_anew(session: Sess
     assert (speeds <= session.frame.problem.team.max_speed + 1e-5).all(), "none is faster than it may be"
 
 
+def test_what_is_let_go_after_somebody_took_it_away_is_refused(session: Session) -> None:
+    drops = (
+        lambda: session.push(9, [0.1, 0.0]),
+        lambda: session.edit(lambda scene: edits.move_robot(scene, 9, [0.1, 0.2])),
+        lambda: session.edit(lambda scene: edits.move_goal(scene, 9, [0.1, 0.2])),
+        lambda: session.edit(lambda scene: edits.move_obstacle(scene, "boxes", 3, [0.1, 0.2])),
+    )
+    for drop in drops:
+        drop()
+    until(lambda: session.frame.moment.refused == len(drops))
+    assert session.failure is None
+
+
 def test_who_is_farthest_from_its_goal_is_pushed_and_who_has_docked_is_not(session: Session) -> None:
     session.set_speed(50)
     until(lambda: session.frame.moment.state == "arrived")

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray, IntArray
-from d4orm_env.engine import compiling, noise
+from d4orm_env.engine import compiling, noise, sample_noise
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.engine.sample_noise import BIT_OPS
 
-_SOURCES = fingerprint((noise, compiling))
+_SOURCES = fingerprint((noise, compiling, sample_noise))
 
 
 @cached_kernel(_SOURCES, **OPTIONS)

@@ -26,6 +26,7 @@ KINDS = ("circles", "spheres", "cylinders", "boxes", "polygons")
 
 def move_goal(problem: Problem, robot: int, place: ArrayLike) -> Problem:
     """Send a robot elsewhere: ``place`` ``(d,)`` [m]."""
+    check_robot(problem, robot)
     goal = np.array(problem.goal)
     goal[robot] = place
     _check_place(problem, "the goal", robot, goal)
@@ -34,11 +35,18 @@ def move_goal(problem: Problem, robot: int, place: ArrayLike) -> Problem:
 
 def move_robot(problem: Problem, robot: int, place: ArrayLike) -> Problem:
     """Put a robot elsewhere, at rest: ``place`` ``(d,)`` [m]."""
+    check_robot(problem, robot)
     start = np.array(problem.start)
     start[robot, : problem.dimension] = place
     _stop(problem, start, robot)
     _check_place(problem, "the robot", robot, start[:, : problem.dimension])
     return problem.resumed_at(start, problem.goal)
+
+
+def check_robot(problem: Problem, robot: int) -> None:
+    """Refuse a robot that somebody has taken away while it was dragged."""
+    if robot >= problem.num_robots:
+        raise ValueError(f"robot_{robot} is not there any more; take another")
 
 
 def at_rest(problem: Problem) -> Problem:
@@ -110,6 +118,8 @@ def move_obstacle(problem: Problem, kind: str, index: int, shift: ArrayLike) -> 
     """
     by, d = np.asarray(shift, np.float32), problem.dimension
     shapes = [np.array(shape) for shape in getattr(problem.world, kind)]
+    if index >= len(shapes):
+        raise ValueError("the obstacle is not there any more; take another")
     if kind == "boxes":
         shapes[index] = shapes[index] + np.tile(by, 2)
     elif kind == "polygons":

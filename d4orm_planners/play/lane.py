@@ -15,6 +15,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.disturbances.world import pushed
 from d4orm_env.joint_state import JointState, split_state
+from d4orm_planners.play.edits import check_robot
 from d4orm_planners.play.frame import Frame, Moment, closest_approach, guidance, plan
 from d4orm_planners.play.recording import Recording
 from d4orm_planners.policy import Policy
@@ -117,6 +118,7 @@ class Lane:
             ValueError: If it stands at its goal.
         """
         joint, problem = self._joint, self._scene
+        check_robot(problem, robot)
         if self.docked[robot]:
             raise ValueError(f"robot_{robot} of {self.name} has docked; push one that is under way")
         given = np.zeros((1, problem.num_robots, problem.dimension), np.float32)
