@@ -164,6 +164,7 @@ def test_a_clearing_keeps_its_obstacles_and_leaves_room_at_starts_and_goals() ->
 
 
 pytest.importorskip("stable_baselines3")
+from d4orm_planners.rl.algorithms import ALGORITHMS  # noqa: E402
 from d4orm_planners.rl.curriculum import Lesson  # noqa: E402
 from d4orm_planners.rl.curve import evaluate_network  # noqa: E402
 from d4orm_planners.rl.mixture import MIXTURES, Exercise, MixedVecEnv, parse_mixture  # noqa: E402
@@ -176,10 +177,15 @@ TINY = TrainingSettings(
 )  # fmt: skip
 
 
+@pytest.fixture(scope="module", params=sorted(ALGORITHMS))
+def practised(request: pytest.FixtureRequest) -> TrainingSettings:
+    return replace(TINY, algorithm=request.param)
+
+
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(practised: TrainingSettings, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("sets")
-    train(TINY, out, command="d4orm train ...")
+    train(practised, out, command="d4orm train ...")
     return out
 
 
@@ -193,7 +199,8 @@ def test_the_network_of_a_training_answers_in_numpy_as_in_torch(trained: Path) -
     assert network.header.encoder == "sets"
     assert network.header.training["mixture"] == list(TINY.mixture)
     last = sorted((trained / "checkpoints").iterdir())[-1]
-    model = stable_baselines3.PPO.load(last / "model.zip", device="cpu")
+    learner = getattr(stable_baselines3, network.header.algorithm.upper())
+    model = learner.load(last / "model.zip", device="cpu")
     normalization = VecNormalize(RobotVecEnv(1, 2, "circle", observed_robots=3))
     features = some_features(network, 9)
     set_network(model, normalization, network)
@@ -206,8 +213,10 @@ def test_the_network_of_a_training_answers_in_numpy_as_in_torch(trained: Path) -
     np.testing.assert_array_equal(back(features), network(features))
 
 
-def test_a_training_on_a_mixture_tells_how_each_part_goes(trained: Path, tmp_path: Path) -> None:
-    result = train(TINY, trained)
+def test_a_training_on_a_mixture_tells_how_each_part_goes(
+    practised: TrainingSettings, trained: Path, tmp_path: Path
+) -> None:
+    result = train(practised, trained)
     assert [evaluation.scenario for evaluation in result.curve] == ["mixture"] * 2
     for evaluation in result.curve:
         assert evaluation.parts is not None
@@ -216,14 +225,16 @@ def test_a_training_on_a_mixture_tells_how_each_part_goes(trained: Path, tmp_pat
     lessons = result.network.header.training["lesson"]
     spent = sum(evaluation.seconds for evaluation in result.curve[:lessons])
     assert result.network.training_time == pytest.approx(spent, abs=0.1), "up to the lesson that was best"
-    again = train(TINY, tmp_path, command="d4orm train ...").network
+    again = train(practised, tmp_path, command="d4orm train ...").network
     for name, array in load_network(trained / "policy.safetensors").arrays.items():
         np.testing.assert_array_equal(array, again.arrays[name])
 
 
-def test_a_policy_of_sets_learns_on_and_a_flat_one_is_refused(trained: Path, tmp_path: Path) -> None:
+def test_a_policy_of_sets_learns_on_and_a_flat_one_is_refused(
+    practised: TrainingSettings, trained: Path, tmp_path: Path
+) -> None:
     path = str(trained / "policy.safetensors")
-    further = replace(TINY, start_from=path, learning_rate=1e-9, lessons=1, steps=32, observed_robots=4)
+    further = replace(practised, start_from=path, learning_rate=1e-9, lessons=1, steps=32, observed_robots=4)
     learned = train(further, tmp_path / "further").network
     for name, array in load_network(path).arrays.items():
         if name != "reward_variance":
@@ -237,9 +248,9 @@ def test_a_policy_of_sets_learns_on_and_a_flat_one_is_refused(trained: Path, tmp
 
 
 def test_a_policy_of_robots_that_turn_says_along_what_it_sees_and_learns_on_from_none_that_sees_otherwise(
-    trained: Path, tmp_path: Path
+    practised: TrainingSettings, trained: Path, tmp_path: Path
 ) -> None:
-    turning = replace(TINY, model="differential_drive", lessons=1, steps=32)
+    turning = replace(practised, model="differential_drive", lessons=1, steps=32)
     network = train(turning, tmp_path / "first").network
     assert load_network(tmp_path / "first" / "policy.safetensors").features.frame == network.header.frame == "heading"
     assert load_network(trained / "policy.safetensors").features.frame == "goal"
@@ -341,6 +352,21 @@ def test_a_network_of_sets_learns_where_nobody_is_seen(tmp_path: Path) -> None:
     assert load_network(tmp_path / "policy.safetensors").header.num_neighbors == 0
 
 
+@pytest.mark.parametrize(
+    ("algorithm", "settings"), [("ppo", {"n_epochs": "7", "clip_range": 0.1}), ("sac", {"gradient_steps": 3, "tau": 1})]
+)
+def test_a_learner_has_the_settings_asked_for(algorithm: str, settings: dict, tmp_path: Path) -> None:
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    asked = replace(TINY, algorithm=algorithm, learner_settings=settings)
+    env = VecNormalize(asked.worlds(None, 0))  # type: ignore[arg-type]
+    model = ALGORITHMS[algorithm].make(env, tuned=asked.learner_settings)
+    for name, value in {**ALGORITHMS[algorithm].tunable, **asked.learner_settings}.items():
+        had = getattr(model, name)
+        assert (had(1.0) if callable(had) else had) == value
+    env.close()
+
+
 def test_rewards_are_those_asked_for() -> None:
     settings = replace(TINY, reward_settings={"arrival": 7.5, "contact": "4"})
     assert (settings.reward.arrival, settings.reward.contact, settings.reward.time) == (7.5, 4, 0.05)
@@ -371,7 +397,12 @@ def test_rewards_are_those_asked_for() -> None:
         ({"scenario": "circle"}, "scenario is 'circle' beside a mixture"),
         ({"num_robots": 8}, "num_robots is 8 beside a mixture"),
         ({"curriculum": True}, "curriculum is True beside a mixture"),
-        ({"algorithm": "sac"}, "network 'sets' is for ppo, not for sac"),
+        ({"learner_settings": {"n_steps": 3}}, "learner_settings has 'n_steps'; choose of n_epochs, gae_lambda"),
+        ({"learner_settings": {"n_epochs": 2.5}}, "learner_settings has n_epochs=2.5; it must be a whole number of at"),
+        ({"learner_settings": {"n_epochs": 0}}, "n_epochs=0; it must be a whole number of at least 1"),
+        ({"learner_settings": {"ent_coef": -1}}, "learner_settings has ent_coef=-1; it must be at least 0"),
+        ({"learner_settings": {"ent_coef": "much"}}, "learner_settings"),
+        ({"algorithm": "sac", "learner_settings": {"n_epochs": 2}}, "has 'n_epochs'; choose of batch_size, gradient"),
         ({"network": "deep"}, "network 'deep' is unknown; choose one of flat, sets"),
         ({"learning_rate": 0.0}, "learning_rate is 0; it must be positive"),
         ({"observed_robots": -1}, "observed_robots is -1"),

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 IMITATION = "imitation"
 _REINFORCEMENT_ONLY = (
     "steps", "num_envs", "curriculum", "lessons", "start_from", "network", "observed_robots", "learning_rate",
-    "reward_settings", "mixture",
+    "learner_settings", "reward_settings", "mixture",
 )  # fmt: skip
 _IMITATION_ONLY = ("expert", "expert_settings", "dataset", "episodes", "rounds", "epochs")
 
@@ -50,12 +50,18 @@ class TrainOptions:
     start_from: Annotated[
         Path | None, typer.Option("--start-from", help="A policy file of the same algorithm that learns on.")
     ] = None
-    network: Annotated[
-        str, typer.Option("--network", help="flat, or sets: neighbours in any order and number; for ppo.")
-    ] = "flat"
+    network: Annotated[str, typer.Option("--network", help="flat, or sets: neighbours in any order and number.")] = (
+        "flat"
+    )
     observed_robots: Annotated[int, typer.Option("--observed-robots", help="Neighbours in observations.")] = 4
     learning_rate: Annotated[
         float | None, typer.Option("--learning-rate", help="At the beginning; it falls to a tenth. 3e-4 for ppo.")
+    ] = None
+    learner_settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--learner-set", help="A setting of ppo or sac in Stable-Baselines3, as gradient_steps=8; repeatable."
+        ),
     ] = None
     reward_settings: Annotated[
         list[str] | None,
@@ -131,6 +137,7 @@ def _reinforcement(options: TrainOptions) -> Callable[..., TrainingResult]:
     )  # fmt: skip
     own = {name: getattr(options, name) for name in same}
     own |= {"steps": int(steps), "mixture": tuple(options.mixture or ())}
+    own["learner_settings"] = parse_settings(options.learner_settings, "--learner-set")
     own["reward_settings"] = parse_settings(options.reward_settings, "--reward-set")
     settings = training.TrainingSettings(**_practice(options), **own)
     return partial(training.train, settings)

@@ -102,5 +102,6 @@ def _layers(model: BaseAlgorithm) -> list[torch.nn.Linear]:
 
 def _sets(model: BaseAlgorithm) -> dict[str, torch.Tensor] | None:
     """Parameters of a network of sets; ``None`` of another."""
-    extractor = getattr(model.policy, "features_extractor", None)
+    policy: Any = model.policy
+    extractor = (policy.actor if _squashed(model) else policy).features_extractor
     return extractor.arrays() if isinstance(extractor, SetExtractor) else None

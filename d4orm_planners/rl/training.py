@@ -59,10 +59,12 @@ class TrainingSettings(Practice):
         curriculum: Whether smaller teams come first.
         lessons: Parts of the training, each with a checkpoint and an evaluation at its end.
         start_from: A policy file of the same algorithm, whose network learns on; ``None`` begins with nothing.
-        network: ``"flat"``, fully connected from all that is observed; or for PPO ``"sets"``, which pools neighbours
-            and obstacles, see :mod:`d4orm_planners.rl.sets`.
+        network: ``"flat"``, fully connected from all that is observed; or ``"sets"``, which pools neighbours and
+            obstacles, see :mod:`d4orm_planners.rl.sets`.
         observed_robots: In observations.
         learning_rate: At the beginning; ``None`` is the algorithm's own. It falls linearly to a tenth.
+        learner_settings: Further settings of the algorithm, as Stable-Baselines3 calls them, where they are others than
+            those of :mod:`d4orm_planners.rl.algorithms`: ``{"gradient_steps": 8}``.
         reward_settings: Weights of the :class:`~d4orm_env.rewards.TrainingReward` to learn from, where they are others.
         mixture: Scenarios and team sizes to be practised all at once, in place of ``scenario`` and ``num_robots``:
             texts as :meth:`~d4orm_planners.rl.mixture.Exercise.parse` takes them, or names of
@@ -82,13 +84,14 @@ class TrainingSettings(Practice):
     network: Annotated[str, one_of(NETWORKS)] = "flat"
     observed_robots: Annotated[Whole, Field(ge=0, le=1000)] = 4
     learning_rate: Annotated[Positive, Field(le=1)] | None = None
+    learner_settings: Mapping[str, Number] = field(default_factory=dict)
     reward_settings: Mapping[str, Number] = field(default_factory=dict)
     mixture: Annotated[tuple[str, ...], BeforeValidator(_as_tuple)] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.network == "sets" and self.algorithm != "ppo":
-            raise ValueError(f"network 'sets' is for ppo, not for {self.algorithm}; leave it out")
+        tuned = ALGORITHMS[self.algorithm].checked(self.learner_settings, "learner_settings")
+        object.__setattr__(self, "learner_settings", tuned)
         known = TrainingReward.term_names
         for name in self.reward_settings:
             if name not in known:
@@ -272,7 +275,7 @@ class _Run:
         if model is None:
             set_random_seed(self._training_seed(0))
             features = self._validation.features if self.settings.network == "sets" else None
-            model = self._algorithm.make(env, features)
+            model = self._algorithm.make(env, features, self.settings.learner_settings)
             model.set_logger(configure(str(self._out / "tensorboard"), ["tensorboard"]))
         else:
             model.set_env(env, force_reset=True)
