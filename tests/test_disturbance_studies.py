@@ -17,15 +17,14 @@ from test_robustness import trial
 from d4orm_env import mujoco, navigation_v0
 from d4orm_env.disturbances import Delay, Intruder, LimitMismatch, Push, Stall
 from d4orm_planners import evaluate, run_episode
-from d4orm_planners.evaluation.conditions import Condition, conditions
-from d4orm_planners.evaluation.disturbance_report import write_disturbances
+from d4orm_planners.evaluation.comparison import compare_pairs
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.leaderboard import leaderboard
-from d4orm_planners.evaluation.pairs import compare_pairs
+from d4orm_planners.evaluation.robustness import write_disturbances
 from d4orm_planners.evaluation.store import STORE, TrialStore
-from d4orm_planners.evaluation.study import Study
-from d4orm_planners.evaluation.summary import TrialGroup, success_rates
-from d4orm_planners.evaluation.tolerance import tolerances
+from d4orm_planners.evaluation.study import Study, conditions
+from d4orm_planners.evaluation.summary import TrialGroup, success_rates, tolerances
+from d4orm_planners.evaluation.trials import Condition
 
 TINY: dict[str, Any] = {"num_robots": 2, "seeds": range(2), "workers": 1}
 Call = Callable[..., tuple[int, str, str]]

@@ -28,7 +28,8 @@ from d4orm_planners.evaluation import pool as pool_module
 from d4orm_planners.evaluation import store as store_module
 from d4orm_planners.evaluation import trials as trials_module
 from d4orm_planners.evaluation.evaluate import run_study
-from d4orm_planners.evaluation.report import HEADER, markdown, write_robustness
+from d4orm_planners.evaluation.report import HEADER, markdown
+from d4orm_planners.evaluation.robustness import write_robustness
 from d4orm_planners.evaluation.store import APPLICATION_ID, STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import SuccessRate, success_rate, success_rates, wilson_interval

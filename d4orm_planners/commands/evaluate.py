@@ -130,8 +130,8 @@ def report(
 ) -> tuple[list[SuccessRate], list[Path]]:
     """Run the trials and write what they came to; the success rates and what was written."""
     from d4orm_planners.commands.progress import tell_results
-    from d4orm_planners.evaluation.disturbance_report import write_disturbances
     from d4orm_planners.evaluation.report import markdown
+    from d4orm_planners.evaluation.robustness import write_disturbances
     from d4orm_planners.evaluation.summary import success_rates
 
     groups = options.run()

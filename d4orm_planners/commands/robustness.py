@@ -36,7 +36,7 @@ class RobustnessOptions(StudyOptions):
 @takes(RobustnessOptions)
 def robustness(options: RobustnessOptions) -> None:
     """Measure how often policies succeed when something goes wrong: noise, delays, pushes and others."""
-    from d4orm_planners.evaluation.report import write_robustness
+    from d4orm_planners.evaluation.robustness import write_robustness
 
     if options.control_noise_std is None and options.disturb is None:
         options = replace(options, disturb=list(STANDARD))

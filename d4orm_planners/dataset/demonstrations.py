@@ -15,7 +15,7 @@ from d4orm_env.core.arrays import shown, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import Disturbance
 from d4orm_planners.dataset.recorded_episode import RecordedEpisode, record_episode
-from d4orm_planners.evaluation.conditions import Condition
+from d4orm_planners.evaluation.trials import Condition
 from d4orm_planners.references import source_digest
 from d4orm_planners.registry import PolicyLike, make_policy, origin, policy_settings
 

@@ -12,13 +12,11 @@ from pathlib import Path
 
 from d4orm_env.core.arrays import duration, whole_number
 from d4orm_env.engine.threads import available_cores
-from d4orm_planners.evaluation.cluster import RayPool
-from d4orm_planners.evaluation.conditions import DisturbanceLevels
-from d4orm_planners.evaluation.disturbance_report import write_disturbances
-from d4orm_planners.evaluation.pool import Pool, ProcessPool, run_here, run_jobs
+from d4orm_planners.evaluation.pool import Pool, ProcessPool, RayPool, run_here, run_jobs
 from d4orm_planners.evaluation.report import PARQUET_HINT, write_results
+from d4orm_planners.evaluation.robustness import write_disturbances
 from d4orm_planners.evaluation.store import STORE, Trial, TrialKey, TrialStore
-from d4orm_planners.evaluation.study import Policies, Scenarios, Study
+from d4orm_planners.evaluation.study import DisturbanceLevels, Policies, Scenarios, Study
 from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_rates
 from d4orm_planners.evaluation.trials import Job
 from d4orm_planners.references import check_sendable
@@ -64,7 +62,7 @@ def evaluate(
         disturbances: Levels of disturbances by name, as ``{"delay": [0, 1, 2], "push.speed": [0.2, 0.5]}``, from
             harmless to bad; without an attribute behind the name it is the kind's first. Or by any label instances of
             them, your own included, or lists of instances. One at a time, each with every level of noise. With them
-            come the files of :func:`~d4orm_planners.evaluation.disturbance_report.write_disturbances` too.
+            come the files of :func:`~d4orm_planners.evaluation.robustness.write_disturbances` too.
         num_robots: Team sizes for scenarios by name; ``None`` is the scenario's own.
         model: Robot models for scenarios by name; ``None`` is the scenario's own.
         scenario_settings: Further arguments of the scenarios by name, as ``{"corridor_width": 0.8}``; every one of them

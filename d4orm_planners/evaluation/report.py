@@ -36,39 +36,12 @@ def write_results(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) 
     paths = [Path(folder, name) for name in ("table.md", "table.csv", "trials.csv", "trials.parquet")]
     with target(paths[0]) as path:
         path.write_text(markdown(rates), encoding="utf-8")
-    _write_rates(paths[1], rates)
+    write_rates(paths[1], rates)
     write_csv(paths[2], [vars(trial) for trial in trials])
     return paths if write_parquet(paths[3], trials) else paths[:3]
 
 
-def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) -> list[Path]:
-    """Write ``robustness.csv``, ``robustness.md`` and, where nothing but noise went wrong, ``robustness.png``, success
-    against it.
-
-    Args:
-        folder: Where to.
-        rates: What :func:`~d4orm_planners.evaluation.evaluate.evaluate` returned.
-
-    Returns:
-        The paths.
-
-    Raises:
-        OSError: If the folder does not exist or cannot be written to.
-    """
-    from d4orm_planners.evaluation.figures import draw_noise  # which needs this module
-
-    paths = [Path(folder, f"robustness.{kind}") for kind in ("csv", "md", "png")]
-    _write_rates(paths[0], rates)
-    with target(paths[1]) as path:
-        path.write_text(markdown(rates), encoding="utf-8")
-    if any(rate.disturbance for rate in rates):
-        return paths[:2]
-    with target(paths[2]) as path:
-        draw_noise(path, rates)
-    return paths
-
-
-def _write_rates(path: Path, rates: Sequence[SuccessRate]) -> None:
+def write_rates(path: Path, rates: Sequence[SuccessRate]) -> None:
     """Write success rates as CSV, with a column ``rate`` in front."""
     write_csv(path, [{"rate": rate.rate, **vars(rate)} for rate in rates])
 

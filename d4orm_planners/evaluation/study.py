@@ -9,15 +9,17 @@ from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
-from d4orm_env.core.arrays import duration, shown, whole_number
+from d4orm_env.core.arrays import duration, positive_number, shown, whole_number
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.selection import at_work
+from d4orm_env.disturbances import Disturbance
+from d4orm_env.disturbances.disturbance import AnyDisturbance
+from d4orm_env.disturbances.registry import attributes_of, disturbance_at
+from d4orm_env.disturbances.selection import at_work, checked_disturbances
 from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_env.scenarios.problems import is_scenario_file
 from d4orm_planners.episode import check_physics
-from d4orm_planners.evaluation.conditions import DisturbanceLevels, conditions
 from d4orm_planners.evaluation.store import LARGEST_NUMBER
-from d4orm_planners.evaluation.trials import Configuration, Job
+from d4orm_planners.evaluation.trials import Condition, Configuration, Job
 from d4orm_planners.registry import PolicyLike, is_brought, list_policies, make_policy, origin
 
 T = TypeVar("T")
@@ -25,6 +27,10 @@ T = TypeVar("T")
 Policies: TypeAlias = PolicyLike | Iterable[PolicyLike] | Mapping[str, PolicyLike | Mapping[str, object]]
 Scenario: TypeAlias = str | os.PathLike[str] | Problem | Callable[..., Problem]
 Scenarios: TypeAlias = Scenario | Iterable[Scenario]
+Levels: TypeAlias = Iterable[object]
+DisturbanceLevels: TypeAlias = Mapping[str, Levels]
+"""Levels by name, as ``{"delay": [0, 1, 2], "push.speed": [0.2, 0.5]}``, or disturbances by any label, as
+``{"wind": [Wind(0.1), Wind(0.2)], "both": [[], [Delay(2), Wind(0.1)]]}``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,3 +200,63 @@ def _several(values: T | Iterable[T]) -> tuple[T, ...]:
     if isinstance(values, str | os.PathLike) or not isinstance(values, Iterable):
         return (values,)
     return tuple(values)
+
+
+def conditions(
+    control_noise_std: float | Iterable[float], disturbances: DisturbanceLevels | None
+) -> tuple[Condition, ...]:
+    """Every level of noise with every level of every disturbance, one disturbance at a time.
+
+    Raises:
+        ValueError: For an unknown name, a level that makes no sense, or nothing to do.
+    """
+    given = control_noise_std if isinstance(control_noise_std, Iterable) else (control_noise_std,)
+    noise = tuple(dict.fromkeys(positive_number(std, "control_noise_std", zero_allowed=True) for std in given))
+    if not noise:
+        raise ValueError("control_noise_std is empty; give at least one level")
+    if disturbances is None:
+        return tuple(Condition(std) for std in noise)
+    if not isinstance(disturbances, Mapping):
+        raise ValueError(f"disturbances is {shown(disturbances)}; give levels by name, as {{'delay': [0, 1, 2]}}")
+    varied = [one for name, levels in disturbances.items() for one in _varied(name, levels)]
+    if not varied:
+        raise ValueError("disturbances is empty; give levels by name, as {'delay': [0, 1, 2]}, or leave it out")
+    return tuple(
+        Condition(std, chosen, name, level) for std, (name, chosen, level) in product(noise, dict.fromkeys(varied))
+    )
+
+
+Varied: TypeAlias = tuple[str, tuple[AnyDisturbance, ...], float]
+
+
+def _varied(name: str, levels: Levels) -> list[Varied]:
+    """A name, disturbances and a level for each of the levels of one thing."""
+    if isinstance(levels, str | Disturbance) or not isinstance(levels, Iterable):
+        levels = (levels,)
+    listed = list(levels)
+    if not listed:
+        raise ValueError(f"disturbances[{name!r}] is empty; give at least one level")
+    if all(isinstance(one, Disturbance | Sequence) and not isinstance(one, str) and _holds(one) for one in listed):
+        chosen = [checked_disturbances(one) for one in listed]
+        return [(name, one, level) for one, level in zip(chosen, _told(chosen))]
+    made = [(level, disturbance_at(name, level)) for level in listed]
+    return [(name, (one,), _number(level, place)) for place, (level, one) in enumerate(made)]
+
+
+def _holds(given: object) -> bool:
+    """Whether something is a disturbance, or a list of disturbances only."""
+    return isinstance(given, Disturbance) or all(isinstance(one, Disturbance) for one in given)  # type: ignore[attr-defined] # a sequence
+
+
+def _told(chosen: Sequence[tuple[AnyDisturbance, ...]]) -> list[float]:
+    """The levels of disturbances that were given themselves: the number in which they differ, or their places."""
+    if all(len(one) == 1 and type(one[0]) is type(chosen[0][0]) for one in chosen):
+        values = [attributes_of(one[0]) for one in chosen]
+        differing = [name for name in values[0] if len({repr(each[name]) for each in values}) > 1]
+        if len(differing) == 1 and all(isinstance(each[differing[0]], int | float) for each in values):
+            return [float(each[differing[0]]) for each in values]  # type: ignore[arg-type] # a number, as was asked
+    return [float(place) for place in range(len(chosen))]
+
+
+def _number(level: object, place: int) -> float:
+    return float(level) if isinstance(level, int | float) else float(place)

@@ -17,18 +17,60 @@ from d4orm_env import verify
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.errors import UnknownKeywordError, describe
 from d4orm_env.core.problem import Problem
+from d4orm_env.disturbances.disturbance import AnyDisturbance
+from d4orm_env.disturbances.registry import attributes_of, name_of
 from d4orm_planners._machine import commit, describe_machine, versions
 from d4orm_planners.episode import Episode, open_env, run_episode
-from d4orm_planners.evaluation.conditions import Condition
 from d4orm_planners.evaluation.store import Trial, TrialKey
 from d4orm_planners.plan import IterationRecord, Plan
 from d4orm_planners.policy import Actions, Observations, OpenLoop, Policy
+from d4orm_planners.references import source_digest
 from d4orm_planners.registry import is_planned, make_policy, policy_settings
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
 
 LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "pyrvo", "casadi", "mujoco")
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What goes wrong in a trial.
+
+    Attributes:
+        control_noise_std: Standard deviation of the execution noise, in the controls' units.
+        disturbances: What else goes wrong.
+        name: What is varied, such as ``"push.speed"``; empty for nothing.
+        level: How much of it; of disturbances that differ in more than a number, their place among the levels.
+        physics: What moves the robots, one of :data:`d4orm_planners.episode.PHYSICS`.
+    """
+
+    control_noise_std: float = 0.0
+    disturbances: tuple[AnyDisturbance, ...] = ()
+    name: str = ""
+    level: float | None = None
+    physics: str = "model"
+
+    @property
+    def text(self) -> str:
+        """The disturbances that change anything, as JSON: a list of ``[name, attributes]``.
+
+        Raises:
+            ValueError: If an attribute of a user's has no form in JSON, or its source cannot be read.
+        """
+        listed = [[name_of(one), _attributes(one)] for one in self.disturbances if not one.negligible]
+        try:
+            return json.dumps(listed, sort_keys=True)
+        except TypeError as error:
+            raise ValueError(
+                f"disturbance {self.name!r} has an attribute that cannot be stored ({error}); give numbers, text, "
+                "truth values, lists and mappings of them"
+            ) from None
+
+    @property
+    def replayable(self) -> bool:
+        """Whether the executed controls alone tell how the robots have moved."""
+        return self.physics == "model" and all(one.negligible or one.replayable for one in self.disturbances)
 
 
 @dataclass(frozen=True)
@@ -219,3 +261,9 @@ def _origin() -> tuple[str, str]:
     """Versions of the libraries with the commit of this package, and the machine, as JSON."""
     source = {"commit": found} if (found := commit()) else {}
     return json.dumps({**versions(LIBRARIES), **source}, sort_keys=True), json.dumps(describe_machine(), sort_keys=True)
+
+
+def _attributes(one: AnyDisturbance) -> dict[str, object]:
+    attributes = attributes_of(one)
+    foreign = type(one).__module__.partition(".")[0] != "d4orm_env"
+    return {**attributes, "source": source_digest(type(one))} if foreign else attributes
