@@ -8,8 +8,6 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.choice import get_engine
 
-__all__ = ["rollout"]
-
 
 def rollout(problem: Problem, controls: ArrayLike, engine: str = "auto") -> Trajectory:
     """The motion of the team under ``controls``, clipped to the robots' limits.

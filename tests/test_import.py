@@ -87,7 +87,7 @@ def test_all_names_resolve() -> None:
 
 
 PUBLIC = (
-    "d4orm_env", "d4orm_env.engine.base", "d4orm_env.engine.choice", "d4orm_env.functional", "d4orm_env.joint_state",
+    "d4orm_env", "d4orm_env.functional", "d4orm_env.joint_state",
     "d4orm_env.models", "d4orm_env.navigation_v0", "d4orm_env.options", "d4orm_env.render", "d4orm_env.rewards",
     "d4orm_env.scenarios", "d4orm_env.verify", "d4orm_env.wrappers", "d4orm_planners", "d4orm_planners.adapters",
 )  # fmt: skip

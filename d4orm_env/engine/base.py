@@ -18,11 +18,6 @@ from d4orm_env.core.trajectory import Trajectory
 if TYPE_CHECKING:
     from d4orm_env.engine.episodes import WorldBatch
 
-__all__ = [
-    "DenoisingStep", "Engine", "MovingObstacles", "SamplingResult", "SamplingRules", "SamplingTask", "StepResult",
-    "StepWatcher", "WorldEngine", "checked_controls",
-]  # fmt: skip
-
 
 class StepResult(NamedTuple):
     """One step of the whole team.

@@ -7,8 +7,6 @@ from importlib.util import find_spec
 
 from d4orm_env.engine.base import Engine
 
-__all__ = ["ENGINES", "get_engine"]
-
 ENGINES = ("auto", "cpu", "jax")
 
 

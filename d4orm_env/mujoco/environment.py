@@ -16,8 +16,6 @@ from d4orm_env.options import EnvOptions
 from d4orm_env.scenarios.problems import ScenarioLike
 from d4orm_env.simulation import Simulation
 
-__all__ = ["env", "parallel_env", "raw_env"]
-
 
 class parallel_env(navigation_v0.parallel_env):
     """:class:`d4orm_env.navigation_v0.parallel_env` with the team as rigid bodies in MuJoCo.

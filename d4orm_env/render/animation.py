@@ -23,8 +23,6 @@ from d4orm_env.render.frames import FrameRenderer
 from d4orm_env.render.panels import picture_palette, view_limits
 from d4orm_env.render.pictures import checked_trajectory, contact_points
 
-__all__ = ["ANIMATION_SUFFIXES", "save_animation"]
-
 ANIMATION_SUFFIXES = (".gif", ".mp4")
 
 _MOST_FRAMES_PER_SECOND = {".gif": 50.0, ".mp4": 120.0}

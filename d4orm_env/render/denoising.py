@@ -14,8 +14,6 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.render.panels import Panel, TeamLayer, view_limits
 from d4orm_env.render.pictures import PICTURE_SUFFIXES
 
-__all__ = ["Denoising", "save_denoising"]
-
 
 @dataclass(frozen=True, eq=False)
 class Denoising:

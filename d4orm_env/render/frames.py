@@ -20,8 +20,6 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.render.marks import MarkLayer
 from d4orm_env.render.panels import INK, Array, Panel, TeamLayer, make_axes, view_limits
 
-__all__ = ["FrameRenderer", "WindowRenderer"]
-
 
 class FrameRenderer:
     """Draws one state after another into an image: the environment's ``rgb_array`` mode, and animations.

@@ -31,8 +31,6 @@ from d4orm_env.render.panels import (
     view_limits,
 )
 
-__all__ = ["plot", "plot_trajectory", "save_picture"]
-
 PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
 
 

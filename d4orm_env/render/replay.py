@@ -22,8 +22,6 @@ from d4orm_env.render.denoising import Denoising
 from d4orm_env.render.panels import robot_colors, view_limits
 from d4orm_env.render.pictures import checked_trajectory
 
-__all__ = ["REPLAY_SUFFIXES", "Replay", "ReplayMotion", "motion"]
-
 REPLAY_SUFFIXES = (".html",)
 
 _NOTEBOOK_HEIGHT = 640
