@@ -2,7 +2,7 @@
 
 >>> env = FunctionalEnv("random", num_robots=8, reward="training")
 >>> state, observations = jax.vmap(env.reset)(jax.random.split(key, 1024))
->>> state, moment = jax.vmap(env.step)(keys, state, actions)
+>>> state, transition = jax.vmap(env.step)(keys, state, actions)
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from d4orm_env.rewards import find_reward
 from d4orm_env.scenarios.problems import ScenarioLike
 from d4orm_env.simulation import Simulation
 
-__all__ = ["EnvState", "FunctionalEnv", "Moment"]
+__all__ = ["EnvState", "FunctionalEnv", "Transition"]
 
 MAX_INSTANCES = 1_000_000
 
@@ -45,7 +45,7 @@ class EnvState(NamedTuple):
     touched: jax.Array
 
 
-class Moment(NamedTuple):
+class Transition(NamedTuple):
     """What a step brought.
 
     Attributes:
@@ -146,7 +146,7 @@ class FunctionalEnv:
         """``(K, D)`` what every robot sees."""
         return functional.observe(self.instance(state.instance), state.team, self.layout, self.max_cycles)
 
-    def advance(self, key: jax.Array, state: EnvState, actions: jax.Array) -> tuple[EnvState, Moment]:
+    def advance(self, key: jax.Array, state: EnvState, actions: jax.Array) -> tuple[EnvState, Transition]:
         """One step, without reset at the end of an episode.
 
         Args:
@@ -154,22 +154,22 @@ class FunctionalEnv:
             state: The world.
             actions: ``(K, m)`` controls in physical units, clipped to the robots' limits.
         """
-        after, moment = self._move(key, state, actions)
-        return after, moment._replace(observations=self.observe(after))
+        after, transition = self._move(key, state, actions)
+        return after, transition._replace(observations=self.observe(after))
 
-    def step(self, key: jax.Array, state: EnvState, actions: jax.Array) -> tuple[EnvState, Moment]:
+    def step(self, key: jax.Array, state: EnvState, actions: jax.Array) -> tuple[EnvState, Transition]:
         """The same; where the episode is over the state returned is the first of the next."""
         noise, fresh = jax.random.split(key)
-        after, moment = self._move(noise, state, actions)
-        after = jax.tree.map(lambda new, old: jnp.where(moment.done, new, old), self._begin(fresh), after)
-        return after, moment._replace(observations=self.observe(after))
+        after, transition = self._move(noise, state, actions)
+        after = jax.tree.map(lambda new, old: jnp.where(transition.done, new, old), self._begin(fresh), after)
+        return after, transition._replace(observations=self.observe(after))
 
     def _begin(self, key: jax.Array) -> EnvState:
         number = jax.random.randint(key, (), 0, self._num_instances)
         problem = self.instance(number)
         return EnvState(functional.reset(problem, key), number, jnp.zeros(problem.num_robots, bool))
 
-    def _move(self, key: jax.Array, state: EnvState, actions: jax.Array) -> tuple[EnvState, Moment]:
+    def _move(self, key: jax.Array, state: EnvState, actions: jax.Array) -> tuple[EnvState, Transition]:
         problem, team = self.instance(state.instance), state.team
         if np.any(self._noise):
             actions = actions + self._noise * jax.random.normal(key, actions.shape)
@@ -177,7 +177,7 @@ class FunctionalEnv:
         before, finished = (self._finished(arrived) for arrived in (team.arrived, step.arrived))
         touched = state.touched | step.collided
         everyone = step.arrived.all()
-        moment = Moment(
+        transition = Transition(
             observations=jnp.zeros(()),
             rewards=step.rewards,
             acted=~before,
@@ -186,7 +186,7 @@ class FunctionalEnv:
             success=everyone & ~touched.any(),
             step=step._replace(truncated=(after.steps >= self.max_cycles) & ~finished.all()),
         )
-        return EnvState(after, state.instance, touched), moment
+        return EnvState(after, state.instance, touched), transition
 
     def _finished(self, arrived: jax.Array) -> jax.Array:
         return arrived if self.problem.docks else arrived & arrived.all()

@@ -193,7 +193,7 @@ class Simulation:
         if self.lifelong:
             # A goal radius that nothing is within: a robot under way to its next goal neither docks nor stops.
             arrays = arrays._replace(squared_goal_radius=np.float32(-1))
-        result = self._met(self._move(arrays, states, controls))
+        result = self._with_disturbers(self._move(arrays, states, controls))
         if self.lifelong:
             arrived = reached_goals(self.problem.team, self.arrays, result.states, result.controls)
         else:
@@ -302,8 +302,8 @@ class Simulation:
         touched, near = self._disturbed.touched(np.array(self.states)[None])
         return collided | touched[0], violated | near[0]
 
-    def _met(self, result: StepResult) -> StepResult:
-        """The result of a step with what robots met that is none."""
+    def _with_disturbers(self, result: StepResult) -> StepResult:
+        """The result of a step with contacts with bodies that are no robots."""
         if self._disturbed is None or not self._disturbed.bodies.shape[1]:
             return result
         touched, near = self._disturbed.touched(result.states[None])

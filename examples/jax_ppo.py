@@ -92,12 +92,18 @@ def collect(env: FunctionalEnv, network: Any, carry: Any, key: Any) -> tuple[Any
     action = mean + along(jnp.exp(network["log_std"]), mean) * jax.random.normal(draw, mean.shape)
     value = apply(network["critic"], observation)[..., 0]
     controls = jnp.clip(action, -1, 1) * along(env.action_limits, action)
-    state, moment = jax.vmap(env.step)(jax.random.split(move, len(observations)), state, controls)
-    done = moment.finished | moment.done[:, None]
+    state, transition = jax.vmap(env.step)(jax.random.split(move, len(observations)), state, controls)
+    done = transition.finished | transition.done[:, None]
     sample = Sample(
-        observation, action, log_density(network, observation, action), value, moment.rewards, done, moment.acted
+        observation,
+        action,
+        log_density(network, observation, action),
+        value,
+        transition.rewards,
+        done,
+        transition.acted,
     )
-    return (state, moment.observations), (sample, (moment.done, moment.success))
+    return (state, transition.observations), (sample, (transition.done, transition.success))
 
 
 def advantages(samples: Sample, last_value: Any) -> Any:

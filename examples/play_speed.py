@@ -109,10 +109,10 @@ class Watched(NamedTuple):
 def watch(session: Session, seconds: float) -> Watched:
     """The control loops of so many seconds."""
     seen: list[tuple[float, float, int]] = []
-    last, end = session.frame.moment.time, time.perf_counter() + seconds
+    last, end = session.frame.status.time, time.perf_counter() + seconds
     while time.perf_counter() < end:
-        if (moment := (frame := session.frame).moment).time != last:
-            last = moment.time
+        if (status := (frame := session.frame).status).time != last:
+            last = status.time
             seen.append((1e3 * frame.loop, memory(), int(frame.collided.sum())))
         time.sleep(0.005)
     loops, held, contacts = zip(*seen)
@@ -121,12 +121,12 @@ def watch(session: Session, seconds: float) -> Watched:
 
 def drop(session: Session, random: np.random.Generator) -> float:
     """Seconds from a goal's being dropped to the first frame with the new plan; nan if there was no room for it."""
-    goal, refused = session.frame.goals[0], session.frame.moment.refused
+    goal, refused = session.frame.goals[0], session.frame.status.refused
     place = random.uniform(-1.2, 1.2, session.frame.problem.dimension)
     begin = time.perf_counter()
     session.edit(lambda scene: edits.move_goal(scene, 0, place))
     while np.array_equal(session.frame.goals[0], goal):
-        if session.frame.moment.refused > refused:
+        if session.frame.status.refused > refused:
             return float("nan")
         time.sleep(0.001)
     return time.perf_counter() - begin

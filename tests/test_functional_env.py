@@ -120,12 +120,12 @@ def test_worlds_are_those_of_the_batched_environment() -> None:
         np.testing.assert_allclose(np.asarray(observations).reshape(4, -1), observed, atol=1e-4)
         actions = random.uniform(-1, 1, (4, 3, 2)).astype(np.float32)
         observed, _, terminated, truncated, _ = batch.step(actions.reshape(4, -1))
-        state, moment = step(keys, state, actions)
-        observations = moment.observations
-        np.testing.assert_allclose(moment.rewards, batch.unwrapped.robot_rewards, atol=1e-4)
-        np.testing.assert_array_equal(moment.done, terminated | truncated)
-        np.testing.assert_array_equal(moment.step.truncated, truncated)
-        ends += int(moment.done.sum())
+        state, transition = step(keys, state, actions)
+        observations = transition.observations
+        np.testing.assert_allclose(transition.rewards, batch.unwrapped.robot_rewards, atol=1e-4)
+        np.testing.assert_array_equal(transition.done, terminated | truncated)
+        np.testing.assert_array_equal(transition.step.truncated, truncated)
+        ends += int(transition.done.sum())
     assert ends == 8
     batch.close()
 
@@ -150,8 +150,8 @@ def test_who_has_arrived_is_done_and_a_contact_spoils_it() -> None:
 
     def run(controls: Any) -> Any:
         def move(state: EnvState, key: Any) -> Any:
-            state, moment = env.advance(key, state, controls)
-            return state, moment
+            state, transition = env.advance(key, state, controls)
+            return state, transition
 
         return jax.lax.scan(move, env.reset(KEY)[0], jax.random.split(KEY, problem.horizon))[1]
 

@@ -40,10 +40,10 @@ def test_it_steps_the_same_world_robot_by_robot() -> None:
         dones.append(bool(done["__all__"]))
         assert set(done) == {*env.agents, "__all__"}
         assert infos["distance_to_goal"].shape == (2,)
-        expected_state, moment = advance(KEY, expected_state, jnp.stack([actions[agent] for agent in env.agents]))
-        expected = moment.observations
+        expected_state, transition = advance(KEY, expected_state, jnp.stack([actions[agent] for agent in env.agents]))
+        expected = transition.observations
         if count < 8:
-            np.testing.assert_allclose([rewards[agent] for agent in env.agents], moment.rewards, atol=1e-5)
+            np.testing.assert_allclose([rewards[agent] for agent in env.agents], transition.rewards, atol=1e-5)
     assert dones == [False] * 7 + [True, False, False]
     assert int(state.team.steps) == 2
     np.testing.assert_allclose(env.get_obs(state)["robot_1"], observations["robot_1"], atol=1e-6)

@@ -28,12 +28,12 @@ from d4orm_planners.mmd.prior import (
     CLIP,
     LEVELS,
     SIZE,
+    condition,
     kept_signal,
     level_features,
     load_prior,
     posterior,
     predict,
-    tell,
 )
 from d4orm_planners.mmd.tracking import drive_along
 from d4orm_planners.mmd.way_frame import FEATURES, MODES, POINTS, WayFrame, make_frame, sine_table, world_space
@@ -46,12 +46,12 @@ def test_the_network_is_a_residual_perceptron() -> None:
     features = random.normal(size=(2, FEATURES)).astype(np.float32)
     noisy = random.normal(size=(6, SIZE)).astype(np.float32)
     level = random.uniform(size=LEVELS).astype(np.float32)
-    told, clean = np.empty((2, len(prior.into_bias)), np.float32), np.empty((6, SIZE), np.float32)
-    tell(prior, features, told)
-    predict(prior, told, level, np.array([0.6, 0.8], np.float32), noisy, clean)
+    context, clean = np.empty((2, len(prior.into_bias)), np.float32), np.empty((6, SIZE), np.float32)
+    condition(prior, features, context)
+    predict(prior, context, level, np.array([0.6, 0.8], np.float32), noisy, clean)
     whitened = ((features - prior.features_mean) / prior.features_deviation)[np.arange(6) % 2]
     given_ = np.hstack([noisy, np.tile(level, (6, 1))])
-    layer = np.maximum(given_ @ prior.into + whitened @ prior.told + prior.into_bias, 0)
+    layer = np.maximum(given_ @ prior.into + whitened @ prior.context + prior.into_bias, 0)
     for weights, bias in zip(prior.hidden, prior.hidden_bias, strict=True):
         layer = layer + np.maximum(layer @ weights + bias, 0)
     expected = 0.6 * noisy + 0.8 * (layer @ prior.out + prior.out_bias)
@@ -82,7 +82,7 @@ def test_a_model_of_another_kind_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "empty.npz", deviation=np.ones(SIZE))
     with pytest.raises(ValueError, match=r"empty.npz has no features_mean; train it anew"):
         load_prior(tmp_path / "empty.npz")
-    other = load_prior()._replace(told=np.ones((3, 4), np.float32))
+    other = load_prior()._replace(context=np.ones((3, 4), np.float32))
     np.savez(tmp_path / "other.npz", **other._asdict())
     with pytest.raises(
         ValueError, match=rf"a model of {SIZE} modes and 3 features; it must be of {SIZE} and {FEATURES}"

@@ -40,7 +40,7 @@ def test_pairs_and_counts_are_those_of_looking_at_all(dimension: int, data: Any,
     index = PathIndex(paths, RADIUS, margin)
     expected = [(i, j) for i in range(5) for j in range(i + 1, 5) if near(paths, paths[:, i], i, margin)[:, j].any()]
     assert [tuple(pair) for pair in index.pairs().tolist()] == expected
-    met, when = index.count_met([4, 1], np.stack([ways.swapaxes(0, 1)] * 2))
+    met, when = index.count_meetings([4, 1], np.stack([ways.swapaxes(0, 1)] * 2))
     for row, robot in enumerate([4, 1]):
         for way in range(3):
             close = near(paths, ways[:, way], robot, margin)
@@ -67,9 +67,9 @@ def test_who_has_stopped_is_still_met_by_who_comes_later() -> None:
     still = paths.copy()
     still[:, 1] = [9, 0]
     index = PathIndex(still, RADIUS[:2], 0.1)
-    assert index.count_met([0], waiting)[0].tolist() == [[0]]
+    assert index.count_meetings([0], waiting)[0].tolist() == [[0]]
     waiting[0, 0, 30:] = [9, 0]
-    assert [values.tolist() for values in index.count_met([0], waiting)] == [[[1]], [[30]]]
+    assert [values.tolist() for values in index.count_meetings([0], waiting)] == [[[1]], [[30]]]
 
 
 def test_any_number_of_threads_says_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,7 +80,7 @@ def test_any_number_of_threads_says_the_same(monkeypatch: pytest.MonkeyPatch) ->
         monkeypatch.setattr(path_index, "Threads", lambda _, threads=threads: Threads(threads))
         index = PathIndex(paths, np.full(60, 0.15), 0.05)
         ways = np.ascontiguousarray(paths.swapaxes(0, 1))[:, None]
-        results.append([index.pairs(), *index.count_met(np.arange(60), ways)])
+        results.append([index.pairs(), *index.count_meetings(np.arange(60), ways)])
     for other in results[1:]:
         for one, same in zip(results[0], other, strict=True):
             np.testing.assert_array_equal(one, same)

@@ -134,37 +134,37 @@ def test_obstacles_move(scene: Problem, world: World) -> None:
 
 
 def test_the_clock_runs_pauses_and_steps(session: Session) -> None:
-    until(lambda: session.frame.moment.time > 0.2)
+    until(lambda: session.frame.status.time > 0.2)
     session.pause(True)
-    until(lambda: session.frame.moment.state == "paused")
+    until(lambda: session.frame.status.state == "paused")
     before = session.frame
     time.sleep(0.3)
     assert session.frame is before, "pause pauses"
     session.step()
-    until(lambda: session.frame.moment.number > before.moment.number)
-    assert session.frame.moment.time == pytest.approx(before.moment.time + 0.1)
-    assert session.frame.moment.state == "paused"
+    until(lambda: session.frame.status.number > before.status.number)
+    assert session.frame.status.time == pytest.approx(before.status.time + 0.1)
+    assert session.frame.status.state == "paused"
 
 
 def test_a_team_goes_on_from_where_it_is(session: Session) -> None:
-    until(lambda: session.frame.moment.time > 0.4)
+    until(lambda: session.frame.status.time > 0.4)
     session.pause(True)
-    until(lambda: session.frame.moment.state == "paused")
-    states, elapsed = session.frame.states, session.frame.moment.time
+    until(lambda: session.frame.status.state == "paused")
+    states, elapsed = session.frame.states, session.frame.status.time
     session.edit(lambda scene: edits.move_goal(scene, 0, [0.7, 0.9]))
     until(lambda: np.allclose(session.frame.goals[0], [0.7, 0.9]))
     np.testing.assert_array_equal(session.frame.states, states)
-    assert session.frame.moment.time == elapsed
+    assert session.frame.status.time == elapsed
     assert session.frame.replanned >= 0
 
 
 def test_a_robot_is_pushed_in_all_that_drive_and_nobody_plans_anew(session: Session) -> None:
     session.choose("goal", "random")
     session.pause(True)
-    until(lambda: len(session.frames) == 2 and session.frame.moment.state == "paused")
+    until(lambda: len(session.frames) == 2 and session.frame.status.state == "paused")
     before, planned = session.frames, [frame.replanned for frame in session.frames]
     session.push(1, [0.1, -0.2])
-    until(lambda: session.frame.moment.number > before[0].moment.number)
+    until(lambda: session.frame.status.number > before[0].status.number)
     for old, new in zip(before, session.frames, strict=True):
         np.testing.assert_allclose(new.states[1] - old.states[1], [0, 0, 0.1, -0.2], atol=1e-6)
         np.testing.assert_array_equal(np.delete(new.states, 1, 0), np.delete(old.states, 1, 0))
@@ -184,32 +184,32 @@ def test_what_is_let_go_after_somebody_took_it_away_is_refused(session: Session)
     )
     for drop in drops:
         drop()
-    until(lambda: session.frame.moment.refused == len(drops))
+    until(lambda: session.frame.status.refused == len(drops))
     assert session.failure is None
 
 
 def test_who_is_farthest_from_its_goal_is_pushed_and_who_has_docked_is_not(session: Session) -> None:
     session.set_speed(50)
-    until(lambda: session.frame.moment.state == "arrived")
+    until(lambda: session.frame.status.state == "arrived")
     session.push(0, [0.3, 0.0])
-    until(lambda: session.frame.moment.message)
-    assert "robot_0 of goal has docked" in session.frame.moment.message
+    until(lambda: session.frame.status.message)
+    assert "robot_0 of goal has docked" in session.frame.status.message
     session.edit(lambda scene: edits.move_goal(scene, 2, [0.7, 0.9]))
-    until(lambda: session.frame.moment.state == "running")
+    until(lambda: session.frame.status.state == "running")
     session.pause(True)
-    until(lambda: session.frame.moment.state == "paused")
+    until(lambda: session.frame.status.state == "paused")
     before = session.frame
     session.push(None, [0.0, 0.1])
-    until(lambda: session.frame.moment.number > before.moment.number)
+    until(lambda: session.frame.status.number > before.status.number)
     assert np.flatnonzero((session.frame.states != before.states).any(axis=1)).tolist() == [2]
 
 
 def test_a_change_that_is_refused_leaves_the_scene_and_says_why(session: Session) -> None:
     session.edit(lambda scene: edits.move_goal(scene, 0, scene.goal[1]))
-    until(lambda: session.frame.moment.message)
-    assert "would touch" in session.frame.moment.message
+    until(lambda: session.frame.status.message)
+    assert "would touch" in session.frame.status.message
     session.choose("nobody")
-    until(lambda: "nobody" in session.frame.moment.message)
+    until(lambda: "nobody" in session.frame.status.message)
     assert session.policies == ("goal",)
     assert session.failure is None
 
@@ -220,22 +220,22 @@ def test_a_step_that_fails_pauses_and_says_why(session: Session, monkeypatch: py
 
     with monkeypatch.context() as patch:
         patch.setattr(session._lanes[0]._env, "step", fail)
-        until(lambda: session.frame.moment.message)
-    assert session.frame.moment.message == "no room for a goal"
-    assert session.frame.moment.state == "paused"
+        until(lambda: session.frame.status.message)
+    assert session.frame.status.message == "no room for a goal"
+    assert session.frame.status.state == "paused"
     session.pause(False)
-    until(lambda: session.frame.moment.state == "running" and not session.frame.moment.message)
+    until(lambda: session.frame.status.state == "running" and not session.frame.status.message)
 
 
 def test_everybody_arrives_and_is_sent_on(session: Session) -> None:
     session.set_speed(50)
-    until(lambda: session.frame.moment.state == "arrived")
+    until(lambda: session.frame.status.state == "arrived")
     session.edit(lambda scene: edits.move_goal(scene, 0, [0.7, 0.9]))
-    until(lambda: session.frame.moment.state == "running")
-    until(lambda: session.frame.moment.state == "arrived")
+    until(lambda: session.frame.status.state == "running")
+    until(lambda: session.frame.status.state == "arrived")
     assert np.linalg.norm(session.frame.states[0, :2] - [0.7, 0.9]) < 0.1
     session.set_lifelong(True)
-    until(lambda: session.frame.moment.state == "running")
+    until(lambda: session.frame.status.state == "running")
 
 
 def test_what_happened_becomes_a_replay(session: Session) -> None:
@@ -259,10 +259,10 @@ def test_a_replay_shows_intruders_while_they_were_there(session: Session) -> Non
 
 
 def test_reset_begins_the_scene_anew(session: Session, scene: Problem) -> None:
-    until(lambda: session.frame.moment.time > 0.2)
+    until(lambda: session.frame.status.time > 0.2)
     session.pause(True)
     session.reset()
-    until(lambda: session.frame.moment.time == 0)
+    until(lambda: session.frame.status.time == 0)
     np.testing.assert_array_equal(session.frame.states, scene.start)
 
 
@@ -277,24 +277,24 @@ def test_a_scene_that_the_policy_cannot_drive_in_is_left(session: Session) -> No
     session.choose("orca")
     until(lambda: session.policies == ("orca",))
     session.load(lambda: make_problem("sphere", num_robots=2))
-    until(lambda: session.frame.moment.message)
-    assert "orca" in session.frame.moment.message
-    moment = session.frame.moment.time
-    until(lambda: session.frame.moment.time > moment + 0.3)
+    until(lambda: session.frame.status.message)
+    assert "orca" in session.frame.status.message
+    status = session.frame.status.time
+    until(lambda: session.frame.status.time > status + 0.3)
     assert session.frame.problem.dimension == 2
 
 
 def test_policies_drive_side_by_side_with_the_same_seed(session: Session, scene: Problem) -> None:
-    until(lambda: session.frame.moment.time > 0.3)
+    until(lambda: session.frame.status.time > 0.3)
     session.choose("goal", "random")
     session.reset()
     until(lambda: len(session.frames) == 2 and session.recorded_steps > 3)
     session.pause(True)
-    until(lambda: session.frame.moment.state == "paused")
+    until(lambda: session.frame.status.state == "paused")
     first, second = session.frames
     assert [frame.policy for frame in session.frames] == ["goal", "random"]
     assert not np.array_equal(first.states, second.states)
-    assert first.moment is second.moment
+    assert first.status is second.status
     motions = session.replay().motions
     assert [motion.content["title"].partition(",")[0] for motion in motions] == ["goal", "random"]
     session.choose("random")
@@ -311,7 +311,7 @@ def test_what_is_changed_for_one_is_changed_for_all(session: Session) -> None:
     session.set_speed(5)
     until(lambda: len(session.frames) == 2 and session.recorded_steps > 25)
     session.pause(True)
-    until(lambda: session.frame.moment.state == "paused")
+    until(lambda: session.frame.status.state == "paused")
     before = session.frames
     session.edit(lambda scene: edits.move_goal(scene, 0, [0.7, 0.9]), lane=1)
     until(lambda: np.allclose(session.frame.goals[0], [0.7, 0.9]))
@@ -326,18 +326,18 @@ def test_what_is_changed_for_one_is_changed_for_all(session: Session) -> None:
     assert session.frames[1].problem.world == session.frame.problem.world
     occupied = session.frames[1].states[2, :2]
     session.edit(lambda scene: edits.move_robot(scene, 0, occupied))
-    until(lambda: session.frame.moment.message)
-    assert session.frame.moment.message.startswith("random: the robot of robot_0 would touch")
+    until(lambda: session.frame.status.message)
+    assert session.frame.status.message.startswith("random: the robot of robot_0 would touch")
 
 
 @pytest.mark.parametrize("policies", [(), ("goal", "goal"), ("goal", "nobody")])
 def test_a_choice_that_cannot_be_leaves_who_drives(session: Session, policies: tuple[str, ...]) -> None:
     session.choose(*policies)
-    until(lambda: session.frame.moment.message)
+    until(lambda: session.frame.status.message)
     assert session.policies == ("goal",)
-    moment = session.frame.moment.time
+    status = session.frame.status.time
     session.pause(False)
-    until(lambda: session.frame.moment.time > moment)
+    until(lambda: session.frame.status.time > status)
 
 
 @pytest.mark.parametrize("name", sorted(DISTURBANCES))
@@ -348,9 +348,9 @@ def test_whatever_goes_wrong_goes_wrong_from_the_next_step_on(session: Session, 
     until(lambda: session.levels == {name: level})
     assert session._lanes[0]._env.unwrapped._simulation.disturbances
     assert len(session.frame.bodies) == (2 if name == "intruder" else 0)
-    moment = session.frame.moment
-    assert not moment.message
-    until(lambda: session.frame.moment.time > moment.time or session.frame.finished)
+    status = session.frame.status
+    assert not status.message
+    until(lambda: session.frame.status.time > status.time or session.frame.finished)
     session.disturb({})
     until(lambda: not session.levels)
     assert not session._lanes[0]._env.unwrapped._simulation.disturbances
@@ -358,7 +358,7 @@ def test_whatever_goes_wrong_goes_wrong_from_the_next_step_on(session: Session, 
 
 def test_the_page_shows_the_truth_and_not_what_the_policy_sees(session: Session) -> None:
     session.pause(True)
-    until(lambda: session.frame.moment.state == "paused")
+    until(lambda: session.frame.status.state == "paused")
     states = session.frame.states
     session.disturb({"state_noise": 0.2})
     until(lambda: session.levels)
@@ -369,7 +369,7 @@ def test_the_page_shows_the_truth_and_not_what_the_policy_sees(session: Session)
 def test_a_level_that_makes_no_sense_is_left(session: Session) -> None:
     session.disturb({"dropout": 0.5})
     session.disturb({"dropout": 7.0})
-    until(lambda: session.frame.moment.message)
+    until(lambda: session.frame.status.message)
     assert session.levels == {"dropout": 0.5}
 
 
@@ -377,29 +377,29 @@ def test_a_slow_planner_holds_nobody_up(session: Session, monkeypatch: pytest.Mo
     go_on = threading.Event()
     monkeypatch.setattr(DriveToGoal, "_begin", lambda *_: go_on.wait(PATIENCE))
     session.reset()
-    until(lambda: session.frame.moment.state == "planning")
+    until(lambda: session.frame.status.state == "planning")
     begin = time.monotonic()
     session.set_speed(2)
     session.disturb({})
     assert session.replay().html
     assert session.scene.num_robots == 4
     assert time.monotonic() - begin < PATIENCE, "nobody waits for the planner"
-    assert session.frame.moment.state == "planning"
+    assert session.frame.status.state == "planning"
     go_on.set()
-    until(lambda: session.frame.moment.state == "running")
+    until(lambda: session.frame.status.state == "running")
 
 
 def test_a_policy_that_predicts_looks_as_far_as_it_is_told(scene: Problem) -> None:
     session = Session(scene, "d4orm-c2f")
     session.start()
     session.set_horizon(7)
-    until(lambda: session.frame.moment.number > 2)
+    until(lambda: session.frame.status.number > 2)
     session.choose("goal")
     until(lambda: session.policies == ("goal",) and session.frame.guidance is None)
     session.set_horizon(0)
     session.choose("d4orm-c2f")
-    until(lambda: session.frame.moment.message)
-    assert "predict_horizon" in session.frame.moment.message
+    until(lambda: session.frame.status.message)
+    assert "predict_horizon" in session.frame.status.message
     session.close()
     assert session.failure is None
 

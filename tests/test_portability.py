@@ -60,7 +60,7 @@ def kernels() -> Iterator[tuple[str, Any]]:
     yield "settle", wavefront.settle_nodes
     yield "drive", drive_kernel("differential_drive")
     yield "search", search_kernel("differential_drive")
-    yield "meetings", path_index._count_met
+    yield "meetings", path_index._count_meetings
     yield "alternate", alternate
     yield "roll out", worlds.world_kernels(("holonomic2d",)).roll_out
 

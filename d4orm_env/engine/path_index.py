@@ -113,7 +113,7 @@ class PathIndex:
         met = np.unique(np.concatenate(list(parts.values())))
         return np.stack(np.divmod(met, num_robots), axis=1)
 
-    def count_met(
+    def count_meetings(
         self, robots: ArrayLike, ways: FloatArray, until: ArrayLike | None = None
     ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """How many others each of some robots would meet on each of some ways, if nobody else's changed.
@@ -129,7 +129,7 @@ class PathIndex:
         index, paths = np.asarray(robots, np.int64), np.ascontiguousarray(ways, np.float32)
         last = np.full(len(index), paths.shape[2]) if until is None else np.asarray(until, np.int64)
         met, when = np.empty((2, *paths.shape[:2]), np.int32)
-        self._threads.over(len(index), lambda part: _count_met(self.table, index, paths, last, part, met, when))
+        self._threads.over(len(index), lambda part: _count_meetings(self.table, index, paths, last, part, met, when))
         return met, when
 
 
@@ -340,7 +340,7 @@ def _pairs(table: PathTable, block_range: IntArray) -> IntArray:
 
 
 @cached_kernel(SOURCES, **OPTIONS)
-def _count_met(
+def _count_meetings(
     table: PathTable,
     robots: IntArray,
     ways: FloatArray,
@@ -349,7 +349,7 @@ def _count_met(
     counts: Ints,
     when: Ints,
 ) -> None:
-    """See :meth:`PathIndex.count_met`."""
+    """See :meth:`PathIndex.count_meetings`."""
     num_ways, num_blocks = ways.shape[1], table.first.shape[0]
     met = np.empty((num_ways, table.places.shape[1]), np.bool_)
     for r in range(robot_range[0], robot_range[1]):

@@ -70,17 +70,18 @@ class JaxMARLNavigation(MultiAgentEnv):
     ) -> tuple[ByAgent, EnvState, ByAgent, ByAgent, dict[str, jax.Array]]:
         """One step without auto-reset, which ``step`` adds; ``actions`` are controls ``(m,)`` by agent."""
         controls = jnp.stack([actions[agent] for agent in self.agents])
-        state, moment = self.world.advance(key, state, controls)
-        dones = self._by_agent(moment.finished | moment.done) | {"__all__": moment.done}
+        state, transition = self.world.advance(key, state, controls)
+        dones = self._by_agent(transition.finished | transition.done) | {"__all__": transition.done}
         infos = {
-            "acted": moment.acted,
-            "arrived": moment.step.arrived,
-            "collided": moment.step.collided,
-            "margin_violated": moment.step.margin_violated,
-            "distance_to_goal": moment.step.distances,
-            "success": moment.success,
+            "acted": transition.acted,
+            "arrived": transition.step.arrived,
+            "collided": transition.step.collided,
+            "margin_violated": transition.step.margin_violated,
+            "distance_to_goal": transition.step.distances,
+            "success": transition.success,
         }
-        return self._by_agent(moment.observations), state, self._by_agent(moment.rewards * moment.acted), dones, infos
+        rewards = self._by_agent(transition.rewards * transition.acted)
+        return self._by_agent(transition.observations), state, rewards, dones, infos
 
     def get_obs(self, state: EnvState) -> ByAgent:
         """Observations ``(D,)`` by agent."""

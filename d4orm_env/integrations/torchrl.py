@@ -120,20 +120,20 @@ class TorchRLNavigation(EnvBase):
             mask = asked.reshape(-1).cpu().numpy()
         observations, infos = self.worlds.reset(seed=self._seed_at_reset, options={"reset_mask": mask})
         self._seed_at_reset = None
-        return self._told(observations, infos, mask, np.zeros_like(mask), np.zeros_like(mask))
+        return self._as_tensors(observations, infos, mask, np.zeros_like(mask), np.zeros_like(mask))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         controls = tensordict[GROUP, "action"].detach().cpu().numpy().reshape(self._shape[0], -1)
         acted = self._info["acting"].copy()
         observations, _, terminated, truncated, infos = self.worlds.step(controls)
-        told = self._told(observations, infos, np.ones_like(terminated), terminated, truncated)
-        told[GROUP, "reward"] = self._tensor(self.worlds.robot_rewards * acted)[..., None]
-        return told
+        after = self._as_tensors(observations, infos, np.ones_like(terminated), terminated, truncated)
+        after[GROUP, "reward"] = self._tensor(self.worlds.robot_rewards * acted)[..., None]
+        return after
 
-    def _told(
+    def _as_tensors(
         self, observations: FloatArray, infos: Info, mask: BoolArray, terminated: BoolArray, truncated: BoolArray
     ) -> TensorDictBase:
-        """What TorchRL is told of a moment; ``mask`` ``(B,)`` says where the infos count."""
+        """The tensors that TorchRL takes; ``mask`` ``(B,)`` says where the infos count."""
         success = np.broadcast_to(infos["is_success"][:, None], self._shape)
         now = {"acting": ~infos["arrived"], "collided": infos["collided"], "success": success}
         for name, values in now.items():

@@ -334,9 +334,9 @@ def _measure_functional(settings: BenchmarkSettings) -> Row:
     def move(carry: tuple[EnvState, Any], key: jax.Array) -> tuple[tuple[EnvState, Any], None]:
         (state, total), keys = carry, jax.random.split(key, 1 + size)
         controls = jax.random.uniform(keys[0], (size, *limits.shape), minval=-limits, maxval=limits)
-        state, moment = jax.vmap(env.step)(keys[1:], state, controls)
+        state, transition = jax.vmap(env.step)(keys[1:], state, controls)
         # What nobody reads would not be computed.
-        return (state, total + moment.rewards.sum() + moment.observations.sum()), None
+        return (state, total + transition.rewards.sum() + transition.observations.sum()), None
 
     @jax.jit
     def steps(state: EnvState, key: jax.Array) -> tuple[EnvState, float]:

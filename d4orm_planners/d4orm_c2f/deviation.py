@@ -67,16 +67,16 @@ class Deviation:
 
     def observe(self, joint: JointState) -> JointState:
         """Compare where the robots are with where they were expected; where they will be once commands arrive."""
-        told = self.lateness.observe(joint.controls, ~joint.arrived)
+        commanded = self.lateness.observe(joint.controls, ~joint.arrived)
         joint = self._filtered(joint)
         going = ~joint.arrived if self.standing is None else ~joint.arrived & ~self.standing.robots
         if self.losses is not None:
-            going &= ~self.losses.observe(told, joint.controls, going)
+            going &= ~self.losses.observe(commanded, joint.controls, going)
         if self._weakness is not None:
-            self._weakness.observe(told, joint.controls, going)
+            self._weakness.observe(commanded, joint.controls, going)
             self.problem = self._weakness.problem
         if self.standing is not None:
-            joint = self.standing.observe(joint, told)
+            joint = self.standing.observe(joint, commanded)
         if self._expected is not None:
             self._compare(joint, *self._expected)
         self._seen = joint

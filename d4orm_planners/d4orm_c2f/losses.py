@@ -38,16 +38,16 @@ class Losses:
         self._sent, self._lost = BEFORE, 0
         self.run = 0
 
-    def observe(self, told: FloatArray, executed: FloatArray, going: BoolArray) -> BoolArray:
+    def observe(self, commanded: FloatArray, executed: FloatArray, going: BoolArray) -> BoolArray:
         """``(K,)`` who goes on with the command before, or stands as before, whatever it was told.
 
         Args:
-            told: ``(K, m)`` the commands that should have been executed in the last step.
+            commanded: ``(K, m)`` the commands that should have been executed in the last step.
             executed: ``(K, m)`` those that were.
             going: ``(K,)`` whose tell anything: docked robots execute none.
         """
-        lost: BoolArray = going & (executed == self._last).all(axis=1) & (executed != told).any(axis=1)
-        new = going & (effort(self._problem, told - self._last) > NOTICED)
+        lost: BoolArray = going & (executed == self._last).all(axis=1) & (executed != commanded).any(axis=1)
+        new = going & (effort(self._problem, commanded - self._last) > NOTICED)
         # Whoever stands may be kept from moving by something else.
         self._lost += int((lost & new & executed.any(axis=1)).sum())
         self._sent += int(new.sum())

@@ -12,26 +12,26 @@ from d4orm_planners.d4orm_c2f.weakness import effort
 from d4orm_planners.steering import present_velocities, track_velocities
 
 AFTER = 8
-"""Steps in a row in which a robot does nothing of what it is told, after which it has stalled."""
+"""Steps in a row in which a robot does nothing of what it is commanded, after which it has stalled."""
 
 BRAKING_AFTER = 3
 """The same of steps in which it brakes as hard as it can instead."""
 
 RESISTING = 0.5
-"""Braking as hard counts from this share of its limits on, and instead if what it was told is as far from it."""
+"""Braking as hard counts from this share of its limits on, and instead if what it was commanded is as far from it."""
 
-TOLD, DONE = 0.2, 0.1
-"""What counts as being told something, as a share of a robot's limits; and as doing it, as a share of that."""
+COMMANDED, DONE = 0.2, 0.1
+"""What counts as being commanded something, as a share of a robot's limits; and as doing it, as a share of that."""
 
 MOVED = 0.1
 """How far it gets from there to be back [m]."""
 
 PROBE = 0.1
-"""Share of its limits that a robot that has stalled is told, so that it is seen when it obeys again."""
+"""Share of its limits that a robot that has stalled is commanded, so that it is seen when it obeys again."""
 
 
 class Standing:
-    """Watches an episode for robots that brake or stand whatever they are told.
+    """Watches an episode for robots that brake or stand whatever they are commanded.
 
     Args:
         problem: The robots.
@@ -47,20 +47,20 @@ class Standing:
         self._places = np.zeros((problem.num_robots, self._d), np.float32)
         self._brakes: FloatArray = np.zeros((problem.num_robots, problem.control_size), np.float32)
 
-    def observe(self, joint: JointState, told: FloatArray) -> JointState:
+    def observe(self, joint: JointState, commanded: FloatArray) -> JointState:
         """The joint state, in which those that do not obey are docked where they are, or will come to rest.
 
         Args:
             joint: Where the robots are.
-            told: ``(K, m)`` the commands that should have been executed in the last step.
+            commanded: ``(K, m)`` the commands that should have been executed in the last step.
         """
         problem, places = self._problem, joint.states[:, : self._d]
-        asked, done = effort(problem, told), effort(problem, joint.controls)
-        idle = (asked > TOLD) & (done < DONE * asked)
+        asked, done = effort(problem, commanded), effort(problem, joint.controls)
+        idle = (asked > COMMANDED) & (done < DONE * asked)
         self._idle[idle] += 1
-        self._idle[(asked > TOLD) & ~idle | joint.arrived] = 0
+        self._idle[(asked > COMMANDED) & ~idle | joint.arrived] = 0
         braking = effort(problem, joint.controls - self._brakes) < DONE
-        hard = (effort(problem, self._brakes) > RESISTING) & (effort(problem, told - self._brakes) > RESISTING)
+        hard = (effort(problem, self._brakes) > RESISTING) & (effort(problem, commanded - self._brakes) > RESISTING)
         self._braking = np.where(braking & hard & ~joint.arrived, self._braking + 1, 0)
         new = ((self._idle >= AFTER) | (self._braking >= BRAKING_AFTER)) & ~self.robots
         self.robots = self.robots | new

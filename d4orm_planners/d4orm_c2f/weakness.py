@@ -60,9 +60,9 @@ class Weakness:
         self._asked = np.zeros(problem.num_robots, int)
         self._seen, self._added = 0, np.zeros((problem.num_robots, problem.control_size))
 
-    def observe(self, told: FloatArray, executed: FloatArray, going: BoolArray) -> None:
+    def observe(self, commanded: FloatArray, executed: FloatArray, going: BoolArray) -> None:
         """Compare commands ``(K, m)`` with what those ``going`` ``(K,)`` executed of them."""
-        asked = effort(self._first, told)
+        asked = effort(self._first, commanded)
         most = going & (asked >= AT_LIMIT)
         self._asked += most
         done = effort(self._first, executed) / np.maximum(asked, AT_LIMIT)
@@ -71,7 +71,7 @@ class Weakness:
         share = np.where(weak, self._most, 1.0)
         # A weak robot does that share of everything, or all that it is asked to up to that share of its limits.
         capped = np.where(weak, share / np.maximum(np.maximum(asked, share), 1e-9), 1.0)
-        scaled, cut = (np.asarray(executed, np.float64) - factor[:, None] * told for factor in (share, capped))
+        scaled, cut = (np.asarray(executed, np.float64) - factor[:, None] * commanded for factor in (share, capped))
         nearer = effort(self._first, cut) < effort(self._first, scaled)
         added = np.where(nearer[:, None], cut, scaled) * going[:, None]
         self._seen += 1

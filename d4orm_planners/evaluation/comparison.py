@@ -150,12 +150,12 @@ def compare_pairs(groups: Iterable[TrialGroup]) -> list[PairedPolicies]:
 
 
 def _compared(first: TrialGroup, second: TrialGroup) -> PairedPolicies | None:
-    met = in_common(first.trials, second.trials)
-    if not met:
+    common = in_common(first.trials, second.trials)
+    if not common:
         return None
-    won = np.array([(one.success, other.success) for one, other in met], float)
+    won = np.array([(one.success, other.success) for one, other in common], float)
     only_first, only_second = int((won[:, 0] > won[:, 1]).sum()), int((won[:, 0] < won[:, 1]).sum())
-    slower = [_time(one) - _time(other) for one, other in met if one.success and other.success]
+    slower = [_time(one) - _time(other) for one, other in common if one.success and other.success]
     trial, lower, upper = first.trials[0], *_bootstrap(won[:, 0] - won[:, 1])
     slower_lower, slower_upper = _bootstrap(slower) if len(slower) > 1 else (None, None)
     return PairedPolicies(
@@ -167,7 +167,7 @@ def _compared(first: TrialGroup, second: TrialGroup) -> PairedPolicies | None:
         level=first.level,
         first=first.label,
         second=second.label,
-        trials=len(met),
+        trials=len(common),
         only_first=only_first,
         only_second=only_second,
         p_value=mcnemar(only_first, only_second),

@@ -60,11 +60,13 @@ def _groups(trials: Sequence[Trial]) -> dict[Key, list[Trial]]:
     for trial in trials:
         label = labels[trial.label, trial.model, trial.config]
         where = (trial.scenario, trial.num_robots, trial.model, trial.physics)
-        groups.setdefault((label, *where, trial.control_noise_std, told(trial.disturbances)), []).append(trial)
+        groups.setdefault(
+            (label, *where, trial.control_noise_std, describe_disturbances(trial.disturbances)), []
+        ).append(trial)
     return {key: groups[key] for key in sorted(groups, key=lambda key: (*key[1:], key[0]))}
 
 
-def told(disturbances: str) -> str:
+def describe_disturbances(disturbances: str) -> str:
     """Disturbances as they are stored, in words: ``"push rate=0.2, speed=0.5; delay steps=2"``."""
     listed = json.loads(disturbances)
     return "; ".join(

@@ -238,7 +238,7 @@ def _varied(name: str, levels: Levels) -> list[Varied]:
         raise ValueError(f"disturbances[{name!r}] is empty; give at least one level")
     if all(isinstance(one, Disturbance | Sequence) and not isinstance(one, str) and _holds(one) for one in listed):
         chosen = [checked_disturbances(one) for one in listed]
-        return [(name, one, level) for one, level in zip(chosen, _told(chosen))]
+        return [(name, one, level) for one, level in zip(chosen, _levels_of(chosen))]
     made = [(level, disturbance_at(name, level)) for level in listed]
     return [(name, (one,), _number(level, place)) for place, (level, one) in enumerate(made)]
 
@@ -248,7 +248,7 @@ def _holds(given: object) -> bool:
     return isinstance(given, Disturbance) or all(isinstance(one, Disturbance) for one in given)  # type: ignore[attr-defined] # a sequence
 
 
-def _told(chosen: Sequence[tuple[AnyDisturbance, ...]]) -> list[float]:
+def _levels_of(chosen: Sequence[tuple[AnyDisturbance, ...]]) -> list[float]:
     """The levels of disturbances that were given themselves: the number in which they differ, or their places."""
     if all(len(one) == 1 and type(one[0]) is type(chosen[0][0]) for one in chosen):
         values = [attributes_of(one[0]) for one in chosen]

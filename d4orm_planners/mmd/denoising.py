@@ -12,7 +12,7 @@ from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.draws import draw_normals, draw_uniforms
 from d4orm_planners.mmd.guiding import Surroundings, guide
-from d4orm_planners.mmd.prior import SIZE, Prior, kept_signal, level_features, load_prior, posterior, predict, tell
+from d4orm_planners.mmd.prior import SIZE, Prior, condition, kept_signal, level_features, load_prior, posterior, predict
 from d4orm_planners.mmd.tracking import Tracked, drive_along
 from d4orm_planners.mmd.way_frame import WayFrame, sine_table
 
@@ -73,14 +73,14 @@ class Denoiser:
         kept = self._signal[first].astype(np.float32)
         motions = noise if before is None else np.sqrt(kept) * before + np.sqrt(1 - kept) * noise
         durations = self._durations(frame, draw)
-        told = np.empty((len(frame.axes), len(self._prior.into_bias)), np.float32)
-        tell(self._prior, frame.features, told)
+        context = np.empty((len(frame.axes), len(self._prior.into_bias)), np.float32)
+        condition(self._prior, frame.features, context)
         done, clean = 0, np.empty_like(motions)
         for step in range(first, 0, -1):
             if self._should_stop():
                 break
             roots = np.sqrt([self._signal[step], 1 - self._signal[step]]).astype(np.float32)
-            predict(self._prior, told, self._levels[step], roots, motions, clean)
+            predict(self._prior, context, self._levels[step], roots, motions, clean)
             if step <= config.guide_from * config.num_steps:
                 guide(frame, self._sines, self._deviation, surroundings, durations, config.guide_steps, clean)
             motions = self._less_noisy(step, motions, clean, draw)

@@ -39,7 +39,7 @@ class Prior(NamedTuple):
         features_mean: ``(FEATURES,)``.
         features_deviation: ``(FEATURES,)``.
         into: ``(SIZE + LEVELS, W)`` from motion and noise level to the first layer.
-        told: ``(FEATURES, W)`` from the features to the first layer.
+        context: ``(FEATURES, W)`` from the features to the first layer.
         into_bias: ``(W,)``.
         hidden: ``(L, W, W)``.
         hidden_bias: ``(L, W)``.
@@ -51,7 +51,7 @@ class Prior(NamedTuple):
     features_mean: FloatArray
     features_deviation: FloatArray
     into: FloatArray
-    told: FloatArray
+    context: FloatArray
     into_bias: FloatArray
     hidden: FloatArray
     hidden_bias: FloatArray
@@ -71,9 +71,9 @@ def load_prior(path: Path = WEIGHTS) -> Prior:
         if missing:
             raise ValueError(f"{path} has no {missing[0]}; train it anew: python -m d4orm_planners.mmd.training")
         prior = Prior(*(np.ascontiguousarray(file[name], np.float32) for name in Prior._fields))
-    if prior.into.shape[0] != SIZE + LEVELS or prior.told.shape[0] != FEATURES:
+    if prior.into.shape[0] != SIZE + LEVELS or prior.context.shape[0] != FEATURES:
         raise ValueError(
-            f"{path} is a model of {prior.into.shape[0] - LEVELS} modes and {prior.told.shape[0]} features; it must "
+            f"{path} is a model of {prior.into.shape[0] - LEVELS} modes and {prior.context.shape[0]} features; it must "
             f"be of {SIZE} and {FEATURES}: train it anew: python -m d4orm_planners.mmd.training"
         )
     return prior
@@ -106,35 +106,35 @@ def posterior(now: float, then: float) -> tuple[float, float, float]:
     return float(of_clean), float(of_noisy), float(np.sqrt((1 - then) / (1 - now) * (1 - ratio)))
 
 
-@cached_kernel(fingerprint((compiling,)), variant="tell", **OPTIONS)
-def tell(prior: Prior, features: FloatArray, told: FloatArray) -> None:
-    """Fill ``told`` ``(P, W)`` with what features ``(P, FEATURES)`` add to the first layer, its bias included."""
+@cached_kernel(fingerprint((compiling,)), variant="condition", **OPTIONS)
+def condition(prior: Prior, features: FloatArray, context: FloatArray) -> None:
+    """Fill ``context`` ``(P, W)`` with what features ``(P, FEATURES)`` add to the first layer, its bias included."""
     for p in range(features.shape[0]):
-        told[p] = prior.into_bias
+        context[p] = prior.into_bias
         for i in range(features.shape[1]):
             value = (features[p, i] - prior.features_mean[i]) / prior.features_deviation[i]
-            for j in range(told.shape[1]):
-                told[p, j] += value * prior.told[i, j]
+            for j in range(context.shape[1]):
+                context[p, j] += value * prior.context[i, j]
 
 
 @cached_kernel(fingerprint((compiling,)), variant="predict", **OPTIONS)
 def predict(
-    prior: Prior, told: FloatArray, level: FloatArray, signal: FloatArray, noisy: FloatArray, clean: FloatArray
+    prior: Prior, context: FloatArray, level: FloatArray, signal: FloatArray, noisy: FloatArray, clean: FloatArray
 ) -> None:
     """Fill ``clean`` ``(B, SIZE)`` with what the network takes noisy motions ``(B, SIZE)`` to be without their noise.
 
     Args:
         prior: The model.
-        told: ``(P, W)`` of :func:`tell`; motion ``b`` is of direction ``b`` modulo ``P``.
+        context: ``(P, W)`` of :func:`condition`; motion ``b`` is of direction ``b`` modulo ``P``.
         level: ``(LEVELS,)`` of :func:`level_features`.
         signal: ``(2,)`` float32 roots of ``alpha_bar`` and of ``1 - alpha_bar``.
         noisy: ``(B, SIZE)`` float32, whitened.
         clean: The same, output, within :data:`CLIP`.
     """
-    width, size = told.shape[1], noisy.shape[1]
+    width, size = context.shape[1], noisy.shape[1]
     layer, change = np.empty(width, np.float32), np.empty(width, np.float32)
     for b in range(noisy.shape[0]):
-        layer[:] = told[b % told.shape[0]]
+        layer[:] = context[b % context.shape[0]]
         for i in range(size + level.shape[0]):
             value = noisy[b, i] if i < size else level[i - size]
             for j in range(width):

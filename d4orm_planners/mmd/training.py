@@ -36,14 +36,14 @@ class DenoisingNetwork(nn.Module):
     def __init__(self, width: int, layers: int) -> None:
         super().__init__()
         self.into = nn.Linear(SIZE + LEVELS, width)
-        self.told = nn.Linear(FEATURES, width, bias=False)
+        self.context = nn.Linear(FEATURES, width, bias=False)
         self.hidden = nn.ModuleList(nn.Linear(width, width) for _ in range(layers))
         self.out = nn.Linear(width, SIZE)
         nn.init.zeros_(self.out.weight)
 
     def forward(self, noisy: Tensor, level: Tensor, features: Tensor) -> Tensor:
         """What is to be added to ``sqrt(alpha_bar)`` times the noisy motion, over ``sqrt(1 - alpha_bar)``."""
-        layer = torch.relu(self.into(torch.cat([noisy, level], dim=1)) + self.told(features))
+        layer = torch.relu(self.into(torch.cat([noisy, level], dim=1)) + self.context(features))
         for hidden in self.hidden:
             layer = layer + torch.relu(hidden(layer))
         result: Tensor = self.out(layer)
@@ -105,8 +105,8 @@ def _weights(network: DenoisingNetwork, deviation: np.ndarray, mean: np.ndarray,
     linear = [network.into, *network.hidden, network.out]
     into, *hidden, out = (layer.weight.detach().numpy().T for layer in linear)
     into_bias, *hidden_bias, out_bias = (layer.bias.detach().numpy() for layer in linear)
-    told = network.told.weight.detach().numpy().T
-    arrays = (deviation, mean, spread, into, told, into_bias, np.stack(hidden), np.stack(hidden_bias), out, out_bias)
+    context = network.context.weight.detach().numpy().T
+    arrays = (deviation, mean, spread, into, context, into_bias, np.stack(hidden), np.stack(hidden_bias), out, out_bias)
     return Prior(*(np.ascontiguousarray(array, np.float32) for array in arrays))
 
 

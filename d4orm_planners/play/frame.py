@@ -11,7 +11,7 @@ from d4orm_env.core.problem import Problem
 
 
 @dataclass(frozen=True)
-class Moment:
+class Status:
     """What all that drive side by side have in common.
 
     Attributes:
@@ -40,7 +40,7 @@ class Frame:
     """A moment of a team that a policy drives.
 
     Attributes:
-        moment: When that is.
+        status: How it goes.
         policy: Name of what drives.
         problem: Team and world; its start and goals are those of the last change.
         states: ``(K, n)`` now.
@@ -58,7 +58,7 @@ class Frame:
         bodies: ``(N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves about and is no robot.
     """
 
-    moment: Moment
+    status: Status
     policy: str
     problem: Problem
     states: FloatArray
@@ -86,8 +86,8 @@ class Frame:
 
     def _share(self, now: float) -> np.float32:
         """How much of the step before this moment has been shown."""
-        moment = self.moment
-        return np.float32(min(max((now - moment.since) / max(moment.pace, 1e-3), 0.0), 1.0))
+        status = self.status
+        return np.float32(min(max((now - status.since) / max(status.pace, 1e-3), 0.0), 1.0))
 
 
 def closest_approach(problem: Problem, states: FloatArray) -> float:

@@ -16,7 +16,7 @@ from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.disturbances.world import pushed
 from d4orm_env.joint_state import JointState, split_state
 from d4orm_planners.play.edits import check_robot
-from d4orm_planners.play.frame import Frame, Moment, closest_approach, guidance, plan
+from d4orm_planners.play.frame import Frame, Status, closest_approach, guidance, plan
 from d4orm_planners.play.recording import Recording
 from d4orm_planners.policy import Policy
 
@@ -129,11 +129,11 @@ class Lane:
         states[robot, : len(within)] = within
         self._observations, _ = self._env.set_state(states)
 
-    def frame(self, moment: Moment) -> Frame:
+    def frame(self, status: Status) -> Frame:
         """What is shown of the present."""
         joint = self._joint
         return Frame(
-            moment=moment,
+            status=status,
             policy=self.name,
             problem=self._scene,
             states=joint.states,

@@ -103,7 +103,7 @@ class LaneView:
     def update(self, frame: Frame, now: float) -> None:
         """Show a frame, where the robots are by a time of ``time.perf_counter()``."""
         nodes = self._nodes  # what has not changed is not sent
-        seen = (frame.moment.number, self._shown["dark"])
+        seen = (frame.status.number, self._shown["dark"])
         if seen != self._seen:
             if seen[0] != self._seen[0]:
                 self._trail = [*self._trail[-TRAIL_STEPS:], frame.states[:, : frame.problem.dimension]]

@@ -80,7 +80,7 @@ class Panel:
         text = status_text(frames)
         if text != self._text:
             self._text = self._status.content = text
-        refused = frames[0].moment.refused
+        refused = frames[0].status.refused
         if refused != self._refused:  # the controls say what is
             self._refused = refused
             self._dials.follow()
@@ -199,10 +199,10 @@ def _send(client: viser.ClientHandle | None, name: str, text: str) -> None:
 
 def status_text(frames: Sequence[Frame]) -> str:
     """What the page says of a moment."""
-    first, moment = frames[0], frames[0].moment
+    first, status = frames[0], frames[0].status
     team = first.problem.num_robots
     who = ", ".join(frame.policy for frame in frames)
-    lines = [f"**{first.problem.name}, {team} robots, {plain(who)}: {moment.state}**", f"time {moment.time:.1f} s"]
+    lines = [f"**{first.problem.name}, {team} robots, {plain(who)}: {status.state}**", f"time {status.time:.1f} s"]
     for frame in frames:
         contacts = int(frame.collided.sum())
         touching = f", **{contacts} in contact**" if contacts else ""
@@ -218,8 +218,8 @@ def status_text(frames: Sequence[Frame]) -> str:
             lines.append(
                 f"**{plain(frame.policy)}**: {arrived}, {100 * frame.closest:.1f} cm{touching}, {loop}, {planning}"
             )
-    if moment.message:
-        lines.append(f"**{plain(moment.message)}**")
+    if status.message:
+        lines.append(f"**{plain(status.message)}**")
     return "  \n".join(lines)
 
 

@@ -17,7 +17,7 @@ MOST_STEPS = 6000
 """Ten minutes at the usual time step; what is older is forgotten."""
 
 
-class _Moment(NamedTuple):
+class _Snapshot(NamedTuple):
     states: FloatArray
     goals: FloatArray
     arrived: BoolArray
@@ -31,41 +31,41 @@ class Recording:
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
-        self._moments: deque[_Moment] = deque(maxlen=MOST_STEPS)
+        self._snapshots: deque[_Snapshot] = deque(maxlen=MOST_STEPS)
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
-        return len(self._moments)
+        return len(self._snapshots)
 
-    def add(self, *moment: np.ndarray) -> None:
-        """Remember a moment.
+    def add(self, *snapshot: np.ndarray) -> None:
+        """Remember a snapshot.
 
         Args:
-            *moment: States ``(K, n)``, goals ``(K, d)``, ``(K,)`` who has arrived, who has collided and who has come
+            *snapshot: States ``(K, n)``, goals ``(K, d)``, ``(K,)`` who has arrived, who has collided and who has come
                 too close, and ``(N, 2 d + 1)`` what moves about and is no robot.
         """
         with self._lock:
-            self._moments.append(_Moment(*moment))
+            self._snapshots.append(_Snapshot(*snapshot))
 
     def motion(self, policy: str) -> ReplayMotion:
         """What happened, for a replay."""
         with self._lock:
-            problem, moments = self._problem, list(self._moments)
-        states = np.stack([moment.states for moment in moments])
-        steps = len(moments) - 1
+            problem, snapshots = self._problem, list(self._snapshots)
+        states = np.stack([snapshot.states for snapshot in snapshots])
+        steps = len(snapshots) - 1
         trajectory = Trajectory(
             states=states,
             positions=states[..., : problem.dimension],
             controls=np.zeros((steps, problem.num_robots, problem.control_size), np.float32),
             rewards=np.zeros((steps, problem.num_robots), np.float32),
-            arrived=np.stack([moment.arrived for moment in moments]),
-            collided=np.stack([moment.collided for moment in moments]),
-            margin_violated=np.stack([moment.violated for moment in moments]),
+            arrived=np.stack([snapshot.arrived for snapshot in snapshots]),
+            collided=np.stack([snapshot.collided for snapshot in snapshots]),
+            margin_violated=np.stack([snapshot.violated for snapshot in snapshots]),
         )
-        goals = np.stack([moment.goals for moment in moments])
+        goals = np.stack([snapshot.goals for snapshot in snapshots])
         bodies = np.zeros(
-            (len(moments), max(len(moment.bodies) for moment in moments), 2 * problem.dimension + 1), np.float32
+            (len(snapshots), max(len(snapshot.bodies) for snapshot in snapshots), 2 * problem.dimension + 1), np.float32
         )
-        for row, moment in zip(bodies, moments):
-            row[: len(moment.bodies)] = moment.bodies
+        for row, snapshot in zip(bodies, snapshots):
+            row[: len(snapshot.bodies)] = snapshot.bodies
         return motion(problem, trajectory, f"{policy}, {steps * problem.dt:.1f} s", goals=goals, bodies=bodies)

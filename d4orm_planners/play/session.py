@@ -22,7 +22,7 @@ from d4orm_env.core.summary import count
 from d4orm_env.disturbances.registry import disturbances_at
 from d4orm_env.render.replay import Replay
 from d4orm_planners.play.edits import Edit, followed
-from d4orm_planners.play.frame import Frame, Moment
+from d4orm_planners.play.frame import Frame, Status
 from d4orm_planners.play.lane import Lane, Terms
 from d4orm_planners.policy import Policy
 from d4orm_planners.registry import make_policy, setting_names
@@ -59,7 +59,7 @@ class Session:
         self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._wake, self._closing = threading.Event(), threading.Event()
         self._paused, self._steps_wanted, self._speed = False, 0, 1.0
-        self._moment = Moment(0, 0, 0.0, 0.0, problem.dt, "planning", "", 0)
+        self._status = Status(0, 0, 0.0, 0.0, problem.dt, "planning", "", 0)
         self._frames: tuple[Frame, ...] = ()
         self._lanes: tuple[Lane, ...] = ()
         self.failure: BaseException | None = None
@@ -269,7 +269,7 @@ class Session:
             if any(not lane.finished for lane in self._lanes):
                 for lane in self._lanes:
                     lane.advance()
-                self._moment = replace(self._moment, time=self._moment.time + self._lanes[0].scene.dt)
+                self._status = replace(self._status, time=self._status.time + self._lanes[0].scene.dt)
                 self._show(self._state, moved=True)
         except (ValueError, RuntimeError) as error:
             self._paused = True
@@ -280,11 +280,11 @@ class Session:
         obeyed = False
         while not self._commands.empty():
             obeyed = True
-            self._moment = replace(self._moment, message="")
+            self._status = replace(self._status, message="")
             try:
                 self._commands.get()()
             except (ValueError, RuntimeError, ImportError) as error:
-                self._moment = replace(self._moment, refused=self._moment.refused + 1)
+                self._status = replace(self._status, refused=self._status.refused + 1)
                 self._show(self._state, first_line(error))
         return obeyed
 
@@ -328,7 +328,7 @@ class Session:
             raise
         self._lanes, self._names, self._terms = lanes, names, terms
         if afresh:
-            self._moment = replace(self._moment, generation=self._moment.generation + 1, time=0.0)
+            self._status = replace(self._status, generation=self._status.generation + 1, time=0.0)
         self._show(self._state, moved=True)
 
     def _driver(self, name: str) -> Policy:
@@ -342,12 +342,12 @@ class Session:
     def _show(self, state: str, message: str | None = None, moved: bool = False) -> None:
         """Make frames of the present; without another message the last one stays."""
         dt = self._lanes[0].scene.dt
-        self._moment = replace(
-            self._moment,
-            number=self._moment.number + 1,
-            since=time.perf_counter() if moved else self._moment.since,
+        self._status = replace(
+            self._status,
+            number=self._status.number + 1,
+            since=time.perf_counter() if moved else self._status.since,
             pace=dt / self._speed,
             state=state,
-            message=self._moment.message if message is None else message,
+            message=self._status.message if message is None else message,
         )
-        self._frames = tuple(lane.frame(self._moment) for lane in self._lanes)
+        self._frames = tuple(lane.frame(self._status) for lane in self._lanes)

@@ -49,7 +49,7 @@ class View:
     def update(self) -> None:
         """Show the present, where the robots are by now."""
         frames = self._session.frames
-        built = (frames[0].moment.generation, *(len(frame.bodies) for frame in frames))
+        built = (frames[0].status.generation, *(len(frame.bodies) for frame in frames))
         if built != self._built:
             self._built = built
             self._rebuild(frames)

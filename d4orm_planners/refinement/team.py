@@ -105,7 +105,7 @@ class TeamPaths:
 
         paths, horizon = np.ascontiguousarray(np.moveaxis(states, 0, 2)), self.problem.horizon
         checked = paths[:, :, :: self._interval]
-        met, meeting = self._checked.count_met(robots, checked)
+        met, meeting = self._checked.count_meetings(robots, checked)
         touching, moves, unsure = judge_alone(self.problem.arrays, robots, paths)
         if self._interval > 1:
             touching = judge_alone(self.problem.arrays, robots, checked)[0] * self._interval

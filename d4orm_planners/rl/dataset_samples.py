@@ -30,7 +30,7 @@ def dataset_samples(path: str, model: str, size: int) -> list[Samples]:
         ImportError: If Minari is not installed.
     """
     dataset = _dataset(path)
-    env, told = _environment(dataset, path)
+    env, metadata = _environment(dataset, path)
     team = env.unwrapped.problem.team
     if set(team.models) != {model} or env.observation_space(env.possible_agents[0]).shape != (size,):
         raise ValueError(
@@ -41,7 +41,7 @@ def dataset_samples(path: str, model: str, size: int) -> list[Samples]:
     env.close()
     episodes = []
     for episode, own in zip(dataset, dataset.storage.get_episode_metadata(dataset.episode_indices), strict=True):
-        limits = team.control_limits[:] if told["agents"] == "team" else team.control_limits[[int(own["robot"])]]
+        limits = team.control_limits[:] if metadata["agents"] == "team" else team.control_limits[[int(own["robot"])]]
         moments = (len(episode.actions), len(limits))
         # A team's robots that have arrived send zeros.
         acting = ~np.asarray(episode.infos["arrived"])[:-1].reshape(moments)
@@ -71,10 +71,10 @@ def _dataset(path: str) -> MinariDataset:
 
 def _environment(dataset: MinariDataset, path: str) -> tuple[ParallelEnv, Mapping[str, object]]:
     """An environment with the dataset's teams, and what it says about itself."""
-    told = dataset.storage.metadata.get("demonstrations")
+    metadata = dataset.storage.metadata.get("demonstrations")
     try:
-        arguments = {name: value for name, value in told["environment"].items() if name != "disturbances"}
-        return navigation_v0.parallel_env(**arguments), told
+        arguments = {name: value for name, value in metadata["environment"].items() if name != "disturbances"}
+        return navigation_v0.parallel_env(**arguments), metadata
     except (TypeError, KeyError, AttributeError, ValueError) as error:
         raise ValueError(
             f"dataset {path!r} does not say in a form that can be read of which team it is ({error}); record one with "

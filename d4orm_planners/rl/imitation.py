@@ -176,8 +176,8 @@ class _Run:
     def _network(self, index: int, seconds: float = 0.0) -> Network:
         """What has been learned by now, the last ``seconds`` in this round."""
         spent = round(seconds + sum(earlier.seconds for earlier in self.evaluations), 1)
-        told = {"command": self._command, "round": index + 1, "training_time": spent}
-        return network_of(self.settings.header(LEARNER, self._validation, **told), self._model, self._env)
+        details = {"command": self._command, "round": index + 1, "training_time": spent}
+        return network_of(self.settings.header(LEARNER, self._validation, **details), self._model, self._env)
 
     def _path(self, index: int, episode: int) -> Path:
         return self._episodes / f"{index:03d}-{episode:06d}.npz"

@@ -211,8 +211,8 @@ class MixedVecEnv(VecEnv):
 
     def step_wait(self) -> tuple[FloatArray, FloatArray, BoolArray, list[Info]]:
         features, rewards, dones, infos = zip(*(part.step_wait() for part in self.parts))
-        told = [info for listed in infos for info in listed]
-        return np.concatenate(features), np.concatenate(rewards), np.concatenate(dones), told
+        flat = [info for listed in infos for info in listed]
+        return np.concatenate(features), np.concatenate(rewards), np.concatenate(dones), flat
 
     def close(self) -> None:
         for part in self.parts:

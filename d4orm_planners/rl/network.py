@@ -94,8 +94,8 @@ class Network:
     @property
     def training_time(self) -> float | None:
         """Seconds of training behind it, where the file tells."""
-        told = self.header.training.get("training_time")
-        return float(told) if isinstance(told, int | float) else None
+        seconds = self.header.training.get("training_time")
+        return float(seconds) if isinstance(seconds, int | float) else None
 
     def __call__(self, features: FloatArray) -> FloatArray:
         """``(N, m)`` most likely actions in ``[-1, 1]`` for ``(N, F)`` features."""
