@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 IMITATION = "imitation"
 _REINFORCEMENT_ONLY = (
-    "steps", "num_envs", "curriculum", "lessons", "start_from", "network", "observed_robots", "learning_rate",
-    "learner_settings", "reward_settings", "mixture",
+    "steps", "num_envs", "curriculum", "lessons", "start_from", "network", "observed_robots", "ways",
+    "learning_rate", "learner_settings", "reward_settings", "mixture",
 )  # fmt: skip
 _IMITATION_ONLY = ("expert", "expert_settings", "dataset", "episodes", "rounds", "epochs")
 
@@ -54,6 +54,9 @@ class TrainOptions:
         "flat"
     )
     observed_robots: Annotated[int, typer.Option("--observed-robots", help="Neighbours in observations.")] = 4
+    ways: Annotated[
+        bool, typer.Option("--ways", help="Robots head along their shortest free ways; for worlds with walls.")
+    ] = False
     learning_rate: Annotated[
         float | None, typer.Option("--learning-rate", help="At the beginning; it falls to a tenth. 3e-4 for ppo.")
     ] = None
@@ -133,7 +136,8 @@ def _reinforcement(options: TrainOptions) -> Callable[..., TrainingResult]:
     if not (math.isfinite(steps) and steps == int(steps) >= 1):
         raise ValueError(f"--steps is {steps:g}; it must be a whole number of at least 1")
     same = (
-        "algorithm", "num_envs", "curriculum", "lessons", "start_from", "network", "observed_robots", "learning_rate"
+        "algorithm", "num_envs", "curriculum", "lessons", "start_from", "network", "observed_robots", "ways",
+        "learning_rate",
     )  # fmt: skip
     own = {name: getattr(options, name) for name in same}
     own |= {"steps": int(steps), "mixture": tuple(options.mixture or ())}

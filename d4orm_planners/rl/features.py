@@ -103,6 +103,20 @@ class Features:
         number = self.slices.num_neighbors + rows
         return None if rest or number < 0 else replace(self, slices=replace(self.slices, num_neighbors=number))
 
+    def along(self, observations: FloatArray, direction: NDArray[np.floating], length: NDArray[np.floating]) -> None:
+        """Put the goals where the shortest free ways seem to lead, as far off as the ways are long.
+
+        Among walls the goal itself says little of where to go; without obstacles nothing changes. Robots at their goals
+        and those without a way see their goals.
+
+        Args:
+            observations: ``(N, D)``, whose goals are changed.
+            direction: ``(N, d)`` along the ways.
+            length: ``(N,)`` of the ways [m].
+        """
+        known = (direction != 0).any(axis=1) & np.isfinite(length)
+        observations[known, self.slices.own.goal] = direction[known] * length[known, None]
+
     def encode(self, observations: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Features of ``N`` robots.
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.joint_state import split_state
 from d4orm_planners.policy import Actions, Observations, Policy, require_reset, robot_indices
 from d4orm_planners.rl.network import SUFFIX, Network, load_network
 from d4orm_planners.settings import CheckedSettings, PathText
@@ -98,8 +99,27 @@ class LearnedPolicy(Policy):
         if not observations:
             return {}
         seen = np.stack([np.asarray(observation, np.float32) for observation in observations.values()])
-        limits = self.problem.team.control_limits[robot_indices(observations)]
-        return dict(zip(observations, self._actor.controls(seen, limits)))
+        robots = robot_indices(observations)
+        if isinstance(self._actor, _NetworkActor) and self._actor.network.header.ways:
+            self._look_along_ways(self._actor.network, robots, seen, state)
+        return dict(zip(observations, self._actor.controls(seen, self.problem.team.control_limits[robots])))
+
+    def _look_along_ways(self, network: Network, robots: list[int], seen: FloatArray, state: FloatArray) -> None:
+        """Change the goals in ``seen`` ``(N, D)`` as :meth:`Features.along` does, by the map that everybody has.
+
+        Where a robot is follows from its goal and where it sees that. Ways lead to the first goals: a robot with a new
+        one, in lifelong mode, sees that itself.
+        """
+        problem = self.problem
+        if not problem.world.num_obstacles:
+            return
+        features = network.features_for(seen.shape[1])
+        assert features is not None, "reset has checked the observations"
+        places = problem.goal.astype(np.float64)
+        places[robots] -= seen[:, features.slices.own.goal]
+        direction, length = problem.ways.ahead(places)
+        length[(split_state(problem, state).goals != problem.goal).any(axis=1)] = np.inf
+        features.along(seen, direction[robots], length[robots])
 
 
 class PPO(LearnedPolicy):

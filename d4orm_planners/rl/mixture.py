@@ -183,7 +183,7 @@ class MixedVecEnv(VecEnv):
         models = sorted({part.problem.team.models[0] for part in parts})
         if len(models) > 1 or any(part.features != first.features for part in parts):
             raise ValueError(f"the mixture has robots of {', '.join(models)}; one policy is learned for one model")
-        self.features, self.problem = first.features, first.problem
+        self.features, self.problem, self.ways = first.features, first.problem, first.ways
         self.num_worlds = sum(part.num_worlds for part in parts)
         self._splits = np.cumsum([part.num_envs for part in parts])[:-1]
         super().__init__(sum(part.num_envs for part in parts), first.observation_space, first.action_space)

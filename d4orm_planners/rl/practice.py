@@ -97,5 +97,6 @@ class Practice(CheckedSettings):
             "num_neighbors": slices.num_neighbors,
             "num_obstacles": slices.num_obstacles,
             "frame": None if frame == "goal" else frame,
+            "ways": worlds.ways or None,
             "training": {**training, **asdict(self)},
         }

@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.core.observation_layout import ObservationSlices
 from d4orm_env.rewards import RewardFunction
 from d4orm_env.team_step import Info
 from d4orm_env.vector_env import NavigationVectorEnv
@@ -38,9 +39,12 @@ class RobotVecEnv(VecEnv):
         seed: Of the first world.
         reward: The reward to learn from, as in :class:`~d4orm_env.options.EnvOptions`.
         sight: How many of the observed robots are shown at most, the others being marked absent; ``None`` is all.
+        ways: Whether robots see their goals along their shortest free ways, see :meth:`Features.along`, and are paid
+            for the way made along those.
         **kwargs: Further arguments of :class:`d4orm_env.vector_env.NavigationVectorEnv`.
 
     Attributes:
+        ways: As above.
         acted: ``(B * K,)`` bool: which robots acted in the last step.
         finished: ``(world, success, travel_time)`` of the worlds that ended in the last step.
         seconds: Time spent stepping so far.
@@ -60,9 +64,12 @@ class RobotVecEnv(VecEnv):
         seed: int = 0,
         reward: str | RewardFunction = "training",
         sight: int | None = None,
+        ways: bool = False,
         **kwargs: Any,
     ) -> None:
-        kwargs |= {"reward": reward, "autoreset_mode": "SameStep"}
+        kwargs |= {"reward": reward, "observed_way": ways, "autoreset_mode": "SameStep"}
+        if ways:
+            kwargs["progress"] = "way"
         self._env = NavigationVectorEnv(num_worlds, scenario, num_robots, **kwargs)
         problem = self.problem = self._env.problem
         if not problem.docks:
@@ -74,7 +81,10 @@ class RobotVecEnv(VecEnv):
                 f"the team mixes {', '.join(sorted(set(problem.team.models)))}; one policy is learned for robots of "
                 "one model, so give model="
             )
-        self.features = Features.of(self._env.layout, problem.team.models[0])
+        layout = self._env.layout
+        slices = ObservationSlices(layout.dimension, layout.num_neighbors, layout.num_obstacles)
+        self.features = Features.of(slices, problem.team.models[0])
+        self.ways = ways
         self.num_worlds = num_worlds
         self._sight = sight
         self._shape = (num_worlds, problem.num_robots)
@@ -136,6 +146,10 @@ class RobotVecEnv(VecEnv):
         count = self.num_envs
         seen = observations.reshape(count, -1)
         seen = np.concatenate([seen, last]) if last else seen
+        if self.ways:
+            seen, way = seen[:, : self.features.slices.size].copy(), self._env.layout.ways(seen)
+            parts = self._env.layout.way
+            self.features.along(seen, way[:, parts.direction], way[:, parts.length][:, 0])
         if self._sight is not None:
             self.features.slices.neighbors(seen)[:, self._sight :] = 0
         features, frames = self.features.encode(seen)

@@ -62,6 +62,8 @@ class TrainingSettings(Practice):
         network: ``"flat"``, fully connected from all that is observed; or ``"sets"``, which pools neighbours and
             obstacles, see :mod:`d4orm_planners.rl.sets`.
         observed_robots: In observations.
+        ways: Whether robots see their goals along their shortest free ways, as is wanted among walls, see
+            :meth:`~d4orm_planners.rl.features.Features.along`.
         learning_rate: At the beginning; ``None`` is the algorithm's own. It falls linearly to a tenth.
         learner_settings: Further settings of the algorithm, as Stable-Baselines3 calls them, where they are others than
             those of :mod:`d4orm_planners.rl.algorithms`: ``{"gradient_steps": 8}``.
@@ -83,6 +85,7 @@ class TrainingSettings(Practice):
     start_from: PathText | None = None
     network: Annotated[str, one_of(NETWORKS)] = "flat"
     observed_robots: Annotated[Whole, Field(ge=0, le=1000)] = 4
+    ways: bool = False
     learning_rate: Annotated[Positive, Field(le=1)] | None = None
     learner_settings: Mapping[str, Number] = field(default_factory=dict)
     reward_settings: Mapping[str, Number] = field(default_factory=dict)
@@ -145,7 +148,7 @@ class TrainingSettings(Practice):
         count, arguments = self.batch // lesson.num_robots, self.arguments(lesson.scenario)
         if self.draws(lesson.scenario, lesson.num_robots):
             arguments |= {"randomize_instance": True, "num_instances": min(_INSTANCES, 2 * count)}
-        arguments |= {"observed_robots": self.observed_robots, "reward": self.reward}
+        arguments |= {"observed_robots": self.observed_robots, "reward": self.reward, "ways": self.ways}
         return RobotVecEnv(count, lesson.num_robots, seed=seed, **arguments)
 
     def validation(self, **options: Any) -> RobotVecEnv | MixedVecEnv:
@@ -155,14 +158,16 @@ class TrainingSettings(Practice):
             ValueError: If one policy cannot be learned for the team.
         """
         if not self.mixture:
-            return super().validation(observed_robots=self.observed_robots, **options)
+            return super().validation(observed_robots=self.observed_robots, ways=self.ways, **options)
         count, options = -(-self.validation_worlds // len(self.exercises)), {**self._options, **options}
         return MixedVecEnv([part.worlds(count, VALIDATION_SEED, None, **options) for part in self.exercises])
 
     @property
     def _options(self) -> dict[str, Any]:
         """Of the environments of a mixture."""
-        return {"model": self.model, "observed_robots": self.observed_robots, "reward": self.reward}
+        return {
+            "model": self.model, "observed_robots": self.observed_robots, "reward": self.reward, "ways": self.ways
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)
