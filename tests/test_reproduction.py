@@ -227,10 +227,19 @@ def test_an_error_is_a_failure() -> None:
     assert (row.trials, row.successes, row.errors, row.error) == (2, 1, 1, "OSError: no")
 
 
-def test_times_are_over_the_successes() -> None:
+def test_times_are_over_all_trials_and_their_mean_over_the_successes() -> None:
     trials = [trial(seed, history=f"[[{seconds},1,0.5]]") for seed, seconds in enumerate((1, 2, 3, 4, 5))]
-    row = measured(Group("Circle", "d4orm", [*trials, trial(9, history="[]", status="time_limit", travel_time=99.0)]))
+    failed = [trial(seed, history="[]", status="time_limit", travel_time=99.0) for seed in range(9, 15)]
+    row = measured(Group("Circle", "d4orm", trials))
     assert (row.runtime_lower, row.runtime, row.runtime_upper, row.runtime_mean) == (2, 3, 4, 3)
+    row = measured(Group("Circle", "d4orm", [*trials, *failed[:2]]))
+    assert (row.runtime_lower, row.runtime, row.runtime_upper, row.runtime_mean) == (2.5, 4, None, 3)
+    assert METRICS["runtime"].text(row) == "4.00 (2.50-∞)"
+    row = measured(Group("Circle", "d4orm", [*trials, *failed]))
+    assert (row.runtime_lower, row.runtime, row.runtime_upper, row.runtime_mean) == (3.5, None, None, 3)
+    assert METRICS["runtime"].text(row) == "∞ (3.50-∞)"
+    assert METRICS["runtime"].text(measured(Group("Circle", "d4orm", failed))) == "-"
+    row = measured(Group("Circle", "d4orm", [*trials, failed[0]]))
     assert row.runtime_deviation == pytest.approx(np.std([1, 2, 3, 4, 5], ddof=1))
     assert row.travel_time == 6.0
     assert row.successes == 5
@@ -290,6 +299,31 @@ def test_the_papers_numbers_stand_beside_ours_where_policies_are_the_rows() -> N
     page = markdown(figure(across="policy", paper=paper), [Group("Circle", "d4orm", [trial()])])
     assert "| policy | success | runtime, s | runtime, s (the paper) |" in page
     assert "| d4orm | 1 of 1 (21% to 100%) | 1.50 (1.50-1.50) | 0.13 |" in page
+
+
+def test_policies_are_compared_with_the_reference_trial_by_trial() -> None:
+    ours = [trial(seed, history=f"[[{seconds},1,0.5]]") for seed, seconds in enumerate((1, 2, 3, 4, 5, 6))]
+    rival = [trial(seed, history=f"[[{seconds},1,0.5]]") for seed, seconds in enumerate((2, 4, 6, 8, 10))]
+    rival.append(trial(5, history="[]", status="time_limit", success=False))
+    groups = [Group("Circle", "d4orm", ours), Group("Circle", "mppi", rival), Group("Square", "mppi", rival)]
+    page = markdown(figure(reference="d4orm"), groups)
+    # Differences of 1 to 5 s, and 14 where it failed: all one way, of which there are 2 in 2 ** 6.
+    assert "| policy | num_robots | pairs | only it | only d4orm | p | difference | p |" in page
+    assert "| mppi | 8 | 6 | 0 | 1 | 1 | +3.50 | 0.031 |" in page
+    assert page.count("| mppi | 8 | 6 |") == 1, "where the reference is"
+    assert "Compared with" not in markdown(figure(), groups)
+    slower = [replace(one, travel_time=one.travel_time + 0.5) for one in ours]
+    groups = [Group("Circle", "d4orm", ours), Group("Circle", "mppi", slower)]
+    page = markdown(figure(reference="d4orm", compared_by="travel_time", across="policy"), groups)
+    assert "| mppi | 6 | 0 | 0 | 1 | +0.50 | 0.031 |" in page
+    assert "the median difference in travel time [s]" in page
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_references_are_policies_of_their_figures(name: str) -> None:
+    reference = FIGURES[name].reference
+    for section in FIGURES[name].sections:
+        assert reference is None or reference in section.policies
 
 
 def test_deadlines_and_errors_have_their_tables() -> None:

@@ -94,6 +94,8 @@ class Figure:
         seeds: Trials per policy, problem and level of noise; the paper's number.
         deadlines: Seconds for planning, for tables of success within them.
         paper: The numbers that the paper gives.
+        reference: Label of the policy that the others are compared with, trial by trial; ``None`` for no comparison.
+        compared_by: What counts in that beside success.
         remarks: What differs from the paper's set-up, one sentence or two each.
     """
 
@@ -107,6 +109,8 @@ class Figure:
     seeds: int = 50
     deadlines: tuple[float, ...] = ()
     paper: PaperNumbers = field(default_factory=dict)
+    reference: str | None = None
+    compared_by: Literal["runtime", "travel_time"] = "runtime"
     remarks: tuple[str, ...] = ()
 
     def quick(self) -> Figure:

@@ -16,14 +16,16 @@ from d4orm_planners.reproduction.figure import Figure, Group
 
 @dataclass(frozen=True, kw_only=True)
 class Measured(Compared):
-    """One policy on one problem. All but counts and reward is over the successes, see :func:`first_solution`.
+    """One policy on one problem. All but counts, runtime's quartiles and reward is over the successes, see
+    :func:`first_solution`.
 
     Attributes:
         section: Title of the section.
-        runtime: Median seconds to the first solution; ``None`` without successes, as all below.
-        runtime_lower: Lower quartile.
-        runtime_upper: Upper quartile.
-        runtime_mean: Mean.
+        runtime: Median seconds to the first solution over all trials, of which those that failed count as never, which
+            ``None`` is.
+        runtime_lower: Lower quartile, likewise.
+        runtime_upper: Upper quartile, likewise.
+        runtime_mean: Mean over the successes; ``None`` without any, as all below.
         runtime_deviation: Standard deviation; 0 for one success.
         iterations: Mean over the successes; ``None`` for policies that execute no plan.
         reward: Mean over all trials of the last best plan's reward per step of the horizon and robot; ``None`` without
@@ -74,9 +76,11 @@ def first_solution(trial: Trial) -> float | None:
 def measured(group: Group) -> Measured:
     """Sum a group up."""
     trials = group.trials
-    solved = [(trial, seconds) for trial in trials if (seconds := first_solution(trial)) is not None]
+    times = [first_solution(trial) for trial in trials]
+    solved = [(trial, seconds) for trial, seconds in zip(trials, times) if seconds is not None]
     rewards = [history[-1][2] for trial in trials if (history := json.loads(trial.history))]
-    lower, runtime, upper, average, deviation = _runtimes([seconds for _, seconds in solved])
+    lower, runtime, upper = _quartiles(times)
+    average, deviation = _mean_and_deviation([seconds for _, seconds in solved])
 
     def mean(name: str) -> float | None:
         values = [value for trial, _ in solved if (value := getattr(trial, name)) is not None]
@@ -103,12 +107,18 @@ def measured(group: Group) -> Measured:
     )
 
 
-def _runtimes(seconds: Sequence[float]) -> tuple[float | None, ...]:
-    """Quartiles, mean and standard deviation; ``None`` each where nothing was solved."""
+def _quartiles(times: Sequence[float | None]) -> tuple[float | None, ...]:
+    """Of seconds over all trials; ``None`` is never."""
+    with np.errstate(invalid="ignore"):  # between two that are never
+        quartiles = np.percentile([np.inf if seconds is None else seconds for seconds in times], (25, 50, 75))
+    return tuple(float(seconds) if np.isfinite(seconds) else None for seconds in quartiles)
+
+
+def _mean_and_deviation(seconds: Sequence[float]) -> tuple[float | None, float | None]:
+    """Mean and standard deviation; ``None`` each where nothing was solved."""
     if not seconds:
-        return (None,) * 5
-    deviation = np.std(seconds, ddof=min(len(seconds) - 1, 1))
-    return tuple(map(float, (*np.percentile(seconds, (25, 50, 75)), np.mean(seconds), deviation)))
+        return None, None
+    return float(np.mean(seconds)), float(np.std(seconds, ddof=min(len(seconds) - 1, 1)))
 
 
 def _step_time(trials: Sequence[Trial]) -> float | None:
@@ -146,12 +156,18 @@ def _number(name: str, digits: int, scale: float = 1.0) -> Callable[[Measured], 
     return text
 
 
+NEVER = "∞"
+"""For the time to the first solution of a trial that found none."""
+
+
 def _success(row: Measured) -> str:
     return f"{row.successes} of {row.trials} ({row.lower:.0%} to {row.upper:.0%})"
 
 
 def _runtime(row: Measured) -> str:
-    return "-" if row.runtime is None else f"{row.runtime:.2f} ({row.runtime_lower:.2f}-{row.runtime_upper:.2f})"
+    quartiles = (row.runtime_lower, row.runtime, row.runtime_upper)
+    lower, middle, upper = (NEVER if seconds is None else f"{seconds:.2f}" for seconds in quartiles)
+    return "-" if not row.successes else f"{middle} ({lower}-{upper})"
 
 
 def _mean_runtime(row: Measured) -> str:

@@ -57,6 +57,7 @@ def _team_size() -> Figure:
         metrics=("success", "runtime", "reward"),
         plots=("runtime", "success", "anytime"),
         deadlines=(0.5, 1, 3, 10),
+        reference="d4orm",
         paper={
             ("2D Holonomic", "d4orm", "runtime"): D4ORM_SECONDS,
             ("2D Holonomic", "d4orm", "success"): {"16": "100% within 3 s"},
@@ -89,6 +90,7 @@ def _ipopt() -> Figure:
         across="num_robots",
         metrics=("mean_runtime", "success"),
         plots=("runtime", "success"),
+        reference="d4orm",
         paper=paper,
     )
 
@@ -124,6 +126,7 @@ def _big_teams() -> Figure:
         metrics=("success", "runtime", "travel_time", "step_time"),
         plots=("runtime", "travel_time", "success"),
         deadlines=(1, 2, 10, 30),
+        reference="d4orm",
         paper=paper,
         remarks=(
             "Runtime is that of the first solution, or of the coarse plan of d4orm-c2f. Within deadlines d4orm-c2f "
@@ -145,6 +148,8 @@ def _robustness() -> Figure:
         across="control_noise_std",
         metrics=("success", "travel_time"),
         plots=("success", "travel_time"),
+        reference="d4orm-c2f",
+        compared_by="travel_time",
         remarks=("The paper gives no numbers in its text; its plots compare the same two methods.",),
     )
 
@@ -169,6 +174,8 @@ def _coarseness() -> Figure:
         across="policy",
         metrics=(*metrics, "success"),
         plots=metrics,
+        reference=labels[1, 1],
+        compared_by="travel_time",
         paper={
             (OBSTACLES[0], labels[key], metric): {labels[key]: value}
             for key, values in table.items()
@@ -192,6 +199,7 @@ def _noise_schedule() -> Figure:
         across="policy",
         metrics=("success", "runtime", "iterations", "travel_time"),
         plots=("runtime", "success"),
+        reference="beta_1=0.0001, beta_T=0.01",
         remarks=("The paper gives no numbers in its text: it finds little variation, most in differential drive.",),
     )
 
@@ -229,6 +237,7 @@ def _amswarm() -> Figure:
         across="scenario",
         metrics=(*metrics, "success"),
         plots=metrics,
+        reference="d4orm-d",
         paper={
             (title, label, metric): dict(zip(scenarios, row))
             for label, rows in numbers.items()

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from d4orm_planners.evaluation.comparison import paired
 from d4orm_planners.evaluation.leaderboard import origin
 from d4orm_planners.evaluation.report import deadline_table, errors, table, target, write_csv, write_parquet
+from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import SuccessWithin, success_by
 from d4orm_planners.reproduction.figure import Figure, Group
-from d4orm_planners.reproduction.numbers import METRICS, Measured, column, measured
+from d4orm_planners.reproduction.numbers import METRICS, Measured, column, first_solution, measured
 from d4orm_planners.reproduction.plots import draw
 
 INTRODUCTION = """\
-Success with its 95% interval (Wilson); runtime to the first solution, median and quartiles, or mean ± standard
-deviation. Runtime, travel time, makespan and jerk are over the successes; the reward is that of the best plan in the
-end, over all trials."""
+Success with its 95% interval (Wilson); runtime to the first solution: median and quartiles over all trials, of which
+those without a solution count as never (∞), or mean ± standard deviation over the successes. Travel time, makespan and
+jerk are over the successes; the reward is that of the best plan in the end, over all trials."""
+
+PAIRS = """\
+The same problems and seeds, trial by trial: how often only the one or the other succeeded, with McNemar's exact test;
+the median difference in {cost}, with Wilcoxon's signed-rank test. A trial that failed counts twice the longest that
+either needed."""
+_COSTS = {"runtime": "seconds to the first solution", "travel_time": "travel time [s]"}
 
 
 def markdown(figure: Figure, groups: Sequence[Group]) -> str:
@@ -28,6 +36,8 @@ def markdown(figure: Figure, groups: Sequence[Group]) -> str:
         blocks.append("\n".join(f"- {remark}" for remark in figure.remarks))
     sections = tuple(dict.fromkeys(row.section for row in rows))
     blocks += [draw_table(figure, title, [row for row in rows if row.section == title]) for title in sections]
+    if pairs := _pairs(figure, groups):
+        blocks += [f"## Compared with {figure.reference}", PAIRS.format(cost=_COSTS[figure.compared_by]), *pairs]
     if figure.deadlines:
         blocks += _deadlines(figure, groups)
     blocks += errors((row.label, row.error) for row in rows)
@@ -72,6 +82,42 @@ def _transposed(figure: Figure, title: str, rows: Sequence[Measured]) -> str:
 def _said(figure: Figure, row: Measured, metric: str) -> str:
     """The paper's number, empty if it gives none."""
     return figure.paper.get((row.section, row.label, metric), {}).get(column(figure, row), "")
+
+
+def _pairs(figure: Figure, groups: Sequence[Group]) -> list[str]:
+    """A table per section of the other policies beside the reference; none without it."""
+    placed = {(group.section, column(figure, row), group.label): group.trials
+              for group in groups for row in [measured(group)]}  # fmt: skip
+    one_column = figure.across == "policy"
+    blocks: dict[str, list[tuple[str, ...]]] = {}
+    for (section, place, label), trials in placed.items():
+        others = placed.get((section, str(figure.reference) if one_column else place, str(figure.reference)))
+        if others is None or label == figure.reference:
+            continue
+        test = paired(trials, others, _cost(figure, [*trials, *others]))
+        counts = (str(count) for count in (test.pairs, test.only_first, test.only_second))
+        blocks.setdefault(section, []).append(
+            (label, *[place] * (not one_column), *counts, f"{test.success_p:.2g}", f"{test.difference:+.2f}",
+             f"{test.cost_p:.2g}")
+        )  # fmt: skip
+    header = ("policy", *[figure.across] * (not one_column), "pairs", "only it", f"only {figure.reference}", "p",
+              "difference", "p")  # fmt: skip
+    return [table(section, header, lines) for section, lines in blocks.items()]
+
+
+def _cost(figure: Figure, trials: Sequence[Trial]) -> Callable[[Trial], float]:
+    """What a trial cost, of trials that are compared."""
+
+    def known(trial: Trial) -> float | None:
+        return first_solution(trial) if figure.compared_by == "runtime" else trial.travel_time
+
+    worst = max((found for trial in trials if (found := known(trial)) is not None), default=1.0)
+
+    def cost(trial: Trial) -> float:
+        found = known(trial)
+        return 2 * worst if found is None or first_solution(trial) is None else found
+
+    return cost
 
 
 def _deadlines(figure: Figure, groups: Sequence[Group]) -> list[str]:
