@@ -55,7 +55,7 @@ def _team_size() -> Figure:
         sections=_sections(policies, *ENVIRONMENTS, num_robots=SIZES, quick_robots=(2, 3)),
         across="num_robots",
         metrics=("success", "runtime", "reward"),
-        plots=("runtime", "success", "anytime"),
+        plots=("runtime", "success", "survival", "anytime"),
         deadlines=(0.5, 1, 3, 10),
         reference="d4orm",
         paper={
@@ -124,7 +124,7 @@ def _big_teams() -> Figure:
         ),
         across="num_robots",
         metrics=("success", "runtime", "travel_time", "step_time"),
-        plots=("runtime", "travel_time", "success"),
+        plots=("runtime", "travel_time", "success", "survival"),
         deadlines=(1, 2, 10, 30),
         reference="d4orm",
         paper=paper,

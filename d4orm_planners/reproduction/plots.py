@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from d4orm_planners.evaluation.comparison import survival
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.reproduction.figure import Figure, Group
-from d4orm_planners.reproduction.numbers import Measured, column
+from d4orm_planners.reproduction.numbers import Measured, column, first_solution
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,8 +46,8 @@ def draw(path: Path, figure: Figure, groups: Sequence[Group], rows: Sequence[Mea
     wide = 2 if figure.across == "policy" else 1
     size = (max(3.2 * wide * len(titles), 5.0), (3.4 if wide == 2 else 2.6) * len(figure.plots) + 0.8)
     canvas = Canvas(figsize=size, layout="constrained")
-    # Only the anytime curves have time from left to right.
-    sharex: Literal["col"] | bool = False if "anytime" in figure.plots else "col"
+    # Some have time from left to right.
+    sharex: Literal["col"] | bool = False if {"anytime", "survival"} & set(figure.plots) else "col"
     axes = canvas.subplots(len(figure.plots), len(titles), squeeze=False, sharex=sharex, sharey="row")
     for i, title in enumerate(titles):
         axes[0, i].set_title(title)
@@ -109,6 +110,21 @@ def _success(ax: Axes, figure: Figure, shown: Shown) -> None:
     ax.set_ylim(-0.03, 1.03)
 
 
+def _survival(ax: Axes, figure: Figure, shown: Shown) -> None:
+    """The share of all trials that are not solved yet against time, with its confidence band, for the largest team."""
+    largest = max(row.num_robots for _, row in shown)
+    for i, (group, row) in enumerate((group, row) for group, row in shown if row.num_robots == largest):
+        curve = survival([first_solution(trial) for trial in group.trials])
+        spent = [history[-1][0] for trial in group.trials if (history := json.loads(trial.history))]
+        end = max([*curve.costs, *spent], default=1.0) * 1.05
+        edges = [min([*curve.costs, end]) / 2, *curve.costs, end]
+        lower, upper = [1.0, *curve.lower], [1.0, *curve.upper]
+        ax.stairs([1.0, *curve.unsolved], edges, baseline=None, color=f"C{i}", label=row.label)
+        ax.stairs(upper, edges, baseline=lower, fill=True, color=f"C{i}", alpha=0.1)
+    ax.tick_params(axis="x", which="minor", labelbottom=False)
+    ax.set(xlabel=f"planning time, s ({largest} robots)", ylabel="not solved", xscale="log", ylim=(-0.03, 1.03))
+
+
 def best_reward(trial: Trial, seconds: np.ndarray) -> np.ndarray:
     """Mean reward of the best plan so far.
 
@@ -156,6 +172,7 @@ PLOTS: Mapping[str, Callable[[Axes, Figure, Shown], None]] = MappingProxyType({
     "iterations": partial(_metric, value="iterations", ends=None, label="iterations", log=True),
     "waiting_share": partial(_metric, value="waiting_share", ends=None, label="share of time spent waiting"),
     "jerk": partial(_metric, value="jerk", ends=None, label="mean squared jerk"),
+    "survival": _survival,
     "anytime": _anytime,
 })  # fmt: skip
 """What can be drawn."""
