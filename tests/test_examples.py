@@ -55,6 +55,7 @@ def completed(name: str, out: Path, *arguments: str) -> None:
     [
         ("supersuit_ppo", "supersuit", "rl"),
         ("train_and_compare", "stable_baselines3", "rl"),
+        ("training_seeds", "stable_baselines3", "rl"),
         ("train_and_compare", "pyrvo", "orca"),
         ("jax_ppo", "optax", "jaxrl"),
         ("cleanrl_ppo", "torch", "rl"),
@@ -470,6 +471,19 @@ def test_a_trained_policy_is_compared_with_planners_under_noise(tmp_path: Path) 
         "2 of 2"
     }
     assert (out / "comparison" / "robustness.png").read_bytes().startswith(PNG)
+
+
+@pytest.mark.slow
+def test_learners_are_trained_with_several_seeds_and_their_curves_read_again(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3")
+    out, again = tmp_path / "out", tmp_path / "again"
+    completed("training_seeds", out, "--seeds", "2")
+    rows = table(out / "training_seeds.csv")
+    assert [row["learner"].split(",")[0] for row in rows] == ["PPO", "PPO", "SAC"]
+    assert {row["seeds"] for row in rows} == {"2"}
+    assert (out / "training_seeds.png").read_bytes().startswith(PNG)
+    completed("training_seeds", again, "--curves", str(out / "training_curves.csv"))
+    assert table(again / "training_seeds.csv") == rows
 
 
 def test_count_of_seeds_below_one_is_refused(tmp_path: Path) -> None:
