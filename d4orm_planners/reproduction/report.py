@@ -35,6 +35,7 @@ def markdown(figure: Figure, groups: Sequence[Group]) -> str:
     if figure.remarks:
         blocks.append("\n".join(f"- {remark}" for remark in figure.remarks))
     sections = tuple(dict.fromkeys(row.section for row in rows))
+    blocks.append("## What was measured")
     blocks += [draw_table(figure, title, [row for row in rows if row.section == title]) for title in sections]
     if pairs := _pairs(figure, groups):
         blocks += [f"## Compared with {figure.reference}", PAIRS.format(cost=_COSTS[figure.compared_by]), *pairs]
