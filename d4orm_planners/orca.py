@@ -19,7 +19,7 @@ from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.joint_state import JointState
 from d4orm_planners.policy import StatePolicy
 from d4orm_planners.settings import CheckedSettings, NotNegative, Positive, Whole
-from d4orm_planners.steering import preferred_velocities, present_velocities, track_velocities
+from d4orm_planners.steering import goals_along_ways, preferred_velocities, present_velocities, track_velocities
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
@@ -42,6 +42,7 @@ class OrcaConfig(CheckedSettings):
         max_neighbors: So many of the nearest robots are looked at.
         clearance: Added to every robot's radius [m]; by default the problem's margin. Two robots so keep twice that
             distance, which leaves robots with inertia some room: they cannot take a new velocity at once.
+        ways: Whether robots prefer to follow their shortest free ways among obstacles, or else the straight line.
         deviation: Standard deviation of the angle by which each robot's preferred velocity is turned, drawn once per
             episode [rad]. Without it robots in a symmetric formation block each other, as the authors note.
 
@@ -54,6 +55,7 @@ class OrcaConfig(CheckedSettings):
     neighbor_distance: Positive = 10.0
     max_neighbors: Neighbors = 10
     clearance: NotNegative | None = None
+    ways: bool = True
     deviation: NotNegative = 0.1
 
 
@@ -84,9 +86,12 @@ class Orca(StatePolicy):
         self._walls = list(_walls(problem))
 
     def _controls(self, joint: JointState) -> FloatArray:
-        preferred = preferred_velocities(self.problem, joint.states, joint.goals)
+        problem, goals = self.problem, joint.goals
+        if self.config.ways:
+            goals = goals_along_ways(problem, joint.states[:, : problem.dimension], goals)
+        preferred = preferred_velocities(problem, joint.states, goals)
         preferred = np.einsum("ijk,kj->ki", self._turn, preferred)
-        return track_velocities(self.problem, joint.states, self._avoid(joint, preferred))
+        return track_velocities(problem, joint.states, self._avoid(joint, preferred))
 
     def _avoid(self, joint: JointState, preferred: FloatArray) -> FloatArray:
         """``(K, 2)`` velocities nearest to the preferred ones that avoid everything; zero for docked robots."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
@@ -44,6 +44,28 @@ def preferred_velocities(problem: Problem, states: FloatArray, goals: FloatArray
         x, goal, limits = (tuple(rows[robots].T) for rows in (states, goals, problem.team.limits))
         velocities[robots] = np.stack(model.functions.approach(x, goal, limits, h, NUMPY_OPS), axis=1)
     return velocities
+
+
+def goals_along_ways(problem: Problem, places: FloatArray | Floats, goals: FloatArray) -> FloatArray:
+    """Where robots without a plan should head: along their shortest free ways, as far off as those are long.
+
+    It is their goals where the world is empty, for robots with new goals, and for those without a way.
+
+    Args:
+        problem: The world, and the first goals, to which the ways lead.
+        places: ``(K, d)`` where the robots are [m].
+        goals: ``(K, d)`` present goals [m].
+
+    Returns:
+        ``(K, d)`` [m].
+    """
+    if not problem.world.num_obstacles:
+        return goals
+    direction, length = problem.ways.ahead(places)
+    known = (direction != 0).any(axis=1) & np.isfinite(length) & (goals == problem.goal).all(axis=1)
+    ahead: FloatArray = goals.copy()
+    ahead[known] = places[known] + direction[known] * length[known, None]
+    return ahead
 
 
 def track_velocities(problem: Problem, states: FloatArray, velocities: FloatArray) -> FloatArray:

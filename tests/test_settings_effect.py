@@ -236,6 +236,7 @@ POLICY_CHANGES: dict[str, dict[str, tuple[Any, dict[str, Any]]]] = {
         "neighbor_distance": (1.0, {}),
         "max_neighbors": (1, {}),
         "clearance": (0.2, {}),
+        "ways": (False, {"scenario": "rooms"}),
         "deviation": (0.4, {}),
     },
 }

@@ -14,6 +14,7 @@ from d4orm_env.joint_state import split_state
 from d4orm_planners.policy import Actions, Observations, Policy, require_reset, robot_indices
 from d4orm_planners.rl.network import SUFFIX, Network, load_network
 from d4orm_planners.settings import CheckedSettings, PathText
+from d4orm_planners.steering import goals_along_ways
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
@@ -100,26 +101,21 @@ class LearnedPolicy(Policy):
             return {}
         seen = np.stack([np.asarray(observation, np.float32) for observation in observations.values()])
         robots = robot_indices(observations)
-        if isinstance(self._actor, _NetworkActor) and self._actor.network.header.ways:
+        among_obstacles = self.problem.world.num_obstacles > 0
+        if among_obstacles and isinstance(self._actor, _NetworkActor) and self._actor.network.header.ways:
             self._look_along_ways(self._actor.network, robots, seen, state)
         return dict(zip(observations, self._actor.controls(seen, self.problem.team.control_limits[robots])))
 
     def _look_along_ways(self, network: Network, robots: list[int], seen: FloatArray, state: FloatArray) -> None:
-        """Change the goals in ``seen`` ``(N, D)`` as :meth:`Features.along` does, by the map that everybody has.
+        """Change the goals in ``seen`` ``(N, D)`` as in training, by the map that everybody has.
 
-        Where a robot is follows from its goal and where it sees that. Ways lead to the first goals: a robot with a new
-        one, in lifelong mode, sees that itself.
+        Where a robot is follows from its goal and where it sees that.
         """
-        problem = self.problem
-        if not problem.world.num_obstacles:
-            return
-        features = network.features_for(seen.shape[1])
+        features, goals = network.features_for(seen.shape[1]), split_state(self.problem, state).goals
         assert features is not None, "reset has checked the observations"
-        places = problem.goal.astype(np.float64)
-        places[robots] -= seen[:, features.slices.own.goal]
-        direction, length = problem.ways.ahead(places)
-        length[(split_state(problem, state).goals != problem.goal).any(axis=1)] = np.inf
-        features.along(seen, direction[robots], length[robots])
+        places, own = goals.copy(), features.slices.own.goal
+        places[robots] -= seen[:, own]
+        seen[:, own] = (goals_along_ways(self.problem, places, goals) - places)[robots]
 
 
 class PPO(LearnedPolicy):
