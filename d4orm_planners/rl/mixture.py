@@ -67,9 +67,32 @@ MIXTURES: Mapping[str, tuple[str, ...]] = MappingProxyType(
             f"{_CLEARING} 8",
             f"{_CLEARING} 8 places=1 obstacles=10",
         ),
+        "walls": (
+            "rooms 4",
+            "rooms 8",
+            "rooms 8",
+            "rooms 8 disturb.control_noise=0.2",
+            "rooms 8 sight=4",
+            "rooms 8 sight=4",
+            "rooms 16",
+            "forest 8",
+            "warehouse 8 sight=4",
+            "maze 4",
+            "random 8",
+            "random 8 sight=4",
+            "random 8 sight=4 disturb.delay=2",
+            "random 16 size=7.07",
+            "random 16 size=7.07 sight=4",
+            "random 16",
+            "random 16 sight=4",
+            "random 32 size=10",
+            "circle 16 disturb.control_noise=0.2",
+            f"{_LOOSENED} 8 base=four_obstacles sight=4",
+            f"{_LOOSENED} 16 shrink=0.05 sight=4",
+        ),
     }
 )
-"""Mixtures by name."""
+"""Mixtures by name; ``walls`` is for robots that look along their ways."""
 
 
 @dataclass(frozen=True)
