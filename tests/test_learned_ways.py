@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -148,5 +149,8 @@ def test_a_training_along_ways_says_so(tmp_path: Path) -> None:
     network = train(settings, tmp_path).network
     assert network.header.ways
     assert network.header.training["ways"] is True
+    with pytest.raises(ValueError, match="whose robots look along their shortest free ways; give --ways"):
+        train(replace(settings, ways=False, start_from=str(tmp_path / "policy.safetensors")), tmp_path / "straight")
+    assert not (tmp_path / "straight").exists()
     flat = TrainingSettings(steps=64, num_envs=4, lessons=1, validation_worlds=2, scenario="rooms", num_robots=2)
     assert train(flat, tmp_path / "flat").network.header.ways is None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 import stable_baselines3
@@ -108,6 +108,7 @@ class _PPO(Algorithm):
     def make(
         self, env: VecNormalize, sets: Features | None = None, tuned: Mapping[str, float] = _AS_THEY_ARE
     ) -> BaseAlgorithm:
+        settings: dict[str, Any] = {**self.tunable, **tuned}
         network: dict[str, object] = {"net_arch": [128, 128], "log_std_init": -0.5}
         if sets is not None:
             network |= {**_sets_of(sets), "activation_fn": torch.nn.ReLU}
@@ -121,7 +122,7 @@ class _PPO(Algorithm):
             policy_kwargs=network,
             rollout_buffer_class=MaskedRolloutBuffer,
             device="cpu",
-            **cast("Any", {**self.tunable, **tuned}),
+            **settings,
         )
 
 
@@ -135,6 +136,7 @@ class _SAC(Algorithm):
     def make(
         self, env: VecNormalize, sets: Features | None = None, tuned: Mapping[str, float] = _AS_THEY_ARE
     ) -> BaseAlgorithm:
+        settings: dict[str, Any] = {**self.tunable, **tuned}
         network: dict[str, object] = {"net_arch": [128, 128]}
         if sets is not None:
             network |= _sets_of(sets)
@@ -150,7 +152,7 @@ class _SAC(Algorithm):
             policy_kwargs=network,
             replay_buffer_class=MaskedReplayBuffer,
             device="cpu",
-            **cast("Any", {**self.tunable, **tuned}),
+            **settings,
         )
 
 

@@ -240,6 +240,10 @@ class _Run:
                 f"start_from is {path}, which sees the world from another frame ({network.features.frame}) than is "
                 f"trained for ({wanted}); give a policy that was trained for robots of this model"
             )
+        if network.header.ways and not self.settings.ways:
+            raise ValueError(
+                f"start_from is {path}, whose robots look along their shortest free ways; give --ways, or another policy"
+            )
         return network
 
     def learn(self, index: int) -> None:
