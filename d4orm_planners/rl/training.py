@@ -242,7 +242,7 @@ class _Run:
             )
         if network.header.ways and not self.settings.ways:
             raise ValueError(
-                f"start_from is {path}, whose robots look along their shortest free ways; give --ways, or another policy"
+                f"start_from is {path}, whose robots look along their shortest free ways; give --ways or another policy"
             )
         return network
 
