@@ -25,7 +25,7 @@ demo: $(CORE_STAMP) ## Plan 16 robots across a warehouse, execute the plan, writ
 	$(BIN)/d4orm demo --out demo
 
 test: $(DEV_STAMP) ## Run the whole test suite; PYTEST_ARGS='-m "not slow"' for the quick part
-	$(BIN)/python -m pytest --numprocesses 3 --dist worksteal $(PYTEST_ARGS)
+	$(BIN)/python -m pytest --numprocesses 3 --dist worksteal --durations 40 $(PYTEST_ARGS)
 
 portability: $(DEV_STAMP) ## Plan under the instruction sets of other processors and compare to the bit
 	$(BIN)/python tests/portability/processors.py --quick
