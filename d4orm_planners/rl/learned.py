@@ -32,7 +32,7 @@ class LearnedConfig(CheckedSettings):
         path: A ``.safetensors`` file of ``d4orm train``, or a ``.zip`` that Stable-Baselines3 saved after training on
             the environment's own observations and actions, as through SuperSuit. A zip holds pickled Python, which can
             run anything when it is loaded: give only one that you made yourself or trust. By default the policy that
-            comes with the package for the robots' model.
+            comes with the package for the robots' model, and for a world with or without obstacles.
 
     Raises:
         ValueError: If the path ends in something else.
@@ -80,6 +80,13 @@ class LearnedPolicy(Policy):
             return [Path(config.path)]
         return [SHIPPED / f"{cls.name}{SUFFIX}", *sorted(SHIPPED.glob(f"{cls.name}-*{SUFFIX}"))]
 
+    def _file(self) -> Path:
+        """That for robots of the team's model in a world like this, or else the nearest."""
+        files, model = self._files(self.config), self.problem.team.models[0]
+        walls = "-walls" if self.problem.world.num_obstacles else ""
+        stems = (f"{self.name}-{model}{walls}", f"{self.name}-{model}", f"{self.name}{walls}")
+        return next((path for stem in stems if (path := SHIPPED / f"{stem}{SUFFIX}") in files), files[0])
+
     def _use(self, path: Path) -> None:
         kind = _ZipActor if path.suffix == ".zip" else _NetworkActor
         self._actor: _NetworkActor | _ZipActor = kind(self.name, path)
@@ -87,10 +94,8 @@ class LearnedPolicy(Policy):
 
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:
         super().reset(env, seed)
-        # The team may be another at every reset.
-        files = self._files(self.config)
-        own = SHIPPED / f"{self.name}-{self.problem.team.models[0]}{SUFFIX}"
-        if (path := own if own in files else files[0]) != self._actor.path:
+        # Team and world may be others at every reset.
+        if (path := self._file()) != self._actor.path:
             self._use(path)
         agent = env.possible_agents[0]
         self._actor.check(self.problem, env.observation_space(agent).shape, env.action_space(agent).shape)
