@@ -20,7 +20,7 @@ from d4orm_planners.reproduction.figure import Figure, Group, Section, regrouped
 from d4orm_planners.reproduction.numbers import METRICS, first_solution, measured
 from d4orm_planners.reproduction.paper import FIGURES, find_figure
 from d4orm_planners.reproduction.plots import PLOTS, best_reward
-from d4orm_planners.reproduction.report import markdown
+from d4orm_planners.reproduction.report import markdown, write_reproduction
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -317,6 +317,19 @@ def test_policies_are_compared_with_the_reference_trial_by_trial() -> None:
     page = markdown(figure(reference="d4orm", compared_by="travel_time", across="policy"), groups)
     assert "| mppi | 6 | 0 | 0 | 1 | +0.50 | 0.031 |" in page
     assert "the median difference in travel time [s]" in page
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_without_times_a_figure_says_nothing_of_seconds(name: str, tmp_path: Path) -> None:
+    timeless = FIGURES[name].without_times()
+    label = timeless.reference or next(iter(timeless.sections[0].policies))
+    groups = [Group(timeless.sections[0].title, label, [trial(), trial(1, history="[]", status="time_limit")])]
+    page = markdown(timeless, groups)
+    assert "| runtime, s" not in page
+    assert "within a deadline" not in page
+    assert "| control loop, ms" not in page
+    write_reproduction(tmp_path, timeless, groups, trials=False)
+    assert (tmp_path / f"{name}.png").read_bytes().startswith(PNG)
 
 
 @pytest.mark.parametrize("name", FIGURES)

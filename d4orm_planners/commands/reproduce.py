@@ -46,6 +46,9 @@ class ReproduceOptions:
     trials: Annotated[
         Path | None, typer.Option("--trials", help="Run nothing; make the figure of a Parquet file of its trials.")
     ] = None
+    times: Annotated[
+        bool, typer.Option("--times/--no-times", help="Leave seconds out, of a machine that did other work too.")
+    ] = True
     quiet: Quiet = False
 
 
@@ -62,6 +65,8 @@ def reproduce(options: ReproduceOptions) -> None:
     from d4orm_planners.reproduction.report import markdown, write_reproduction
 
     figure = find_figure(options.figure).only(options.sections or (), options.policies or ())
+    if not options.times:
+        figure = figure.without_times()
     if options.trials is not None:
         _make_of_trials(figure, options)
         return
@@ -102,7 +107,7 @@ def _list_figures(context: typer.Context) -> None:
 
     refuse_options(
         context,
-        ("figure", "quick", "sections", "policies", "seeds", "workers", "out", "trials", "quiet"),
+        ("figure", "quick", "sections", "policies", "seeds", "workers", "out", "trials", "times", "quiet"),
         "does not go with the list of figures; give a figure, and leave out --list",
     )
     for figure in FIGURES.values():

@@ -32,6 +32,8 @@ QUICK_SETTINGS: Mapping[str, Mapping[str, object]] = MappingProxyType({
 })  # fmt: skip
 """Settings of the quick version by policy: enough to go through every step, not to solve much."""
 QUICK_TIME_LIMIT = 5.0
+TIMES = frozenset({"runtime", "mean_runtime", "step_time", "waiting_share", "survival", "anytime"})
+"""Metrics and plots of seconds, which depend on what else a machine does."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,6 +119,17 @@ class Figure:
         """The version that takes seconds and shows that everything works."""
         remarks = ("Quick version: tiny teams and few samples, whose numbers say nothing.", *self.remarks)
         return replace(self, sections=tuple(section.quick() for section in self.sections), seeds=1, remarks=remarks)
+
+    def without_times(self) -> Figure:
+        """The version that says nothing of seconds, for trials of a machine that did other work too."""
+        return replace(
+            self,
+            metrics=tuple(name for name in self.metrics if name not in TIMES),
+            plots=tuple(name for name in self.plots if name not in TIMES) or ("success",),
+            deadlines=(),
+            compared_by="travel_time",
+            remarks=(*self.remarks, "The machine did other work too, so seconds are left out."),
+        )
 
     def only(self, titles: Sequence[str] = (), labels: Sequence[str] = ()) -> Figure:
         """A part of the figure.

@@ -100,7 +100,7 @@ def _metric(ax: Axes, figure: Figure, shown: Shown, *, value: str, ends: tuple[s
         ax.set_xticks([int(name) for name in columns])
     ax.set_xlabel(NUMERIC.get(figure.across, ""))
     ax.set_ylabel(label)
-    if log:
+    if log and any(getattr(row, value) for _, row in shown):
         ax.set_yscale("log")
 
 
