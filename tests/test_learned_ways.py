@@ -12,8 +12,9 @@ import pytest
 from d4orm_env import make_problem, navigation_v0
 from d4orm_env.core.observation_layout import ObservationSlices
 from d4orm_env.vector_env import NavigationVectorEnv
-from d4orm_planners import make_policy
+from d4orm_planners import make_policy, run_episode
 from d4orm_planners.rl.features import Features
+from d4orm_planners.rl.learned import SHIPPED
 from d4orm_planners.rl.network import Header, Network, load_network
 
 OWN, NEIGHBOR, OBSTACLE = 11, 9, 5
@@ -90,6 +91,24 @@ def test_a_robot_with_a_new_goal_sees_that_itself(tmp_path: Path) -> None:
         state[goals] = elsewhere.ravel()
         found[path] = np.stack(list(policy.act(observations, state).values()))
     np.testing.assert_array_equal(found[along], found[straight])
+
+
+def test_the_policy_of_the_package_is_that_for_the_world() -> None:
+    policy = make_policy("ppo")
+    for scenario, along in (("random", False), ("rooms", True), ("circle", False), ("four_obstacles", True)):
+        env = navigation_v0.parallel_env(scenario, num_robots=4)
+        env.reset(seed=0)
+        policy.reset(env)
+        assert bool(policy._actor.network.header.ways) == along
+
+
+def test_the_policy_of_the_package_goes_through_doors() -> None:
+    """The other one, which knows nothing of ways, drives into the walls."""
+    for path, expected in ((None, 3), (SHIPPED / "ppo.safetensors", 0)):
+        policy = make_policy("ppo", path=path)
+        envs = [navigation_v0.parallel_env("rooms", num_robots=4) for _ in range(3)]
+        solved = [run_episode(env, policy, seed=seed).metrics["success"] for seed, env in enumerate(envs)]
+        assert sum(solved) == expected
 
 
 pytest.importorskip("stable_baselines3")
