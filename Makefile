@@ -46,6 +46,7 @@ results: $(DEV_STAMP) ## Make the tables and figures in docs/tables from the tri
 	$(BIN)/python examples/tune_rivals.py --trials data/tuning.parquet --out docs/tables
 	$(BIN)/python examples/credit_by_update.py --trials data/credit_by_update.parquet --out docs/tables
 	$(BIN)/python examples/disturbance_study.py --trials data/disturbance_study.parquet --out docs/tables
+	$(BIN)/python examples/training_seeds.py --curves data/training_curves.csv --out docs/tables
 	for figure in $(FIGURES); do \
 	  $(BIN)/d4orm reproduce $$figure --trials data/$$figure.parquet --no-times --out docs/tables --quiet || exit 1; done
 	$(BIN)/d4orm leaderboard data/leaderboard.parquet --out docs/tables/leaderboard.md
