@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 EXTRAS ?= dev,rl,ipopt
 PYTEST_ARGS ?=
-FIGURES := coarseness noise-schedule
+FIGURES := coarseness noise-schedule robustness
 
 # A stamp is as new as the last install that succeeded, so an install is repeated only when what it reads has changed.
 CORE_STAMP := $(VENV)/.core-installed
