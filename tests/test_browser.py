@@ -188,11 +188,11 @@ def pause_and_drag(page: Page, playground: Any, tmp_path: Path) -> None:
     page.complaints.clear()
     look_at(page, playground, "circle, 4 robots, d4orm-c2f")
     tick(page, "Paused")
-    wait_for(lambda: session.frame.moment.state == "paused")
+    wait_for(lambda: session.frame.status.state == "paused")
     page.until("document.body.textContent.includes('d4orm-c2f: paused')")
-    number = session.frame.moment.number
+    number = session.frame.status.number
     page.evaluate("new Promise((done) => setTimeout(done, 500))")
-    assert session.frame.moment.number == number, "pause pauses"
+    assert session.frame.status.number == number, "pause pauses"
 
     wait_for(lambda: len(playground.clients) == 1)
     goal = session.frame.goals[0]
@@ -200,7 +200,7 @@ def pause_and_drag(page: Page, playground: Any, tmp_path: Path) -> None:
     page.drag(pixel(playground, goal + np.array([0.0, 0.19])), pixel(playground, (0.4, 0.6)))
     wait_for(lambda: not np.array_equal(session.frame.goals[0], goal))
     assert np.abs(session.frame.goals[0] - [0.4, 0.6]).max() < 0.25
-    assert session.frame.moment.state == "paused"
+    assert session.frame.status.state == "paused"
     tick(page, "Paused")
     wait_for(lambda: session.frame.arrived[0])
     assert np.linalg.norm(session.frame.states[0, :2] - session.frame.goals[0]) < 0.1
@@ -219,7 +219,7 @@ def test_obstacles_are_dragged_and_scenes_and_replays_saved(page: Page, tmp_path
         page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
         look_at(page, playground, "circle, 2 robots, goal")
         tick(page, "Paused")
-        wait_for(lambda: session.frame.moment.state == "paused" and len(playground.clients) == 1)
+        wait_for(lambda: session.frame.status.state == "paused" and len(playground.clients) == 1)
         page.drag(pixel(playground, (0, 0)), pixel(playground, (0.9, 0.9)))
         wait_for(lambda: session.frame.problem.world.boxes[0, 0] > 0)
         assert np.abs(session.frame.problem.world.boxes[0] - [0.7, 0.7, 1.1, 1.1]).max() < 0.3
@@ -309,7 +309,7 @@ def test_a_slow_planner_does_not_freeze_the_page(page: Page) -> None:
         click(page, "Show")
         tick(page, "Margins")
         wait_for(lambda: playground._view.shown["margins"])
-        assert session.frame.moment.state == "planning"
+        assert session.frame.status.state == "planning"
         ended.set()
         page.until("document.body.textContent.includes('circle, 3 robots, slow')")
 

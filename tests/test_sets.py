@@ -235,14 +235,16 @@ def test_a_policy_of_sets_learns_on_and_a_flat_one_is_refused(
 ) -> None:
     path = str(trained / "policy.safetensors")
     further = replace(practised, start_from=path, learning_rate=1e-9, lessons=1, steps=32, observed_robots=4)
-    learned = train(further, tmp_path / "further").network
+    result = train(further, tmp_path / "further")
+    learned = result.network
     for name, array in load_network(path).arrays.items():
         if name != "reward_variance":
             np.testing.assert_allclose(array, learned.arrays[name], atol=1e-6)
     before = load_network(path).training_time
     assert before is not None
     assert learned.training_time is not None
-    assert learned.training_time > before, "what it began with counts"
+    spent = before + sum(evaluation.seconds for evaluation in result.curve)
+    assert learned.training_time == pytest.approx(spent, abs=0.11), "what it began with counts"
     with pytest.raises(ValueError, match="is a sets network, and a flat one is wanted; give network='sets'"):
         train(replace(further, network="flat"), tmp_path / "flat")
 

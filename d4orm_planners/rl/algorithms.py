@@ -55,6 +55,10 @@ class Algorithm:
         """
         raise NotImplementedError
 
+    def _settings(self, tuned: Mapping[str, float]) -> dict[str, Any]:
+        """Further keywords of Stable-Baselines3."""
+        return {**self.tunable, **tuned}
+
     def checked(self, tuned: Mapping[str, float], name: str) -> dict[str, float]:
         """Values for :attr:`tunable`, whole where those here are.
 
@@ -108,7 +112,6 @@ class _PPO(Algorithm):
     def make(
         self, env: VecNormalize, sets: Features | None = None, tuned: Mapping[str, float] = _AS_THEY_ARE
     ) -> BaseAlgorithm:
-        settings: dict[str, Any] = {**self.tunable, **tuned}
         network: dict[str, object] = {"net_arch": [128, 128], "log_std_init": -0.5}
         if sets is not None:
             network |= {**_sets_of(sets), "activation_fn": torch.nn.ReLU}
@@ -122,7 +125,7 @@ class _PPO(Algorithm):
             policy_kwargs=network,
             rollout_buffer_class=MaskedRolloutBuffer,
             device="cpu",
-            **settings,
+            **self._settings(tuned),
         )
 
 
@@ -136,7 +139,6 @@ class _SAC(Algorithm):
     def make(
         self, env: VecNormalize, sets: Features | None = None, tuned: Mapping[str, float] = _AS_THEY_ARE
     ) -> BaseAlgorithm:
-        settings: dict[str, Any] = {**self.tunable, **tuned}
         network: dict[str, object] = {"net_arch": [128, 128]}
         if sets is not None:
             network |= _sets_of(sets)
@@ -152,7 +154,7 @@ class _SAC(Algorithm):
             policy_kwargs=network,
             replay_buffer_class=MaskedReplayBuffer,
             device="cpu",
-            **settings,
+            **self._settings(tuned),
         )
 
 

@@ -13,12 +13,14 @@ from d4orm_planners.rl.sb3_sets import SetExtractor
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.running_mean_std import RunningMeanStd
+    from stable_baselines3.common.vec_env import VecNormalize
 
 START_COUNT = 1e6
 """How many observations the normalisation of a network that learns on counts for: what it knows is not forgotten."""
 
 
-def network_of(header: Mapping[str, Any], model: BaseAlgorithm, normalization: Any) -> Network:
+def network_of(header: Mapping[str, Any], model: BaseAlgorithm, normalization: VecNormalize) -> Network:
     """The deterministic policy of a Stable-Baselines3 model.
 
     Args:
@@ -29,7 +31,8 @@ def network_of(header: Mapping[str, Any], model: BaseAlgorithm, normalization: A
     layers, sets = _layers(model), _sets(model)
     arrays = {"reward_variance": normalization.ret_rms.var}
     if sets is None:
-        arrays |= {"observation_mean": normalization.obs_rms.mean, "observation_variance": normalization.obs_rms.var}
+        seen = _seen(normalization)
+        arrays |= {"observation_mean": seen.mean, "observation_variance": seen.var}
     else:
         arrays |= {name: array.detach().numpy() for name, array in sets.items()}
     for index, layer in enumerate(layers):
@@ -43,7 +46,7 @@ def network_of(header: Mapping[str, Any], model: BaseAlgorithm, normalization: A
     return Network(full, {name: np.array(value, np.float32) for name, value in arrays.items()})
 
 
-def set_network(model: BaseAlgorithm, normalization: Any, network: Network) -> None:
+def set_network(model: BaseAlgorithm, normalization: VecNormalize, network: Network) -> None:
     """Have a model act as a network does, in its own normalisation; what it thinks of states is left as it is.
 
     Args:
@@ -79,9 +82,15 @@ def set_network(model: BaseAlgorithm, normalization: Any, network: Network) -> N
             parameter.copy_(torch.as_tensor(arrays[name]))
     if sets:
         return
-    seen = normalization.obs_rms
+    seen = _seen(normalization)
     seen.mean, seen.var = (arrays[f"observation_{part}"].astype(np.float64) for part in ("mean", "variance"))
     seen.count = START_COUNT
+
+
+def _seen(normalization: VecNormalize) -> RunningMeanStd:
+    """Mean and variance of the features, which are one array."""
+    assert not isinstance(normalization.obs_rms, dict)
+    return normalization.obs_rms
 
 
 def _squashed(model: BaseAlgorithm) -> bool:
