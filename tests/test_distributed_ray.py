@@ -29,7 +29,8 @@ if __name__ == "__main__":
         return planner.solve(make_problem("circle", num_robots=4), seed=3, max_iterations=3)
 
     connection = RayConnection("local", "this test")
-    plans = {{clip: [solve(clip_between_iterations=clip, **{settings}) for _ in range(1 + clip)] for clip in (True, False)}}
+    times = {{True: 2, False: 1}}
+    plans = {{clip: [solve(clip_between_iterations=clip, **{settings}) for _ in range(times[clip])] for clip in times}}
     shared = connection.ray.is_initialized()
     connection.close()
     solve(**{settings})
