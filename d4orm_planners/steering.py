@@ -62,10 +62,21 @@ def goals_along_ways(problem: Problem, places: FloatArray | Floats, goals: Float
     if not problem.world.num_obstacles:
         return goals
     direction, length = problem.ways.ahead(places)
-    known = (direction != 0).any(axis=1) & np.isfinite(length) & (goals == problem.goal).all(axis=1)
-    ahead: FloatArray = goals.copy()
-    ahead[known] = places[known] + direction[known] * length[known, None]
-    return ahead
+    first = (goals == problem.goal).all(axis=1)
+    ahead, known = along_ways(direction, np.where(first, length, np.inf))
+    return np.where(known[:, None], places + ahead, goals).astype(np.float32)
+
+
+def along_ways(direction: ArrayLike, length: ArrayLike) -> tuple[Floats, BoolArray]:
+    """Vectors along ways ``(N, d)``, as long as they are, and ``(N,)`` who has one: is neither at its goal nor lost.
+
+    Args:
+        direction: ``(N, d)`` unit vectors, zero at a goal.
+        length: ``(N,)`` [m], infinite without a way.
+    """
+    direction, length = np.asarray(direction, np.float64), np.asarray(length, np.float64)
+    known = (direction != 0).any(axis=1) & np.isfinite(length)
+    return direction * np.where(known, length, 0.0)[:, None], known
 
 
 def track_velocities(problem: Problem, states: FloatArray, velocities: FloatArray) -> FloatArray:

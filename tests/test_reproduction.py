@@ -329,6 +329,9 @@ def test_without_times_a_figure_says_nothing_of_seconds(name: str, tmp_path: Pat
     assert "within a deadline" not in page
     assert "| control loop, ms" not in page
     write_reproduction(tmp_path, timeless, groups, trials=False)
+    columns = (tmp_path / f"{name}.csv").read_text().splitlines()[0].split(",")
+    assert "success_rate" in columns or "successes" in columns
+    assert not [column for column in columns if "runtime" in column or column in ("step_time", "waiting_share")]
     assert (tmp_path / f"{name}.png").read_bytes().startswith(PNG)
 
 

@@ -98,6 +98,7 @@ class Figure:
         paper: The numbers that the paper gives.
         reference: Label of the policy that the others are compared with, trial by trial; ``None`` for no comparison.
         compared_by: What counts in that beside success.
+        timed: Whether seconds of planning are told at all.
         remarks: What differs from the paper's set-up, one sentence or two each.
     """
 
@@ -113,6 +114,7 @@ class Figure:
     paper: PaperNumbers = field(default_factory=dict)
     reference: str | None = None
     compared_by: Literal["runtime", "travel_time"] = "runtime"
+    timed: bool = True
     remarks: tuple[str, ...] = ()
 
     def quick(self) -> Figure:
@@ -128,6 +130,7 @@ class Figure:
             plots=tuple(name for name in self.plots if name not in TIMES) or ("success",),
             deadlines=(),
             compared_by="travel_time",
+            timed=False,
             remarks=(*self.remarks, "The machine did other work too, so seconds are left out."),
         )
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import Compared
-from d4orm_planners.reproduction.figure import Figure, Group
+from d4orm_planners.reproduction.figure import TIMES, Figure, Group
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +56,11 @@ class Measured(Compared):
     message_bytes: float | None
     waiting_share: float | None
     step_time: float | None
+
+
+def is_time(name: str) -> bool:
+    """Whether an attribute of :class:`Measured` is about seconds of planning."""
+    return name.startswith("runtime") or name in TIMES
 
 
 def first_solution(trial: Trial) -> float | None:

@@ -12,7 +12,7 @@ from d4orm_planners.evaluation.report import deadline_table, errors, table, targ
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import SuccessWithin, success_by
 from d4orm_planners.reproduction.figure import Figure, Group
-from d4orm_planners.reproduction.numbers import METRICS, Measured, column, first_solution, measured
+from d4orm_planners.reproduction.numbers import METRICS, Measured, column, first_solution, is_time, measured
 from d4orm_planners.reproduction.plots import draw
 
 INTRODUCTION = """\
@@ -150,7 +150,8 @@ def write_reproduction(
     rows = [measured(group) for group in groups]
     paths = [Path(folder, f"{figure.name}.{kind}") for kind in ("csv", "md", "png")]
     said = [{f"paper_{metric}": _said(figure, row, metric) for metric in figure.metrics} for row in rows]
-    write_csv(paths[0], [{**vars(row), **beside} for row, beside in zip(rows, said)])
+    columns = [{name: value for name, value in vars(row).items() if figure.timed or not is_time(name)} for row in rows]
+    write_csv(paths[0], [{**shown, **beside} for shown, beside in zip(columns, said)])
     with target(paths[1]) as temporary:
         temporary.write_text(markdown(figure, groups), encoding="utf-8")
     with target(paths[2]) as temporary:

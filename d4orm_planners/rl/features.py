@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.dynamics import get_model
 from d4orm_env.core.observation_layout import ObservationSlices
+from d4orm_planners.steering import along_ways
 
 TURNED_MODELS = frozenset({"holonomic2d", "holonomic3d", "velocity2d"})
 """Models whose controls are vectors of the world."""
@@ -114,8 +115,8 @@ class Features:
             direction: ``(N, d)`` along the ways.
             length: ``(N,)`` of the ways [m].
         """
-        known = (direction != 0).any(axis=1) & np.isfinite(length)
-        observations[known, self.slices.own.goal] = direction[known] * length[known, None]
+        ahead, known = along_ways(direction, length)
+        observations[known, self.slices.own.goal] = ahead[known]
 
     def encode(self, observations: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Features of ``N`` robots.
