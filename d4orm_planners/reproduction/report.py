@@ -110,13 +110,14 @@ def _cost(figure: Figure, trials: Sequence[Trial]) -> Callable[[Trial], float]:
     """What a trial cost, of trials that are compared."""
 
     def known(trial: Trial) -> float | None:
-        return first_solution(trial) if figure.compared_by == "runtime" else trial.travel_time
+        seconds = first_solution(trial)
+        return seconds if figure.compared_by == "runtime" or seconds is None else trial.travel_time
 
     worst = max((found for trial in trials if (found := known(trial)) is not None), default=1.0)
 
     def cost(trial: Trial) -> float:
         found = known(trial)
-        return 2 * worst if found is None or first_solution(trial) is None else found
+        return 2 * worst if found is None else found
 
     return cost
 
