@@ -242,7 +242,12 @@ def test_ppo_in_one_jit_learns_to_arrive(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "module"),
-    [("cleanrl_ppo", "torch"), ("torchrl_mappo", "torchrl"), ("benchmarl_mappo", "benchmarl.environments")],
+    [
+        ("cleanrl_ppo", "torch"),
+        ("torchrl_mappo", "torchrl"),
+        ("benchmarl_mappo", "benchmarl.environments"),
+        ("rllib_ppo", "ray.rllib"),
+    ],
 )
 def test_recipes_learn_something(name: str, module: str, tmp_path: Path) -> None:
     pytest.importorskip(module, exc_type=ImportError)
