@@ -181,7 +181,7 @@ def test_the_history_keeps_the_moments_at_which_the_best_plan_changed() -> None:
         record(3, 0.3, True, 0.4),
         record(4, 0.4, True, 0.6),
     )
-    assert trials.compact_history(history) == "[[0.1,0,0.5],[0.3,1,0.4],[0.4,1,0.6]]"
+    assert trials.compact_history(history) == "[[0.1,0,0.5,1],[0.3,1,0.4,3],[0.4,1,0.6,4]]"
 
 
 def test_success_within_deadlines() -> None:

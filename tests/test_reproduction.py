@@ -17,7 +17,7 @@ from d4orm_planners.evaluation import evaluate
 from d4orm_planners.evaluation.report import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import Trial, TrialStore
 from d4orm_planners.reproduction.figure import Figure, Group, Section, regrouped, reproduce
-from d4orm_planners.reproduction.numbers import METRICS, first_solution, measured
+from d4orm_planners.reproduction.numbers import METRICS, first_solution, first_steps, measured
 from d4orm_planners.reproduction.paper import FIGURES, find_figure
 from d4orm_planners.reproduction.plots import PLOTS, best_reward
 from d4orm_planners.reproduction.report import markdown, write_reproduction
@@ -254,6 +254,34 @@ def test_the_reward_is_that_of_the_last_best_plan_of_every_trial() -> None:
 def test_the_best_reward_is_a_staircase() -> None:
     rewards = best_reward(trial(), np.array([0.1, 0.5, 1.0, 1.5, 9.0]))
     assert rewards == pytest.approx([np.nan, 0.6, 0.6, 0.5, 0.7], nan_ok=True)
+
+
+def test_denoising_steps_are_counted_where_rows_tell_them(tmp_path: Path) -> None:
+    told = [trial(seed, history=f"[[0.1,0,0.4,50],[0.5,1,0.5,{steps}]]") for seed, steps in enumerate((100, 200, 300))]
+    never = [trial(seed, history="[[0.1,0,0.4,50]]", status="iteration_limit", success=False) for seed in (3, 4)]
+    assert [first_steps(one) for one in [*told, *never, trial()]] == [100, 200, 300, None, None, None]
+    row = measured(Group("Circle", "d4orm", [*told, *never]))
+    assert (row.first_steps_lower, row.first_steps, row.first_steps_upper) == (200, 300, None)
+    assert METRICS["first_steps"].text(row) == "300 (200-∞)"
+    assert best_reward(told[0], np.array([49, 50, 100]), counted=True) == pytest.approx([np.nan, 0.4, 0.5], nan_ok=True)
+    rivals = [trial(seed, history=f"[[9,1,0.5,{100 * seed + 50}]]") for seed in range(5)]
+    by_steps = figure(compared_by="first_steps", reference="d4orm", metrics=("first_steps", "runtime"),
+                      plots=("first_steps", "survival", "anytime", "runtime")).without_times()  # fmt: skip
+    assert by_steps.metrics == ("first_steps",)
+    assert by_steps.plots == ("first_steps", "survival", "anytime")
+    groups = [Group("Circle", "d4orm", [*told, *never]), Group("Circle", "mppi", rivals)]
+    # Steps of the rival: 50 to 450; of d4orm 100 to 300, and two without, each of which counts 900.
+    page = markdown(by_steps, groups)
+    assert "the median difference in denoising steps" in page
+    assert "| mppi | 8 | 5 | 2 | 0 | 0.5 | -50.00 |" in page
+    assert write_reproduction(tmp_path, by_steps, groups, trials=False)
+
+
+def test_what_is_never_can_be_drawn(tmp_path: Path) -> None:
+    solved, never = trial(0, history="[[0.5,1,0.5]]"), trial(1, history="[]", status="time_limit")
+    drawn = figure(plots=("runtime", "survival"))
+    paths = write_reproduction(tmp_path, drawn, [Group("Circle", "ipopt", [solved, solved, never])], trials=False)
+    assert paths[-1].read_bytes().startswith(PNG)
 
 
 def test_every_policy_is_run_with_every_number_of_nodes(tmp_path: Path) -> None:

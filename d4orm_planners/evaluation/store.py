@@ -48,6 +48,22 @@ class TrialKey(NamedTuple):
     physics: str = "model"
 
 
+class BestSoFar(NamedTuple):
+    """The best plan of a solve from some moment on.
+
+    Attributes:
+        seconds: Since the solve began.
+        solved: Whether it is a solution, 1 or 0.
+        reward: Its mean reward.
+        steps: Denoising steps done; ``None`` in rows that older versions wrote.
+    """
+
+    seconds: float
+    solved: int
+    reward: float
+    steps: int | None = None
+
+
 @dataclass(frozen=True, kw_only=True)
 class Trial:
     """One episode of one policy and how it ended: a row of the store, with a column per field, in this order.
@@ -83,8 +99,9 @@ class Trial:
         training_time: Seconds of training behind a learned policy, all before it included, where its file tells; else
             ``None``.
         elapsed: Seconds that the trial took, with the environment and the judge.
-        history: Times of the solve at which the best plan so far changed, as JSON: a list of
-            ``[seconds, solved (0 or 1), mean reward]``; empty for a policy that executes no plan.
+        history: When in the solve the best plan so far changed, as JSON: a list of
+            ``[seconds, solved (0 or 1), mean reward, denoising steps]``, the last not in rows that older versions
+            wrote; empty for a policy that executes no plan. See :attr:`progress`.
         messages: Candidates that the nodes of a distributed planner sent, each to all others; ``None`` for others.
         message_bytes: Their length together.
         waiting_share: Share of the nodes' time that they waited for each other.
@@ -133,6 +150,11 @@ class Trial:
     def key(self) -> TrialKey:
         return TrialKey(*(getattr(self, name) for name in TrialKey._fields))
 
+    @property
+    def progress(self) -> list[BestSoFar]:
+        """:attr:`history`, point by point."""
+        return [BestSoFar(*point) for point in json.loads(self.history)]
+
 
 _NAMES = tuple(field.name for field in fields(Trial))
 _KEY = ", ".join(TrialKey._fields)
@@ -141,8 +163,14 @@ _FORMER = {"num_robots": "robots", "control_noise_std": "noise"}
 _FORMERLY = {"disturbances": "'[]'", "physics": "'model'"}
 """What columns that were missing stand for; others are empty."""
 _TRUTHS = ("success", "verified")
-_JSON: Mapping[str, type | int] = {"config": dict, "versions": dict, "machine": dict, "history": 3, "disturbances": 2}
-"""What must be JSON: an object, or a list of lists of so many."""
+_JSON: Mapping[str, type | tuple[int, ...]] = {
+    "config": dict,
+    "versions": dict,
+    "machine": dict,
+    "history": (3, 4),
+    "disturbances": (2,),
+}
+"""What must be JSON: an object, or a list of lists of one of these lengths."""
 _SQL = {"str": "TEXT", "int": "INTEGER", "float": "REAL", "bool": "INTEGER"}
 _PYTHON: Mapping[str, tuple[type, ...]] = {
     "str": (str,),
@@ -336,15 +364,15 @@ def _use_wal(connection: sqlite3.Connection) -> None:
             time.sleep(0.01)
 
 
-def _is_json(text: str, kind: type | int) -> bool:
-    """Whether a text is JSON of this kind: an object, or a list of lists of so many."""
+def _is_json(text: str, kind: type | tuple[int, ...]) -> bool:
+    """Whether a text is JSON of this kind: an object, or a list of lists of one of these lengths."""
     try:
         content = json.loads(text)
     except ValueError:
         return False
-    if isinstance(kind, int):
+    if isinstance(kind, tuple):
         lists = content if isinstance(content, list) else [None]
-        return all(isinstance(entry, list) and len(entry) == kind for entry in lists)
+        return all(isinstance(entry, list) and len(entry) in kind for entry in lists)
     return isinstance(content, kind)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -239,8 +238,7 @@ def solved_after(trial: Trial) -> float | None:
     """
     if not trial.success:
         return None
-    solutions = (seconds for seconds, solved, _ in json.loads(trial.history) if solved)
-    return next(solutions, trial.wall_time)
+    return next((best.seconds for best in trial.progress if best.solved), trial.wall_time)
 
 
 def success_by(trials: Iterable[Trial], deadline: float) -> SuccessWithin:

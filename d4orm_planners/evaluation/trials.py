@@ -216,8 +216,9 @@ def compact_history(history: tuple[IterationRecord, ...]) -> str:
     """The iterations of a solve after which the best plan was another, as :attr:`Trial.history` keeps them."""
     points: list[list[float]] = []
     for record in history:
-        point = [round(record.wall_time, 6), int(record.best_solved), float(f"{record.best_reward:.6g}")]
-        if not points or points[-1][1:] != point[1:]:
+        seconds, reward = round(record.wall_time, 6), float(f"{record.best_reward:.6g}")
+        point = [seconds, int(record.best_solved), reward, record.denoising_steps]
+        if not points or points[-1][1:3] != point[1:3]:
             points.append(point)
     return json.dumps(points, separators=(",", ":"))
 

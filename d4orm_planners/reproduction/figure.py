@@ -16,6 +16,7 @@ from d4orm_planners.evaluation.study import Study
 
 PaperNumbers = Mapping[tuple[str, str, str], Mapping[str, str]]
 """By section, label and metric: what the paper says, by column."""
+Cost = Literal["runtime", "travel_time", "first_steps"]
 Across = Literal["num_robots", "nodes", "scenario", "control_noise_std", "policy"]
 
 _FEW: dict[str, object] = {"num_samples": 64, "num_steps": 10, "max_iterations": 3}
@@ -32,8 +33,10 @@ QUICK_SETTINGS: Mapping[str, Mapping[str, object]] = MappingProxyType({
 })  # fmt: skip
 """Settings of the quick version by policy: enough to go through every step, not to solve much."""
 QUICK_TIME_LIMIT = 5.0
-TIMES = frozenset({"runtime", "mean_runtime", "step_time", "waiting_share", "survival", "anytime"})
+TIMES = frozenset({"runtime", "mean_runtime", "step_time", "waiting_share"})
 """Metrics and plots of seconds, which depend on what else a machine does."""
+EFFORTS = frozenset({"survival", "anytime"})
+"""Plots over denoising steps where these are compared, else over seconds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +116,7 @@ class Figure:
     deadlines: tuple[float, ...] = ()
     paper: PaperNumbers = field(default_factory=dict)
     reference: str | None = None
-    compared_by: Literal["runtime", "travel_time"] = "runtime"
+    compared_by: Cost = "runtime"
     timed: bool = True
     remarks: tuple[str, ...] = ()
 
@@ -124,12 +127,13 @@ class Figure:
 
     def without_times(self) -> Figure:
         """The version that says nothing of seconds, for trials of a machine that did other work too."""
+        told = TIMES if self.compared_by == "first_steps" else TIMES | EFFORTS
         return replace(
             self,
-            metrics=tuple(name for name in self.metrics if name not in TIMES),
-            plots=tuple(name for name in self.plots if name not in TIMES) or ("success",),
+            metrics=tuple(name for name in self.metrics if name not in told),
+            plots=tuple(name for name in self.plots if name not in told) or ("success",),
             deadlines=(),
-            compared_by="travel_time",
+            compared_by="travel_time" if self.compared_by == "runtime" else self.compared_by,
             timed=False,
             remarks=(*self.remarks, "The machine did other work too, so seconds are left out."),
         )

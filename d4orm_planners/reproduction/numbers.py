@@ -16,7 +16,7 @@ from d4orm_planners.reproduction.figure import TIMES, Figure, Group
 
 @dataclass(frozen=True, kw_only=True)
 class Measured(Compared):
-    """One policy on one problem. All but counts, runtime's quartiles and reward is over the successes, see
+    """One policy on one problem. All but counts, quartiles and reward is over the successes, see
     :func:`first_solution`.
 
     Attributes:
@@ -27,6 +27,9 @@ class Measured(Compared):
         runtime_upper: Upper quartile, likewise.
         runtime_mean: Mean over the successes; ``None`` without any, as all below.
         runtime_deviation: Standard deviation; 0 for one success.
+        first_steps: Median denoising steps to the first solution over all trials, likewise.
+        first_steps_lower: Lower quartile.
+        first_steps_upper: Upper quartile.
         iterations: Mean over the successes; ``None`` for policies that execute no plan.
         reward: Mean over all trials of the last best plan's reward per step of the horizon and robot; ``None`` without
             plans.
@@ -46,6 +49,9 @@ class Measured(Compared):
     runtime_upper: float | None
     runtime_mean: float | None
     runtime_deviation: float | None
+    first_steps: float | None
+    first_steps_lower: float | None
+    first_steps_upper: float | None
     iterations: float | None
     reward: float | None
     travel_time: float | None
@@ -70,7 +76,7 @@ def first_solution(trial: Trial) -> float | None:
     one, also when planning went on. Under noise what counts is what happened, and the time is that of the plan, if
     there was one. For a policy that plans under way the time is that before its first action.
     """
-    times = (seconds for seconds, solved, _ in json.loads(trial.history) if solved)
+    times = (best.seconds for best in trial.progress if best.solved)
     if trial.error or (not trial.success and (trial.control_noise_std > 0 or not trial.status)):
         return None
     if not trial.status:
@@ -78,13 +84,21 @@ def first_solution(trial: Trial) -> float | None:
     return next(times, trial.wall_time if trial.control_noise_std > 0 else None)
 
 
+def first_steps(trial: Trial) -> int | None:
+    """Denoising steps until a plan was a solution; ``None`` for a trial without one, or whose row does not tell."""
+    if trial.error:
+        return None
+    return next((best.steps for best in trial.progress if best.solved), None)
+
+
 def measured(group: Group) -> Measured:
     """Sum a group up."""
     trials = group.trials
     times = [first_solution(trial) for trial in trials]
     solved = [(trial, seconds) for trial, seconds in zip(trials, times) if seconds is not None]
-    rewards = [history[-1][2] for trial in trials if (history := json.loads(trial.history))]
+    rewards = [progress[-1].reward for trial in trials if (progress := trial.progress)]
     lower, runtime, upper = _quartiles(times)
+    fewer, steps, more = _quartiles([first_steps(trial) for trial in trials])
     average, deviation = _mean_and_deviation([seconds for _, seconds in solved])
 
     def mean(name: str) -> float | None:
@@ -99,6 +113,9 @@ def measured(group: Group) -> Measured:
         runtime_upper=upper,
         runtime_mean=average,
         runtime_deviation=deviation,
+        first_steps=steps,
+        first_steps_lower=fewer,
+        first_steps_upper=more,
         iterations=mean("iterations"),
         reward=float(np.mean(rewards)) if rewards else None,
         travel_time=mean("travel_time"),
@@ -113,10 +130,11 @@ def measured(group: Group) -> Measured:
 
 
 def _quartiles(times: Sequence[float | None]) -> tuple[float | None, ...]:
-    """Of seconds over all trials; ``None`` is never."""
-    with np.errstate(invalid="ignore"):  # between two that are never
-        quartiles = np.percentile([np.inf if seconds is None else seconds for seconds in times], (25, 50, 75))
-    return tuple(float(seconds) if np.isfinite(seconds) else None for seconds in quartiles)
+    """Of what all trials took; ``None`` is never."""
+    # Not infinite: percentiles multiply the distance to the next trial by zero where they fall on one.
+    never = 1e300
+    quartiles = np.percentile([never if time is None else time for time in times], (25, 50, 75))
+    return tuple(float(time) if time < 1e-9 * never else None for time in quartiles)
 
 
 def _mean_and_deviation(seconds: Sequence[float]) -> tuple[float | None, float | None]:
@@ -175,6 +193,12 @@ def _runtime(row: Measured) -> str:
     return "-" if not row.successes else f"{middle} ({lower}-{upper})"
 
 
+def _steps(row: Measured) -> str:
+    quartiles = (row.first_steps_lower, row.first_steps, row.first_steps_upper)
+    lower, middle, upper = (NEVER if steps is None else f"{steps:.0f}" for steps in quartiles)
+    return "-" if not row.successes else f"{middle} ({lower}-{upper})"
+
+
 def _mean_runtime(row: Measured) -> str:
     return "-" if row.runtime_mean is None else f"{row.runtime_mean:.2f} ± {row.runtime_deviation:.3f}"
 
@@ -183,6 +207,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType({
     "success": Metric("success", _success),
     "runtime": Metric("runtime, s", _runtime),
     "mean_runtime": Metric("runtime, s", _mean_runtime),
+    "first_steps": Metric("denoising steps", _steps),
     "iterations": Metric("iterations", _number("iterations", 1)),
     "reward": Metric("reward", _number("reward", 3)),
     "travel_time": Metric("travel time, s", _number("travel_time", 2)),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -12,9 +11,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from d4orm_planners.evaluation.comparison import survival
-from d4orm_planners.evaluation.store import Trial
+from d4orm_planners.evaluation.store import BestSoFar, Trial
 from d4orm_planners.reproduction.figure import Figure, Group
-from d4orm_planners.reproduction.numbers import Measured, column, first_solution
+from d4orm_planners.reproduction.numbers import Measured, column, first_solution, first_steps
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -89,7 +88,8 @@ def _metric(ax: Axes, figure: Figure, shown: Shown, *, value: str, ends: tuple[s
         if failed and value != "rate":
             ax.plot(*zip(*failed), marker="x", markersize=8, linestyle="none", color=f"C{i}")
         if ends:
-            low, high = ([getattr(row, end) for row in known] for end in ends)
+            # What is never has no band.
+            low, high = (np.array([getattr(row, end) for row in known], np.float64) for end in ends)
             if numeric:
                 ax.fill_between(places, low, high, color=f"C{i}", alpha=0.1, linewidth=0)
             else:
@@ -111,61 +111,81 @@ def _success(ax: Axes, figure: Figure, shown: Shown) -> None:
 
 
 def _survival(ax: Axes, figure: Figure, shown: Shown) -> None:
-    """The share of all trials that are not solved yet against time, with its confidence band, for the largest team."""
+    """The share of all trials that are not solved yet against time or steps, with its band, for the largest team."""
+    counted = figure.compared_by == "first_steps"
     largest = max(row.num_robots for _, row in shown)
     for i, (group, row) in enumerate((group, row) for group, row in shown if row.num_robots == largest):
-        curve = survival([first_solution(trial) for trial in group.trials])
-        spent = [history[-1][0] for trial in group.trials if (history := json.loads(trial.history))]
-        end = max([*curve.costs, *spent], default=1.0) * 1.05
+        curve = survival([(first_steps if counted else first_solution)(trial) for trial in group.trials])
+        spent = [_spent(best, counted) for trial in group.trials for best in trial.progress[-1:]]
+        end = 1.05 * max([*curve.costs, *spent], default=1.0) or 1.0
         edges = [min([*curve.costs, end]) / 2, *curve.costs, end]
         lower, upper = [1.0, *curve.lower], [1.0, *curve.upper]
         ax.stairs([1.0, *curve.unsolved], edges, baseline=None, color=f"C{i}", label=row.label)
         ax.stairs(upper, edges, baseline=lower, fill=True, color=f"C{i}", alpha=0.1)
     ax.tick_params(axis="x", which="minor", labelbottom=False)
-    ax.set(xlabel=f"planning time, s ({largest} robots)", ylabel="not solved", xscale="log", ylim=(-0.03, 1.03))
+    ax.set(xlabel=_effort(figure, largest), ylabel="not solved", xscale="log", ylim=(-0.03, 1.03))
 
 
-def best_reward(trial: Trial, seconds: np.ndarray) -> np.ndarray:
+def _effort(figure: Figure, num_robots: int) -> str:
+    """What planning costs, to write below."""
+    what = "denoising steps" if figure.compared_by == "first_steps" else "planning time, s"
+    return f"{what} ({num_robots} robots)"
+
+
+def _spent(best: BestSoFar, counted: bool) -> float:
+    """Denoising steps, or seconds, until a plan was found."""
+    return float(best.steps or 0) if counted else best.seconds
+
+
+def best_reward(trial: Trial, spent: np.ndarray, counted: bool = False) -> np.ndarray:
     """Mean reward of the best plan so far.
 
     Args:
         trial: A trial of a planner.
-        seconds: ``(n,)`` times since the start of the solve [s], in ascending order.
+        spent: ``(n,)`` times since the start of the solve [s], in ascending order.
+        counted: Whether these are denoising steps instead.
 
     Returns:
         ``(n,)`` rewards; NaN before the first plan.
     """
-    history = json.loads(trial.history)
-    times = np.array([time for time, _, _ in history])
-    rewards = np.array([np.nan, *(reward for _, _, reward in history)])
-    return rewards[np.searchsorted(times, seconds, side="right")]
+    times = np.array([_spent(best, counted) for best in trial.progress])
+    rewards = np.array([np.nan, *(best.reward for best in trial.progress)])
+    return rewards[np.searchsorted(times, spent, side="right")]
 
 
 def _anytime(ax: Axes, figure: Figure, shown: Shown) -> None:
-    """Median best reward against time with quartiles, for the largest team; a dot where half of the trials are solved.
+    """Median best reward against time or steps with quartiles, for the largest team; a dot where half are solved.
 
     A curve begins when half of the trials have a plan.
     """
+    counted = figure.compared_by == "first_steps"
     largest = max(row.num_robots for _, row in shown)
     for i, (group, row) in enumerate((group, row) for group, row in shown if row.num_robots == largest):
-        histories = [json.loads(trial.history) for trial in group.trials]
-        times = [time for history in histories for time, _, _ in history]
+        times = [_spent(best, counted) for trial in group.trials for best in trial.progress]
         if not times:
             continue  # every trial raised an error, or the policy makes no plan
-        seconds = np.geomspace(max(min(times), 1e-3), 1.1 * max(*times, 1e-3), INSTANTS)
-        rewards = np.array([best_reward(trial, seconds) for trial in group.trials])
+        spent = np.geomspace(max(min(times), 1e-3), 1.1 * max(*times, 1e-3), INSTANTS)
+        rewards = np.array([best_reward(trial, spent, counted) for trial in group.trials])
         seen = 2 * np.isfinite(rewards).sum(axis=0) >= len(rewards)
         low, middle, high = np.nanpercentile(rewards[:, seen], (25, 50, 75), axis=0)
-        ax.plot(seconds[seen], middle, color=f"C{i}", label=row.label)
-        ax.fill_between(seconds[seen], low, high, color=f"C{i}", alpha=0.15, linewidth=0)
-        if row.runtime is not None and 2 * row.successes >= row.trials and seen.any():
-            ax.plot(row.runtime, np.interp(row.runtime, seconds[seen], middle), marker="o", color=f"C{i}")
+        ax.plot(spent[seen], middle, color=f"C{i}", label=row.label)
+        ax.fill_between(spent[seen], low, high, color=f"C{i}", alpha=0.15, linewidth=0)
+        solved = row.first_steps if counted else row.runtime
+        if solved is not None and 2 * row.successes >= row.trials and seen.any():
+            ax.plot(solved, np.interp(solved, spent[seen], middle), marker="o", color=f"C{i}")
     ax.tick_params(axis="x", which="minor", labelbottom=False)
-    ax.set(xlabel=f"planning time, s ({largest} robots)", ylabel="best reward so far", xscale="log")
+    ax.set(xlabel=_effort(figure, largest), ylabel="best reward so far", xscale="log")
 
 
 PLOTS: Mapping[str, Callable[[Axes, Figure, Shown], None]] = MappingProxyType({
     "runtime": partial(_metric, value="runtime", ends=("runtime_lower", "runtime_upper"), label="runtime, s", log=True),
+    "first_steps": partial(
+        _metric,
+        value="first_steps",
+        ends=("first_steps_lower", "first_steps_upper"),
+        label="denoising steps",
+        log=True,
+    ),
     "success": _success,
     "travel_time": partial(_metric, value="travel_time", ends=None, label="travel time, s"),
     "makespan": partial(_metric, value="makespan", ends=None, label="makespan, s"),

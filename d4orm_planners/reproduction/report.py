@@ -12,19 +12,32 @@ from d4orm_planners.evaluation.report import deadline_table, errors, table, targ
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import SuccessWithin, success_by
 from d4orm_planners.reproduction.figure import Figure, Group
-from d4orm_planners.reproduction.numbers import METRICS, Measured, column, first_solution, is_time, measured
+from d4orm_planners.reproduction.numbers import (
+    METRICS,
+    Measured,
+    column,
+    first_solution,
+    first_steps,
+    is_time,
+    measured,
+)
 from d4orm_planners.reproduction.plots import draw
 
 INTRODUCTION = """\
-Success with its 95% interval (Wilson); runtime to the first solution: median and quartiles over all trials, of which
-those without a solution count as never (∞), or mean ± standard deviation over the successes. Travel time, makespan and
-jerk are over the successes; the reward is that of the best plan in the end, over all trials."""
+Success with its 95% interval (Wilson); runtime and denoising steps to the first solution: median and quartiles over
+all trials, of which those without a solution count as never (∞), or mean ± standard deviation over the successes.
+Travel time, makespan and jerk are over the successes; the reward is that of the best plan in the end, over all
+trials."""
 
 PAIRS = """\
 The same problems and seeds, trial by trial: how often only the one or the other succeeded, with McNemar's exact test;
 the median difference in {cost}, with Wilcoxon's signed-rank test. A trial that failed counts twice the longest that
 either needed."""
-_COSTS = {"runtime": "seconds to the first solution", "travel_time": "travel time [s]"}
+_COSTS = {
+    "runtime": "seconds to the first solution",
+    "travel_time": "travel time [s]",
+    "first_steps": "denoising steps to the first solution",
+}
 
 
 def markdown(figure: Figure, groups: Sequence[Group]) -> str:
@@ -110,6 +123,8 @@ def _cost(figure: Figure, trials: Sequence[Trial]) -> Callable[[Trial], float]:
     """What a trial cost, of trials that are compared."""
 
     def known(trial: Trial) -> float | None:
+        if figure.compared_by == "first_steps":
+            return first_steps(trial)
         seconds = first_solution(trial)
         return seconds if figure.compared_by == "runtime" or seconds is None else trial.travel_time
 
