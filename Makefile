@@ -27,14 +27,14 @@ demo: $(CORE_STAMP) ## Plan 16 robots across a warehouse, execute the plan, writ
 test: $(DEV_STAMP) ## Run the whole test suite; PYTEST_ARGS='-m "not slow"' for the quick part
 	$(BIN)/python -m pytest --numprocesses 3 --dist worksteal --durations 40 $(PYTEST_ARGS)
 
-# RLlib pins an older Gymnasium, BenchMARL an older TorchRL than the rest is tested with.
-integrations: ## Test the integrations whose libraries need an environment of their own: RLlib, BenchMARL
-	$(PYTHON) -m venv $(VENV)-rllib
-	$(VENV)-rllib/bin/python -m pip install --quiet --editable . 'ray[rllib]==2.60.0' torch==2.13.0 pytest
-	$(VENV)-rllib/bin/python -m pytest --noconftest -W default tests/test_rllib.py
-	$(PYTHON) -m venv $(VENV)-benchmarl
-	$(VENV)-benchmarl/bin/python -m pip install --quiet --editable . benchmarl==1.5.2 pytest
-	$(VENV)-benchmarl/bin/python -m pytest --noconftest -W default tests/test_benchmarl.py
+# RLlib and JaxMARL pin an older Gymnasium, BenchMARL an older TorchRL than the rest is tested with.
+test-apart = $(PYTHON) -m venv $(VENV)-$(1) && \
+  $(VENV)-$(1)/bin/python -m pip install --quiet --editable . pytest $(2) && \
+  $(VENV)-$(1)/bin/python -m pytest --noconftest -W default tests/test_$(1).py
+integrations: ## Test the integrations whose libraries need an environment of their own: RLlib, BenchMARL, JaxMARL
+	$(call test-apart,rllib,'ray[rllib]==2.60.0' torch==2.13.0)
+	$(call test-apart,benchmarl,benchmarl==1.5.2)
+	$(call test-apart,jaxmarl,jaxmarl==0.2.0)
 
 portability: $(DEV_STAMP) ## Plan under the instruction sets of other processors and compare to the bit
 	$(BIN)/python tests/portability/processors.py --quick
@@ -65,7 +65,7 @@ format: $(DEV_STAMP) ## Format the code and mend what ruff can
 	$(BIN)/ruff format .
 
 clean: ## Remove what the targets above made, .venv included
-	rm -rf $(VENV) $(VENV)-rllib $(VENV)-benchmarl demo bench docs/_build docs/_extra docs/reference build dist \
+	rm -rf $(VENV)* demo bench docs/_build docs/_extra docs/reference build dist \
 	  .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 
 # Debian's Python may come without ensurepip; its own pip then puts one into the environment.
