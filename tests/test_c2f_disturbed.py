@@ -123,6 +123,17 @@ def test_what_is_added_to_commands_is_kept_back() -> None:
     np.testing.assert_allclose(weakness.problem.team.max_acceleration, [1, 0.9, 0.8], rtol=1e-5)
 
 
+@pytest.mark.parametrize(("bias", "believed"), [(0.0, 1.0), (0.3, 0.7)])
+def test_noise_that_is_added_to_commands_is_not_kept_back(bias: float, believed: float) -> None:
+    problem, random, shares = hop_problem(3), np.random.default_rng(0), []
+    weakness = Weakness(problem)
+    for _ in range(400):
+        told = random.uniform(-0.3, 0.3, (3, 2)).astype(np.float32)
+        weakness.observe(told, told + np.float32([bias, 0]) + random.normal(0, 0.15, (3, 2)).astype(np.float32), ALL)
+        shares.append(weakness.problem.team.max_acceleration / problem.team.max_acceleration)
+    assert np.mean(shares[50:]) == pytest.approx(believed, abs=0.05 if bias else 0.005)
+
+
 @pytest.mark.parametrize(("share", "runs"), [(0.0, {0}), (0.1, {4, 5}), (0.3, {7, 8, 9}), (0.7, {10})])
 def test_how_many_commands_may_get_lost_in_a_row_is_found_out(share: float, runs: set[int]) -> None:
     """So many that 0.1, 0.3 to that power are about one in ten thousand; ten at most."""

@@ -28,6 +28,9 @@ FORGOTTEN = 0.1
 FIRST = 4
 """... after the first steps, which count as if so many with nothing added had been before."""
 
+BY_CHANCE = 3.0
+"""How many times its standard error that mean may be, and still be nothing but noise."""
+
 STEP = 0.05
 """Shares of the limits that are told apart."""
 
@@ -45,7 +48,8 @@ class Weakness:
     What they do at most of what they are asked to is what they are able to. Something that is added to commands for
     some time, such as a bias, takes away from that against its direction; so much is kept back, as tightened limits of
     control do in robust predictive control (Chisci, Rossiter, Zappa, Systems with persistent disturbances: predictive
-    control with restricted constraints, Automatica 37, 2001).
+    control with restricted constraints, Automatica 37, 2001). Noise comes to nothing on average: a mean that may be
+    chance is not kept back.
 
     Args:
         problem: The robots, with the limits that are believed at first.
@@ -59,6 +63,7 @@ class Weakness:
         self._most, self._share = np.zeros(problem.num_robots), np.ones(problem.num_robots)
         self._asked = np.zeros(problem.num_robots, int)
         self._seen, self._added = 0, np.zeros((problem.num_robots, problem.control_size))
+        self._variance = np.zeros_like(self._added)
 
     def observe(self, commanded: FloatArray, executed: FloatArray, going: BoolArray) -> None:
         """Compare commands ``(K, m)`` with what those ``going`` ``(K,)`` executed of them."""
@@ -75,12 +80,21 @@ class Weakness:
         nearer = effort(self._first, cut) < effort(self._first, scaled)
         added = np.where(nearer[:, None], cut, scaled) * going[:, None]
         self._seen += 1
-        self._added += max(FORGOTTEN, 1 / (FIRST + self._seen)) * (added - self._added)
-        held_back = STEP * np.floor(effort(self._first, self._added) / STEP)
+        held_back = STEP * np.floor(self._persistent(added) / STEP)
         share = np.maximum(share - held_back, WEAKEST)
         if (share != self._share).any():
             self._share = share
             self.problem = self._first.resumed_at(self._first.start, self._first.goal, team=self._team(share))
+
+    def _persistent(self, added: NDArray[np.float64]) -> NDArray[np.float64]:
+        """``(K,)`` effort that is added for some time, now that ``added`` ``(K, m)`` is."""
+        rate = max(FORGOTTEN, 1 / (FIRST + self._seen))
+        self._variance += rate * ((added - self._added) ** 2 - self._variance)
+        self._added += rate * (added - self._added)
+        # Of a mean that forgets exponentially, of independent values.
+        error = np.sqrt(rate / (2 - rate) * self._variance)
+        mean = effort(self._first, self._added)
+        return np.where(mean > BY_CHANCE * effort(self._first, error), mean, 0.0)
 
     def _team(self, share: NDArray[np.float64]) -> Team:
         """The team that does a share ``(K,)`` of what it was believed to do."""
