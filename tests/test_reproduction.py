@@ -14,10 +14,11 @@ import pytest
 
 from d4orm_planners import list_planners
 from d4orm_planners.evaluation import evaluate
+from d4orm_planners.evaluation.comparison import steps_to_solution
 from d4orm_planners.evaluation.report import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import Trial, TrialStore
 from d4orm_planners.reproduction.figure import Figure, Group, Section, regrouped, reproduce
-from d4orm_planners.reproduction.numbers import METRICS, first_solution, first_steps, measured
+from d4orm_planners.reproduction.numbers import METRICS, first_solution, measured
 from d4orm_planners.reproduction.paper import FIGURES, find_figure
 from d4orm_planners.reproduction.plots import PLOTS, best_reward
 from d4orm_planners.reproduction.report import markdown, write_reproduction
@@ -259,7 +260,7 @@ def test_the_best_reward_is_a_staircase() -> None:
 def test_denoising_steps_are_counted_where_rows_tell_them(tmp_path: Path) -> None:
     told = [trial(seed, history=f"[[0.1,0,0.4,50],[0.5,1,0.5,{steps}]]") for seed, steps in enumerate((100, 200, 300))]
     never = [trial(seed, history="[[0.1,0,0.4,50]]", status="iteration_limit", success=False) for seed in (3, 4)]
-    assert [first_steps(one) for one in [*told, *never, trial()]] == [100, 200, 300, None, None, None]
+    assert [steps_to_solution(one) for one in [*told, *never]] == [100, 200, 300, None, None]
     row = measured(Group("Circle", "d4orm", [*told, *never]))
     assert (row.first_steps_lower, row.first_steps, row.first_steps_upper) == (200, 300, None)
     assert METRICS["first_steps"].text(row) == "300 (200-∞)"

@@ -198,7 +198,13 @@ def _bootstrap(differences: Sequence[float] | np.ndarray) -> tuple[float, float]
 
 
 def steps_to_solution(trial: Trial) -> int | None:
-    """Denoising steps of a sampling planner's solve that ended with its first solution; ``None`` if it found none."""
+    """Denoising steps of a sampling planner until its first solution; ``None`` if it found none.
+
+    Rows that older versions wrote tell it of solves that ended with the first solution only.
+    """
+    first = next((best for best in trial.progress if best.solved), None)
+    if first is not None and first.steps is not None:
+        return first.steps
     if trial.status != "solved" or not trial.iterations:
         return None
     return trial.iterations * int(json.loads(trial.config)["num_steps"])

@@ -9,6 +9,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from d4orm_planners.evaluation.comparison import steps_to_solution
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import Compared
 from d4orm_planners.reproduction.figure import TIMES, Figure, Group
@@ -84,13 +85,6 @@ def first_solution(trial: Trial) -> float | None:
     return next(times, trial.wall_time if trial.control_noise_std > 0 else None)
 
 
-def first_steps(trial: Trial) -> int | None:
-    """Denoising steps until a plan was a solution; ``None`` for a trial without one, or whose row does not tell."""
-    if trial.error:
-        return None
-    return next((best.steps for best in trial.progress if best.solved), None)
-
-
 def measured(group: Group) -> Measured:
     """Sum a group up."""
     trials = group.trials
@@ -98,7 +92,7 @@ def measured(group: Group) -> Measured:
     solved = [(trial, seconds) for trial, seconds in zip(trials, times) if seconds is not None]
     rewards = [progress[-1].reward for trial in trials if (progress := trial.progress)]
     lower, runtime, upper = _quartiles(times)
-    fewer, steps, more = _quartiles([first_steps(trial) for trial in trials])
+    fewer, steps, more = _quartiles([steps_to_solution(trial) for trial in trials])
     average, deviation = _mean_and_deviation([seconds for _, seconds in solved])
 
     def mean(name: str) -> float | None:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from d4orm_planners.evaluation.comparison import survival
+from d4orm_planners.evaluation.comparison import steps_to_solution, survival
 from d4orm_planners.evaluation.store import BestSoFar, Trial
 from d4orm_planners.reproduction.figure import Figure, Group
-from d4orm_planners.reproduction.numbers import Measured, column, first_solution, first_steps
+from d4orm_planners.reproduction.numbers import Measured, column, first_solution
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -115,7 +115,7 @@ def _survival(ax: Axes, figure: Figure, shown: Shown) -> None:
     counted = figure.compared_by == "first_steps"
     largest = max(row.num_robots for _, row in shown)
     for i, (group, row) in enumerate((group, row) for group, row in shown if row.num_robots == largest):
-        curve = survival([(first_steps if counted else first_solution)(trial) for trial in group.trials])
+        curve = survival([(steps_to_solution if counted else first_solution)(trial) for trial in group.trials])
         spent = [_spent(best, counted) for trial in group.trials for best in trial.progress[-1:]]
         end = 1.05 * max([*curve.costs, *spent], default=1.0) or 1.0
         edges = [min([*curve.costs, end]) / 2, *curve.costs, end]

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from d4orm_planners.evaluation.comparison import paired
+from d4orm_planners.evaluation.comparison import paired, steps_to_solution
 from d4orm_planners.evaluation.leaderboard import origin
 from d4orm_planners.evaluation.report import deadline_table, errors, table, target, write_csv, write_parquet
 from d4orm_planners.evaluation.store import Trial
@@ -17,7 +17,6 @@ from d4orm_planners.reproduction.numbers import (
     Measured,
     column,
     first_solution,
-    first_steps,
     is_time,
     measured,
 )
@@ -124,7 +123,7 @@ def _cost(figure: Figure, trials: Sequence[Trial]) -> Callable[[Trial], float]:
 
     def known(trial: Trial) -> float | None:
         if figure.compared_by == "first_steps":
-            return first_steps(trial)
+            return steps_to_solution(trial)
         seconds = first_solution(trial)
         return seconds if figure.compared_by == "runtime" or seconds is None else trial.travel_time
 
@@ -144,6 +143,13 @@ def _deadlines(figure: Figure, groups: Sequence[Group]) -> list[str]:
         title = f"{group.section}, {first.num_robots} robots: success within a deadline for planning"
         blocks.setdefault(title, []).append((group.label, [success_by(group.trials, s) for s in figure.deadlines]))
     return [deadline_table(title, lines) for title, lines in blocks.items()]
+
+
+def _is_told(figure: Figure, name: str) -> bool:
+    """Whether a table of numbers has an attribute of :class:`Measured`."""
+    if name.startswith("first_steps"):
+        return "first_steps" in figure.metrics
+    return figure.timed or not is_time(name)
 
 
 def write_reproduction(
@@ -166,7 +172,7 @@ def write_reproduction(
     rows = [measured(group) for group in groups]
     paths = [Path(folder, f"{figure.name}.{kind}") for kind in ("csv", "md", "png")]
     said = [{f"paper_{metric}": _said(figure, row, metric) for metric in figure.metrics} for row in rows]
-    columns = [{name: value for name, value in vars(row).items() if figure.timed or not is_time(name)} for row in rows]
+    columns = [{name: value for name, value in vars(row).items() if _is_told(figure, name)} for row in rows]
     write_csv(paths[0], [{**shown, **beside} for shown, beside in zip(columns, said)])
     with target(paths[1]) as temporary:
         temporary.write_text(markdown(figure, groups), encoding="utf-8")
