@@ -178,6 +178,20 @@ def test_credit_and_update_are_crossed(tmp_path: Path) -> None:
     assert table(tmp_path / "again" / "credit_by_update.csv") == rows
 
 
+def test_samples_are_counted_for_every_setting(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("fewer_samples", out)
+    rows = {row["steps x samples"]: row for row in table(out / "fewer_samples.csv")}
+    assert len(rows) == 10
+    # One iteration each: 100 steps of 1024; 70 of 256; and 30 of 256 with 70 of 128, or of 64.
+    counted = {label: row["1000 samples"] for label, row in rows.items() if row["solved"] == "1 of 1"}
+    expected = {"100 x 1024": "102", "70 x 256": "18", "100 x 256, the last 70% with 128 (default)": "17",
+                "100 x 256, the last 70% with 64": "12"}  # fmt: skip
+    assert {label: counted[label] for label in expected} == expected
+    completed("fewer_samples", tmp_path / "again", "--trials", str(out / "fewer_samples.parquet"))
+    assert table(tmp_path / "again" / "fewer_samples.csv") == list(rows.values())
+
+
 @pytest.mark.slow
 def test_policies_meet_every_disturbance(tmp_path: Path) -> None:
     out = tmp_path / "out"
@@ -198,6 +212,7 @@ def test_policies_meet_every_disturbance(tmp_path: Path) -> None:
     [
         ("tune_rivals", "tuning"),
         ("credit_by_update", "credit_by_update"),
+        ("fewer_samples", "fewer_samples"),
         ("disturbance_study", "disturbance_study"),
         ("disturbance_study", "disturbance_overview"),
     ],
