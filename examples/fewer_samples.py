@@ -4,8 +4,9 @@
 
 8 and 16 robots on the circle, at most 8 iterations. The table has success with its 95% interval (Wilson), the samples
 drawn until the first solution (median and quartiles; a trial without one counts twice the budget), the mean travel time
-of the solutions, and how likely it is that a row and the defaults need equally many (Wilcoxon, paired by seed). Trials are stored in the folder, and a call that was broken off goes on from
-there. `--trials FILE` makes the table of trials that are in a Parquet file, such as those in `data/`.
+of the solutions, and how likely it is that a row and the defaults need equally many (Wilcoxon, paired by seed). Trials
+are stored in the folder, and a call that was broken off goes on from there. `--trials FILE` makes the table of trials
+that are in a Parquet file, such as those in `data/`.
 """
 
 from __future__ import annotations
