@@ -1,6 +1,7 @@
-"""Which kinds of solution D4orm finds: two robots swap places around an obstacle (the paper's appendix A).
+"""Which kinds of solution a planner finds: two robots swap places around an obstacle (the paper's appendix A).
 
     python examples/multimodality.py --seeds 100
+    python examples/multimodality.py --seeds 100 --planner ipopt
 
 One solve per seed. A plan's class is the signs of three winding angles: of robot 0 about the obstacle, of robot 1 about
 the obstacle, and of robot 1 about robot 0. Every combination of signs can be had. Six of the eight say in which order
@@ -115,13 +116,13 @@ def main() -> None:
     """Solve with every seed, count the classes, write the table and the plot."""
     parser = argument_parser(__doc__)
     parser.add_argument("--seeds", type=count, default=100)
+    parser.add_argument("--planner", choices=["d4orm", "ipopt"], default="d4orm")
     parser.add_argument("--preset", choices=["paper"], help="the paper's settings instead of this project's")
     parser.add_argument("--radius", type=float, default=0.5, help="of the obstacle [m]")
-    parser.add_argument("--engine", default="auto")
     arguments = parser.parse_args()
     seeds = min(arguments.seeds, 8) if arguments.quick else arguments.seeds
     problem = crossing(arguments.radius)
-    planner = make_planner("d4orm", preset=arguments.preset, engine=arguments.engine)
+    planner = make_planner(arguments.planner, preset=arguments.preset)
     plans: dict[Signature, list[Any]] = {signs: [] for signs in CLASSES}
     for seed in range(seeds):
         plan = planner.solve(problem, seed=seed, max_iterations=10)

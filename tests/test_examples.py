@@ -297,6 +297,18 @@ def test_d4orm_finds_several_kinds_of_solution_and_no_robot_weaves(tmp_path: Pat
 
 
 @pytest.mark.slow
+def test_planners_find_several_kinds_of_solution_for_a_team(tmp_path: Path) -> None:
+    pytest.importorskip("casadi")
+    out = tmp_path / "out"
+    completed("multimodality_team", out)
+    rows = {row["planner"]: row for row in table(out / "multimodality_team.csv")}
+    assert list(rows) == ["d4orm", "d4orm, preset paper", "ipopt"]
+    assert rows["d4orm"]["solved"] == "4 of 4", "every seed solves so easy a problem"
+    assert all(1 <= int(row["classes"]) <= int(row["solved"].split()[0]) for row in rows.values())
+    assert (out / "multimodality_team.png").read_bytes().startswith(PNG)
+
+
+@pytest.mark.slow
 def test_big_team_example_ends_without_failures_and_draws_the_plan(tmp_path: Path) -> None:
     out = tmp_path / "out"
     completed("sixty_four_robots", out)
