@@ -113,6 +113,19 @@ def test_what_a_figure_names_exists(name: str) -> None:
                 assert len(study.configurations()) == len(section.policies)
 
 
+def test_trials_of_a_file_are_not_run_again(d4orm, tmp_path: Path) -> None:
+    part = ("coarseness", "--quick", "--policy", "f=1, o=1", "--quiet")
+    assert d4orm(*part, "--out", "first")[0] == 0
+    file = str(tmp_path / "first" / "coarseness-quick" / "trials.parquet")
+    assert d4orm(*part, "--out", "second", "--go-on-from", file)[0] == 0
+    before, after = (TrialStore.existing(tmp_path / name / "coarseness-quick").trials() for name in ("first", "second"))
+    assert before == after, "with the times of the first"
+    status, _, error = d4orm("coarseness", "--trials", file, "--go-on-from", file)
+    assert (status, error) == (2, "d4orm: --go-on-from is about running trials; leave it out beside --trials\n")
+    assert d4orm(*part, "--out", "third", "--go-on-from", "no.parquet")[0] == 2
+    assert not (tmp_path / "third").exists()
+
+
 def test_a_figure_is_made_of_trials_of_other_times(d4orm, tmp_path: Path) -> None:
     part = ("robustness", "--section", "2D Holonomic", "--policy", "d4orm-d, defaults")
     status, out, err = d4orm(*part, "--seeds", "2", "--workers", "2")

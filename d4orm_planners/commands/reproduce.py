@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -46,6 +46,9 @@ class ReproduceOptions:
     trials: Annotated[
         Path | None, typer.Option("--trials", help="Run nothing; make the figure of a Parquet file of its trials.")
     ] = None
+    go_on_from: Annotated[
+        Path | None, typer.Option("--go-on-from", help="A Parquet file of trials that need not be run again.")
+    ] = None
     times: Annotated[
         bool, typer.Option("--times/--no-times", help="Leave seconds out, of a machine that did other work too.")
     ] = True
@@ -60,6 +63,8 @@ def reproduce(options: ReproduceOptions) -> None:
         return
     from d4orm_planners.commands.progress import resumable, tell_results
     from d4orm_planners.commands.warmup import warm_up
+    from d4orm_planners.evaluation.report import read_parquet
+    from d4orm_planners.evaluation.store import STORE, TrialStore
     from d4orm_planners.reproduction.figure import reproduce as run
     from d4orm_planners.reproduction.paper import find_figure
     from d4orm_planners.reproduction.report import markdown, write_reproduction
@@ -70,8 +75,11 @@ def reproduce(options: ReproduceOptions) -> None:
     if options.trials is not None:
         _make_of_trials(figure, options)
         return
+    known = [] if options.go_on_from is None else read_parquet(options.go_on_from)
     folder = options.out / (f"{figure.name}-quick" if options.quick else figure.name)
     make_folder(folder)
+    if known:
+        TrialStore(folder / STORE).add(*known)
     if options.quick:
         figure = figure.quick()
     else:
@@ -90,9 +98,8 @@ def _make_of_trials(figure: Figure, options: ReproduceOptions) -> None:
     from d4orm_planners.reproduction.figure import regrouped
     from d4orm_planners.reproduction.report import markdown, write_reproduction
 
-    refuse_options(
-        options.context, ("quick", "seeds", "workers"), "is about running trials; leave it out beside --trials"
-    )
+    running = ("quick", "seeds", "workers", "go_on_from")
+    refuse_options(options.context, running, "is about running trials; leave it out beside --trials")
     assert options.trials is not None
     groups = regrouped(figure, read_parquet(options.trials))
     folder = options.out / figure.name
@@ -105,10 +112,7 @@ def _make_of_trials(figure: Figure, options: ReproduceOptions) -> None:
 def _list_figures(context: typer.Context) -> None:
     from d4orm_planners.reproduction.paper import FIGURES
 
-    refuse_options(
-        context,
-        ("figure", "quick", "sections", "policies", "seeds", "workers", "out", "trials", "times", "quiet"),
-        "does not go with the list of figures; give a figure, and leave out --list",
-    )
+    others = [field.name for field in fields(ReproduceOptions) if field.name not in ("context", "list_")]
+    refuse_options(context, others, "does not go with the list of figures; give a figure, and leave out --list")
     for figure in FIGURES.values():
         typer.echo(f"{figure.name:<15} {figure.title} ({figure.source})")
