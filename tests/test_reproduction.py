@@ -442,6 +442,8 @@ def test_a_part_of_a_figure() -> None:
         ((16, 32, 64), ["d4orm-d, defaults", "d4orm-c2f"]),
     ]
     assert find_figure("big-teams").only() == FIGURES["big-teams"]
+    for labels, limit in ((["d4orm-c2f"], None), (["d4orm-c2f", "d4orm-d"], 30.0)):  # which is a planner's
+        assert {section.time_limit for section in find_figure("robustness").only((), labels).sections} == {limit}
 
 
 # The store.

@@ -13,6 +13,7 @@ from d4orm_env.core.arrays import whole_number
 from d4orm_planners.evaluation.evaluate import Progress, run_study
 from d4orm_planners.evaluation.store import Trial, TrialKey
 from d4orm_planners.evaluation.study import Study
+from d4orm_planners.registry import list_planners
 
 PaperNumbers = Mapping[tuple[str, str, str], Mapping[str, str]]
 """By section, label and metric: what the paper says, by column."""
@@ -158,7 +159,8 @@ class Figure:
         for section in self.sections:
             chosen = {label: section.policies[label] for label in section.policies if label in labels or not labels}
             if chosen and (section.title in titles or not titles):
-                kept.append(replace(section, policies=chosen))
+                plans = any(settings.get("policy", label) in list_planners() for label, settings in chosen.items())
+                kept.append(replace(section, policies=chosen, time_limit=section.time_limit if plans else None))
         return replace(self, sections=tuple(kept))
 
 
