@@ -274,6 +274,7 @@ def test_denoising_steps_are_counted_where_rows_tell_them(tmp_path: Path) -> Non
     told = [trial(seed, history=f"[[0.1,0,0.4,50],[0.5,1,0.5,{steps}]]") for seed, steps in enumerate((100, 200, 300))]
     never = [trial(seed, history="[[0.1,0,0.4,50]]", status="iteration_limit", success=False) for seed in (3, 4)]
     assert [steps_to_solution(one) for one in [*told, *never]] == [100, 200, 300, None, None]
+    assert steps_to_solution(trial(policy="ipopt", iterations=3)) is None, "it denoises nothing"
     row = measured(Group("Circle", "d4orm", [*told, *never]))
     assert (row.first_steps_lower, row.first_steps, row.first_steps_upper) == (200, 300, None)
     assert METRICS["first_steps"].text(row) == "300 (200-∞)"

@@ -205,9 +205,10 @@ def steps_to_solution(trial: Trial) -> int | None:
     first = next((best for best in trial.progress if best.solved), None)
     if first is not None and first.steps is not None:
         return first.steps
-    if trial.status != "solved" or not trial.iterations:
+    steps = json.loads(trial.config).get("num_steps")
+    if trial.status != "solved" or not trial.iterations or steps is None:
         return None
-    return trial.iterations * int(json.loads(trial.config)["num_steps"])
+    return trial.iterations * int(steps)
 
 
 def penalised_steps(trial: Trial) -> int:
