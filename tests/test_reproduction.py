@@ -271,20 +271,22 @@ def test_the_best_reward_is_a_staircase() -> None:
 
 
 def test_denoising_steps_are_counted_where_rows_tell_them(tmp_path: Path) -> None:
-    told = [trial(seed, history=f"[[0.1,0,0.4,50],[0.5,1,0.5,{steps}]]") for seed, steps in enumerate((100, 200, 300))]
+    known = [trial(seed, history=f"[[0.1,0,0.4,50],[0.5,1,0.5,{steps}]]") for seed, steps in enumerate((100, 200, 300))]
     never = [trial(seed, history="[[0.1,0,0.4,50]]", status="iteration_limit", success=False) for seed in (3, 4)]
-    assert [steps_to_solution(one) for one in [*told, *never]] == [100, 200, 300, None, None]
+    assert [steps_to_solution(one) for one in [*known, *never]] == [100, 200, 300, None, None]
     assert steps_to_solution(trial(policy="ipopt", iterations=3)) is None, "it denoises nothing"
-    row = measured(Group("Circle", "d4orm", [*told, *never]))
+    row = measured(Group("Circle", "d4orm", [*known, *never]))
     assert (row.first_steps_lower, row.first_steps, row.first_steps_upper) == (200, 300, None)
     assert METRICS["first_steps"].text(row) == "300 (200-∞)"
-    assert best_reward(told[0], np.array([49, 50, 100]), counted=True) == pytest.approx([np.nan, 0.4, 0.5], nan_ok=True)
+    assert best_reward(known[0], np.array([49, 50, 100]), counted=True) == pytest.approx(
+        [np.nan, 0.4, 0.5], nan_ok=True
+    )
     rivals = [trial(seed, history=f"[[9,1,0.5,{100 * seed + 50}]]") for seed in range(5)]
     by_steps = figure(compared_by="first_steps", reference="d4orm", metrics=("first_steps", "runtime"),
                       plots=("first_steps", "survival", "anytime", "runtime")).without_times()  # fmt: skip
     assert by_steps.metrics == ("first_steps",)
     assert by_steps.plots == ("first_steps", "survival", "anytime")
-    groups = [Group("Circle", "d4orm", [*told, *never]), Group("Circle", "mppi", rivals)]
+    groups = [Group("Circle", "d4orm", [*known, *never]), Group("Circle", "mppi", rivals)]
     # Steps of the rival: 50 to 450; of d4orm 100 to 300, and two without, each of which counts 900.
     page = markdown(by_steps, groups)
     assert "the median difference in denoising steps" in page

@@ -24,12 +24,12 @@ def test_steps_are_those_of_pettingzoo() -> None:
     for _ in range(5):
         actions = {agent: ours.action_spaces[agent].sample() for agent in ours.agents}
         *mine, infos = ours.step(actions)
-        *others, told = theirs.step(actions)
+        *others, expected_infos = theirs.step(actions)
         for got, wanted in zip(mine, others):
             assert {agent: np.asarray(got[agent]).tolist() for agent in wanted} == {
                 agent: np.asarray(value).tolist() for agent, value in wanted.items()
             }
-        assert all(infos[agent] == info | {"is_success": False} for agent, info in told.items())
+        assert all(infos[agent] == info | {"is_success": False} for agent, info in expected_infos.items())
 
 
 @pytest.mark.parametrize(("robots", "cycles", "terminated"), [(1, 150, True), (3, 5, False)])

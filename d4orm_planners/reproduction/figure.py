@@ -128,11 +128,11 @@ class Figure:
 
     def without_times(self) -> Figure:
         """The version that says nothing of seconds, for trials of a machine that did other work too."""
-        told = TIMES if self.compared_by == "first_steps" else TIMES | EFFORTS
+        dropped = TIMES if self.compared_by == "first_steps" else TIMES | EFFORTS
         return replace(
             self,
-            metrics=tuple(name for name in self.metrics if name not in told),
-            plots=tuple(name for name in self.plots if name not in told) or ("success",),
+            metrics=tuple(name for name in self.metrics if name not in dropped),
+            plots=tuple(name for name in self.plots if name not in dropped) or ("success",),
             deadlines=(),
             compared_by="travel_time" if self.compared_by == "runtime" else self.compared_by,
             timed=False,

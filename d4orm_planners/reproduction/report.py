@@ -12,14 +12,7 @@ from d4orm_planners.evaluation.report import deadline_table, errors, table, targ
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import SuccessWithin, success_by
 from d4orm_planners.reproduction.figure import Figure, Group
-from d4orm_planners.reproduction.numbers import (
-    METRICS,
-    Measured,
-    column,
-    first_solution,
-    is_time,
-    measured,
-)
+from d4orm_planners.reproduction.numbers import METRICS, Measured, column, first_solution, is_time, measured
 from d4orm_planners.reproduction.plots import draw
 
 INTRODUCTION = """\
