@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 EXTRAS ?= dev,rl,ipopt
 PYTEST_ARGS ?=
-FIGURES := coarseness noise-schedule robustness
+FIGURES := amswarm coarseness nodes noise-schedule robustness selections team-size
 
 # A stamp is as new as the last install that succeeded, so an install is repeated only when what it reads has changed.
 CORE_STAMP := $(VENV)/.core-installed
@@ -54,10 +54,12 @@ bench: $(CORE_STAMP) ## Measure the engines on this machine, write bench/
 results: $(DEV_STAMP) ## Make the tables and figures in docs/tables from the trials in data/
 	$(BIN)/python examples/tune_rivals.py --trials data/tuning.parquet --out docs/tables
 	$(BIN)/python examples/credit_by_update.py --trials data/credit_by_update.parquet --out docs/tables
+	$(BIN)/python examples/fewer_samples.py --trials data/fewer_samples.parquet --out docs/tables
 	$(BIN)/python examples/disturbance_study.py --trials data/disturbance_study.parquet --out docs/tables
 	$(BIN)/python examples/training_seeds.py --curves data/training_curves.csv --out docs/tables
 	for figure in $(FIGURES); do \
 	  $(BIN)/d4orm reproduce $$figure --trials data/$$figure.parquet --no-times --out docs/tables --quiet || exit 1; done
+	$(BIN)/d4orm reproduce ipopt --trials data/ipopt.parquet --out docs/tables --quiet
 	$(BIN)/d4orm leaderboard data/leaderboard.parquet --out docs/tables/leaderboard.md
 
 format: $(DEV_STAMP) ## Format the code and mend what ruff can
