@@ -59,7 +59,8 @@ results: $(DEV_STAMP) ## Make the tables and figures in docs/tables from the tri
 	$(BIN)/python examples/training_seeds.py --curves data/training_curves.csv --out docs/tables
 	for figure in $(FIGURES); do \
 	  $(BIN)/d4orm reproduce $$figure --trials data/$$figure.parquet --no-times --out docs/tables --quiet || exit 1; done
-	$(BIN)/d4orm reproduce ipopt --trials data/ipopt.parquet --out docs/tables --quiet
+	for figure in big-teams ipopt; do \
+	  $(BIN)/d4orm reproduce $$figure --trials data/$$figure.parquet --out docs/tables --quiet || exit 1; done
 	$(BIN)/d4orm leaderboard data/leaderboard.parquet --out docs/tables/leaderboard.md
 
 format: $(DEV_STAMP) ## Format the code and mend what ruff can
