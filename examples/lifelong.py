@@ -12,11 +12,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from outputs import argument_parser, count, save_gif, save_table
+from outputs import argument_parser, count, measured, save_gif, save_table, trials_argument
 
 from d4orm_env import Problem, make_problem, navigation_v0
 from d4orm_env.joint_state import JointState, split_state
@@ -42,20 +42,8 @@ def least_times(problem: Problem, joint: JointState) -> np.ndarray:
     return accelerating + np.maximum(way - to_top_speed, 0) / speed
 
 
-class Drive(NamedTuple):
-    """What came of driving a team from goal to goal."""
-
-    seconds: float
-    metrics: Mapping[str, float]
-    bounds: list[float]
-    act_times: list[float]
-    robots_that_touched: int
-    replanned: int
-    frames: list[NDArray[np.uint8]]
-
-
-def drive(problem: Problem, seed: int, minutes: float, film: float) -> Drive:
-    """Drive for so many minutes, and film the first seconds."""
+def drive(problem: Problem, seed: int, minutes: float, film: float) -> tuple[dict[str, Any], list[NDArray[np.uint8]]]:
+    """Drive for so many minutes, and film the first seconds: what was measured, and the film."""
     env = navigation_v0.parallel_env(problem=problem, lifelong=True)
     env.max_cycles = max(round(60 * minutes / problem.dt), 1)
     observations, _ = env.reset(seed=seed)
@@ -85,7 +73,38 @@ def drive(problem: Problem, seed: int, minutes: float, film: float) -> Drive:
     renderer.close()
     metrics, replanned = env.unwrapped.metrics(), sum(loop.replanned for loop in policy.loops)
     env.close()
-    return Drive(seconds, metrics, bounds, act_times, int(touched.sum()), replanned, frames)
+    row = {
+        "robots": problem.num_robots,
+        "seconds": seconds,
+        "goals": int(metrics["goals_reached"]),
+        "least_time": float(np.mean(bounds)),
+        "touched": int(touched.sum()),
+        "contacts": int(metrics["collisions"]),
+        "replanned": replanned,
+        "loop_seconds": act_times,
+    }
+    return row, frames
+
+
+def summary(row: Mapping[str, Any]) -> dict[str, Any]:
+    """The table's row of a drive."""
+    rate, bound = 60 * row["goals"] / (row["robots"] * row["seconds"]), 60 / row["least_time"]
+    loops = 1000 * np.array(row["loop_seconds"])
+    return {
+        "scenario": row["scenario"],
+        "robots": row["robots"],
+        "simulated [s]": f"{row['seconds']:.1f}",
+        "goals reached": row["goals"],
+        "goals per robot-minute": f"{rate:.2f}",
+        "bound": f"{bound:.2f}",
+        "share of the bound": f"{rate / bound:.0%}",
+        "robots that touched": row["touched"],
+        "robot-steps in contact": row["contacts"],
+        "loop, median [ms]": f"{np.median(loops):.0f}",
+        "loop, 95th percentile [ms]": f"{np.percentile(loops, 95):.0f}",
+        "loop, slowest [ms]": f"{loops.max():.0f}",
+        "guidance planned anew": row["replanned"],
+    }
 
 
 def main() -> None:
@@ -96,32 +115,20 @@ def main() -> None:
     parser.add_argument("--num-robots", "--robots", type=count, default=16)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--film", type=float, default=20.0, help="seconds of the animation")
+    trials_argument(parser)
     arguments = parser.parse_args()
     num_robots, minutes, film = arguments.num_robots, arguments.minutes, arguments.film
     if arguments.quick:
         num_robots, minutes, film = 4, 0.1, 2.0
 
-    problem = make_problem(arguments.scenario, num_robots=num_robots, seed=arguments.seed)
-    driven = drive(problem, arguments.seed, minutes, film)
-    rate, bound = driven.metrics["goals_per_robot_minute"], 60 / float(np.mean(driven.bounds))
-    loops = 1000 * np.array(driven.act_times)
-    row = {
-        "scenario": arguments.scenario,
-        "robots": num_robots,
-        "simulated [s]": f"{driven.seconds:.1f}",
-        "goals reached": int(driven.metrics["goals_reached"]),
-        "goals per robot-minute": f"{rate:.2f}",
-        "bound": f"{bound:.2f}",
-        "share of the bound": f"{rate / bound:.0%}",
-        "robots that touched": driven.robots_that_touched,
-        "robot-steps in contact": int(driven.metrics["collisions"]),
-        "loop, median [ms]": f"{np.median(loops):.0f}",
-        "loop, 95th percentile [ms]": f"{np.percentile(loops, 95):.0f}",
-        "loop, slowest [ms]": f"{loops.max():.0f}",
-        "guidance planned anew": driven.replanned,
-    }
-    save_table([row], arguments.out / "lifelong.csv")
-    save_gif(driven.frames, arguments.out / "lifelong.gif", problem.dt)
+    def measure() -> list[dict[str, Any]]:
+        problem = make_problem(arguments.scenario, num_robots=num_robots, seed=arguments.seed)
+        row, frames = drive(problem, arguments.seed, minutes, film)
+        save_gif(frames, arguments.out / "lifelong.gif", problem.dt)
+        return [{"scenario": arguments.scenario, "seed": arguments.seed, **row}]
+
+    rows = measured(arguments.trials, measure, arguments.out / "lifelong.parquet")
+    save_table([summary(row) for row in rows], arguments.out / "lifelong.csv")
 
 
 if __name__ == "__main__":

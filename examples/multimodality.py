@@ -1,26 +1,36 @@
 """Which kinds of solution a planner finds: two robots swap places around an obstacle (the paper's appendix A).
 
     python examples/multimodality.py --seeds 100
-    python examples/multimodality.py --seeds 100 --planner ipopt
 
-One solve per seed. A plan's class is the signs of three winding angles: of robot 0 about the obstacle, of robot 1 about
-the obstacle, and of robot 1 about robot 0. Every combination of signs can be had. Six of the eight say in which order
-the two robots and the obstacle lie from top to bottom as they pass each other, of which there are 3! = 6. The other two
-are cyclic (robot 0 above the obstacle, the obstacle above robot 1, robot 1 above robot 0): a robot must weave, and pass
-the other on one side before it passes the obstacle on the other. The signs do not tell how often a robot goes round.
+One solve per planner and seed. A plan's class is the signs of three winding angles: of robot 0 about the obstacle, of
+robot 1 about the obstacle, and of robot 1 about robot 0. Every combination of signs can be had. Six of the eight say in
+which order the two robots and the obstacle lie from top to bottom as they pass each other, of which there are 3! = 6.
+The other two are cyclic (robot 0 above the obstacle, the obstacle above robot 1, robot 1 above robot 0): a robot must
+weave, and pass the other on one side before it passes the obstacle on the other. The signs do not tell how often a
+robot goes round.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
-from outputs import argument_parser, count, plt, save_figure, save_table
+from outputs import argument_parser, count, measured, plt, require, save_figure, save_table, trials_argument
 
-from d4orm_env import Problem, Trajectory, World, make_problem, verify
+require("ipopt", "casadi")
+from d4orm_env import Problem, World, make_problem, verify
 from d4orm_planners import make_planner
 
 Signature = tuple[int, int, int]
+Row = Mapping[str, Any]
+
+PLANNERS: dict[str, tuple[str, dict[str, Any]]] = {
+    "d4orm": ("d4orm", {}),
+    "d4orm, preset paper": ("d4orm", {"preset": "paper"}),
+    "ipopt": ("ipopt", {}),
+}
 
 CLASSES: dict[Signature, tuple[str, str]] = {
     (-1, -1, -1): ("1 over O over 0", "#0072B2"),
@@ -56,19 +66,47 @@ def signature(positions: np.ndarray) -> Signature:
     return signs[0], signs[1], signs[2]
 
 
-def principal_components(trajectories: list[Trajectory]) -> tuple[np.ndarray, np.ndarray]:
-    """Where the plans lie ``(S, 2)`` [m] in the two directions in which they differ most.
+def solve(problem: Problem, seeds: int, **limits: Any) -> list[dict[str, Any]]:
+    """A row per planner and seed: whether the first solution passes, its travel time, and where the robots go."""
+    rows = []
+    for label, (name, settings) in PLANNERS.items():
+        planner = make_planner(name, **settings)
+        for seed in range(seeds):
+            plan = planner.solve(problem, seed=seed, **limits)
+            solved = plan.solved and verify(problem, plan.controls).ok
+            # To the millimetre, which compresses well.
+            places = np.round(plan.trajectory.positions.astype(np.float64), 3).ravel().tolist() if solved else []
+            rows.append(
+                {"planner": label, "seed": seed, "solved": solved, "robots": problem.num_robots,
+                 "travel_time": plan.metrics["travel_time"] if solved else None, "positions": places}
+            )  # fmt: skip
+        print(f"{label}: {sum(row['solved'] for row in rows[-seeds:])} of {seeds} seeds solved", flush=True)
+    return rows
+
+
+def solutions(rows: Sequence[Row], label: str) -> list[Row]:
+    """Those of a planner."""
+    return [row for row in rows if row["planner"] == label and row["solved"]]
+
+
+def path_of(row: Row) -> np.ndarray:
+    """``(T, K, 2)`` where the robots are [m]."""
+    return np.array(row["positions"]).reshape(-1, row["robots"], 2)
+
+
+def principal_components(paths: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Where plans ``(T, K, 2)`` lie ``(S, 2)`` [m] in the two directions in which they differ most.
 
     Also the ``(2,)`` shares of the variance.
     """
-    features = np.stack([trajectory.positions.ravel() for trajectory in trajectories]).astype(np.float64)
+    features = np.stack([path.ravel() for path in paths]).astype(np.float64)
     u, singular, _ = np.linalg.svd(features - features.mean(axis=0), full_matrices=False)
     power = singular**2
     # Over the root of steps times robots: two plans then lie as far apart as their robots do, in root mean square.
     return u[:, :2] * singular[:2] / np.sqrt(features.shape[1] / 2), power[:2] / power.sum()
 
 
-def draw(problem: Problem, found: dict[Signature, list[Trajectory]], out: Any) -> None:
+def draw(problem: Problem, found: dict[Signature, list[np.ndarray]], out: Any) -> None:
     """Left: all plans along their principal components. Right: of every class the plan nearest to its mean."""
     rows = -(-len(found) // 2)
     figure = plt.figure(figsize=(10.5, 0.8 + 1.45 * max(rows, 2)), layout="constrained")
@@ -95,12 +133,11 @@ def draw(problem: Problem, found: dict[Signature, list[Trajectory]], out: Any) -
     save_figure(figure, out / "multimodality.png")
 
 
-def draw_plan(panel: Any, problem: Problem, trajectory: Trajectory, colour: str) -> None:
+def draw_plan(panel: Any, problem: Problem, positions: np.ndarray, colour: str) -> None:
     """Both paths, and where the robots are when they are nearest to each other."""
     x, y, radius = problem.world.circles[0]
     panel.add_patch(plt.Circle((x, y), radius, color="0.75"))
     panel.text(x, y, "O", ha="center", va="center", fontsize=8)
-    positions = trajectory.positions
     nearest = int(np.linalg.norm(positions[:, 0] - positions[:, 1], axis=1).argmin())
     for robot, style in enumerate(("-", "--")):
         path = positions[:, robot]
@@ -112,38 +149,37 @@ def draw_plan(panel: Any, problem: Problem, trajectory: Trajectory, colour: str)
     panel.set_axis_off()
 
 
+def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """A row per class: how many plans of each planner are of it, and how long they travel."""
+    classes = {label: [signature(path_of(row)) for row in solutions(rows, label)] for label in PLANNERS}
+    table = []
+    for signs, (name, _) in CLASSES.items():
+        line = {"top to bottom": name, "signs": " ".join("+" if sign > 0 else "-" for sign in signs)}
+        for label, found in classes.items():
+            pairs = zip(solutions(rows, label), found, strict=True)
+            times = [row["travel_time"] for row, of in pairs if of == signs]
+            line[f"{label}: plans"] = str(len(times))
+            line[f"{label}: travel time [s]"] = f"{np.mean(times):.2f}" if times else ""
+        table.append(line)
+    return table
+
+
 def main() -> None:
-    """Solve with every seed, count the classes, write the table and the plot."""
+    """Solve with every planner and seed, count the classes, write the table and the plot of D4orm's."""
     parser = argument_parser(__doc__)
     parser.add_argument("--seeds", type=count, default=100)
-    parser.add_argument("--planner", choices=["d4orm", "ipopt"], default="d4orm")
-    parser.add_argument("--preset", choices=["paper"], help="the paper's settings instead of this project's")
     parser.add_argument("--radius", type=float, default=0.5, help="of the obstacle [m]")
+    trials_argument(parser)
     arguments = parser.parse_args()
     seeds = min(arguments.seeds, 8) if arguments.quick else arguments.seeds
     problem = crossing(arguments.radius)
-    planner = make_planner(arguments.planner, preset=arguments.preset)
-    plans: dict[Signature, list[Any]] = {signs: [] for signs in CLASSES}
-    for seed in range(seeds):
-        plan = planner.solve(problem, seed=seed, max_iterations=10)
-        if plan.solved and verify(problem, plan.controls).ok:
-            plans[signature(plan.trajectory.positions)].append(plan)
-    solved = sum(map(len, plans.values()))
-    print(f"{solved} of {seeds} seeds solved")
-    if not solved:
-        raise SystemExit(1)
-    rows = [
-        {
-            "top to bottom": CLASSES[signs][0],
-            "signs": " ".join("+" if sign > 0 else "-" for sign in signs),
-            "plans": len(members),
-            "travel time [s]": f"{np.mean([p.metrics['travel_time'] for p in members]):.2f}" if members else "",
-        }
-        for signs, members in plans.items()
-    ]
-    save_table(rows, arguments.out / "multimodality.csv")
-    found = {signs: [plan.trajectory for plan in members] for signs, members in plans.items() if members}
-    draw(problem, found, arguments.out)
+    rows = measured(
+        arguments.trials, partial(solve, problem, seeds, max_iterations=10), arguments.out / "multimodality.parquet"
+    )
+    save_table(summary(rows), arguments.out / "multimodality.csv")
+    paths = [path_of(row) for row in solutions(rows, "d4orm")]
+    found = {signs: [path for path in paths if signature(path) == signs] for signs in CLASSES}
+    draw(problem, {signs: members for signs, members in found.items() if members}, arguments.out)
 
 
 if __name__ == "__main__":

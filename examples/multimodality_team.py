@@ -11,22 +11,16 @@ over all pairs). The plot has all solutions along the directions in which they d
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
 from itertools import combinations
 from typing import Any
 
 import numpy as np
-from multimodality import principal_components, winding
-from outputs import argument_parser, count, plt, require, save_figure, save_table
+from multimodality import PLANNERS, Row, path_of, principal_components, solutions, solve, winding
+from outputs import argument_parser, count, measured, plt, save_figure, save_table, trials_argument
 
-require("ipopt", "casadi")
-from d4orm_env import make_problem, verify
-from d4orm_planners import Plan, make_planner
-
-PLANNERS: dict[str, tuple[str, dict[str, Any]]] = {
-    "d4orm": ("d4orm", {}),
-    "d4orm, preset paper": ("d4orm", {"preset": "paper"}),
-    "ipopt": ("ipopt", {}),
-}
+from d4orm_env import make_problem
 
 
 def signature(positions: np.ndarray) -> tuple[bool, ...]:
@@ -35,16 +29,17 @@ def signature(positions: np.ndarray) -> tuple[bool, ...]:
     return tuple(winding(positions[:, second] - positions[:, first]) > 0 for first, second in pairs)
 
 
-def row_of(label: str, seeds: int, plans: list[Plan]) -> dict[str, Any]:
+def row_of(label: str, rows: Sequence[Row]) -> dict[str, Any]:
     """The table's row of a planner."""
-    paths = [plan.trajectory.positions for plan in plans]
+    plans = solutions(rows, label)
+    paths = [path_of(plan) for plan in plans]
     classes, pairs = [signature(path) for path in paths], list(combinations(range(len(plans)), 2))
     same = sum(classes[one] == classes[other] for one, other in pairs)
     apart = [np.sqrt(((paths[one] - paths[other]) ** 2).sum(axis=2).mean()) for one, other in pairs]
-    times = [plan.metrics["travel_time"] for plan in plans]
+    times = [plan["travel_time"] for plan in plans]
     return {
         "planner": label,
-        "solved": f"{len(plans)} of {seeds}",
+        "solved": f"{len(plans)} of {sum(row['planner'] == label for row in rows)}",
         "classes": len(set(classes)),
         "pairs of one class": f"{same / len(pairs):.0%}" if pairs else "-",
         "distance [m]": f"{np.mean(apart):.2f}" if pairs else "-",
@@ -52,9 +47,10 @@ def row_of(label: str, seeds: int, plans: list[Plan]) -> dict[str, Any]:
     }
 
 
-def draw(found: dict[str, list[Plan]], out: Any) -> None:
+def draw(rows: Sequence[Row], out: Any) -> None:
     """All planners' solutions along the principal components of all of them together."""
-    points, shares = principal_components([plan.trajectory for plans in found.values() for plan in plans])
+    found = {label: solutions(rows, label) for label in PLANNERS}
+    points, shares = principal_components([path_of(plan) for plans in found.values() for plan in plans])
     figure, axis = plt.subplots(figsize=(5.5, 4.5), layout="constrained")
     first = 0
     for marker, (label, plans) in zip("o^s", found.items(), strict=True):
@@ -74,18 +70,14 @@ def main() -> None:
     parser = argument_parser(__doc__)
     parser.add_argument("--seeds", type=count, default=30)
     parser.add_argument("--num-robots", "--robots", type=count, default=8, help="size of the team")
+    trials_argument(parser)
     arguments = parser.parse_args()
     seeds, num_robots = (4, 3) if arguments.quick else (arguments.seeds, arguments.num_robots)
     problem = make_problem("paper_circle", num_robots=num_robots)
-    found: dict[str, list[Plan]] = {}
-    for label, (name, settings) in PLANNERS.items():
-        planner = make_planner(name, **settings)
-        plans = [planner.solve(problem, seed=seed, max_iterations=20, time_limit=120) for seed in range(seeds)]
-        found[label] = [plan for plan in plans if plan.solved and verify(problem, plan.controls).ok]
-    save_table(
-        [row_of(label, seeds, plans) for label, plans in found.items()], arguments.out / "multimodality_team.csv"
-    )
-    draw(found, arguments.out)
+    plans = partial(solve, problem, seeds, max_iterations=20, time_limit=120)
+    rows = measured(arguments.trials, plans, arguments.out / "multimodality_team.parquet")
+    save_table([row_of(label, rows) for label in PLANNERS], arguments.out / "multimodality_team.csv")
+    draw(rows, arguments.out)
 
 
 if __name__ == "__main__":

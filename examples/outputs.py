@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import csv
+import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 from d4orm_env.core.files import replaced_when_done
+from d4orm_planners._machine import commit, describe_machine
 
 COLOURS = {"d4orm": "#0072B2", "default": "#56B4E9", "mppi": "#D55E00", "cem": "#009E73", "i-mbd": "#CC79A7"}
 """One colour per method in every plot, told apart by the colour-blind too."""
@@ -44,6 +46,30 @@ def argument_parser(description: str | None) -> argparse.ArgumentParser:
     parser.add_argument("--out", type=Path, default=Path("examples/output"), help="folder for the results")
     parser.add_argument("--quick", action="store_true", help="a small version, for a first look and for the tests")
     return parser
+
+
+def trials_argument(parser: argparse.ArgumentParser) -> None:
+    """Let a study make its table and plot of what :func:`measured` wrote before."""
+    parser.add_argument("--trials", type=Path, help="run nothing; a Parquet file of trials")
+
+
+def measured(trials: Path | None, measure: Callable[[], list[dict[str, Any]]], path: Path) -> list[dict[str, Any]]:
+    """The rows of the file ``trials``, or without it those of ``measure()``, written to ``path`` (``.parquet``).
+
+    Each row is written with the commit and the machine that it was measured with.
+    """
+    require("evaluate", "pyarrow")
+    from pyarrow import Table, parquet
+
+    if trials is not None:
+        return list(parquet.read_table(trials).to_pylist())
+    source = {"commit": commit(), "machine": json.dumps(describe_machine(), sort_keys=True)}
+    rows = measure()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replaced_when_done(path) as temporary:
+        parquet.write_table(Table.from_pylist([{**row, **source} for row in rows]), temporary, compression="zstd")
+    print(f"wrote {path}")
+    return rows
 
 
 def count(text: str) -> int:

@@ -8,10 +8,12 @@ Random starts and goals on a square with 1.5625 square metres per robot: 10 m x 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
-from outputs import COLOURS, argument_parser, count, plt, save_figure, save_table
+from outputs import COLOURS, argument_parser, count, measured, plt, save_figure, save_table, trials_argument
 
 from d4orm_env import make_problem
 from d4orm_planners import make_planner
@@ -37,36 +39,53 @@ def draw(rows: list[dict[str, Any]], out: Any) -> None:
     save_figure(figure, out / "scaling.png")
 
 
+def measure(sizes: Sequence[int], seeds: int, time_limit: float) -> list[dict[str, Any]]:
+    """A row per team size and problem."""
+    planner = make_planner("d4orm-d", max_iterations=1000)
+    rows = []
+    for robots in sizes:
+        for seed in range(seeds):
+            problem = make_problem("random", num_robots=robots, seed=seed, size=(robots * AREA) ** 0.5)
+            plan = planner.solve(problem, seed=seed, time_limit=time_limit)
+            rows.append(
+                {"robots": robots, "seed": seed, "solved": plan.solved, "iterations": plan.iterations,
+                 "seconds": plan.wall_time}
+            )  # fmt: skip
+            print(rows[-1], flush=True)
+    return rows
+
+
+def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row per team size."""
+    table = []
+    for robots in dict.fromkeys(row["robots"] for row in rows):
+        team = [row for row in rows if row["robots"] == robots]
+        seconds = [row["seconds"] for row in team]
+        table.append(
+            {
+                "robots": robots,
+                "side [m]": f"{(robots * AREA) ** 0.5:.1f}",
+                "solved": f"{sum(row['solved'] for row in team)} of {len(team)}",
+                "iterations, median": f"{np.median([row['iterations'] for row in team]):g}",
+                "seconds, median": f"{np.median(seconds):.2f}",
+                "seconds, most": f"{max(seconds):.2f}",
+                "ms per robot": f"{1000 * np.median(seconds) / robots:.1f}",
+            }
+        )
+    return table
+
+
 def main() -> None:
     """Plan for every team size, and write the table and the plot."""
     parser = argument_parser(__doc__)
     parser.add_argument("--num-robots", "--robots", type=count, nargs="+", default=ROBOTS)
     parser.add_argument("--seeds", type=count, default=3, help="problems per team size")
     parser.add_argument("--time-limit", type=float, default=120.0, help="seconds per plan")
+    trials_argument(parser)
     arguments = parser.parse_args()
-    sizes, seeds = arguments.num_robots, arguments.seeds
-    if arguments.quick:
-        sizes, seeds = (4, 8), 1
-    planner = make_planner("d4orm-d", max_iterations=1000)
-    rows = []
-    for robots in sizes:
-        side = (robots * AREA) ** 0.5
-        problems = [make_problem("random", num_robots=robots, seed=seed, size=side) for seed in range(seeds)]
-        plans = [
-            planner.solve(problem, seed=seed, time_limit=arguments.time_limit) for seed, problem in enumerate(problems)
-        ]
-        rows.append(
-            {
-                "robots": robots,
-                "side [m]": f"{side:.1f}",
-                "solved": f"{sum(plan.solved for plan in plans)} of {seeds}",
-                "iterations, median": f"{np.median([plan.iterations for plan in plans]):g}",
-                "seconds, median": f"{np.median([plan.wall_time for plan in plans]):.2f}",
-                "seconds, most": f"{max(plan.wall_time for plan in plans):.2f}",
-                "ms per robot": f"{1000 * np.median([plan.wall_time for plan in plans]) / robots:.1f}",
-            }
-        )
-        print(rows[-1], flush=True)
+    sizes, seeds = ((4, 8), 1) if arguments.quick else (arguments.num_robots, arguments.seeds)
+    plans = partial(measure, sizes, seeds, arguments.time_limit)
+    rows = summary(measured(arguments.trials, plans, arguments.out / "scaling.parquet"))
     save_table(rows, arguments.out / "scaling.csv")
     draw(rows, arguments.out)
 
