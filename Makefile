@@ -25,6 +25,7 @@ demo: $(CORE_STAMP) ## Plan 16 robots across a warehouse, execute the plan, writ
 	$(BIN)/d4orm demo --out demo
 
 test: $(DEV_STAMP) ## Run the whole test suite; PYTEST_ARGS='-m "not slow"' for the quick part
+	$(BIN)/d4orm warmup # once; processes that find nothing in the cache all compile the same kernels
 	$(BIN)/python -m pytest --numprocesses 3 --dist worksteal --durations 40 $(PYTEST_ARGS)
 
 # RLlib and JaxMARL pin an older Gymnasium, BenchMARL an older TorchRL than the rest is tested with.
