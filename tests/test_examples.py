@@ -217,6 +217,7 @@ def test_policies_meet_every_disturbance(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("program", "name"),
     [
+        ("ablation", "ablation"),
         ("tune_rivals", "tuning"),
         ("credit_by_update", "credit_by_update"),
         ("fewer_samples", "fewer_samples"),
@@ -232,6 +233,20 @@ def test_the_tables_of_the_docs_are_those_of_the_data(tmp_path: Path, program: s
     for kind in ("csv", "md"):
         committed = ROOT / "docs" / "tables" / f"{name}.{kind}"
         assert (tmp_path / "out" / f"{name}.{kind}").read_bytes() == committed.read_bytes()
+
+
+@pytest.mark.slow
+def test_measures_against_disturbances_are_left_out_one_by_one(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("ablation", out, "--workers", "1")
+    rows = table(out / "ablation.csv")
+    assert [(row["scenario"], row["disturbance"], row["left out"], row["trials"]) for row in rows] == [
+        ("circle", "delay of 2 steps", "delay", "1"),
+        ("circle", "delay of 2 steps", "all of them", "1"),
+    ]
+    assert {row["with"] for row in rows} == {"1, 0"}
+    completed("ablation", tmp_path / "again", "--trials", str(out / "ablation.parquet"))
+    assert table(tmp_path / "again" / "ablation.csv") == rows
 
 
 def test_gradient_ascent_through_the_dynamics_raises_the_reward(tmp_path: Path) -> None:
