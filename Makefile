@@ -4,6 +4,8 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 EXTRAS ?= dev,rl,ipopt
 PYTEST_ARGS ?=
+STUDIES := ablation credit_by_update disturbance_study fewer_samples gradient_dilution lifelong multimodality \
+  multimodality_team scaling
 FIGURES := amswarm coarseness nodes noise-schedule robustness selections team-size
 
 # A stamp is as new as the last install that succeeded, so an install is repeated only when what it reads has changed.
@@ -53,10 +55,10 @@ bench: $(CORE_STAMP) ## Measure the engines on this machine, write bench/
 	$(BIN)/d4orm bench --out bench
 
 results: $(DEV_STAMP) ## Make the tables and figures in docs/tables from the trials in data/
+	$(BIN)/python examples/one_dimension.py --out docs/tables
 	$(BIN)/python examples/tune_rivals.py --trials data/tuning.parquet --out docs/tables
-	$(BIN)/python examples/credit_by_update.py --trials data/credit_by_update.parquet --out docs/tables
-	$(BIN)/python examples/fewer_samples.py --trials data/fewer_samples.parquet --out docs/tables
-	$(BIN)/python examples/disturbance_study.py --trials data/disturbance_study.parquet --out docs/tables
+	for study in $(STUDIES); do \
+	  $(BIN)/python examples/$$study.py --trials data/$$study.parquet --out docs/tables || exit 1; done
 	$(BIN)/python examples/training_seeds.py --curves data/training_curves.csv --out docs/tables
 	for figure in $(FIGURES); do \
 	  $(BIN)/d4orm reproduce $$figure --trials data/$$figure.parquet --no-times --out docs/tables --quiet || exit 1; done

@@ -38,6 +38,7 @@ TEMPERATURE = 0.3
 GROUP = 4
 MORE, MOST_WITH_MORE = "team, samples in proportion", 16
 STYLES = {"team": "mppi", "group": "cem", "robot": "d4orm", MORE: "default"}
+NAMES = {"group": f"groups of {GROUP}"}
 LEAST = {"team": 2, "group": 2 * GROUP, "robot": 1, MORE: 2}
 """The smallest team in which weights by this reward differ from those of the rows before."""
 
@@ -134,7 +135,7 @@ def summary(rows: Rows) -> Rows:
         table.append(
             {
                 "robots": size,
-                "weighted by": f"groups of {GROUP}" if credit == "group" else credit.partition(",")[0],
+                "weighted by": NAMES.get(credit, credit.partition(",")[0]),
                 "samples": of("samples")[0],
                 "effective samples": f"{np.mean(of('effective_samples')):.1f}",
                 "theory": f"{limit['effective_samples']:.1f}",
@@ -156,7 +157,7 @@ def draw(rows: Rows, out: Any) -> None:
         if not sizes:
             continue
         rewards = [np.mean(means(rows, size, credit, "reward")) for size in sizes]
-        ends.plot(sizes, rewards, "o-", color=COLOURS[style], label=credit)
+        ends.plot(sizes, rewards, "o-", color=COLOURS[style], label=NAMES.get(credit, credit))
         if credit != MORE:
             own = [np.mean(means(rows, size, credit, "own_reward")) for size in sizes]
             signal.plot(sizes, own, "o", color=COLOURS[style])
@@ -169,6 +170,7 @@ def draw(rows: Rows, out: Any) -> None:
         axes.set_xticks(every, [str(size) for size in every])
         axes.set_xlabel("robots")
     signal.set_yscale("log", base=2)
+    signal.set_yticks([0.25, 0.5, 1, 2], ["0.25", "0.5", "1", "2"])
     signal.set_ylabel("own reward, weighted mean [SD]")
     signal.set_title("First step (lines: theory)", fontsize=9)
     ends.set_ylabel("reward")
