@@ -34,6 +34,9 @@ WIDER = 4
 CROWDED = 8
 """Obstacles of a cell beyond which it is worthwhile to look closer at which of them count."""
 
+FEW = 8
+"""Ranks up to which it is quicker to take the nearest away one by one than to sort."""
+
 _CORNERS = {d: np.array(list(product((-0.5, 0.5), repeat=d))) for d in (2, 3)}
 
 _PAIRS_AT_ONCE = 2**18
@@ -284,13 +287,22 @@ class _Turn(NamedTuple):
 
 def _smallest(distance: Floats, cell: NDArray[np.int64], bounds: NDArray[np.int64], nearest: int) -> Floats:
     """``(C,)`` distance of the obstacle of this rank in every cell; of the last one where there are fewer."""
+    smallest: Floats = np.minimum.reduceat(distance, bounds)
     if nearest == 1:
-        smallest: Floats = np.minimum.reduceat(distance, bounds)
         return smallest
-    ordered = distance[np.lexsort((distance, cell))]
-    last = np.append(bounds[1:], len(cell)) - 1
-    ranked: Floats = ordered[np.minimum(bounds + nearest - 1, last)]
-    return ranked
+    if nearest > FEW:
+        ordered = distance[np.lexsort((distance, cell))]
+        last = np.append(bounds[1:], len(cell)) - 1
+        ranked: Floats = ordered[np.minimum(bounds + nearest - 1, last)]
+        return ranked
+    left = distance.copy()
+    for _ in range(nearest - 1):
+        # Without the first one of every cell that is as near as its nearest.
+        at = np.flatnonzero(left == smallest[cell])
+        left[at[np.diff(cell[at], prepend=-1) > 0]] = np.inf
+        next_ones = np.minimum.reduceat(left, bounds)
+        smallest = np.where(np.isfinite(next_ones), next_ones, smallest)
+    return smallest
 
 
 def _halved(cells: _Cells) -> Iterator[_Cells]:
