@@ -17,7 +17,7 @@ from d4orm_env import load_problem, navigation_v0, rollout, save_problem, verify
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.core.world_index import MAX_BYTES, build_index, nearest_distance
+from d4orm_env.core.world_index import FEW, MAX_BYTES, build_index, nearest_distance
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.verify.geometry import polygon_approach
 from d4orm_planners import make_planner
@@ -85,18 +85,19 @@ def test_crowded_cells_keep_only_who_can_be_nearest(dimension: int, monkeypatch:
     np.testing.assert_array_equal(*distances)
 
 
+@pytest.mark.parametrize("nearest", [3, FEW + 3])
 @worlds
 @settings(max_examples=30, deadline=None)
-def test_index_finds_several_of_the_nearest(seed: int, dimension: int, count: int, radius: float) -> None:
+def test_index_finds_several_of_the_nearest(nearest: int, seed: int, dimension: int, count: int, radius: float) -> None:
     world = random_world(seed, dimension, count)
-    index, random = world.index(radius, nearest=3), np.random.default_rng(seed)
+    index, random = world.index(radius, nearest=nearest), np.random.default_rng(seed)
     inside = index.low + random.uniform(0, 1, (50, dimension)) * index.size / index.scale
     for point in inside:
         cell = np.ravel_multi_index(tuple(((point - index.low) * index.scale).astype(int)), tuple(index.size))
         items = index.items[index.first[cell] : index.first[cell + 1]].astype(int)
         every = np.arange(world.shapes.count)
         gaps = world.shapes.signed_distance(np.repeat(point[None], len(every), axis=0), every)
-        np.testing.assert_array_equal(np.sort(gaps[items])[:3], np.sort(gaps)[:3])
+        np.testing.assert_array_equal(np.sort(gaps[items])[:nearest], np.sort(gaps)[:nearest])
 
 
 @worlds
