@@ -95,7 +95,8 @@ def test_a_robot_with_a_new_goal_sees_that_itself(tmp_path: Path) -> None:
 
 def test_the_policy_of_the_package_is_that_for_the_world() -> None:
     policy = make_policy("ppo")
-    for scenario, along in (("random", False), ("rooms", True), ("circle", False), ("four_obstacles", True)):
+    worlds = {"random": False, "rooms": True, "four_obstacles": False, "forest": True, "warehouse": True}
+    for scenario, along in worlds.items():
         env = navigation_v0.parallel_env(scenario, num_robots=4)
         env.reset(seed=0)
         policy.reset(env)

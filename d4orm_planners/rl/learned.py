@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
 
 SHIPPED = Path(__file__).parent / "policies"
+SEEN_OBSTACLES = 4
+"""Obstacles that the policies that come with the package see."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +34,7 @@ class LearnedConfig(CheckedSettings):
         path: A ``.safetensors`` file of ``d4orm train``, or a ``.zip`` that Stable-Baselines3 saved after training on
             the environment's own observations and actions, as through SuperSuit. A zip holds pickled Python, which can
             run anything when it is loaded: give only one that you made yourself or trust. By default the policy that
-            comes with the package for the robots' model, and for a world with or without obstacles.
+            comes with the package for the robots' model, and for open ground or a world with walls or many obstacles.
 
     Raises:
         ValueError: If the path ends in something else.
@@ -83,9 +85,15 @@ class LearnedPolicy(Policy):
     def _file(self) -> Path:
         """That for robots of the team's model in a world like this, or else the nearest."""
         files, model = self._files(self.config), self.problem.team.models[0]
-        walls = "-walls" if self.problem.world.num_obstacles else ""
+        walls = "-walls" if self._walled else ""
         stems = (f"{self.name}-{model}{walls}", f"{self.name}-{model}", f"{self.name}{walls}")
         return next((path for stem in stems if (path := SHIPPED / f"{stem}{SUFFIX}") in files), files[0])
+
+    @property
+    def _walled(self) -> bool:
+        """Whether ways matter: round a few round obstacles, all of which it sees, a robot finds by what it sees."""
+        world = self.problem.world
+        return len(world.boxes) + len(world.polygons) > 0 or world.num_obstacles > SEEN_OBSTACLES
 
     def _use(self, path: Path) -> None:
         kind = _ZipActor if path.suffix == ".zip" else _NetworkActor
