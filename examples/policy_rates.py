@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -111,19 +112,19 @@ def cell(rows: Rows) -> tuple[str, str, str]:
 
 
 def table_of(rows: Rows, table: str) -> list[dict[str, str]]:
-    """A row per case, columns per file."""
-    files = [file for file in FILES if FILES[file][1] == table and any(row["file"] == file for row in rows)]
+    """A row per case and file."""
     lines = []
-    for name in dict.fromkeys(row["case"] for row in rows if row["file"] in files):
-        line = {"": name}
-        for file in files:
-            few, more = (
-                cell([row for row in rows if (row["file"], row["case"], row["observed"]) == (file, name, observed)])
-                for observed in OBSERVED
-            )
-            line |= {f"`{file}`": few[0], f"95%, {file}": few[1], f"travel time [s], {file}": few[2]}
-            line[f"8 observed, {file}"] = more[0]
-        lines.append(line)
+    files = [file for file in FILES if FILES[file][1] == table]
+    for name, file in product(dict.fromkeys(row["case"] for row in rows), files):
+        few, more = (
+            cell([row for row in rows if (row["file"], row["case"], row["observed"]) == (file, name, observed)])
+            for observed in OBSERVED
+        )
+        if few[0]:
+            lines.append(
+                {"": name, "policy": f"`{file}`", "succeeded": few[0], "95%": few[1], "travel time [s]": few[2],
+                 "8 observed": more[0], "its 95%": more[1]}
+            )  # fmt: skip
     return lines
 
 

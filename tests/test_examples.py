@@ -223,12 +223,14 @@ def test_policies_meet_every_disturbance(tmp_path: Path) -> None:
         ("fewer_samples", "fewer_samples"),
         ("disturbance_study", "disturbance_study"),
         ("disturbance_study", "disturbance_overview"),
+        ("policy_rates", "policy_rates"),
+        ("policy_rates", "policy_rates_walls"),
         *((program, program) for program in ("gradient_dilution", "lifelong", "multimodality", "multimodality_team",
                                              "scaling")),
     ],
 )  # fmt: skip
 def test_the_tables_of_the_docs_are_those_of_the_data(tmp_path: Path, program: str, name: str) -> None:
-    data = "disturbance_study" if program == "disturbance_study" else name
+    data = "tuning" if program == "tune_rivals" else program
     completed(program, tmp_path / "out", "--trials", str(ROOT / "data" / f"{data}.parquet"))
     for kind in ("csv", "md"):
         committed = ROOT / "docs" / "tables" / f"{name}.{kind}"
@@ -540,6 +542,20 @@ def test_learners_are_trained_with_several_seeds_and_their_curves_read_again(tmp
     assert (out / "training_seeds.png").read_bytes().startswith(PNG)
     completed("training_seeds", again, "--curves", str(out / "training_curves.csv"))
     assert table(again / "training_seeds.csv") == rows
+
+
+@pytest.mark.slow
+def test_policies_are_rolled_out_among_walls(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3")
+    out = tmp_path / "out"
+    completed("policy_rates", out)
+    rows = table(out / "policy_rates_walls.csv")
+    assert {row["policy"] for row in rows} == {"`ppo-walls`"}
+    assert len(rows) == 7
+    assert sum(row["succeeded"] == "1 of 1" for row in rows) >= 3
+    assert not (out / "policy_rates.csv").exists(), "nothing was measured on open ground"
+    completed("policy_rates", tmp_path / "again", "--trials", str(out / "policy_rates.parquet"))
+    assert table(tmp_path / "again" / "policy_rates_walls.csv") == rows
 
 
 def test_count_of_seeds_below_one_is_refused(tmp_path: Path) -> None:
