@@ -3,7 +3,7 @@
     python examples/training_seeds.py --seeds 3
     python examples/training_seeds.py --curves data/training_curves.csv
 
-Trains every learner with every seed, one after another: about two hours of one core. Broken off, it goes on where it
+Trains every learner with every seed, one after another: about three hours of one core. Broken off, it goes on where it
 was. With ``--curves`` it trains nothing, and makes table and picture of a file that it wrote before.
 """
 
@@ -33,6 +33,17 @@ CROWDS = TrainingSettings(
 LEARNERS: Mapping[str, TrainingSettings] = {
     "PPO, holonomic2d, crowds": replace(CROWDS, model="holonomic2d"),
     "PPO, differential_drive, crowds": replace(CROWDS, model="differential_drive"),
+    "SAC, holonomic2d, crowds": TrainingSettings(
+        algorithm="sac",
+        network="sets",
+        mixture=("crowds",),
+        observed_robots=6,
+        num_envs=64,
+        steps=1_500_000,
+        lessons=10,
+        learner_settings={"gradient_steps": 12},
+        validation_worlds=330,
+    ),
     "SAC, holonomic2d, 4 random robots": TrainingSettings(
         algorithm="sac", num_robots=4, steps=400_000, lessons=10, curriculum=True
     ),
@@ -49,7 +60,7 @@ def measure(seeds: int, out: Path, quick: bool) -> list[dict[str, str]]:
             chosen = replace(settings, seed=seed)
             if quick:
                 chosen = replace(chosen, **QUICK, mixture=("random 2", "circle 2") if chosen.mixture else ())
-            folder = out / f"{settings.algorithm}-{settings.model or 'holonomic2d'}-{seed}"
+            folder = out / f"{learner.lower().replace(', ', '-').replace(' ', '-')}-{seed}"
             print(f"{learner}, seed {seed}", flush=True)
             rows += [_row(learner, seed, point) for point in train(chosen, folder).curve]
     return rows
