@@ -18,15 +18,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from disturbance_study import DISTURBANCES, NOTHING, ROBOTS, SCENARIOS, tell
-from outputs import argument_parser, count, save_table
+from disturbance_study import DISTURBANCES, NOTHING, ROBOTS, SCENARIOS, names_by_text, successes, tell
+from outputs import argument_parser, count, save_table, trials_argument
 
 from d4orm_planners.evaluation.comparison import in_common, paired
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.report import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
-from d4orm_planners.evaluation.trials import Condition
 
 ALL, WITHOUT_ALL = "d4orm-c2f", "all of them"
 MEASURES: dict[str, dict[str, Any]] = {
@@ -75,17 +74,12 @@ def studies(scenarios: Sequence[str], disturbances: Sequence[str], seeds: int) -
 
 def by_cell(trials: Sequence[Trial]) -> Cells:
     """The table's cells, in its order."""
-    named = {Condition(disturbances=(one,)).text: name for name, one in DISTURBANCES.items()}
+    named = names_by_text()
     cells: Cells = {(scenario, name): {} for name in MEANT_FOR for scenario in SCENARIOS}
     for trial in trials:
         cell = cells[trial.scenario, named.get(trial.disturbances, NOTHING)]
         cell.setdefault(trial.label, []).append(trial)
     return {key: cell for key, cell in cells.items() if cell}
-
-
-def successes(trials: Sequence[Trial]) -> str:
-    """How many there were, and in how many trials anybody touched anything."""
-    return f"{sum(trial.success for trial in trials)}, {sum(trial.collided > 0 for trial in trials)}"
 
 
 def travel_time(trial: Trial) -> float:
@@ -120,7 +114,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=count, default=30)
     parser.add_argument("--workers", type=count, help="processes, by default one per core")
     parser.add_argument("--go-on-from", type=Path, help="a Parquet file of trials that need not be run again")
-    parser.add_argument("--trials", type=Path, help="run nothing; a Parquet file of trials")
+    trials_argument(parser)
     arguments = parser.parse_args()
     if arguments.trials is not None:
         trials = read_parquet(arguments.trials)

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from outputs import argument_parser, count, plt, save_figure, save_table
+from outputs import argument_parser, count, plt, save_figure, save_table, trials_argument
 
 from d4orm_planners.evaluation.comparison import paired, penalised_steps, steps_to_solution, survival
 from d4orm_planners.evaluation.evaluate import run_study
@@ -120,7 +120,7 @@ def main() -> int:
     """Run every cell on every team, write the table and draw the curves."""
     parser = argument_parser(__doc__)
     parser.add_argument("--seeds", type=count, default=50)
-    parser.add_argument("--trials", type=Path, help="run nothing; a Parquet file of trials")
+    trials_argument(parser)
     arguments = parser.parse_args()
     if arguments.trials is None:
         teams, seeds, budget = (TEAMS[:1], 1, TINY) if arguments.quick else (TEAMS, arguments.seeds, BUDGET)

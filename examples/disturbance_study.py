@@ -15,13 +15,13 @@ such as those in `data/`.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from outputs import argument_parser, count, plt, save_figure, save_table
+from outputs import argument_parser, count, plt, save_figure, save_table, trials_argument
 
 from d4orm_env.disturbances import (
     Bias,
@@ -90,9 +90,14 @@ def tell(what: str, done: int, total: int) -> None:
     print(f"{done} of {total}: {what}", flush=True)
 
 
+def names_by_text() -> dict[str, str]:
+    """Names of the disturbances, by what stands in trials."""
+    return {Condition(disturbances=(one,)).text: name for name, one in DISTURBANCES.items()}
+
+
 def by_cell(trials: Iterable[Trial]) -> Cells:
     """The table's cells."""
-    named = {Condition(disturbances=(one,)).text: name for name, one in DISTURBANCES.items()}
+    named = names_by_text()
     cells: Cells = {}
     bodies = {model: name for name, model in BODIES.items()}
     for trial in trials:
@@ -117,14 +122,18 @@ def rows_of(cells: Cells) -> list[dict[str, Any]]:
     return rows
 
 
+def successes(trials: Sequence[Trial]) -> str:
+    """How many there were, and in how many trials anybody touched anything."""
+    return f"{sum(trial.success for trial in trials)}, {sum(trial.collided > 0 for trial in trials)}"
+
+
 def overview(cells: Cells) -> list[dict[str, Any]]:
     """A row per scenario and policy: how many trials succeeded under each disturbance, and in how many was contact."""
     rows: dict[tuple[str, str], dict[str, Any]] = {}
     for (scenario, policy, disturbance), trials in cells.items():
         row = rows.setdefault((scenario, policy), {"scenario": scenario, "policy": policy, "trials": len(trials)})
         row.update({name: row.get(name, "-") for name in COLUMNS})
-        touched = sum(trial.collided > 0 for trial in trials)
-        row[disturbance] = f"{sum(trial.success for trial in trials)}, {touched}"
+        row[disturbance] = successes(trials)
     return list(rows.values())
 
 
@@ -167,7 +176,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=count, default=50)
     parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=SCENARIOS)
     parser.add_argument("--workers", type=count, help="processes, by default one per core")
-    parser.add_argument("--trials", type=Path, help="run nothing; a Parquet file of trials")
+    trials_argument(parser)
     arguments = parser.parse_args()
     if arguments.trials is not None:
         trials = read_parquet(arguments.trials)

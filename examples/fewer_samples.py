@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from outputs import argument_parser, count, save_table
+from outputs import argument_parser, count, save_table, trials_argument
 
 from d4orm_planners.evaluation.comparison import paired, penalised_steps, steps_to_solution
 from d4orm_planners.evaluation.evaluate import run_study
@@ -91,7 +91,7 @@ def main() -> int:
     """Run every setting with every team, and write the table."""
     parser = argument_parser(__doc__)
     parser.add_argument("--seeds", type=count, default=50)
-    parser.add_argument("--trials", type=Path, help="run nothing; a Parquet file of trials")
+    trials_argument(parser)
     arguments = parser.parse_args()
     if arguments.trials is not None:
         trials = read_parquet(arguments.trials)

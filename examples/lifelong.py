@@ -42,6 +42,31 @@ def least_times(problem: Problem, joint: JointState) -> np.ndarray:
     return accelerating + np.maximum(way - to_top_speed, 0) / speed
 
 
+class Film:
+    """Pictures of the first seconds."""
+
+    def __init__(self, problem: Problem, seconds: float) -> None:
+        self.frames: list[NDArray[np.uint8]] = []
+        self._seconds, self._dt, self._nobody = seconds, problem.dt, np.zeros(problem.num_robots, bool)
+        self._trail: list[np.ndarray] = []
+        # With a view of all places that a goal may come to lie.
+        self._renderer = FrameRenderer(problem, (520, 540), goal_region(problem))
+
+    def show(self, joint: JointState, collided: np.ndarray, reached: int) -> None:
+        """Draw what a step has come to, unless the film is over."""
+        self._trail = [*self._trail[-30:], joint.states[:, :2]]
+        seconds = joint.steps * self._dt
+        if seconds <= self._seconds:
+            trail, caption = np.stack(self._trail), f"{seconds:.1f} s    {reached} goals reached"
+            self.frames.append(
+                self._renderer.draw(joint.states, self._nobody, collided, joint.goals, trail, caption=caption)
+            )
+
+    def close(self) -> None:
+        """Free what draws."""
+        self._renderer.close()
+
+
 def drive(problem: Problem, seed: int, minutes: float, film: float) -> tuple[dict[str, Any], list[NDArray[np.uint8]]]:
     """Drive for so many minutes, and film the first seconds: what was measured, and the film."""
     env = navigation_v0.parallel_env(problem=problem, lifelong=True)
@@ -52,10 +77,9 @@ def drive(problem: Problem, seed: int, minutes: float, film: float) -> tuple[dic
 
     joint = split_state(problem, env.state())
     bounds = list(least_times(problem, joint))
-    nobody = np.zeros(problem.num_robots, bool)
-    trail, frames, act_times, touched = [joint.states[:, :2]], [], [], nobody
-    # With a view of all places that a goal may come to lie.
-    renderer = FrameRenderer(problem, (520, 540), goal_region(problem))
+    act_times, collided = [], np.zeros(problem.num_robots, bool)
+    touched, pictures = collided, Film(problem, film)
+    pictures.show(joint, collided, 0)
     while env.agents:
         begin = time.perf_counter()
         actions = policy.act(observations, env.state())
@@ -65,17 +89,13 @@ def drive(problem: Problem, seed: int, minutes: float, film: float) -> tuple[dic
         bounds.extend(least_times(problem, joint)[(joint.goals != before.goals).any(axis=1)])
         collided = np.array([infos[agent]["collided"] for agent in env.possible_agents])
         touched = touched | collided
-        trail = [*trail[-30:], joint.states[:, :2]]
-        seconds = joint.steps * problem.dt
-        if seconds <= film:
-            caption = f"{seconds:.1f} s    {len(bounds) - problem.num_robots} goals reached"
-            frames.append(renderer.draw(joint.states, nobody, collided, joint.goals, np.stack(trail), caption=caption))
-    renderer.close()
+        pictures.show(joint, collided, len(bounds) - problem.num_robots)
+    pictures.close()
     metrics, replanned = env.unwrapped.metrics(), sum(loop.replanned for loop in policy.loops)
     env.close()
     row = {
         "robots": problem.num_robots,
-        "seconds": seconds,
+        "seconds": joint.steps * problem.dt,
         "goals": int(metrics["goals_reached"]),
         "least_time": float(np.mean(bounds)),
         "touched": int(touched.sum()),
@@ -83,7 +103,7 @@ def drive(problem: Problem, seed: int, minutes: float, film: float) -> tuple[dic
         "replanned": replanned,
         "loop_seconds": act_times,
     }
-    return row, frames
+    return row, pictures.frames
 
 
 def summary(row: Mapping[str, Any]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from outputs import argument_parser, count, save_table
+from outputs import argument_parser, count, save_table, trials_argument
 
 from d4orm_planners.evaluation.comparison import penalised_steps, steps_to_solution
 from d4orm_planners.evaluation.evaluate import run_study
@@ -135,7 +135,7 @@ def main() -> int:
     parser.add_argument("--candidates", type=count, default=27, help="settings tried per method, the preset included")
     parser.add_argument("--seeds", type=count, default=4, help="seeds of the first round")
     parser.add_argument("--method", action="append", choices=SPACES, help="only this one; repeatable")
-    parser.add_argument("--trials", type=Path, help="run nothing; a Parquet file of trials")
+    trials_argument(parser)
     arguments = parser.parse_args()
     if arguments.trials is None:
         number, seeds, budget = (2, 1, TINY) if arguments.quick else (arguments.candidates, arguments.seeds, BUDGET)

@@ -14,7 +14,7 @@ from d4orm_env.core.observation_layout import ObservationSlices
 from d4orm_env.vector_env import NavigationVectorEnv
 from d4orm_planners import make_policy, run_episode
 from d4orm_planners.rl.features import Features
-from d4orm_planners.rl.learned import SHIPPED
+from d4orm_planners.rl.learned import SEEN_OBSTACLES, SHIPPED
 from d4orm_planners.rl.network import Header, Network, load_network
 
 OWN, NEIGHBOR, OBSTACLE = 11, 9, 5
@@ -101,6 +101,7 @@ def test_the_policy_of_the_package_is_that_for_the_world() -> None:
         env.reset(seed=0)
         policy.reset(env)
         assert bool(policy._actor.network.header.ways) == along
+        assert policy._actor.network.header.num_obstacles == SEEN_OBSTACLES
 
 
 def test_the_policy_of_the_package_goes_through_doors() -> None:
