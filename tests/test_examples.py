@@ -564,6 +564,13 @@ def test_count_of_seeds_below_one_is_refused(tmp_path: Path) -> None:
     assert "0 is too few; give at least 1" in result.stderr
 
 
+def test_a_file_of_trials_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    result = run("ablation", tmp_path / "out", "--trials", "nowhere.parquet")
+    assert result.returncode == 2
+    assert "nowhere.parquet is no file; give a Parquet file of trials" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_cost_of_a_message_is_measured(tmp_path: Path) -> None:
     out = tmp_path / "out"
     completed("message_overhead", out)
