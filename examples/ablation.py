@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 from disturbance_study import DISTURBANCES, NOTHING, ROBOTS, SCENARIOS, names_by_text, successes, tell
-from outputs import argument_parser, count, save_table, trials_argument
+from outputs import argument_parser, count, existing_file, save_table, trials_argument
 
 from d4orm_planners.evaluation.comparison import in_common, paired
 from d4orm_planners.evaluation.evaluate import run_study
@@ -113,7 +113,7 @@ def main() -> int:
     parser = argument_parser(__doc__)
     parser.add_argument("--seeds", type=count, default=30)
     parser.add_argument("--workers", type=count, help="processes, by default one per core")
-    parser.add_argument("--go-on-from", type=Path, help="a Parquet file of trials that need not be run again")
+    parser.add_argument("--go-on-from", type=existing_file, help="a Parquet file of trials that need not be run again")
     trials_argument(parser)
     arguments = parser.parse_args()
     if arguments.trials is not None:

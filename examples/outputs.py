@@ -50,10 +50,11 @@ def argument_parser(description: str | None) -> argparse.ArgumentParser:
 
 def trials_argument(parser: argparse.ArgumentParser) -> None:
     """Let a study make its table and plot of what :func:`measured` wrote before."""
-    parser.add_argument("--trials", type=_existing, help="run nothing; a Parquet file of trials")
+    parser.add_argument("--trials", type=existing_file, help="run nothing; a Parquet file of trials")
 
 
-def _existing(text: str) -> Path:
+def existing_file(text: str) -> Path:
+    """A command-line path of a file of trials."""
     if not Path(text).is_file():
         raise argparse.ArgumentTypeError(f"{text} is no file; give a Parquet file of trials, such as those in data/")
     return Path(text)
