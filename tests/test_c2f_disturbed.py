@@ -392,15 +392,18 @@ def test_a_robot_that_has_stalled_is_driven_around() -> None:
     np.testing.assert_array_equal(executed.trajectory.arrived[-1], ~policy._deviation.standing.robots)
 
 
+@pytest.mark.parametrize("lifelong", [False, True], ids=["once", "lifelong"])
 @pytest.mark.parametrize("model", ["holonomic2d", "differential_drive", "velocity2d"])
-def test_finding_out_changes_nothing_while_all_is_as_believed(model: str) -> None:
+def test_finding_out_changes_nothing_while_all_is_as_believed(model: str, lifelong: bool) -> None:
     problem = make_problem("circle", num_robots=4, model=model)
+    options: dict[str, Any] = {"problem": problem, "lifelong": lifelong, "max_cycles": 120 if lifelong else None}
     known = {"delay": 0, "filter_states": False, "learn_limits": False, "stalls": False, "last_resort": False}
     known["expect_losses"] = False
     plain, watchful = (
-        run_episode(navigation_v0.parallel_env(problem=problem), controller(**config), seed=0) for config in (known, {})
+        run_episode(navigation_v0.parallel_env(**options), controller(**config), seed=0) for config in (known, {})
     )
     np.testing.assert_array_equal(watchful.trajectory.states, plain.trajectory.states)
+    assert not lifelong or watchful.metrics["goals_reached"] > 4
 
 
 def test_the_paper_preset_is_algorithm_4() -> None:
