@@ -6,9 +6,11 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine.base import Engine
 from d4orm_env.joint_state import JointState
 from d4orm_planners.d4orm_c2f.filtering import StateFilter
+from d4orm_planners.d4orm_c2f.homing import docking_radius
 from d4orm_planners.d4orm_c2f.lateness import Lateness
 from d4orm_planners.d4orm_c2f.losses import Losses
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
@@ -42,6 +44,7 @@ class Deviation:
         problem: The robots.
         engine: What knows how they should move.
         config: What is to be found out: how late commands are, how noisy states are, who is weak or does not obey.
+        docks: Whether robots dock at their goals, rather than drive through them to others.
 
     Attributes:
         speed: The largest deviation of a robot in a time step, over its length, of late [m/s].
@@ -52,8 +55,8 @@ class Deviation:
         standing: Who has stalled.
     """
 
-    def __init__(self, problem: Problem, engine: Engine, config: D4ormC2FConfig) -> None:
-        self.problem, self._engine = problem, engine
+    def __init__(self, problem: Problem, engine: Engine, config: D4ormC2FConfig, docks: bool) -> None:
+        self.problem, self._engine, self._docks = problem, engine, docks
         self.lateness = Lateness(problem.num_robots, problem.control_size, config.delay)
         self.losses = Losses(problem) if config.expect_losses else None
         self._weakness = Weakness(problem) if config.learn_limits else None
@@ -112,15 +115,19 @@ class Deviation:
 
     def expect(self, controls: FloatArray) -> None:
         """Remember where the robots should be in a time step, now that these controls ``(K, m)`` are sent."""
-        arrays = self.problem.resumed_at(self._seen.states, self._seen.goals).arrays
-        step = self._engine.step(arrays, self._seen.states, self._seen.arrived, controls)
+        step = self._engine.step(self.arrays(self._seen), self._seen.states, self._seen.arrived, controls)
         now = self.lateness.send(step.controls)
         states = step.states if now is step.controls else self._moved(self._seen, now).states
         self._expected = states[:, : self.problem.dimension], present_velocities(self.problem, states, now)
 
+    def arrays(self, joint: JointState) -> ProblemArrays:
+        """By which to step on from there: with the limits that robots are believed to have now."""
+        radius = docking_radius(self.problem, self._docks)
+        return self.problem.resumed_at(joint.states, joint.goals, goal_radius=radius).arrays
+
     def _moved(self, joint: JointState, controls: FloatArray) -> JointState:
-        arrays, d = self.problem.resumed_at(joint.states, joint.goals).arrays, self.problem.dimension
-        step = self._engine.step(arrays, joint.states, joint.arrived, controls)
+        d = self.problem.dimension
+        step = self._engine.step(self.arrays(joint), joint.states, joint.arrived, controls)
         bodies = joint.bodies.copy()
         if len(bodies):
             bodies[:, :d] += self.problem.dt * bodies[:, d : 2 * d]

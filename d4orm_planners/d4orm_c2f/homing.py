@@ -14,6 +14,11 @@ PASSING = 1e-6
 """Goal radius of robots that drive through a place and do not dock there [m]."""
 
 
+def docking_radius(problem: Problem, docks: bool) -> float:
+    """The goal radius for rollouts of an episode [m]; who does not dock drives on when it arrives, to its next goal."""
+    return problem.goal_radius if docks else PASSING
+
+
 def drive_home(window: Problem, engine: Engine, controls: FloatArray, near: BoolArray) -> tuple[FloatArray, BoolArray]:
     """The controls, but straight drives for robots that dock by these no later.
 

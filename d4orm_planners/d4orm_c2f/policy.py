@@ -114,7 +114,7 @@ class D4ormC2F(StatePolicy):
         begin = time.perf_counter()
         self._guide = Guide(self.problem, self.config, seed, self._refiner, self._refinement, lifelong)
         self._guide.begin(joint, self._docked)
-        self._deviation = Deviation(self.problem, self._engine, self.config)
+        self._deviation = Deviation(self.problem, self._engine, self.config, docks=not lifelong)
         self.coarse_time = time.perf_counter() - begin
 
     def _controls(self, joint: JointState) -> FloatArray:
@@ -164,7 +164,7 @@ class D4ormC2F(StatePolicy):
     ) -> FloatArray:
         """The controls ``(K, m)``, but for robots that could not brake in time any more after so many steps of them."""
         problem, docked, states = self._deviation.problem, self._docked, joint.states
-        arrays = problem.resumed_at(states, joint.goals).arrays
+        arrays = self._deviation.arrays(joint)
         for _ in range(steps):
             ahead = self._engine.step(arrays, states, docked, controls)
             states = ahead.states

@@ -11,7 +11,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.base import Engine, MovingObstacles, SamplingRules, SamplingTask
 from d4orm_env.joint_state import JointState
-from d4orm_planners.d4orm_c2f.homing import PASSING, drive_home
+from d4orm_planners.d4orm_c2f.homing import docking_radius, drive_home
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.steering import track_velocities
 
@@ -101,7 +101,7 @@ class Window:
         limit = problem.team.control_limits
         sampled = np.clip(now.base + result.mean, -limit, limit).astype(np.float32)
         controls = sampled if now.careful is None else np.where(now.stuck[:, None], now.careful, sampled)
-        radius = problem.goal_radius if self._docks else PASSING
+        radius = docking_radius(problem, self._docks)
         joint, horizon = now.joint, config.predict_horizon
         truth = problem.resumed_at(joint.states, joint.goals, horizon=horizon, goal_radius=radius)
         if not config.safe_mix:
@@ -128,7 +128,7 @@ class Window:
             np.where((near | now.docked)[:, None], goals, now.subgoals),
             horizon=config.predict_horizon,
             margin=problem.margin + config.extra_margin + now.room,
-            goal_radius=problem.goal_radius if near.any() and self._docks else PASSING,
+            goal_radius=docking_radius(problem, self._docks and bool(near.any())),
         )
         reach = problem.dt * config.subgoal_offset * float(np.max(np.asarray(problem.team.max_speed)))
         return SamplingTask(
@@ -231,7 +231,7 @@ class Window:
 
     def touching(self, joint: JointState, docked: BoolArray, controls: FloatArray, gap: float) -> BoolArray:
         """``(K,)`` who comes within a gap [m] of anything if all execute ``controls`` ``(T, K, m)``, and a stop."""
-        radius = self.problem.goal_radius if self._docks else PASSING
+        radius = docking_radius(self.problem, self._docks)
         present = self.problem.resumed_at(
             joint.states, joint.goals, horizon=len(controls), margin=gap, goal_radius=radius
         )
