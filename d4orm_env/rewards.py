@@ -135,12 +135,12 @@ def along_ways(step: RewardInput, ways: Ways | Sequence[Ways]) -> RewardInput:
         step: One of ``(K,)`` or ``(B, K)``.
         ways: From the starts to the goals; one for each of the ``B`` worlds where they differ.
     """
-    places = np.stack([step.previous_positions, step.positions])
+    both = step.previous_positions, step.positions
     if isinstance(ways, Ways):
-        initial, lengths = ways.length, ways.distance(places)
+        initial, lengths = ways.length, np.stack([ways.distance(places) for places in both])
     else:
         initial = np.stack([own.length for own in ways])
-        lengths = np.stack([own.distance(places[:, world]) for world, own in enumerate(ways)], axis=1)
+        lengths = np.stack([[own.distance(place) for own, place in zip(ways, places)] for places in both])
     straight = np.stack([step.previous_distances, step.distances])
     previous, present = np.where(np.isfinite(lengths), lengths, straight).astype(np.float32)
     # It is at least the goal radius, as the straight one is.

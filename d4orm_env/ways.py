@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -14,7 +14,7 @@ from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 
 if TYPE_CHECKING:
-    from d4orm_env.engine.wavefront import Front, Lattice, Space
+    from d4orm_env.engine.wavefront import Fields, Front, Lattice, Space
 
 
 MAX_NODES, MAX_NODES_IN_ALL = 2**21, 2**24
@@ -26,22 +26,12 @@ REFINEMENTS = 2
 """How often a robot that seems to have no way is tried again on a grid that is twice as fine."""
 
 
-class _Field(NamedTuple):
-    """Where one robot can go, and by which way."""
+class _Look(NamedTuple):
+    """From places ``(..., K, d)`` where to go first ``(..., K, d)``, and how far it is in all ``(..., K)``."""
 
-    space: Space
-    lattice: Lattice
-    reach: float
-    front: Front
-
-    def look(self, places: Floats) -> tuple[Floats, Floats, NDArray[np.int32]]:
-        """``(Q, d)`` where to go first from places ``(Q, d)``, ``(Q,)`` the length of the way, ``(Q,)`` its anchor."""
-        from d4orm_env.engine.wavefront import look
-
-        spatial = in_space(places)
-        target, length, anchor = spatial.copy(), np.empty(len(spatial)), np.empty(len(spatial), np.int32)
-        look(self.space, self.lattice, self.reach, self.front, spatial, target, length, anchor)
-        return target[:, : places.shape[1]], length, anchor
+    places: Floats
+    target: Floats
+    length: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,17 +50,18 @@ class Ways:
 
     problem: Problem
     length: Floats
-    _fields: tuple[_Field, ...]
+    _world: tuple[Space, Fields] | None
+    _looks: list[_Look] = field(default_factory=list, repr=False)
 
     def distance(self, points: ArrayLike) -> Floats:
         """``(..., K)`` float64 length of the ways from points ``(..., K, d)`` to the goals [m]."""
-        return self._look(points)[1]
+        return self._look(points)[1].copy()
 
     def distance_from(self, robot: int, places: Floats) -> Floats:
         """``(Q,)`` float64 length of the ways of one robot from places ``(Q, d)`` to its goal [m]."""
-        if not self._fields:
+        if self._world is None:
             return np.linalg.norm(places - self.problem.goal[robot], axis=1)
-        return self._fields[robot].look(places)[1]
+        return _find(self._world, robot, in_space(places)[None])[1][0]
 
     def direction(self, points: ArrayLike) -> Floats:
         """``(..., K, d)`` float64 unit vectors along the ways; zero at a goal and where there is no way."""
@@ -83,7 +74,7 @@ class Ways:
         offset = target - places
         norm = np.sqrt((offset * offset).sum(axis=-1, keepdims=True))
         direction: Floats = offset / np.where(norm > 0, norm, 1.0)
-        return direction, length
+        return direction, length.copy()
 
     def path(self, robot: int) -> Floats:
         """``(w, d)`` float64 corners of the way of a robot, its start first and its goal last; empty if there is none.
@@ -95,14 +86,14 @@ class Ways:
         start, goal = self.problem.start[robot, :d].astype(np.float64), self.problem.goal[robot].astype(np.float64)
         if not np.isfinite(self.length[robot]):
             return np.empty((0, d))
-        if not self._fields:
+        if self._world is None:
             return np.stack([start, goal])
-        field = self._fields[robot]
-        target, _, anchors = field.look(start[None])
-        corners, anchor = [start, target[0]], int(anchors[0])
+        target, _, anchors = _find(self._world, robot, in_space(start[None])[None])
+        corners, anchor, fields = [start, target[0, 0, :d]], int(anchors[0, 0]), self._world[1]
+        first = fields.first_point[robot]
         while anchor >= 0:
-            corners.append(field.front.points[anchor, :d])
-            anchor = int(field.front.parents[anchor])
+            corners.append(fields.points[first + anchor, :d])
+            anchor = int(fields.parents[first + anchor])
         way = np.stack(corners)
         return way[np.append(True, (np.diff(way, axis=0) != 0).any(axis=1))]
 
@@ -110,16 +101,31 @@ class Ways:
         """Where to go first, and how far it is in all."""
         places: Floats = np.asarray(points, np.float64)
         goal = self.problem.goal.astype(np.float64)
-        if not self._fields:
+        if self._world is None:
             offset = goal - places
             straight: Floats = np.sqrt((offset * offset).sum(axis=-1))
             return np.broadcast_to(goal, places.shape), straight
-        target, length = np.empty(places.shape), np.empty(places.shape[:-1])
-        for robot, field in enumerate(self._fields):
-            own = places[..., robot, :]
-            first, far, _ = field.look(own.reshape(-1, own.shape[-1]))
-            target[..., robot, :], length[..., robot] = first.reshape(own.shape), far.reshape(own.shape[:-1])
-        return target, length
+        # Who observes, and then is paid for the way made since, asks for the same places again, and the ones before.
+        for look in tuple(self._looks):
+            if np.array_equal(look.places, places):
+                return look.target, look.length
+        num_robots, d = places.shape[-2:]
+        spatial = in_space(places.reshape(-1, d)).reshape(-1, num_robots, 3).swapaxes(0, 1)
+        target, length, _ = _find(self._world, 0, np.ascontiguousarray(spatial))
+        first, far = target.swapaxes(0, 1)[..., :d], length.T
+        look = _Look(places.copy(), first.reshape(places.shape), far.reshape(places.shape[:-1]))
+        self._looks[:] = [*self._looks[-1:], look]
+        return look.target, look.length
+
+
+def _find(world: tuple[Space, Fields], robot: int, places: Floats) -> tuple[Floats, Floats, NDArray[np.int32]]:
+    """Where robots from this number on go first from places ``(R, Q, 3)``, how far it is in all, and their anchors."""
+    from d4orm_env.engine.wavefront import look
+
+    shape = places.shape[:2]
+    target, length, anchor = np.empty(places.shape), np.empty(shape), np.empty(shape, np.int32)
+    look(*world, robot, places, target, length, anchor)
+    return target, length, anchor
 
 
 def shortest_ways(problem: Problem) -> Ways:
@@ -133,27 +139,32 @@ def shortest_ways(problem: Problem) -> Ways:
     """
     start = problem.start[:, : problem.dimension].astype(np.float64)
     if not problem.world.num_obstacles:
-        return Ways(problem, np.linalg.norm(problem.goal - start, axis=1), ())
+        return Ways(problem, np.linalg.norm(problem.goal - start, axis=1), None)
     # Here, because importing the compiler takes longer than importing all the rest of the package.
-    from d4orm_env.engine.wavefront import make_space, spread
+    from d4orm_env.engine.wavefront import gather, make_space, spread
 
-    space = make_space(problem)
-    length, fields = np.full(problem.num_robots, np.inf), []
+    space, starts = make_space(problem), in_space(start)[:, None]
+    reaches = np.asarray(problem.team.radius, np.float64) + problem.margin
     lattices: dict[tuple[float, int], Lattice] = {}
-    for robot, goal in enumerate(in_space(problem.goal.astype(np.float64))):
-        reach = float(np.asarray(problem.team.radius)[robot]) + problem.margin
+    chosen: list[tuple[float, int]] = []
+    fronts: list[Front] = []
+    for reach, goal, place in zip(reaches.tolist(), in_space(problem.goal.astype(np.float64)), starts):
         for refinement in range(1 + REFINEMENTS):
             if (reach, refinement) not in lattices:
                 step, most = STEP * reach / 2**refinement, min(MAX_NODES, MAX_NODES_IN_ALL // problem.num_robots)
                 lattices[reach, refinement] = lay_lattice(problem, space, reach, step, most)
             lattice = lattices[reach, refinement]
-            field = _Field(space, lattice, reach, spread(space, lattice, reach, goal))
-            length[robot] = field.look(start[robot : robot + 1])[1][0]
-            if np.isfinite(length[robot]):
+            front = spread(space, lattice, reach, goal)
+            own = gather(np.array([reach]), [lattice], np.array([0]), [front])
+            if np.isfinite(_find((space, own), 0, place[None])[1]).all():
                 break
-        fields.append(field)
+        chosen.append((reach, refinement))
+        fronts.append(front)
+    number = {key: n for n, key in enumerate(lattices)}
+    world = space, gather(reaches, list(lattices.values()), np.array([number[key] for key in chosen]), fronts)
+    length = _find(world, 0, starts)[1][:, 0]
     length.setflags(write=False)
-    return Ways(problem, length, tuple(fields))
+    return Ways(problem, length, world)
 
 
 def observe_ways(observations: FloatArray, layout: ObservationLayout, ways: Ways, places: FloatArray) -> None:

@@ -165,8 +165,10 @@ class World(Frozen):
             levels = _LEVELS if self.shapes.count <= _FEW else 1
         key = (reach, nearest, margin, levels)
         if key not in self._indices:
-            # Cells of a quarter of a reach leave few points undecided.
-            self._indices[key] = build_index(self.shapes, reach / 4, margin, nearest, levels)
+            # Cells of a quarter of a reach leave few points undecided, which pays for thousands of samples. Who
+            # observes asks once per robot and time step, and in ever new worlds.
+            cell = reach / 4 if places is None else reach
+            self._indices[key] = build_index(self.shapes, cell, margin, nearest, levels)
         return self._indices[key]
 
     def clearance(self, positions: ArrayLike) -> np.ndarray:

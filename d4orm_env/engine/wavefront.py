@@ -15,7 +15,8 @@ Worlds of the plane are treated as spatial ones without end in z.
 from __future__ import annotations
 
 import heapq
-from typing import NamedTuple, TypeAlias
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -104,6 +105,40 @@ class Front(NamedTuple):
     """
 
     anchor: Ints
+    points: Floats
+    values: Floats
+    parents: Ints
+
+
+class Fields(NamedTuple):
+    """The wavefronts of a team, one behind the other, and the lattices that they are on.
+
+    Attributes:
+        reach: ``(K,)`` the distance that each robot keeps [m].
+        lattice: ``(K,)`` int64 number of its lattice.
+        low: ``(L, 3)`` the first nodes of the lattices [m].
+        step: ``(L,)`` between neighbours along an axis [m].
+        size: ``(L, 3)`` int64 nodes along each axis.
+        first_place: ``(L + 1,)`` int64 where the part of ``places`` of each lattice begins, and the end.
+        places: ``(., 3)`` where the nodes are [m].
+        first_anchor: ``(K + 1,)`` int64 where the part of ``anchor`` of each robot begins, and the end.
+        anchor: int32, see :class:`Front`.
+        first_point: ``(K + 1,)`` int64 where those of ``points``, ``values`` and ``parents`` begin, and the end.
+        points: ``(., 3)`` [m].
+        values: [m].
+        parents: int32, counted from the first one of the robot.
+    """
+
+    reach: Floats
+    lattice: IntArray
+    low: Floats
+    step: Floats
+    size: IntArray
+    first_place: IntArray
+    places: Floats
+    first_anchor: IntArray
+    anchor: Ints
+    first_point: IntArray
     points: Floats
     values: Floats
     parents: Ints
@@ -273,9 +308,8 @@ def _place(rows: Floats, n: Whole) -> Place:
 
 
 @inlined
-def _corner(lattice: Lattice, q: Place) -> tuple[int, int, int]:
+def _corner(low: Floats, step: float, size: IntArray, q: Place) -> tuple[int, int, int]:
     """Steps along each axis to the node below a place, or to the outermost one."""
-    low, step, size = lattice.low, lattice.step, lattice.size
     i = min(max(np.int64((q[0] - low[0]) / step), 0), size[0] - 1)
     j = min(max(np.int64((q[1] - low[1]) / step), 0), size[1] - 1)
     return i, j, min(max(np.int64((q[2] - low[2]) / step), 0), size[2] - 1)
@@ -472,7 +506,7 @@ def _spread(space: Space, lattice: Lattice, reach: float, goal: Floats, nodes: _
     own_goal = clearance_at(space, at[0], at[1], at[2])
     heap = [(0.0, np.int64(0)) for _ in range(0)]
     around = 2 + int(2 * max(0.0, reach - own_goal) / lattice.step)
-    low_i, low_j, low_k = _corner(lattice, at)
+    low_i, low_j, low_k = _corner(lattice.low, lattice.step, lattice.size, at)
     for i in range(max(0, low_i - around), min(size[0], low_i + around + 1)):
         for j in range(max(0, low_j - around), min(size[1], low_j + around + 1)):
             for k in range(max(0, low_k - around), min(size[2], low_k + around + 1)):
@@ -545,68 +579,93 @@ def spread(space: Space, lattice: Lattice, reach: float, goal: Floats) -> Front:
     return Front(nodes.anchor, *_spread(space, lattice, reach, goal, nodes))
 
 
+def gather(reach: Floats, lattices: Sequence[Lattice], number: IntArray, fronts: Sequence[Front]) -> Fields:
+    """The wavefronts of robots that keep ``reach`` ``(K,)``, on the lattices of these numbers ``(K,)``."""
+    return Fields(
+        reach=reach,
+        lattice=number,
+        low=np.stack([lattice.low for lattice in lattices]),
+        step=np.array([lattice.step for lattice in lattices]),
+        size=np.stack([lattice.size for lattice in lattices]),
+        first_place=_beginnings([lattice.places for lattice in lattices]),
+        places=_joined([lattice.places for lattice in lattices]),
+        first_anchor=_beginnings([front.anchor for front in fronts]),
+        anchor=_joined([front.anchor for front in fronts]),
+        first_point=_beginnings([front.points for front in fronts]),
+        points=_joined([front.points for front in fronts]),
+        values=_joined([front.values for front in fronts]),
+        parents=_joined([front.parents for front in fronts]),
+    )
+
+
+def _beginnings(arrays: list[np.ndarray]) -> IntArray:
+    """Where each begins when they stand one behind the other, and where the last one ends."""
+    return np.cumsum([0, *map(len, arrays)])
+
+
+def _joined(arrays: list[np.ndarray]) -> Any:
+    """The arrays, one behind the other; a single one is not copied."""
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
+
+
+@compiled
+def _look_from(space: Space, fields: Fields, robot: int, q: Place) -> tuple[Place, float, np.int32]:
+    """Where a robot at ``q`` goes first, the length of the whole way, and the anchor."""
+    reach, lattice, first = fields.reach[robot], fields.lattice[robot], fields.first_point[robot]
+    step, size, first_place = fields.step[lattice], fields.size[lattice], fields.first_place[lattice]
+    first_anchor = fields.first_anchor[robot]
+    goal = _place(fields.points, first)
+    own_goal, own = clearance_at(space, goal[0], goal[1], goal[2]), clearance_at(space, q[0], q[1], q[2])
+    if _sees(space, reach, goal, own_goal, q, own):
+        return goal, _distance(goal, q), np.int32(0)
+    i, j, k = _corner(fields.low[lattice], step, size, q)
+    # From deep inside an obstacle there may be none.
+    rings = 2 + np.int64(2 * min(max(0.0, reach - own), 2 * reach) / step)
+    ring, target, length, anchor = 0, q, np.inf, _NOBODY
+    while ring < rings and anchor < 0:
+        last = _NOBODY
+        for ni in range(max(0, i - ring), min(size[0], i + ring + 2)):
+            for nj in range(max(0, j - ring), min(size[1], j + ring + 2)):
+                for nk in range(max(0, k - ring), min(size[2], k + ring + 2)):
+                    n = (ni * size[1] + nj) * size[2] + nk
+                    a = fields.anchor[first_anchor + n]
+                    if a < 0:
+                        continue
+                    at, value = _place(fields.points, first + a), fields.values[first + a]
+                    straight = value + _distance(at, q)
+                    if straight < length and a != last:
+                        last = a
+                        if _sees(space, reach, at, own_goal if a == 0 else reach, q, own):
+                            target, length, anchor = at, straight, a
+                            continue
+                    place = _place(fields.places, first_place + n)
+                    bent = value + _distance(at, place) + _distance(place, q)
+                    if bent < length and _sees(space, reach, place, reach, q, own):
+                        target, length, anchor = place, bent, a
+        ring += 1
+    return target, length, anchor
+
+
 @cached_kernel(SOURCES, variant="look", **OPTIONS)
 def look(
-    space: Space,
-    lattice: Lattice,
-    reach: float,
-    front: Front,
-    places: Floats,
-    target: Floats,
-    length: Floats,
-    anchor: Ints,
+    space: Space, fields: Fields, first: int, places: Floats, target: Floats, length: Floats, anchor: Ints
 ) -> None:
-    """The ways from places of a body of this reach.
+    """The ways of some robots from places.
 
     Args:
         space: The world.
-        lattice: The nodes.
-        reach: The distance to keep [m].
-        front: The wavefront from the goal.
-        places: ``(Q, 3)``.
-        target: ``(Q, 3)`` where to go first, output.
-        length: ``(Q,)`` of the whole way; infinite where there is none, output.
-        anchor: ``(Q,)`` int32 the anchor that is the target or comes next, output; -1 where there is none.
+        fields: The wavefronts of all robots.
+        first: Number of the first of these robots, who follow each other.
+        places: ``(R, Q, 3)``.
+        target: ``(R, Q, 3)`` where to go first, output; unchanged where there is no way.
+        length: ``(R, Q)`` of the whole way; infinite where there is none, output.
+        anchor: ``(R, Q)`` int32 the anchor that is the target or comes next, output; -1 where there is none.
     """
-    points, values = front.points, front.values
-    step, size = lattice.step, lattice.size
-    own_goal = clearance_at(space, points[0, 0], points[0, 1], points[0, 2])
-    goal = (points[0, 0], points[0, 1], points[0, 2])
-    for b in range(places.shape[0]):
-        q = (places[b, 0], places[b, 1], places[b, 2])
-        own = clearance_at(space, q[0], q[1], q[2])
-        length[b], anchor[b] = np.inf, _NOBODY
-        if _sees(space, reach, goal, own_goal, q, own):
-            length[b], anchor[b] = _distance(goal, q), 0
-            target[b] = points[0]
-            continue
-        i, j, k = _corner(lattice, q)
-        # From deep inside an obstacle there may be none.
-        rings = 2 + np.int64(2 * min(max(0.0, reach - own), 2 * reach) / step)
-        ring = 0
-        while ring < rings and anchor[b] < 0:
-            last = _NOBODY
-            for ni in range(max(0, i - ring), min(size[0], i + ring + 2)):
-                for nj in range(max(0, j - ring), min(size[1], j + ring + 2)):
-                    for nk in range(max(0, k - ring), min(size[2], k + ring + 2)):
-                        n = (ni * size[1] + nj) * size[2] + nk
-                        a = front.anchor[n]
-                        if a < 0:
-                            continue
-                        at = _place(points, a)
-                        straight = values[a] + _distance(at, q)
-                        if straight < length[b] and a != last:
-                            last = a
-                            if _sees(space, reach, at, own_goal if a == 0 else reach, q, own):
-                                length[b], anchor[b] = straight, a
-                                target[b] = points[a]
-                                continue
-                        place = _place(lattice.places, n)
-                        bent = values[a] + _distance(at, place) + _distance(place, q)
-                        if bent < length[b] and _sees(space, reach, place, reach, q, own):
-                            length[b], anchor[b] = bent, a
-                            target[b, 0], target[b, 1], target[b, 2] = place
-            ring += 1
+    for r in range(places.shape[0]):
+        for b in range(places.shape[1]):
+            q = (places[r, b, 0], places[r, b, 1], places[r, b, 2])
+            to, length[r, b], anchor[r, b] = _look_from(space, fields, first + r, q)
+            target[r, b, 0], target[r, b, 1], target[r, b, 2] = to
 
 
 @compiled
