@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
 from typing import ClassVar
@@ -10,9 +10,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, shown
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, shown
 from d4orm_env.core.team import Team
-from d4orm_env.ways import Ways
 
 __all__ = ["RewardFunction", "RewardInput", "TrainingReward"]
 
@@ -126,31 +125,30 @@ def paper_reward(step: RewardInput) -> FloatArray:
     return step.paper
 
 
-def along_ways(step: RewardInput, ways: Ways | Sequence[Ways]) -> RewardInput:
+def along_ways(step: RewardInput, initial: Floats, previous: Floats, present: Floats) -> RewardInput:
     """The same step with all distances, the paper's reward included, along the shortest free ways.
 
     A distance stays straight where a robot has got to that no way leads from, as inside an obstacle.
 
     Args:
-        step: One of ``(K,)`` or ``(B, K)``.
-        ways: From the starts to the goals; one for each of the ``B`` worlds where they differ.
+        step: One of ``(..., K)``.
+        initial: ``(..., K)`` length of the ways from the starts [m].
+        previous: ``(..., K)`` length from where the robots were before the step [m].
+        present: ``(..., K)`` length from where they are after it [m].
     """
-    both = step.previous_positions, step.positions
-    if isinstance(ways, Ways):
-        initial, lengths = ways.length, np.stack([ways.distance(places) for places in both])
-    else:
-        initial = np.stack([own.length for own in ways])
-        lengths = np.stack([[own.distance(place) for own, place in zip(ways, places)] for places in both])
-    straight = np.stack([step.previous_distances, step.distances])
-    previous, present = np.where(np.isfinite(lengths), lengths, straight).astype(np.float32)
+    straight = step.previous_distances, step.distances
+    before, after = (
+        np.where(np.isfinite(length), length, instead).astype(np.float32)
+        for length, instead in zip((previous, present), straight)
+    )
     # It is at least the goal radius, as the straight one is.
     least: FloatArray = np.maximum(initial, step.initial_distances).astype(np.float32)
     return replace(
         step,
-        previous_distances=previous,
-        distances=present,
+        previous_distances=before,
+        distances=after,
         initial_distances=least,
-        paper=step.paper + step.distances / step.initial_distances - present / least,
+        paper=step.paper + step.distances / step.initial_distances - after / least,
     )
 
 

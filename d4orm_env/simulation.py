@@ -331,7 +331,9 @@ class Simulation:
             team=self.problem.team,
             dt=self.problem.dt,
         )
-        step = along_ways(step, self.problem.ways) if self.along_ways else step
+        if self.along_ways:
+            ways = self.problem.ways
+            step = along_ways(step, ways.length, ways.distance(step.previous_positions), ways.distance(step.positions))
         rewards, self._terms = compute_rewards(reward, step)
         return rewards
 
@@ -358,7 +360,7 @@ class Simulation:
         observations: FloatArray = np.empty((len(self.states), layout.size), np.float32)
         self._engine.observe_worlds(self.arrays, layout, sight, observations[None])
         if layout.observed_way:
-            observe_ways(observations, layout, self.problem.ways, states[:, : self._dimension])
+            observe_ways(observations, layout, *self.problem.ways.ahead(states[:, : self._dimension]))
         return observations if self._disturbed is None else self._disturbed.observe(observations[None], layout)[0]
 
     def _assign_goals(self, robots: NDArray[np.intp]) -> None:

@@ -15,7 +15,7 @@ from d4orm_env._vector_disturbances import DisturbedBatch
 from d4orm_env._vector_infos import final_infos, masked
 from d4orm_env._vector_inputs import checked_autoreset_mode, reset_mask, world_seeds
 from d4orm_env._world_draws import OWN_ARRAYS, WorldDraws
-from d4orm_env.core.arrays import BoolArray, FloatArray, whole_number
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, whole_number
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.env_inputs import checked_states, joint_controls
@@ -26,7 +26,7 @@ from d4orm_env.rewards import RewardInput, along_ways, compute_rewards, no_terms
 from d4orm_env.scenarios.problems import ScenarioLike
 from d4orm_env.simulation import Simulation
 from d4orm_env.team_step import Info
-from d4orm_env.ways import observe_ways
+from d4orm_env.ways import ahead_in_each, observe_ways
 
 if TYPE_CHECKING:
     from d4orm_env.engine.base import WorldEngine
@@ -127,6 +127,11 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         self._apart = False
         self.robot_rewards = np.zeros((count, problem.num_robots), np.float32)
         self._terms = no_terms(self._template.reward, self.robot_rewards.shape)
+        # Of the shortest free ways from where the robots are, and from their starts.
+        self._way_direction = np.zeros((*self.robot_rewards.shape, problem.dimension))
+        self._way_length, self._first_length = (np.zeros(self.robot_rewards.shape) for _ in range(2))
+        if self._template.along_ways:
+            self._first_length[:] = problem.ways.length
         shape = (count, problem.num_robots, self._template.layout.size)
         self._observations = np.empty(shape, np.float32)
         self._running = np.zeros(count, np.bool_)
@@ -199,12 +204,12 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         self._require_episodes()
         controls = joint_controls(actions, self._action_shape, self.problem.num_robots)
         ended = self._ended
-        before, worlds = self._before(), self._worlds
+        before, length, worlds = self._before(), self._way_length.copy(), self._worlds
         np.copyto(worlds.control, self._disturbances.act(controls))
         if ended.any():
             self._begin(np.flatnonzero(ended))
         observations = self._advance(np.where(ended, RESET, STEP))
-        self._reward(before, ~ended)
+        self._reward(before, length, ~ended)
         ended = self._ended
         rewards, terminated, truncated = worlds.reward.copy(), worlds.terminated.copy(), worlds.truncated.copy()
         infos = self._infos()
@@ -298,10 +303,13 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
                 part = WorldBatch._make(values[one] for values in self._worlds)
                 advance(true(arrays), layout, cycles, orders[one], part, made[one])
         self._disturbances.meet(orders == STEP)
-        if self._disturbances.alters_sight:
-            self._look(np.flatnonzero(orders != SKIP), out)
+        altered, going = self._disturbances.alters_sight, np.flatnonzero(orders != SKIP)
+        if self._template.along_ways or (layout.observed_way and not altered):
+            self._way_direction[going], self._way_length[going] = self._ahead(going, self._worlds.state[going])
+        if altered:
+            self._look(going, out)
         elif layout.observed_way:
-            self._observe_ways(np.arange(self.num_envs), self._worlds.state, out)
+            observe_ways(out, layout, self._way_direction, self._way_length)
         return out.reshape(self.num_envs, -1)
 
     def _look(self, worlds: NDArray[np.intp], out: FloatArray) -> None:
@@ -315,19 +323,17 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             one = slice(row, row + 1)
             self._engine.observe_worlds(self._arrays[world], layout, sight.of(one), seen[one])
         if layout.observed_way:
-            self._observe_ways(worlds, sight.state, seen)
+            observe_ways(seen, layout, *self._ahead(worlds, sight.state))
         seen = self._disturbances.observe(seen, layout)
         if seen is not out:
             out[worlds] = seen
 
-    def _observe_ways(self, worlds: NDArray[np.intp], states: FloatArray, out: FloatArray) -> None:
-        """Add the ways of some worlds, from ``states`` ``(b, K, n)``, to what is seen there, ``(b, K, D)``."""
+    def _ahead(self, worlds: NDArray[np.intp], states: FloatArray) -> tuple[Floats, Floats]:
+        """Directions ``(b, K, d)`` and lengths ``(b, K)`` of the ways in some worlds, from ``states`` ``(b, K, n)``."""
         places = states[..., : self.problem.dimension]
         if not self._template.redraws:
-            observe_ways(out, self.layout, self.problem.ways, places)
-            return
-        for row, world in enumerate(worlds):
-            observe_ways(out[row], self.layout, self._problems[world].ways, places[row])
+            return self.problem.ways.ahead(places)
+        return ahead_in_each([self._problems[world].ways for world in worlds], places)
 
     def _before(self) -> WorldBatch | None:
         """The worlds before a step, as far as a reward is computed from them; ``None`` for the paper's."""
@@ -336,8 +342,8 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         worlds = self._worlds
         return worlds._replace(**{name: getattr(worlds, name).copy() for name in _READ_BEFORE})
 
-    def _reward(self, before: WorldBatch | None, moved: BoolArray) -> None:
-        """Give the robots of the worlds that have ``moved`` from ``before`` their rewards."""
+    def _reward(self, before: WorldBatch | None, length: Floats, moved: BoolArray) -> None:
+        """Give the robots of the worlds that have ``moved`` from ``before``, with ways of ``length``, their rewards."""
         worlds, reward = self._worlds, self._template.reward
         self.robot_rewards = np.where(moved[:, None], worlds.rewards, np.float32(0))
         if reward is None or before is None:
@@ -359,8 +365,8 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             dt=self.problem.dt,
         )
         if self._template.along_ways:
-            drawn = [problem.ways for problem in self._problems] if self._template.redraws else None
-            step = along_ways(step, drawn or self.problem.ways)
+            previous = np.where(moved[:, None], length, self._way_length)
+            step = along_ways(step, self._first_length, previous, self._way_length)
         rewards, terms = compute_rewards(reward, step)
         self.robot_rewards = np.where(moved[:, None], rewards, np.float32(0))
         self._terms = {name: np.where(moved[:, None], term, np.float32(0)) for name, term in terms.items()}
@@ -380,6 +386,8 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
                 self._worlds.inverse[world] = problem.arrays.inverse_initial_distance
                 self._arrays[world] = problem.arrays_to_observe(self._template.layout.num_obstacles)
                 self._apart |= bool(self._draws.differing(problem))
+                if self._template.along_ways:
+                    self._first_length[world] = problem.ways.length
         self._disturbances.begin(indices, self._draws.seeds)
 
     def _infos(self, mask: BoolArray | None = None) -> Info:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,14 +27,6 @@ REFINEMENTS = 2
 """How often a robot that seems to have no way is tried again on a grid that is twice as fine."""
 
 
-class _Look(NamedTuple):
-    """From places ``(..., K, d)`` where to go first ``(..., K, d)``, and how far it is in all ``(..., K)``."""
-
-    places: Floats
-    target: Floats
-    length: Floats
-
-
 @dataclass(frozen=True, eq=False)
 class Ways:
     """The shortest free way of every robot of a problem to its goal, other robots not counted.
@@ -51,11 +44,10 @@ class Ways:
     problem: Problem
     length: Floats
     _world: tuple[Space, Fields] | None
-    _looks: list[_Look] = field(default_factory=list, repr=False)
 
     def distance(self, points: ArrayLike) -> Floats:
         """``(..., K)`` float64 length of the ways from points ``(..., K, d)`` to the goals [m]."""
-        return self._look(points)[1].copy()
+        return self._look(points)[1]
 
     def distance_from(self, robot: int, places: Floats) -> Floats:
         """``(Q,)`` float64 length of the ways of one robot from places ``(Q, d)`` to its goal [m]."""
@@ -71,10 +63,7 @@ class Ways:
         """:meth:`direction` and :meth:`distance` at once."""
         places = np.asarray(points, np.float64)
         target, length = self._look(places)
-        offset = target - places
-        norm = np.sqrt((offset * offset).sum(axis=-1, keepdims=True))
-        direction: Floats = offset / np.where(norm > 0, norm, 1.0)
-        return direction, length.copy()
+        return _towards(places, target), length
 
     def path(self, robot: int) -> Floats:
         """``(w, d)`` float64 corners of the way of a robot, its start first and its goal last; empty if there is none.
@@ -105,17 +94,10 @@ class Ways:
             offset = goal - places
             straight: Floats = np.sqrt((offset * offset).sum(axis=-1))
             return np.broadcast_to(goal, places.shape), straight
-        # Who observes, and then is paid for the way made since, asks for the same places again, and the ones before.
-        for look in tuple(self._looks):
-            if np.array_equal(look.places, places):
-                return look.target, look.length
         num_robots, d = places.shape[-2:]
         spatial = in_space(places.reshape(-1, d)).reshape(-1, num_robots, 3).swapaxes(0, 1)
         target, length, _ = _find(self._world, 0, np.ascontiguousarray(spatial))
-        first, far = target.swapaxes(0, 1)[..., :d], length.T
-        look = _Look(places.copy(), first.reshape(places.shape), far.reshape(places.shape[:-1]))
-        self._looks[:] = [*self._looks[-1:], look]
-        return look.target, look.length
+        return target.swapaxes(0, 1)[..., :d].reshape(places.shape), length.T.reshape(places.shape[:-1])
 
 
 def _find(world: tuple[Space, Fields], robot: int, places: Floats) -> tuple[Floats, Floats, NDArray[np.int32]]:
@@ -167,17 +149,34 @@ def shortest_ways(problem: Problem) -> Ways:
     return Ways(problem, length, world)
 
 
-def observe_ways(observations: FloatArray, layout: ObservationLayout, ways: Ways, places: FloatArray) -> None:
+def _towards(places: Floats, targets: Floats) -> Floats:
+    """Unit vectors ``(..., d)`` from places to targets; zero where these are the same."""
+    offset = targets - places
+    norm = np.sqrt((offset * offset).sum(axis=-1, keepdims=True))
+    direction: Floats = offset / np.where(norm > 0, norm, 1.0)
+    return direction
+
+
+def ahead_in_each(ways: Sequence[Ways], places: FloatArray) -> tuple[Floats, Floats]:
+    """:meth:`Ways.ahead` in ``B`` worlds, each with ways of its own, from places ``(B, K, d)``."""
+    given = places.astype(np.float64)
+    target, length = np.empty(given.shape), np.empty(given.shape[:-1])
+    for world, own in enumerate(ways):
+        target[world], length[world] = own._look(given[world])
+    return _towards(given, target), length
+
+
+def observe_ways(observations: FloatArray, layout: ObservationLayout, direction: Floats, length: Floats) -> None:
     """Fill in what robots see of their ways.
 
     Args:
         observations: ``(..., K, D)``.
         layout: What is in them.
-        ways: The ways.
-        places: ``(..., K, d)`` where the robots are [m].
+        direction: ``(..., K, d)`` of the ways, unit vectors.
+        length: ``(..., K)`` of the ways [m].
     """
     seen, parts = layout.ways(observations), layout.way
-    seen[..., parts.direction], length = ways.ahead(places)
+    seen[..., parts.direction] = direction
     seen[..., parts.length] = np.minimum(length, layout.high[-1])[..., None]
 
 
