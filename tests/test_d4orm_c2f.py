@@ -445,6 +445,34 @@ def test_ways_of_robots_that_were_pushed_lead_on_to_their_ends() -> None:
     assert get_engine("cpu").rollout(coarse, initial).arrived[-1].all()
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_plan_that_comes_before_the_episode_ends_is_preferred(seed: int) -> None:
+    problem, nobody = circle(16), np.zeros(16, bool)
+    policy, env = controller(), navigation_v0.parallel_env(problem=problem)
+    env.reset(seed=seed)
+    policy.reset(env, seed=seed)
+    joint, left = split_state(problem, env.state()), 33
+    late = joint._replace(steps=env.max_cycles - left * policy.config.coarse_factor)
+    plan = policy._guide.plan(late, nobody, None, 20, thorough=True)
+    assert get_engine("cpu").rollout(plan.problem, plan.controls).arrived[left].all()
+
+
+def test_who_is_behind_robots_that_have_docked_is_barred() -> None:
+    problem = circle(4)
+    policy, env = controller(), navigation_v0.parallel_env(problem=problem)
+    env.reset(seed=0)
+    policy.reset(env, seed=0)
+    joint, docked = split_state(problem, env.state()), np.array([True, False, False, False])
+    states = joint.states.copy()
+    states[0, :2] = policy.guidance.path[10, 2]
+    barred = policy._guide._barred(joint._replace(states=states), docked)
+    assert barred[2]
+    assert not barred[0]
+    far = joint.states.copy()
+    far[0, :2] = 50
+    assert not policy._guide._barred(joint._replace(states=far), docked).any()
+
+
 @pytest.mark.parametrize("seed", [0, 2])
 def test_who_docked_at_the_rim_of_its_goal_stays_there_in_new_plans(seed: int) -> None:
     problem = make_problem("random", num_robots=20, seed=seed)

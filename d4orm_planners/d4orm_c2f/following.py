@@ -13,6 +13,9 @@ from d4orm_planners.steering import track_velocities
 STUCK_WITHIN, STUCK_AFTER = 3, 25
 """How many waypoints a robot has to get on in so many time steps not to be stuck."""
 
+BARRED_AFTER = 8
+"""The same for robots whose ways lead through those that stand for good, who will not let them pass."""
+
 WAITING_WITHIN = 0.15
 """A robot this near to where it should be by now waits [m]."""
 
@@ -35,19 +38,22 @@ class Patience:
         self._since = np.full(len(joint.goals), joint.steps)
         self._careful_until = np.full(len(joint.goals), joint.steps)
 
-    def observe(self, step: int, indices: IntArray, waiting: BoolArray) -> tuple[BoolArray, BoolArray]:
+    def observe(
+        self, step: int, indices: IntArray, waiting: BoolArray, barred: BoolArray
+    ) -> tuple[BoolArray, BoolArray]:
         """``(K,)`` who is stuck now, and who is or was not long ago, so that it follows its path.
 
         Args:
             step: Time step.
             indices: ``(K,)`` waypoints that the robots are at; lower ones than before are of another path.
             waiting: ``(K,)`` who is where it should be by now, or ahead of the team.
+            barred: ``(K,)`` whose way leads through robots that stand for good.
         """
         moved = (indices >= self._indices + STUCK_WITHIN) | (indices < self._indices) | waiting
         self._indices[moved], self._since[moved] = indices[moved], step
-        late = step - self._since > STUCK_AFTER
-        self._careful_until[late] = step + CAREFUL_FOR
-        return late, self._careful_until > step
+        idle = step - self._since
+        self._careful_until[idle > STUCK_AFTER] = step + CAREFUL_FOR
+        return idle > np.where(barred, BARRED_AFTER, STUCK_AFTER), self._careful_until > step
 
 
 def keep_time(

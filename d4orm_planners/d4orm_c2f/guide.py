@@ -12,6 +12,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.engine.base import Engine
 from d4orm_env.joint_state import JointState
+from d4orm_planners.candidate import Candidate
 from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.coarse import (
     Guidance,
@@ -23,7 +24,7 @@ from d4orm_planners.d4orm_c2f.coarse import (
     subgoal_indices,
 )
 from d4orm_planners.d4orm_c2f.first_guess import episode_of
-from d4orm_planners.d4orm_c2f.following import STUCK_AFTER, WAITING_WITHIN, Patience, keep_time
+from d4orm_planners.d4orm_c2f.following import BARRED_AFTER, STUCK_AFTER, WAITING_WITHIN, Patience, keep_time
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.d4orm_c2f.sight import within_sight
 from d4orm_planners.d4orm_d.planner import D4ormD
@@ -47,6 +48,7 @@ class Guide:
         refiner: What refinements roll out and sample with.
         background: Where they are made, if not between control loops.
         lifelong: Whether robots that arrive get new goals.
+        last_step: Time steps after which the episode ends.
 
     Attributes:
         problem: The problem, with the limits that the robots are believed to have now.
@@ -69,8 +71,10 @@ class Guide:
         refiner: Engine,
         background: Background[Guidance],
         lifelong: bool,
+        last_step: int,
     ) -> None:
         self.problem, self._config, self._seed, self._lifelong = problem, config, seed, lifelong
+        self._last_step = last_step
         self._refiner, self._background = refiner, background
         # Ways that fit between others to the centimetre are no guidance: fine plans cannot keep to them. But where
         # the team does not get on there may be no other ways.
@@ -107,12 +111,27 @@ class Guide:
         thorough: bool = False,
     ) -> Guidance:
         """Plan for the whole team from where it is, until a plan passes the checks (Algorithm 4, lines 1 to 3)."""
-        planner = self._thorough if thorough else self._planner
         # Whoever has docked at the rim of its goal could leave it within a coarse step.
         goals = np.where(docked[:, None], joint.states[:, : self.problem.dimension], joint.goals)
         coarse = coarse_problem(self.problem.resumed_at(joint.states, goals), self._config.coarse_factor)
-        seed, interval = derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps), self._config.check_interval
-        search = Search(planner, coarse, seed, initial, check_interval=interval)
+        chosen, guidance = self._planned(coarse, joint.steps, initial, iterations, thorough)
+        left = (self._last_step - joint.steps) // self._config.coarse_factor
+        if 0 < left < coarse.horizon and not chosen.failed.any() and not chosen.trajectory.arrived[left].all():
+            # It would come too late. Plans that come too late are none, if there are others.
+            in_time = coarse.replace(horizon=left)
+            hurried, other = self._planned(in_time, joint.steps, initial, iterations, thorough)
+            if not hurried.failed.any():
+                return other
+        return guidance
+
+    def _planned(
+        self, coarse: Problem, step: int, initial: FloatArray | None, iterations: int, thorough: bool
+    ) -> tuple[Candidate, Guidance]:
+        """The first plan that passes the checks, or the best one."""
+        planner = self._thorough if thorough else self._planner
+        seed, interval = derived_seed(self._seed, Stream.COARSE_PLAN, step), self._config.check_interval
+        start = None if initial is None else initial[: coarse.horizon]
+        search = Search(planner, coarse, seed, start, check_interval=interval)
         chosen, ordered = search.current, False
         for number in range(iterations):
             if not chosen.failed.any():
@@ -125,7 +144,7 @@ class Guide:
                 chosen = search.current
         plan = chosen.trajectory
         path = interpolate(plan.positions, self._config.coarse_factor)
-        return Guidance(problem=coarse, controls=plan.controls, states=plan.states, path=path, ordered=ordered)
+        return chosen, Guidance(problem=coarse, controls=plan.controls, states=plan.states, path=path, ordered=ordered)
 
     def subgoals(self, joint: JointState, docked: BoolArray) -> IntArray:
         """``(K,)`` waypoints that the robots head for; finds out where on the path they are (Algorithm 4, line 6)."""
@@ -168,15 +187,16 @@ class Guide:
         """Plan anew for robots with new goals or stuck, for a team that lost the guidance or has come to its end."""
         changed = (joint.goals != self._goals).any(axis=1)
         moving = ~docked
-        stuck, lost = np.zeros_like(docked), False
+        stuck, barred, lost = np.zeros_like(docked), np.zeros_like(docked), False
         if self._config.replan:
-            stuck, self.stuck = self._patience.observe(joint.steps, self._indices, self._waiting(joint))
+            barred = self._barred(joint, docked)
+            stuck, self.stuck = self._patience.observe(joint.steps, self._indices, self._waiting(joint), barred)
             lost = bool(moving.any()) and self._is_lost(joint, moving)
         if not moving.any():
             return False
         if self._config.replan:
             changed |= moving & (self._away(joint) > self._config.replan_distance)
-        held_up = moving & stuck & (joint.steps - self._began > STUCK_AFTER)
+        held_up = moving & stuck & (joint.steps - self._began > np.where(barred, BARRED_AFTER, STUCK_AFTER))
         if not (changed | held_up).any() and not lost:
             return False
         changed |= held_up
@@ -216,6 +236,16 @@ class Guide:
             along = keep_time(present, self._refiner, joint, ways, self._clock() // factor, present.horizon)
             initial[:, keep] = along[:, keep]
         return initial
+
+    def _barred(self, joint: JointState, docked: BoolArray) -> BoolArray:
+        """``(K,)`` whose next waypoints, up to the subgoal, lie within robots that stand for good."""
+        path, ahead = self.guidance.path, np.arange(self._config.subgoal_offset + 1)
+        steps = np.minimum(self._indices + ahead[:, None], len(path) - 1)
+        standing = joint.states[docked, : self.problem.dimension]
+        away = np.linalg.norm(path[steps, np.arange(len(docked)), None] - standing, axis=3)
+        radius = np.asarray(self.problem.team.radius)
+        barred: BoolArray = (away < radius[:, None] + radius[docked]).any(axis=(0, 2)) & ~docked
+        return barred
 
     def _waiting(self, joint: JointState) -> BoolArray:
         """``(K,)`` who is where it should be by now, or ahead of the team, and so has to wait."""

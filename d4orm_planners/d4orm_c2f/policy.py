@@ -112,7 +112,8 @@ class D4ormC2F(StatePolicy):
         self._homes = np.full_like(joint.goals, np.nan)
         self._see_docked(joint)
         begin = time.perf_counter()
-        self._guide = Guide(self.problem, self.config, seed, self._refiner, self._refinement, lifelong)
+        last_step = env.unwrapped.max_cycles
+        self._guide = Guide(self.problem, self.config, seed, self._refiner, self._refinement, lifelong, last_step)
         self._guide.begin(joint, self._docked)
         self._deviation = Deviation(self.problem, self._engine, self.config, docks=not lifelong)
         self.coarse_time = time.perf_counter() - begin
