@@ -35,7 +35,8 @@ class Evaluation:
         success_rate: Share of the validation episodes in which all arrived and none ever touched anything.
         travel_time: Their mean arrival time [s], with the whole episode for robots that did not arrive.
         seconds: What the lesson took.
-        env_share: Share of it that went into stepping the environment; in an imitation, into recording.
+        env_share: Share of it that went into the environments, instances that are drawn included; in an imitation, into
+            recording.
         imitation_error: Root mean square of the actions less those of the expert, in units of the limits, in episodes
             that were not learned from; ``None`` without an expert.
         parts: Success rates of the parts of a mixture, in their order, of which ``success_rate`` is the mean.

@@ -222,7 +222,7 @@ class MixedVecEnv(VecEnv):
 
     @property
     def seconds(self) -> float:
-        """Time spent stepping so far."""
+        """Time spent in the environments so far."""
         return sum(part.seconds for part in self.parts)
 
     def reset(self) -> FloatArray:

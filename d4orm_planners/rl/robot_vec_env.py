@@ -47,7 +47,7 @@ class RobotVecEnv(VecEnv):
         ways: As above.
         acted: ``(B * K,)`` bool: which robots acted in the last step.
         finished: ``(world, success, travel_time)`` of the worlds that ended in the last step.
-        seconds: Time spent stepping so far.
+        seconds: Time spent so far on stepping and on what episodes begin with, such as drawing instances.
 
     Raises:
         ValueError: For a bad argument, or a team of mixed models.
@@ -100,13 +100,16 @@ class RobotVecEnv(VecEnv):
 
     def reset(self) -> FloatArray:
         """Begin an episode in every world; the seed counts once."""
+        begin = time.perf_counter()
         observations, infos = self._env.reset(seed=self._seed)
         self._seed = None
         self._acting = ~infos["arrived"]
         self._touched = infos["collided"].copy()
         self._return = np.zeros(self._shape)
         self._length = np.zeros(self._shape, np.int64)
-        return self._encode(observations, [])[0]
+        features = self._encode(observations, [])[0]
+        self.seconds += time.perf_counter() - begin
+        return features
 
     def step_async(self, actions: FloatArray) -> None:
         self._actions = np.asarray(actions, np.float32)
