@@ -21,7 +21,7 @@ from d4orm_planners.d4orm_c2f.coarse import (
     rest_of,
     subgoal_indices,
 )
-from d4orm_planners.d4orm_c2f.following import BARRED_AFTER, STUCK_AFTER, Patience, keep_time
+from d4orm_planners.d4orm_c2f.following import STUCK_AFTER, STUCK_WITHIN, Patience, keep_time
 from d4orm_planners.d4orm_c2f.sight import LEAST, within_sight
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
@@ -185,18 +185,17 @@ def joint(problem: Any, states: Any, steps: int = 0) -> JointState:
 
 
 def test_who_does_not_get_on_is_stuck() -> None:
-    problem, nobody = hop_problem(4), np.zeros(4, bool)
-    patience, indices = Patience(joint(problem, problem.start)), np.zeros(4, int)
+    problem = hop_problem(3)
+    patience, indices = Patience(joint(problem, problem.start)), np.zeros(3, int)
     for step in range(1, STUCK_AFTER + 2):
         indices[2] = step
-        # The second one has to wait where it is, the third one moves, and the last one's way leads through others.
-        waiting, barred = np.array([False, True, False, False]), np.array([False, False, False, True])
-        late, careful = patience.observe(step, indices, waiting, barred)
-        np.testing.assert_array_equal(late, [step > STUCK_AFTER, False, False, step > BARRED_AFTER])
-        np.testing.assert_array_equal(careful, (step > STUCK_AFTER) & np.array([True, False, False, True]))
+        # The second one has to wait where it is, and the third one moves.
+        idle, careful = patience.observe(step, indices, np.array([False, True, False]))
+        np.testing.assert_array_equal(idle, [step, 0, step % STUCK_WITHIN])
+        np.testing.assert_array_equal(careful, [step > STUCK_AFTER, False, False])
     indices[0] += 10
-    late, careful = patience.observe(STUCK_AFTER + 2, indices, nobody, nobody)
-    assert not late[0]
+    idle, careful = patience.observe(STUCK_AFTER + 2, indices, np.zeros(3, bool))
+    assert idle[0] == 0
     assert careful[0]
 
 

@@ -465,12 +465,13 @@ def test_who_is_behind_robots_that_have_docked_is_barred() -> None:
     joint, docked = split_state(problem, env.state()), np.array([True, False, False, False])
     states = joint.states.copy()
     states[0, :2] = policy.guidance.path[10, 2]
-    barred = policy._guide._barred(joint._replace(states=states), docked)
+    barred = policy._guide._barred(joint._replace(states=states), docked, np.ones(4, bool))
     assert barred[2]
     assert not barred[0]
+    assert not policy._guide._barred(joint._replace(states=states), docked, np.arange(4) == 1)[2]
     far = joint.states.copy()
     far[0, :2] = 50
-    assert not policy._guide._barred(joint._replace(states=far), docked).any()
+    assert not policy._guide._barred(joint._replace(states=far), docked, np.ones(4, bool)).any()
 
 
 @pytest.mark.parametrize("seed", [0, 2])

@@ -38,22 +38,19 @@ class Patience:
         self._since = np.full(len(joint.goals), joint.steps)
         self._careful_until = np.full(len(joint.goals), joint.steps)
 
-    def observe(
-        self, step: int, indices: IntArray, waiting: BoolArray, barred: BoolArray
-    ) -> tuple[BoolArray, BoolArray]:
-        """``(K,)`` who is stuck now, and who is or was not long ago, so that it follows its path.
+    def observe(self, step: int, indices: IntArray, waiting: BoolArray) -> tuple[IntArray, BoolArray]:
+        """``(K,)`` steps for which each has not got on, and who is stuck, or was not long ago, and so follows its path.
 
         Args:
             step: Time step.
             indices: ``(K,)`` waypoints that the robots are at; lower ones than before are of another path.
             waiting: ``(K,)`` who is where it should be by now, or ahead of the team.
-            barred: ``(K,)`` whose way leads through robots that stand for good.
         """
         moved = (indices >= self._indices + STUCK_WITHIN) | (indices < self._indices) | waiting
         self._indices[moved], self._since[moved] = indices[moved], step
         idle = step - self._since
         self._careful_until[idle > STUCK_AFTER] = step + CAREFUL_FOR
-        return idle > np.where(barred, BARRED_AFTER, STUCK_AFTER), self._careful_until > step
+        return idle, self._careful_until > step
 
 
 def keep_time(

@@ -116,7 +116,12 @@ class Guide:
         coarse = coarse_problem(self.problem.resumed_at(joint.states, goals), self._config.coarse_factor)
         chosen, guidance = self._planned(coarse, joint.steps, initial, iterations, thorough)
         left = (self._last_step - joint.steps) // self._config.coarse_factor
-        if 0 < left < coarse.horizon and not chosen.failed.any() and not chosen.trajectory.arrived[left].all():
+        if (
+            not self._lifelong
+            and 0 < left < coarse.horizon
+            and not chosen.failed.any()
+            and not chosen.trajectory.arrived[left].all()
+        ):
             # It would come too late. Plans that come too late are none, if there are others.
             in_time = coarse.replace(horizon=left)
             hurried, other = self._planned(in_time, joint.steps, initial, iterations, thorough)
@@ -187,16 +192,18 @@ class Guide:
         """Plan anew for robots with new goals or stuck, for a team that lost the guidance or has come to its end."""
         changed = (joint.goals != self._goals).any(axis=1)
         moving = ~docked
-        stuck, barred, lost = np.zeros_like(docked), np.zeros_like(docked), False
+        held_up, lost = np.zeros_like(docked), False
         if self._config.replan:
-            barred = self._barred(joint, docked)
-            stuck, self.stuck = self._patience.observe(joint.steps, self._indices, self._waiting(joint), barred)
+            idle, self.stuck = self._patience.observe(joint.steps, self._indices, self._waiting(joint))
+            barred = self._barred(joint, docked, idle > BARRED_AFTER)
+            held_up = moving & (
+                np.minimum(idle, joint.steps - self._began) > np.where(barred, BARRED_AFTER, STUCK_AFTER)
+            )
             lost = bool(moving.any()) and self._is_lost(joint, moving)
         if not moving.any():
             return False
         if self._config.replan:
             changed |= moving & (self._away(joint) > self._config.replan_distance)
-        held_up = moving & stuck & (joint.steps - self._began > np.where(barred, BARRED_AFTER, STUCK_AFTER))
         if not (changed | held_up).any() and not lost:
             return False
         changed |= held_up
@@ -237,14 +244,14 @@ class Guide:
             initial[:, keep] = along[:, keep]
         return initial
 
-    def _barred(self, joint: JointState, docked: BoolArray) -> BoolArray:
-        """``(K,)`` whose next waypoints, up to the subgoal, lie within robots that stand for good."""
+    def _barred(self, joint: JointState, docked: BoolArray, asked: BoolArray) -> BoolArray:
+        """``(K,)`` those ``asked`` whose next waypoints, up to the subgoal, lie within robots that stand for good."""
+        robots, barred = np.flatnonzero(asked & ~docked), np.zeros_like(docked)
         path, ahead = self.guidance.path, np.arange(self._config.subgoal_offset + 1)
-        steps = np.minimum(self._indices + ahead[:, None], len(path) - 1)
-        standing = joint.states[docked, : self.problem.dimension]
-        away = np.linalg.norm(path[steps, np.arange(len(docked)), None] - standing, axis=3)
+        waypoints = path[np.minimum(self._indices[robots] + ahead[:, None], len(path) - 1), robots]
+        away = np.linalg.norm(waypoints[:, :, None] - joint.states[docked, : self.problem.dimension], axis=3)
         radius = np.asarray(self.problem.team.radius)
-        barred: BoolArray = (away < radius[:, None] + radius[docked]).any(axis=(0, 2)) & ~docked
+        barred[robots] = (away < radius[robots, None] + radius[docked]).any(axis=(0, 2))
         return barred
 
     def _waiting(self, joint: JointState) -> BoolArray:
