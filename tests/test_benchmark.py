@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from d4orm_env.core.dynamics import COMMON, MODEL_CODES, NUM_BUILT_IN
+from d4orm_env.scenarios import make_problem
 from d4orm_planners import cli
 from d4orm_planners.benchmark import benchmark, report, timing
 from d4orm_planners.benchmark.benchmark import MODELS, BenchmarkSettings, parts, run_parts
@@ -99,10 +100,12 @@ def test_the_numbers_hang_together(results: dict[str, list[Any]]) -> None:
         assert row["steps_per_second"] == pytest.approx(1 / row["seconds_per_step"].median)
     for row in results["obstacles"]:
         assert row["ratio"].count == row["iteration"].count >= 1
+    walls = make_problem("rooms", 8).world.num_obstacles
     assert [(row["obstacles"], row["disturbances"]) for row in results["environments"]] == [
-        (0, 0), (0, 0), (5, 0), (5, 0), (0, 3), (0, 3), (0, 0), (0, 0), (0, 0)
+        (0, 0), (0, 0), (5, 0), (5, 0), (0, 3), (0, 3), (walls, 0), (0, 0), (0, 0), (0, 0)
     ]  # fmt: skip
-    assert "FunctionalEnv" in {row["environment"] for row in results["environments"]}
+    names = {row["environment"] for row in results["environments"]}
+    assert {"make_vec, rooms along ways", "FunctionalEnv"} <= names
     assert [(row["obstacles"], row["where"]) for row in results["obstacles"]] == [(3, "near"), (5, "far")]
     (index,) = results["index"]
     assert 0 < index["bytes"] < 2**20

@@ -657,7 +657,7 @@ def look(
         fields: The wavefronts of all robots.
         first: Number of the first of these robots, who follow each other.
         places: ``(R, Q, 3)``.
-        target: ``(R, Q, 3)`` where to go first, output; unchanged where there is no way.
+        target: ``(R, Q, 3)`` where to go first, the place itself where there is no way; output.
         length: ``(R, Q)`` of the whole way; infinite where there is none, output.
         anchor: ``(R, Q)`` int32 the anchor that is the target or comes next, output; -1 where there is none.
     """

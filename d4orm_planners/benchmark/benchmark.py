@@ -159,6 +159,7 @@ def parts(settings: BenchmarkSettings) -> Iterator[Part]:
     for what, measurement in (("one environment", _measure_env), (f"{settings.num_worlds} worlds", _measure_worlds)):
         disturbed = partial(measurement, settings, 0, DISTURBANCES)
         yield "environments", f"{what} with {len(DISTURBANCES)} disturbances", disturbed
+    yield "environments", "rooms, each world its own, along ways", partial(_measure_rooms, settings)
     yield "environments", f"{settings.num_worlds} worlds in JAX", partial(_measure_functional, settings)
     for model in RIGID if find_spec("mujoco") else ():
         yield "environments", f"one environment of {model} in MuJoCo", partial(_measure_rigid, settings, model)
@@ -294,16 +295,25 @@ def _measure_steps(settings: BenchmarkSettings, env: ParallelEnv, count: int) ->
 
 def _measure_worlds(settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[AnyDisturbance] = ()) -> Row:
     """The batched environment of 8 robots per world under random controls, auto-reset included."""
+    size, problem = settings.num_worlds, boxed_problem(num_boxes, "near")
+    seconds = _measure_batch(settings, size, problem=problem, disturbances=disturbances)
+    return _rate("make_vec", size, num_boxes, disturbances, seconds)
+
+
+def _measure_rooms(settings: BenchmarkSettings) -> Row:
+    """The same in rooms, every world with walls of its own, where robots see their ways and are paid along them."""
+    size = max(1, settings.num_worlds // 8)
+    along = {"observed_way": True, "progress": "way", "reward": "training"}
+    seconds = _measure_batch(settings, size, scenario="rooms", num_robots=8, num_instances=8, **along)
+    num_boxes = make_problem("rooms", num_robots=8).world.num_obstacles
+    return _rate("make_vec, rooms along ways", size, num_boxes, (), seconds)
+
+
+def _measure_batch(settings: BenchmarkSettings, size: int, **options: Any) -> Spread:
+    """Seconds per step of a world of the batched environment, of ``size`` worlds."""
     import gymnasium
 
-    size = settings.num_worlds
-    env = gymnasium.make_vec(
-        "d4orm/Navigation-v0",
-        num_envs=size,
-        vectorization_mode="vector_entry_point",
-        problem=boxed_problem(num_boxes, "near"),
-        disturbances=disturbances,
-    )
+    env = gymnasium.make_vec("d4orm/Navigation-v0", num_envs=size, vectorization_mode="vector_entry_point", **options)
     env.reset(seed=0)
     space = env.single_action_space
     assert isinstance(space, gymnasium.spaces.Box)
@@ -318,7 +328,7 @@ def _measure_worlds(settings: BenchmarkSettings, num_boxes: int, disturbances: S
 
     spread = measure(steps, settings.repetitions, settings.time_limit)
     env.close()
-    return _rate("make_vec", size, num_boxes, disturbances, spread.times(1 / (calls * size)))
+    return spread.times(1 / (calls * size))
 
 
 def _measure_functional(settings: BenchmarkSettings) -> Row:
