@@ -24,7 +24,7 @@ TESTS = Path(__file__).parent
 
 ELSEWHERE = {
     "patience": ("test_distributed.py", "test_an_asynchronous_node_waits_once_for_one_that_is_silent"),
-    "transport": ("test_distributed_ray.py", "test_rounds_in_actors_are_those_of_threads"),
+    "transport": ("test_distributed_ray.py", "test_rounds_over_ray"),
     "address": ("test_distributed_ray.py", "test_a_cluster_that_is_not_there_is_one_clear_error"),
     "node": ("test_network_faults.py", "test_of_two_nodes_with_one_number_the_second_is_refused"),
     "zenoh": ("test_network_faults.py", "test_a_partition_that_heals"),

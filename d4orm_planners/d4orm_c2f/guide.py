@@ -123,7 +123,7 @@ class Guide:
             and not chosen.trajectory.arrived[left].all()
         ):
             # It would come too late. Plans that come too late are none, if there are others.
-            in_time = coarse.replace(horizon=left)
+            in_time = coarse.resumed_at(coarse.start, coarse.goal, horizon=left)
             hurried, other = self._planned(in_time, joint.steps, initial, iterations, thorough)
             if not hurried.failed.any():
                 return other
