@@ -270,7 +270,7 @@ def test_every_part_of_a_mixture_has_its_worlds_robots_and_sight() -> None:
     assert parts == (Exercise("random", 2, {"size": 4}), Exercise("circle", 4, {}, sight=1))
     assert TINY.worlds_of_exercises == (5, 2)
     assert TINY.batch == 18
-    env = TINY.worlds(None, seed=1)  # type: ignore[arg-type] # a mixture is the same in every lesson
+    env = TINY.worlds(None)  # type: ignore[arg-type] # a mixture is the same in every lesson
     assert isinstance(env, MixedVecEnv)
     assert [part.problem.name for part in env.parts] == ["random", "circle"]
     assert env.num_envs == 18
@@ -279,19 +279,41 @@ def test_every_part_of_a_mixture_has_its_worlds_robots_and_sight() -> None:
     _, neighbors, _ = env.features.parts(env.reset())
     shown = neighbors[..., 0].sum(axis=1)
     np.testing.assert_array_equal(shown, [1] * 18)
-    wide = replace(TINY, mixture=("random 2 size=4", "circle 4")).worlds(None, seed=1)  # type: ignore[arg-type]
+    wide = replace(TINY, mixture=("random 2 size=4", "circle 4")).worlds(None)  # type: ignore[arg-type]
     _, neighbors, _ = wide.features.parts(wide.reset())
     np.testing.assert_array_equal(neighbors[..., 0].sum(axis=1), [1] * 10 + [3] * 8)
     for both in (env, wide):
         both.close()
 
 
+@pytest.mark.parametrize(("ways", "kept"), [(True, 6), (False, 0)])
+def test_instances_with_ways_last_for_four_lessons(ways: bool, kept: int) -> None:
+    """Whether those of earlier lessons are at hand or have to be drawn again, as when a killed training goes on."""
+    settings = replace(TINY, mixture=("random 2 size=4",), num_envs=8, ways=ways)
+    drawn: dict = {}
+
+    def begun(number: int, drawn: dict) -> list[set[tuple[float, ...]]]:
+        env = settings.worlds(None, number, drawn)  # type: ignore[arg-type]
+        starts = [set(map(tuple, env.reset().reshape(4, -1).tolist())) for _ in range(30)]
+        env.close()
+        return starts
+
+    instances = []
+    for number in range(3):
+        starts = begun(number, drawn)
+        assert starts == begun(number, {})
+        assert len(set.union(*starts)) == 8 == len(*drawn.values())
+        instances.append(set(*drawn.values()))
+    assert len(instances[0] & instances[1]) == len(instances[1] & instances[2]) == kept
+    assert len(instances[0] & instances[2]) == (4 if ways else 0)
+
+
 def test_a_part_of_a_mixture_may_be_disturbed() -> None:
     part = Exercise.parse("circle 2 disturb.delay=2 disturb.push.speed=0.5 sight=1")
     assert part == Exercise("circle", 2, {}, sight=1, disturbances={"delay": 2, "push.speed": 0.5})
-    env = part.worlds(3, seed=1, instances=None)
+    env = part.worlds(3, 1)
     assert env.num_worlds == 3, "what goes wrong differs, though places do not"
-    assert Exercise.parse("circle 2").worlds(3, seed=1, instances=None).num_worlds == 1
+    assert Exercise.parse("circle 2").worlds(3, 1).num_worlds == 1
     env.reset()
     features = [env.step(np.full((6, 2), 1, np.float32))[0] for _ in range(2)]
     # Nothing has been obeyed yet, but somebody may have been pushed.
@@ -361,7 +383,7 @@ def test_a_learner_has_the_settings_asked_for(algorithm: str, settings: dict, tm
     from stable_baselines3.common.vec_env import VecNormalize
 
     asked = replace(TINY, algorithm=algorithm, learner_settings=settings)
-    env = VecNormalize(asked.worlds(None, 0))  # type: ignore[arg-type]
+    env = VecNormalize(asked.worlds(None))  # type: ignore[arg-type]
     model = ALGORITHMS[algorithm].make(env, tuned=asked.learner_settings)
     for name, value in {**ALGORITHMS[algorithm].tunable, **asked.learner_settings}.items():
         had = getattr(model, name)
@@ -373,7 +395,7 @@ def test_rewards_are_those_asked_for() -> None:
     settings = replace(TINY, reward_settings={"arrival": 7.5, "contact": "4"})
     assert (settings.reward.arrival, settings.reward.contact, settings.reward.time) == (7.5, 4, 0.05)
     flat = TrainingSettings(scenario="circle", num_robots=2, num_envs=2, reward_settings={"time": 1})
-    for env in (settings.worlds(None, 0), flat.worlds(Lesson(2, "circle", 1), 0)):  # type: ignore[arg-type]
+    for env in (settings.worlds(None), flat.worlds(Lesson(2, "circle", 1))):  # type: ignore[arg-type]
         env.reset()
         env.step_async(np.zeros((env.num_envs, 2), np.float32))
         _, rewards, *_ = env.step_wait()

@@ -35,6 +35,7 @@ class Stream(IntEnum):
     GUIDANCE = 18  # ties of path finding, by try, and which robots are replanned, by iteration
     NEIGHBOURHOODS = 19  # which robots look for faster ways, and how, by iteration
     DEMONSTRATIONS = 20  # of an expert, by round and episode
+    TRAINING_INSTANCES = 21  # by part of the mixture and number
 
 
 def derived_seed(seed: int, stream: Stream, *key: int) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
@@ -12,10 +12,11 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.problem import Problem
 from d4orm_env.core.yaml_text import parse_yaml
 from d4orm_env.disturbances.registry import disturbances_at
 from d4orm_env.scenarios import make_problem
-from d4orm_env.scenarios.problems import unknown_argument
+from d4orm_env.scenarios.problems import find_scenario, unknown_argument
 from d4orm_env.team_step import Info
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 
@@ -149,29 +150,51 @@ class Exercise:
             raise ValueError(f"mixture has {text!r}: {complaint}")
         return cls(scenario, int(rest[0]), settings, sight, disturbances)
 
+    def problem(self, seed: int, model: str | None = None) -> Problem:
+        """An instance with robots of that model; ``None`` is the scenario's own."""
+        return make_problem(self.scenario, self.num_robots, seed, model=model, **self.settings)
+
     def worlds(
-        self, count: int, seed: int, instances: int | None, model: str | None = None, **options: Any
+        self, count: int, seed: int, instances: Instances | None = None, model: str | None = None, **options: Any
     ) -> RobotVecEnv:
         """Worlds to practise in.
 
         Args:
             count: How many; one is enough for a single undisturbed instance if ``instances`` is ``None``.
             seed: Of the first.
-            instances: To draw at most; ``None`` draws a new one for every episode.
+            instances: To choose among at every reset; ``None`` draws a new one for every episode.
             model: Robot model; ``None`` is the scenario's own.
             **options: Further arguments of the environment.
         """
         arguments: dict[str, Any] = {"scenario": self.scenario, "model": model, **self.settings}
-        first, second = (make_problem(**arguments, num_robots=self.num_robots, seed=number) for number in (0, 1))
-        drawn = first != second
+        drawn = find_scenario(self.scenario).draws or self.problem(0, model) != self.problem(1, model)
         if drawn:
+            arguments = arguments if instances is None else {"scenario": instances}
             arguments["randomize_instance"] = True
-            if instances is not None:
-                arguments["num_instances"] = instances
         if self.disturbances:
             options["disturbances"] = disturbances_at(self.disturbances)
         count = count if drawn or self.disturbances or instances is not None else 1
         return RobotVecEnv(count, self.num_robots, seed=seed, sight=self.sight, **arguments, **options)
+
+
+class Instances:
+    """A scenario of few instances: each is drawn when it is first asked for, and kept.
+
+    Args:
+        draw: ``seed -> Problem``.
+        seeds: Of the instances.
+        drawn: Instances by their seeds; those of ``seeds`` are added when they are drawn.
+    """
+
+    def __init__(self, draw: Callable[[int], Problem], seeds: Sequence[int], drawn: dict[int, Problem]) -> None:
+        self._draw, self._seeds, self._drawn = draw, seeds, drawn
+
+    def __call__(self, seed: int, num_robots: int) -> Problem:
+        """The instance that this number stands for."""
+        own = self._seeds[seed % len(self._seeds)]
+        if own not in self._drawn:
+            self._drawn[own] = self._draw(own)
+        return self._drawn[own]
 
 
 def parse_mixture(texts: Sequence[str]) -> tuple[Exercise, ...]:

@@ -9,9 +9,8 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from d4orm_env.core.problem import Problem
-from d4orm_env.scenarios import make_problem
 from d4orm_env.scenarios.problems import unknown_argument
-from d4orm_planners.rl.mixture import MixedVecEnv
+from d4orm_planners.rl.mixture import Exercise, MixedVecEnv
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 from d4orm_planners.settings import CheckedSettings, Count, Whole
 
@@ -58,20 +57,22 @@ class Practice(CheckedSettings):
 
     def _example(self) -> Problem:
         """An instance of the scenario."""
-        return make_problem(**self.arguments(self.scenario), num_robots=self.num_robots)
+        return self.exercise(self.scenario, self.num_robots).problem(0, self.model)
 
     def arguments(self, scenario: str) -> dict[str, Any]:
         """Of environments of the scenario to be learned, or of ``random`` with robots like its own, but for their
         number.
         """
-        if scenario == self.scenario:
-            return {"scenario": scenario, "model": self.model, **self.scenario_settings}
-        return {"scenario": scenario, "model": self._example().team.models[0]}
+        settings = self.exercise(scenario, self.num_robots).settings
+        return {"scenario": scenario, "model": self.model_in(scenario), **settings}
 
-    def draws(self, scenario: str, num_robots: int) -> bool:
-        """Whether instances of such a scenario differ."""
-        first, second = (make_problem(**self.arguments(scenario), num_robots=num_robots, seed=seed) for seed in (0, 1))
-        return first != second
+    def exercise(self, scenario: str, num_robots: int) -> Exercise:
+        """The same scenario with a team of that size."""
+        return Exercise(scenario, num_robots, self.scenario_settings if scenario == self.scenario else {})
+
+    def model_in(self, scenario: str) -> str | None:
+        """The model of its robots; ``None`` is the scenario's own."""
+        return self.model if scenario == self.scenario else self._example().team.models[0]
 
     def validation(self, **options: Any) -> RobotVecEnv | MixedVecEnv:
         """Worlds to judge by.
@@ -82,10 +83,8 @@ class Practice(CheckedSettings):
         Raises:
             ValueError: If one policy cannot be learned for the team.
         """
-        drawn = self.draws(self.scenario, self.num_robots)
-        arguments = self.arguments(self.scenario) | ({"randomize_instance": True} if drawn else {})
-        count = self.validation_worlds if drawn else 1
-        return RobotVecEnv(count, self.num_robots, seed=VALIDATION_SEED, **arguments, **options)
+        exercise = self.exercise(self.scenario, self.num_robots)
+        return exercise.worlds(self.validation_worlds, VALIDATION_SEED, model=self.model, **options)
 
     def header(self, algorithm: str, worlds: RobotVecEnv | MixedVecEnv, **training: object) -> dict[str, object]:
         """Of a policy file: what a model does not tell."""

@@ -11,7 +11,7 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,13 +22,14 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
+from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.rewards import TrainingReward
 from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm
 from d4orm_planners.rl.checkpoints import Checkpoints
 from d4orm_planners.rl.curriculum import Lesson, common_batch, make_lessons, team_sizes
 from d4orm_planners.rl.curve import Evaluation, evaluate_network, write_curve
-from d4orm_planners.rl.mixture import Exercise, MixedVecEnv, parse_mixture
+from d4orm_planners.rl.mixture import Exercise, Instances, MixedVecEnv, parse_mixture
 from d4orm_planners.rl.network import CLIP, EPSILON, Network, load_network
 from d4orm_planners.rl.practice import VALIDATION_SEED, Many, Practice
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
@@ -37,8 +38,11 @@ from d4orm_planners.rl.sb3_sets import leave_as_they_are
 from d4orm_planners.settings import Count, Number, PathText, Positive, Whole, one_of
 
 Progress = Callable[[str, int, int], object]
-_INSTANCES = 256
-"""Drawn for each lesson, at most."""
+_INSTANCES, _LASTING = 256, 4
+"""At most so many for a lesson, of each part; and for how many lessons one lasts where robots look along ways, which
+take long to find. Elsewhere all are new in each lesson."""
+Drawn = dict[tuple[int, str, int], dict[int, Problem]]
+"""Instances by part, scenario and team size, and by their seeds."""
 NETWORKS = ("flat", "sets")
 MIXTURE = "mixture"
 """Stands for the scenario of lessons that are about several."""
@@ -131,25 +135,33 @@ class TrainingSettings(Practice):
         sizes = team_sizes(self.num_robots) if self.curriculum else (self.num_robots,)
         return common_batch(sizes, self.num_envs or ALGORITHMS[self.algorithm].num_envs)
 
-    def worlds(self, lesson: Lesson, seed: int) -> RobotVecEnv | MixedVecEnv:
-        """Worlds for a lesson."""
+    def parts(self, lesson: Lesson) -> list[tuple[int, Exercise, str | None]]:
+        """What is practised in a lesson: so many worlds of an exercise, with robots of a model."""
         if self.mixture:
-            counted = enumerate(zip(self.worlds_of_exercises, self.exercises, strict=True))
-            parts = [
-                part.worlds(
-                    count,
-                    derived_seed(seed, Stream.TRAINING_WORLDS, index),
-                    min(_INSTANCES, 2 * count),
-                    **self._options,
-                )
-                for index, (count, part) in counted
-            ]
-            return MixedVecEnv(parts)
-        count, arguments = self.batch // lesson.num_robots, self.arguments(lesson.scenario)
-        if self.draws(lesson.scenario, lesson.num_robots):
-            arguments |= {"randomize_instance": True, "num_instances": min(_INSTANCES, 2 * count)}
-        arguments |= {"observed_robots": self.observed_robots, "reward": self.reward, "ways": self.ways}
-        return RobotVecEnv(count, lesson.num_robots, seed=seed, **arguments)
+            return [(*part, self.model) for part in zip(self.worlds_of_exercises, self.exercises, strict=True)]
+        exercise = self.exercise(lesson.scenario, lesson.num_robots)
+        return [(self.batch // lesson.num_robots, exercise, self.model_in(lesson.scenario))]
+
+    def worlds(self, lesson: Lesson, number: int = 0, drawn: Drawn | None = None) -> RobotVecEnv | MixedVecEnv:
+        """Worlds for a lesson.
+
+        Args:
+            lesson: What is practised.
+            number: Of the lesson.
+            drawn: Instances of earlier lessons, from which those that are used again are taken; others are left out,
+                and new ones added when they are drawn.
+        """
+        seed, drawn, parts = derived_seed(self.seed, Stream.TRAINING_WORLDS, number), {} if drawn is None else drawn, []
+        for part, (count, exercise, model) in enumerate(self.parts(lesson)):
+            size = min(_INSTANCES, 2 * count)
+            first = number * -(-size // (_LASTING if self.ways else 1))
+            seeds = [derived_seed(self.seed, Stream.TRAINING_INSTANCES, part, first + index) for index in range(size)]
+            key = part, exercise.scenario, exercise.num_robots
+            drawn[key] = {own: problem for own, problem in drawn.get(key, {}).items() if own in seeds}
+            instances = Instances(partial(exercise.problem, model=model), seeds, drawn[key])
+            own_seed = derived_seed(seed, Stream.TRAINING_WORLDS, part)
+            parts.append(exercise.worlds(count, own_seed, instances, model, **self._options))
+        return MixedVecEnv(parts) if self.mixture else parts[0]
 
     def validation(self, **options: Any) -> RobotVecEnv | MixedVecEnv:
         """Worlds to judge by.
@@ -157,17 +169,17 @@ class TrainingSettings(Practice):
         Raises:
             ValueError: If one policy cannot be learned for the team.
         """
+        options = {**self._options, **options}
         if not self.mixture:
-            return super().validation(observed_robots=self.observed_robots, ways=self.ways, **options)
-        count, options = -(-self.validation_worlds // len(self.exercises)), {**self._options, **options}
-        return MixedVecEnv([part.worlds(count, VALIDATION_SEED, None, **options) for part in self.exercises])
+            return super().validation(**options)
+        count = -(-self.validation_worlds // len(self.exercises))
+        parts = [part.worlds(count, VALIDATION_SEED, model=self.model, **options) for part in self.exercises]
+        return MixedVecEnv(parts)
 
     @property
     def _options(self) -> dict[str, Any]:
-        """Of the environments of a mixture."""
-        return {
-            "model": self.model, "observed_robots": self.observed_robots, "reward": self.reward, "ways": self.ways
-        }  # fmt: skip
+        """Of the environments."""
+        return {"observed_robots": self.observed_robots, "reward": self.reward, "ways": self.ways}
 
 
 @dataclass(frozen=True)
@@ -225,6 +237,7 @@ class _Run:
             self.lessons = tuple(Lesson(largest, MIXTURE, lesson.steps) for lesson in self.lessons)
         self._total = sum(lesson.steps for lesson in self.lessons)
         self._model: BaseAlgorithm | None = None
+        self._drawn: Drawn = {}
         # First of all, because it refuses what cannot be learned, and nothing is to be written then.
         self._validation = settings.validation()
         self._start = None if settings.start_from is None else self._first_network(settings.start_from)
@@ -251,7 +264,8 @@ class _Run:
         begin, lesson, settings = time.perf_counter(), self.lessons[index], self.settings
         done = sum(earlier.steps for earlier in self.lessons[:index])
         self._progress(_describe(lesson, self.evaluations), done, self._total)
-        robots = settings.worlds(lesson, derived_seed(settings.seed, Stream.TRAINING_WORLDS, index))
+        robots = settings.worlds(lesson, index, self._drawn)
+        making = time.perf_counter() - begin
         normalized = VecNormalize(robots, clip_obs=CLIP, gamma=self._algorithm.gamma, epsilon=EPSILON)
         if settings.network == "sets":
             leave_as_they_are(normalized)
@@ -270,7 +284,7 @@ class _Run:
         outcome = evaluate_network(network, self._validation, VALIDATION_SEED)
         evaluation = Evaluation(
             done + lesson.steps, lesson.num_robots, lesson.scenario, outcome.success_rate, outcome.travel_time,
-            seconds, robots.seconds / seconds, parts=outcome.parts if settings.mixture else None,
+            seconds, (making + robots.seconds) / seconds, parts=outcome.parts if settings.mixture else None,
         )  # fmt: skip
         self.evaluations = [*self.evaluations, evaluation]
         self.checkpoints.keep_best(network, self.evaluations)
