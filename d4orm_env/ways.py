@@ -159,10 +159,19 @@ def _towards(places: Floats, targets: Floats) -> Floats:
 
 def ahead_in_each(ways: Sequence[Ways], places: FloatArray) -> tuple[Floats, Floats]:
     """:meth:`Ways.ahead` in ``B`` worlds, each with ways of its own, from places ``(B, K, d)``."""
+    from d4orm_env.engine.wavefront import look
+
     given = places.astype(np.float64)
     target, length = np.empty(given.shape), np.empty(given.shape[:-1])
+    # Each robot is one row of one place.
+    spatial = in_space(given.reshape(-1, given.shape[-1])).reshape(*given.shape[:-1], 1, 3)
+    found, lengths, anchors = np.empty(spatial.shape), length[:, :, None], np.empty(spatial.shape[:3], np.int32)
     for world, own in enumerate(ways):
-        target[world], length[world] = own._look(given[world])
+        if own._world is None:
+            target[world], length[world] = own._look(given[world])
+        else:
+            look(*own._world, 0, spatial[world], found[world], lengths[world], anchors[world])
+            target[world] = found[world, :, 0, : given.shape[-1]]
     return _towards(given, target), length
 
 

@@ -311,9 +311,9 @@ def test_instances_with_ways_last_for_four_lessons(ways: bool, kept: int) -> Non
 def test_a_part_of_a_mixture_may_be_disturbed() -> None:
     part = Exercise.parse("circle 2 disturb.delay=2 disturb.push.speed=0.5 sight=1")
     assert part == Exercise("circle", 2, {}, sight=1, disturbances={"delay": 2, "push.speed": 0.5})
-    env = part.worlds(3, 1)
+    env = part.validation(3, 1)
     assert env.num_worlds == 3, "what goes wrong differs, though places do not"
-    assert Exercise.parse("circle 2").worlds(3, 1).num_worlds == 1
+    assert Exercise.parse("circle 2").validation(3, 1).num_worlds == 1
     env.reset()
     features = [env.step(np.full((6, 2), 1, np.float32))[0] for _ in range(2)]
     # Nothing has been obeyed yet, but somebody may have been pushed.

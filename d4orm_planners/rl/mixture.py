@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -154,44 +156,52 @@ class Exercise:
         """An instance with robots of that model; ``None`` is the scenario's own."""
         return make_problem(self.scenario, self.num_robots, seed, model=model, **self.settings)
 
+    def draws(self, model: str | None = None) -> bool:
+        """Whether its instances differ."""
+        return find_scenario(self.scenario).draws or self.problem(0, model) != self.problem(1, model)
+
     def worlds(
-        self, count: int, seed: int, instances: Instances | None = None, model: str | None = None, **options: Any
+        self, count: int, seed: int, instances: Instances, model: str | None = None, **options: Any
     ) -> RobotVecEnv:
         """Worlds to practise in.
 
         Args:
-            count: How many; one is enough for a single undisturbed instance if ``instances`` is ``None``.
+            count: How many.
             seed: Of the first.
-            instances: To choose among at every reset; ``None`` draws a new one for every episode.
+            instances: To choose among at every reset.
             model: Robot model; ``None`` is the scenario's own.
             **options: Further arguments of the environment.
         """
         arguments: dict[str, Any] = {"scenario": self.scenario, "model": model, **self.settings}
-        drawn = find_scenario(self.scenario).draws or self.problem(0, model) != self.problem(1, model)
-        if drawn:
-            arguments = arguments if instances is None else {"scenario": instances}
-            arguments["randomize_instance"] = True
+        if self.draws(model):
+            arguments = {"scenario": instances, "randomize_instance": True}
         if self.disturbances:
             options["disturbances"] = disturbances_at(self.disturbances)
-        count = count if drawn or self.disturbances or instances is not None else 1
         return RobotVecEnv(count, self.num_robots, seed=seed, sight=self.sight, **arguments, **options)
+
+    def validation(self, count: int, seed: int, model: str | None = None, **options: Any) -> RobotVecEnv:
+        """Worlds to judge by, a new instance for each; one is enough where nothing differs. Arguments as above."""
+        # Every validation asks for the same again.
+        instances = Instances(partial(self.problem, model=model), None, {})
+        count = count if self.disturbances or self.draws(model) else 1
+        return self.worlds(count, seed, instances, model, **options)
 
 
 class Instances:
-    """A scenario of few instances: each is drawn when it is first asked for, and kept.
+    """A scenario whose instances are kept when they have been drawn.
 
     Args:
         draw: ``seed -> Problem``.
-        seeds: Of the instances.
-        drawn: Instances by their seeds; those of ``seeds`` are added when they are drawn.
+        seeds: Of the instances there are; ``None`` is all.
+        drawn: Instances by their seeds, to which others are added.
     """
 
-    def __init__(self, draw: Callable[[int], Problem], seeds: Sequence[int], drawn: dict[int, Problem]) -> None:
+    def __init__(self, draw: Callable[[int], Problem], seeds: Sequence[int] | None, drawn: dict[int, Problem]) -> None:
         self._draw, self._seeds, self._drawn = draw, seeds, drawn
 
     def __call__(self, seed: int, num_robots: int) -> Problem:
         """The instance that this number stands for."""
-        own = self._seeds[seed % len(self._seeds)]
+        own = seed if self._seeds is None else self._seeds[seed % len(self._seeds)]
         if own not in self._drawn:
             self._drawn[own] = self._draw(own)
         return self._drawn[own]
@@ -217,6 +227,7 @@ class MixedVecEnv(VecEnv):
         parts: Them.
         acted: Which robots acted in the last step.
         finished: ``(world, success, travel_time)`` of the worlds that ended in the last step, worlds counted through.
+        seconds: Time spent in the environments so far.
 
     Raises:
         ValueError: If the parts do not go together.
@@ -232,6 +243,8 @@ class MixedVecEnv(VecEnv):
         self.features, self.problem, self.ways = first.features, first.problem, first.ways
         self.num_worlds = sum(part.num_worlds for part in parts)
         self._splits = np.cumsum([part.num_envs for part in parts])[:-1]
+        self._limits = np.concatenate([part.limits for part in parts])
+        self.seconds = 0.0
         super().__init__(sum(part.num_envs for part in parts), first.observation_space, first.action_space)
 
     @property
@@ -243,22 +256,32 @@ class MixedVecEnv(VecEnv):
         offsets = np.cumsum([0, *(part.num_worlds for part in self.parts)]).tolist()
         return [(offset + world, *how) for offset, part in zip(offsets, self.parts) for world, *how in part.finished]
 
-    @property
-    def seconds(self) -> float:
-        """Time spent in the environments so far."""
-        return sum(part.seconds for part in self.parts)
-
     def reset(self) -> FloatArray:
-        return np.concatenate([part.reset() for part in self.parts])
+        begin = time.perf_counter()
+        encoded = self._encoded([part.begin() for part in self.parts])
+        features = np.concatenate([part.show(*own)[0] for part, own in zip(self.parts, encoded, strict=True)])
+        self.seconds += time.perf_counter() - begin
+        return features
 
     def step_async(self, actions: FloatArray) -> None:
-        for part, own in zip(self.parts, np.split(np.asarray(actions), self._splits)):
-            part.step_async(own)
+        self._actions = np.asarray(actions, np.float32)
 
     def step_wait(self) -> tuple[FloatArray, FloatArray, BoolArray, list[Info]]:
-        features, rewards, dones, infos = zip(*(part.step_wait() for part in self.parts))
+        begin = time.perf_counter()
+        frames = np.concatenate([part.frames for part in self.parts])
+        controls = np.split(self.features.decode(self._actions, frames, self._limits), self._splits)
+        encoded = self._encoded([part.drive(own) for part, own in zip(self.parts, controls, strict=True)])
+        outcomes = (part.conclude(*own) for part, own in zip(self.parts, encoded, strict=True))
+        features, rewards, dones, infos = zip(*outcomes)
         flat = [info for listed in infos for info in listed]
+        self.seconds += time.perf_counter() - begin
         return np.concatenate(features), np.concatenate(rewards), np.concatenate(dones), flat
+
+    def _encoded(self, seen: list[FloatArray]) -> list[tuple[FloatArray, FloatArray]]:
+        """Features and frames of what the robots of each part see: all at once, for each call takes its time."""
+        features, frames = self.parts[0].encoded(np.concatenate(seen))
+        ends = np.cumsum([len(own) for own in seen])[:-1]
+        return list(zip(np.split(features, ends), np.split(frames, ends), strict=True))
 
     def close(self) -> None:
         for part in self.parts:

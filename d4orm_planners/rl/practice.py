@@ -84,7 +84,7 @@ class Practice(CheckedSettings):
             ValueError: If one policy cannot be learned for the team.
         """
         exercise = self.exercise(self.scenario, self.num_robots)
-        return exercise.worlds(self.validation_worlds, VALIDATION_SEED, model=self.model, **options)
+        return exercise.validation(self.validation_worlds, VALIDATION_SEED, self.model, **options)
 
     def header(self, algorithm: str, worlds: RobotVecEnv | MixedVecEnv, **training: object) -> dict[str, object]:
         """Of a policy file: what a model does not tell."""

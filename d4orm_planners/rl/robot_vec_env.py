@@ -47,6 +47,8 @@ class RobotVecEnv(VecEnv):
         ways: As above.
         acted: ``(B * K,)`` bool: which robots acted in the last step.
         finished: ``(world, success, travel_time)`` of the worlds that ended in the last step.
+        limits: ``(B * K, m)`` largest controls.
+        frames: ``(B * K, 2)`` in which the robots act now, see :meth:`Features.encode`.
         seconds: Time spent so far on stepping and on what episodes begin with, such as drawing instances.
 
     Raises:
@@ -89,7 +91,7 @@ class RobotVecEnv(VecEnv):
         self._sight = sight
         self._shape = (num_worlds, problem.num_robots)
         count = num_worlds * problem.num_robots
-        self._limits = np.tile(problem.team.control_limits, (num_worlds, 1))
+        self.limits = np.tile(problem.team.control_limits, (num_worlds, 1))
         self._seed: int | None = seed
         self.acted = np.ones(count, np.bool_)
         self.finished: list[tuple[int, bool, float]] = []
@@ -101,13 +103,7 @@ class RobotVecEnv(VecEnv):
     def reset(self) -> FloatArray:
         """Begin an episode in every world; the seed counts once."""
         begin = time.perf_counter()
-        observations, infos = self._env.reset(seed=self._seed)
-        self._seed = None
-        self._acting = ~infos["arrived"]
-        self._touched = infos["collided"].copy()
-        self._return = np.zeros(self._shape)
-        self._length = np.zeros(self._shape, np.int64)
-        features = self._encode(observations, [])[0]
+        features, _ = self.show(*self.encoded(self.begin()))
         self.seconds += time.perf_counter() - begin
         return features
 
@@ -116,49 +112,84 @@ class RobotVecEnv(VecEnv):
 
     def step_wait(self) -> tuple[FloatArray, FloatArray, BoolArray, list[Info]]:
         begin = time.perf_counter()
-        controls = self.features.decode(self._actions, self._frames, self._limits)
+        seen = self.drive(self.features.decode(self._actions, self.frames, self.limits))
+        outcome = self.conclude(*self.encoded(seen))
+        self.seconds += time.perf_counter() - begin
+        return outcome
+
+    def begin(self) -> FloatArray:
+        """Begin an episode in every world; what the robots see ``(B * K, .)``, for :meth:`encoded`."""
+        observations, infos = self._env.reset(seed=self._seed)
+        self._seed = None
+        self._acting = ~infos["arrived"]
+        self._touched = infos["collided"].copy()
+        self._return = np.zeros(self._shape)
+        self._length = np.zeros(self._shape, np.int64)
+        return self._in_sight(observations, [])
+
+    def drive(self, controls: FloatArray) -> FloatArray:
+        """Step the worlds with controls ``(B * K, m)`` in physical units.
+
+        Returns:
+            What the robots see ``(B * K + E, .)``, for :meth:`encoded`: after all others the ``E`` whose episodes have
+            ended, who saw that last.
+        """
         observations, _, terminated, truncated, infos = self._env.step(controls.reshape(self._shape[0], -1))
         ended, acting = terminated | truncated, self._acting
         now = {name: infos[name] for name in ("arrived", "collided")}
         if ended.any():
             final = infos["final_info"]
             now = {name: np.where(ended[:, None], final[name], value) for name, value in now.items()}
-        rewards = self._env.robot_rewards * acting
+        self._rewards = self._env.robot_rewards * acting
         self.acted = acting.ravel()
         self._touched |= now["collided"] & acting
-        self._return += rewards
+        self._return += self._rewards
         self._length += acting
         self._finish_worlds(ended, infos)
+        self._arrived = now["arrived"]
         # The slot of an arrived robot ends with its world, so that the next episode begins afresh.
-        dones = np.where(acting, now["arrived"], False) | ended[:, None]
-        self._acting = (acting & ~now["arrived"]) | ended[:, None]
-        finishing = np.argwhere(dones & acting)
+        self._dones = np.where(acting, self._arrived, False) | ended[:, None]
+        self._acting = (acting & ~self._arrived) | ended[:, None]
+        self._finishing = np.argwhere(self._dones & acting)
         last = [
             (infos["final_obs"][b] if ended[b] else observations[b]).reshape(self._shape[1], -1)[k]
-            for b, k in finishing
+            for b, k in self._finishing
         ]
-        features, terminal = self._encode(observations, last)
-        robot_infos = self._robot_infos(finishing, terminal, now["arrived"])
-        for values in (self._touched, self._return, self._length):
-            values[dones] = 0
-        self.seconds += time.perf_counter() - begin
-        return features, rewards.ravel().astype(np.float32), dones.ravel(), robot_infos
+        return self._in_sight(observations, last)
 
-    def _encode(self, observations: FloatArray, last: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """Features of what the robots see now, and of what those whose episodes have ended saw last."""
-        count = self.num_envs
-        seen = observations.reshape(count, -1)
-        seen = np.concatenate([seen, last]) if last else seen
+    def encoded(self, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Features ``(N, F)`` and frames ``(N, 2)`` of what robots of any such worlds see ``(N, .)``."""
         if self.ways:
             seen, way = seen[:, : self.features.slices.size].copy(), self._env.layout.ways(seen)
             parts = self._env.layout.way
             self.features.along(seen, way[:, parts.direction], way[:, parts.length][:, 0])
-        if self._sight is not None:
-            self.features.slices.neighbors(seen)[:, self._sight :] = 0
-        features, frames = self.features.encode(seen)
-        self._frames = frames[:count]
+        return self.features.encode(seen)
+
+    def show(self, features: FloatArray, frames: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Features that the robots are shown, and those that the ones whose episodes have ended are."""
+        count = self.num_envs
+        self.frames = frames[:count]
         features[:count][~self._acting.ravel()] = 0
         return features[:count], features[count:]
+
+    def conclude(
+        self, features: FloatArray, frames: FloatArray
+    ) -> tuple[FloatArray, FloatArray, BoolArray, list[Info]]:
+        """What a step gives, with the features and frames of what :meth:`drive` returned."""
+        shown, terminal = self.show(features, frames)
+        robot_infos, dones = self._robot_infos(self._finishing, terminal, self._arrived), self._dones
+        for values in (self._touched, self._return, self._length):
+            values[dones] = 0
+        return shown, self._rewards.ravel().astype(np.float32), dones.ravel(), robot_infos
+
+    def _in_sight(self, observations: FloatArray, last: list[FloatArray]) -> FloatArray:
+        """What the robots are to see now, and what those whose episodes have ended saw last."""
+        seen = observations.reshape(self.num_envs, -1)
+        seen = np.concatenate([seen, last]) if last else seen
+        if self._sight is not None:
+            seen = seen.copy() if not last else seen
+            self.features.slices.neighbors(seen)[:, self._sight :] = 0
+        return seen
 
     def _finish_worlds(self, ended: BoolArray, infos: Info) -> None:
         self.finished = []

@@ -173,8 +173,7 @@ class TrainingSettings(Practice):
         if not self.mixture:
             return super().validation(**options)
         count = -(-self.validation_worlds // len(self.exercises))
-        parts = [part.worlds(count, VALIDATION_SEED, model=self.model, **options) for part in self.exercises]
-        return MixedVecEnv(parts)
+        return MixedVecEnv([part.validation(count, VALIDATION_SEED, self.model, **options) for part in self.exercises])
 
     @property
     def _options(self) -> dict[str, Any]:
