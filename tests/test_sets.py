@@ -287,13 +287,13 @@ def test_every_part_of_a_mixture_has_its_worlds_robots_and_sight() -> None:
 
 
 @pytest.mark.parametrize(("ways", "kept"), [(True, 6), (False, 0)])
-def test_instances_with_ways_last_for_four_lessons(ways: bool, kept: int) -> None:
+def test_instances_with_ways_last_for_some_time(ways: bool, kept: int) -> None:
     """Whether those of earlier lessons are at hand or have to be drawn again, as when a killed training goes on."""
     settings = replace(TINY, mixture=("random 2 size=4",), num_envs=8, ways=ways)
     drawn: dict = {}
 
     def begun(number: int, drawn: dict) -> list[set[tuple[float, ...]]]:
-        env = settings.worlds(None, number, drawn)  # type: ignore[arg-type]
+        env = settings.worlds(None, number, 30_000 * number, drawn)  # type: ignore[arg-type]
         starts = [set(map(tuple, env.reset().reshape(4, -1).tolist())) for _ in range(30)]
         env.close()
         return starts

@@ -38,9 +38,9 @@ from d4orm_planners.rl.sb3_sets import leave_as_they_are
 from d4orm_planners.settings import Count, Number, PathText, Positive, Whole, one_of
 
 Progress = Callable[[str, int, int], object]
-_INSTANCES, _LASTING = 256, 4
-"""At most so many for a lesson, of each part; and for how many lessons one lasts where robots look along ways, which
-take long to find. Elsewhere all are new in each lesson."""
+_INSTANCES, _STEPS_PER_INSTANCE = 256, 15_000
+"""At most so many of each part are chosen among. All are new in each lesson, but where robots look along ways, which
+take long to find: there one is new for so many robot-steps."""
 Drawn = dict[tuple[int, str, int], dict[int, Problem]]
 """Instances by part, scenario and team size, and by their seeds."""
 NETWORKS = ("flat", "sets")
@@ -142,19 +142,23 @@ class TrainingSettings(Practice):
         exercise = self.exercise(lesson.scenario, lesson.num_robots)
         return [(self.batch // lesson.num_robots, exercise, self.model_in(lesson.scenario))]
 
-    def worlds(self, lesson: Lesson, number: int = 0, drawn: Drawn | None = None) -> RobotVecEnv | MixedVecEnv:
+    def worlds(
+        self, lesson: Lesson, number: int = 0, done: int = 0, drawn: Drawn | None = None
+    ) -> RobotVecEnv | MixedVecEnv:
         """Worlds for a lesson.
 
         Args:
             lesson: What is practised.
             number: Of the lesson.
+            done: Robot-steps in the lessons before.
             drawn: Instances of earlier lessons, from which those that are used again are taken; others are left out,
                 and new ones added when they are drawn.
         """
         seed, drawn, parts = derived_seed(self.seed, Stream.TRAINING_WORLDS, number), {} if drawn is None else drawn, []
         for part, (count, exercise, model) in enumerate(self.parts(lesson)):
             size = min(_INSTANCES, 2 * count)
-            first = number * -(-size // (_LASTING if self.ways else 1))
+            own_steps = done * count * exercise.num_robots // self.batch
+            first = own_steps // _STEPS_PER_INSTANCE if self.ways else number * size
             seeds = [derived_seed(self.seed, Stream.TRAINING_INSTANCES, part, first + index) for index in range(size)]
             key = part, exercise.scenario, exercise.num_robots
             drawn[key] = {own: problem for own, problem in drawn.get(key, {}).items() if own in seeds}
@@ -263,7 +267,7 @@ class _Run:
         begin, lesson, settings = time.perf_counter(), self.lessons[index], self.settings
         done = sum(earlier.steps for earlier in self.lessons[:index])
         self._progress(_describe(lesson, self.evaluations), done, self._total)
-        robots = settings.worlds(lesson, index, self._drawn)
+        robots = settings.worlds(lesson, index, done, self._drawn)
         making = time.perf_counter() - begin
         normalized = VecNormalize(robots, clip_obs=CLIP, gamma=self._algorithm.gamma, epsilon=EPSILON)
         if settings.network == "sets":
