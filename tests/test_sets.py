@@ -293,7 +293,7 @@ def test_instances_with_ways_last_for_some_time(ways: bool, kept: int) -> None:
     drawn: dict = {}
 
     def begun(number: int, drawn: dict) -> list[set[tuple[float, ...]]]:
-        env = settings.worlds(None, number, 30_000 * number, drawn)  # type: ignore[arg-type]
+        env = settings.worlds(None, number, 50_000 * number, drawn)  # type: ignore[arg-type]
         starts = [set(map(tuple, env.reset().reshape(4, -1).tolist())) for _ in range(30)]
         env.close()
         return starts

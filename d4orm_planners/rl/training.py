@@ -38,7 +38,7 @@ from d4orm_planners.rl.sb3_sets import leave_as_they_are
 from d4orm_planners.settings import Count, Number, PathText, Positive, Whole, one_of
 
 Progress = Callable[[str, int, int], object]
-_INSTANCES, _STEPS_PER_INSTANCE = 256, 15_000
+_INSTANCES, _STEPS_PER_INSTANCE = 256, 25_000
 """At most so many of each part are chosen among. All are new in each lesson, but where robots look along ways, which
 take long to find: there one is new for so many robot-steps."""
 Drawn = dict[tuple[int, str, int], dict[int, Problem]]
