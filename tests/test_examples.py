@@ -58,6 +58,7 @@ def completed(name: str, out: Path, *arguments: str) -> None:
         ("supersuit_ppo", "supersuit", "rl"),
         ("train_and_compare", "stable_baselines3", "rl"),
         ("training_seeds", "stable_baselines3", "rl"),
+        ("tune_learners", "stable_baselines3", "rl"),
         ("train_and_compare", "pyrvo", "orca"),
         ("jax_ppo", "optax", "jaxrl"),
         ("cleanrl_ppo", "torch", "rl"),
@@ -153,6 +154,23 @@ def test_mixed_team_example_solves_a_scenario_and_draws_it(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
+def test_learners_are_tuned_and_a_second_call_trains_nothing(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3")
+    out = tmp_path / "out"
+    completed("tune_learners", out, "--learner", "ppo")
+    rows = table(out / "tune_learners.csv")
+    # Three settings at first, the learner's own among them; the best one goes on.
+    assert [bool(row["twice as long"]) for row in rows] == [True, False, False]
+    assert sum(row["settings"] == "as they are" for row in rows) == 1
+    trained = sorted((path, path.stat().st_mtime_ns) for path in out.glob("*/policy.safetensors"))
+    assert len(trained) == 4
+    completed("tune_learners", out, "--learner", "ppo")
+    assert sorted((path, path.stat().st_mtime_ns) for path in out.glob("*/policy.safetensors")) == trained
+    completed("tune_learners", tmp_path / "again", "--trials", str(out / "tune_learners.parquet"))
+    assert table(tmp_path / "again" / "tune_learners.csv") == rows
+
+
+@pytest.mark.slow
 def test_scenarios_are_drawn(tmp_path: Path) -> None:
     completed("scenario_pictures", tmp_path / "out")
     pictures = sorted((tmp_path / "out").iterdir())
@@ -225,7 +243,7 @@ def test_policies_meet_every_disturbance(tmp_path: Path) -> None:
         ("solve_rates", " ".join(["solve_rates", *(f"solve_rates_{name}" for name in SOLVE_RATES)])),
         *((program, program) for program in ("ablation", "credit_by_update", "fewer_samples", "gradient_dilution",
                                              "lifelong", "multimodality", "multimodality_team", "scaling",
-                                             "warm_start")),
+                                             "tune_learners", "warm_start")),
     ],
 )  # fmt: skip
 def test_the_tables_of_the_docs_are_those_of_the_data(tmp_path: Path, program: str, names: str) -> None:

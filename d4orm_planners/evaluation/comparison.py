@@ -205,10 +205,13 @@ def steps_to_solution(trial: Trial) -> int | None:
     first = next((best for best in trial.progress if best.solved), None)
     if first is not None and first.steps is not None:
         return first.steps
+    return steps_spent(trial) if trial.status == "solved" else None
+
+
+def steps_spent(trial: Trial) -> int | None:
+    """Denoising steps of a whole trial; ``None`` where they are not known."""
     steps = json.loads(trial.config).get("num_steps")
-    if trial.status != "solved" or not trial.iterations or steps is None:
-        return None
-    return trial.iterations * int(steps)
+    return None if steps is None or not trial.iterations else trial.iterations * int(steps)
 
 
 def penalised_steps(trial: Trial) -> int:

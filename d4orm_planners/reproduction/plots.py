@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from d4orm_planners.evaluation.comparison import steps_to_solution, survival
+from d4orm_planners.evaluation.comparison import steps_spent, steps_to_solution, survival
 from d4orm_planners.evaluation.store import BestSoFar, Trial
 from d4orm_planners.reproduction.figure import Figure, Group
 from d4orm_planners.reproduction.numbers import Measured, column, first_solution
@@ -116,8 +116,8 @@ def _survival(ax: Axes, figure: Figure, shown: Shown) -> None:
     largest = max(row.num_robots for _, row in shown)
     for i, (group, row) in enumerate((group, row) for group, row in shown if row.num_robots == largest):
         curve = survival([(steps_to_solution if counted else first_solution)(trial) for trial in group.trials])
-        spent = [_spent(best, counted) for trial in group.trials for best in trial.progress[-1:]]
-        end = 1.05 * max([*curve.costs, *spent], default=1.0) or 1.0
+        spent = [(steps_spent(trial) if counted else trial.wall_time) or 0.0 for trial in group.trials]
+        end = 1.05 * max([*curve.costs, *spent]) or 1.0
         edges = [min([*curve.costs, end]) / 2, *curve.costs, end]
         lower, upper = [1.0, *curve.lower], [1.0, *curve.upper]
         ax.stairs([1.0, *curve.unsolved], edges, baseline=None, color=f"C{i}", label=row.label)
