@@ -126,7 +126,7 @@ def test_training_sees_what_the_policy_sees(scenario: str, tmp_path: Path) -> No
     features = worlds.reset()
     env = navigation_v0.parallel_env(scenario, num_robots=6)
     limits = env.unwrapped.problem.team.control_limits
-    expected = network.features.decode(network(features), worlds._frames, limits)
+    expected = network.features.decode(network(features), worlds.frames, limits)
     np.testing.assert_allclose(actions_of(tmp_path / "along.safetensors", env), expected, atol=2e-5)
     policy = make_policy("ppo", path=tmp_path / "along.safetensors")
     observations, _ = env.reset(seed=0)
@@ -135,7 +135,7 @@ def test_training_sees_what_the_policy_sees(scenario: str, tmp_path: Path) -> No
         actions = policy.act(observations, env.state())
         features, *_ = worlds.step(network(features))
         observations, *_ = env.step(actions)
-    expected = network.features.decode(network(features), worlds._frames, limits)
+    expected = network.features.decode(network(features), worlds.frames, limits)
     np.testing.assert_allclose(np.stack(list(policy.act(observations, env.state()).values())), expected, atol=2e-4)
     worlds.close()
 
@@ -152,7 +152,7 @@ def test_robots_are_paid_for_the_way_made_along_ways() -> None:
     env = RobotVecEnv(1, 6, "rooms", ways=True)
     env.reset()
     actions = np.random.default_rng(0).uniform(-1, 1, (6, 2)).astype(np.float32)
-    controls = env.features.decode(actions, env._frames, env.problem.team.control_limits)
+    controls = env.features.decode(actions, env.frames, env.problem.team.control_limits)
     paid = {}
     for progress in ("way", "straight"):
         worlds = NavigationVectorEnv(1, "rooms", 6, reward="training", progress=progress)
