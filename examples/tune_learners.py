@@ -6,8 +6,8 @@ Both have the settings of `training_seeds.py` in crowds and so many drawn at ran
 trained for a first look, and the better third twice as long, from nothing and with another seed (successive halving:
 K. Jamieson and A. Talwalkar, AISTATS 2016). What counts is the success in validation after the last step. A first look
 is 150,000 robot-steps for SAC and a million for PPO, which takes about as long. Seeds are 100 and up: evaluations use
-those below. Broken off, it goes on where it was; about an hour of one core. With `--trials` it trains nothing, and
-makes the table of a file that it wrote before.
+those below. Broken off, it goes on where it was; more than an hour of one core. With `--trials` it trains nothing,
+and makes the table of a file that it wrote before.
 """
 
 from __future__ import annotations
