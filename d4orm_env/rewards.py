@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
 from typing import ClassVar
@@ -59,7 +59,8 @@ class RewardInput:
     def __post_init__(self) -> None:
         for attribute in fields(self):
             value = getattr(self, attribute.name)
-            if isinstance(value, np.ndarray):
+            # What is read-only and its own is what an input had before; see `along_ways`.
+            if isinstance(value, np.ndarray) and (value.flags.writeable or not value.flags.owndata):
                 copy = value.copy()
                 copy.setflags(write=False)
                 object.__setattr__(self, attribute.name, copy)
@@ -192,9 +193,20 @@ def compute_rewards(function: RewardFunction, step: RewardInput) -> tuple[FloatA
     if not names:
         return _checked(function(step), name, shape), {}
     terms = function.terms(step)  # type: ignore[attr-defined] # it has names for them
-    return _checked(sum(terms.values()), name, shape), {
-        term: _checked(terms[term], f"{name}.{term}", shape) for term in names
-    }
+    parts = {name: sum(terms.values()), **{f"{name}.{term}": terms[term] for term in names}}
+    rewards, *paid = _all_checked(parts, shape)
+    return rewards, dict(zip(names, paid))
+
+
+def _all_checked(parts: Mapping[str, ArrayLike], expected: tuple[int, ...]) -> Sequence[FloatArray]:
+    """:func:`_checked` of several, at once where they are as they should be."""
+    try:
+        rows = as_float32([*parts.values()])  # type: ignore[arg-type] # what is none is refused
+    except ValueError:
+        rows = np.empty(0, np.float32)
+    if rows.shape == (len(parts), *expected) and np.isfinite(rows).all():
+        return list(rows)
+    return [_checked(values, name, expected) for name, values in parts.items()]
 
 
 def _checked(values: ArrayLike, name: str, expected: tuple[int, ...]) -> FloatArray:

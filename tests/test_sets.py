@@ -286,6 +286,30 @@ def test_every_part_of_a_mixture_has_its_worlds_robots_and_sight() -> None:
         both.close()
 
 
+def test_parts_that_differ_in_sight_only_are_stepped_together() -> None:
+    mixture = ("circle 3", "circle 2", "circle 3 sight=1", "circle 3 disturb.delay=1", "circle 3 sight=0")
+    settings = replace(TINY, mixture=mixture, num_envs=30)
+    assert settings.worlds_of_exercises == (2, 3, 2, 2, 2)
+    env = settings.worlds(None)  # type: ignore[arg-type]
+    assert [(part.num_worlds, part.problem.num_robots) for part in env.parts] == [(6, 3), (3, 2), (2, 3)]
+    seen = [2] * 6 + [1] * 6 + [0] * 6 + [1] * 6 + [2] * 6
+    shown = env.features.parts(env.reset())[1][..., 0].sum(axis=1)
+    np.testing.assert_array_equal(shown, seen)
+    ended = 0
+    while not ended:
+        features, _, dones, infos = env.step(np.zeros((env.num_envs, 2), np.float32))
+        np.testing.assert_array_equal(env.features.parts(features)[1][..., 0].sum(axis=1), seen)
+        for robot in np.flatnonzero(dones):
+            last = infos[robot]["terminal_observation"][None]
+            assert env.features.parts(last)[1][..., 0].sum() == seen[robot], "also what it saw last"
+            ended += 1
+    assert ended == env.num_envs
+    env.close()
+    one_by_one = settings.validation()
+    assert [part.problem.num_robots for part in one_by_one.parts] == [3, 2, 3, 3, 3], "each is judged by itself"
+    one_by_one.close()
+
+
 @pytest.mark.parametrize(("ways", "kept"), [(True, 6), (False, 0)])
 def test_instances_with_ways_last_for_some_time(ways: bool, kept: int) -> None:
     """Whether those of earlier lessons are at hand or have to be drawn again, as when a killed training goes on."""

@@ -77,9 +77,9 @@ class Shapes:
             items: ``(N,)``.
         """
         if not len(self.triangles):
-            return _box_distance(points, self.boxes[items].astype(np.float64))
+            return _box_distance(points, self.boxes, items)
         distance, angular = np.empty(len(points)), items >= len(self.boxes)
-        distance[~angular] = _box_distance(points[~angular], self.boxes[items[~angular]].astype(np.float64))
+        distance[~angular] = _box_distance(points[~angular], self.boxes, items[~angular])
         corners = self.triangles[items[angular] - len(self.boxes)].astype(np.float64)
         distance[angular] = _triangle_distance(points[angular], corners)
         return distance
@@ -97,16 +97,20 @@ class Shapes:
         return slope
 
 
-def _box_distance(points: Floats, boxes: Floats) -> Floats:
-    d = points.shape[1]
+def _box_distance(points: Floats, boxes: FloatArray, items: IntArray) -> Floats:
+    d, columns = points.shape[1], boxes.T.astype(np.float64)
     square, deepest = np.zeros(len(points)), np.full(len(points), -np.inf)
     for axis in range(d):
         x = points[:, axis]
-        outside = np.maximum(boxes[:, axis] - x, x - boxes[:, d + axis])
-        beyond = np.maximum(outside, 0.0)
-        square += beyond * beyond
-        deepest = np.maximum(deepest, outside)
-    distance: Floats = np.sqrt(square) + np.minimum(deepest, 0.0) - boxes[:, 2 * d]
+        outside = columns[axis].take(items) - x
+        np.maximum(outside, x - columns[d + axis].take(items), out=outside)
+        np.maximum(deepest, outside, out=deepest)
+        np.maximum(outside, 0.0, out=outside)
+        outside *= outside
+        square += outside
+    distance: Floats = np.sqrt(square, out=square)
+    distance += np.minimum(deepest, 0.0, out=deepest)
+    distance -= columns[2 * d].take(items)
     return distance
 
 

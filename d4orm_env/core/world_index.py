@@ -215,7 +215,7 @@ def _refined(
         level, cells = waiting.pop()
         width = cell * 2**level
         centre = low + (cells.place + 0.5) * width
-        distance = shapes.signed_distance(centre[cells.cell], cells.item)
+        distance = shapes.signed_distance(centre.take(cells.cell, axis=0), cells.item)
         bounds = np.searchsorted(cells.cell, np.arange(len(cells.place)))
         clearance, diagonal = np.minimum.reduceat(distance, bounds), width * np.sqrt(len(size))
         bar = _smallest(distance, cells.cell, bounds, nearest) + diagonal * turn.at_most(centre, diagonal / 2)
@@ -227,8 +227,11 @@ def _refined(
             if nearest == 1:
                 keep = ~_hidden(shapes, centre, cells, distance, width, 2 * rounding)
                 cells, distance = _Cells(cells.place, cells.cell[keep], cells.item[keep]), distance[keep]
-            order = np.lexsort((distance, cells.cell))
-            cells = _Cells(cells.place, cells.cell, cells.item[order])
+            # Most cells have one only.
+            several = np.flatnonzero(np.bincount(cells.cell, minlength=len(cells.place))[cells.cell] > 1)
+            items = cells.item.copy()
+            items[several] = items[several[np.lexsort((distance[several], cells.cell[several]))]]
+            cells = _Cells(cells.place, cells.cell, items)
             yield cells, clearance
             continue
         for part in _halved(cells):

@@ -102,12 +102,14 @@ class Front(NamedTuple):
         points: ``(A, 3)`` the anchors; the first is the goal [m].
         values: ``(A,)`` length of the way from each to the goal [m].
         parents: ``(A,)`` int32 the anchor that comes next on that way; -1 for the goal.
+        room: Clearance at the goal [m].
     """
 
     anchor: Ints
     points: Floats
     values: Floats
     parents: Ints
+    room: float
 
 
 class Fields(NamedTuple):
@@ -115,6 +117,7 @@ class Fields(NamedTuple):
 
     Attributes:
         reach: ``(K,)`` the distance that each robot keeps [m].
+        room: ``(K,)`` clearance at its goal [m].
         lattice: ``(K,)`` int64 number of its lattice.
         low: ``(L, 3)`` the first nodes of the lattices [m].
         step: ``(L,)`` between neighbours along an axis [m].
@@ -130,6 +133,7 @@ class Fields(NamedTuple):
     """
 
     reach: Floats
+    room: Floats
     lattice: IntArray
     low: Floats
     step: Floats
@@ -495,8 +499,10 @@ def _add_anchor(points: Floats, values: Floats, parents: Ints, number: int, plac
 
 
 @cached_kernel(SOURCES, variant="wave", **OPTIONS)
-def _spread(space: Space, lattice: Lattice, reach: float, goal: Floats, nodes: _Nodes) -> tuple[Floats, Floats, Ints]:
-    """See :func:`spread`; anchors, their values and their parents."""
+def _spread(
+    space: Space, lattice: Lattice, reach: float, goal: Floats, nodes: _Nodes
+) -> tuple[Floats, Floats, Ints, float]:
+    """See :func:`spread`; anchors, their values and their parents, and the clearance at the goal."""
     count, size = lattice.free.shape[0], lattice.size
     value, anchor, hidden = nodes.value, nodes.anchor, nodes.hidden
     points, values, parents = np.empty((256, 3)), np.empty(256), np.empty(256, np.int32)
@@ -562,7 +568,7 @@ def _spread(space: Space, lattice: Lattice, reach: float, goal: Floats, nodes: _
     for n in range(count):
         if not nodes.done[n]:
             anchor[n] = _NOBODY
-    return points[:used].copy(), values[:used].copy(), parents[:used].copy()
+    return points[:used].copy(), values[:used].copy(), parents[:used].copy(), own_goal
 
 
 def spread(space: Space, lattice: Lattice, reach: float, goal: Floats) -> Front:
@@ -583,6 +589,7 @@ def gather(reach: Floats, lattices: Sequence[Lattice], number: IntArray, fronts:
     """The wavefronts of robots that keep ``reach`` ``(K,)``, on the lattices of these numbers ``(K,)``."""
     return Fields(
         reach=reach,
+        room=np.array([front.room for front in fronts]),
         lattice=number,
         low=np.stack([lattice.low for lattice in lattices]),
         step=np.array([lattice.step for lattice in lattices]),
@@ -614,8 +621,7 @@ def _look_from(space: Space, fields: Fields, robot: int, q: Place) -> tuple[Plac
     reach, lattice, first = fields.reach[robot], fields.lattice[robot], fields.first_point[robot]
     step, size, first_place = fields.step[lattice], fields.size[lattice], fields.first_place[lattice]
     first_anchor = fields.first_anchor[robot]
-    goal = _place(fields.points, first)
-    own_goal, own = clearance_at(space, goal[0], goal[1], goal[2]), clearance_at(space, q[0], q[1], q[2])
+    goal, own_goal, own = _place(fields.points, first), fields.room[robot], clearance_at(space, q[0], q[1], q[2])
     if _sees(space, reach, goal, own_goal, q, own):
         return goal, _distance(goal, q), np.int32(0)
     i, j, k = _corner(fields.low[lattice], step, size, q)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
 from typing import Any
@@ -161,12 +161,12 @@ class Exercise:
         return find_scenario(self.scenario).draws or self.problem(0, model) != self.problem(1, model)
 
     def worlds(
-        self, count: int, seed: int, instances: Instances, model: str | None = None, **options: Any
+        self, sights: Sequence[int | None], seed: int, instances: Instances, model: str | None = None, **options: Any
     ) -> RobotVecEnv:
         """Worlds to practise in.
 
         Args:
-            count: How many.
+            sights: Of each, in place of :attr:`sight`.
             seed: Of the first.
             instances: To choose among at every reset.
             model: Robot model; ``None`` is the scenario's own.
@@ -177,14 +177,14 @@ class Exercise:
             arguments = {"scenario": instances, "randomize_instance": True}
         if self.disturbances:
             options["disturbances"] = disturbances_at(self.disturbances)
-        return RobotVecEnv(count, self.num_robots, seed=seed, sight=self.sight, **arguments, **options)
+        return RobotVecEnv(len(sights), self.num_robots, seed=seed, sight=sights, **arguments, **options)
 
     def validation(self, count: int, seed: int, model: str | None = None, **options: Any) -> RobotVecEnv:
         """Worlds to judge by, a new instance for each; one is enough where nothing differs. Arguments as above."""
         # Every validation asks for the same again.
         instances = Instances(partial(self.problem, model=model), None, {})
         count = count if self.disturbances or self.draws(model) else 1
-        return self.worlds(count, seed, instances, model, **options)
+        return self.worlds([self.sight] * count, seed, instances, model, **options)
 
 
 class Instances:
@@ -215,6 +215,23 @@ def parse_mixture(texts: Sequence[str]) -> tuple[Exercise, ...]:
     """
     named = [part for text in texts for part in MIXTURES.get(text.strip(), (text,))]
     return tuple(Exercise.parse(text) for text in named)
+
+
+def gather_parts(exercises: Sequence[Exercise], counts: Sequence[int]) -> list[tuple[Exercise, list[int | None]]]:
+    """Parts that differ in nothing but sight as one, since each takes its time to step, and the sight of its worlds.
+
+    Args:
+        exercises: Parts of a mixture.
+        counts: How many worlds each has.
+    """
+    gathered: list[tuple[Exercise, list[int | None]]] = []
+    for exercise, count in zip(exercises, counts, strict=True):
+        own = replace(exercise, sight=None)
+        if own not in [other for other, _ in gathered]:
+            gathered.append((own, []))
+        sights = next(sights for other, sights in gathered if other == own)
+        sights.extend([exercise.sight] * count)
+    return gathered
 
 
 class MixedVecEnv(VecEnv):

@@ -38,7 +38,8 @@ class RobotVecEnv(VecEnv):
         scenario: As for :class:`d4orm_env.navigation_v0.parallel_env`, like ``**kwargs``. One model for all robots.
         seed: Of the first world.
         reward: The reward to learn from, as in :class:`~d4orm_env.options.EnvOptions`.
-        sight: How many of the observed robots are shown at most, the others being marked absent; ``None`` is all.
+        sight: How many of the observed robots are shown at most, the others being marked absent; ``None`` is all. Or
+            that of each world.
         ways: Whether robots see their goals along their shortest free ways, see :meth:`Features.along`, and are paid
             for the way made along those.
         **kwargs: Further arguments of :class:`d4orm_env.vector_env.NavigationVectorEnv`.
@@ -65,7 +66,7 @@ class RobotVecEnv(VecEnv):
         *,
         seed: int = 0,
         reward: str | RewardFunction = "training",
-        sight: int | None = None,
+        sight: int | Sequence[int | None] | None = None,
         ways: bool = False,
         **kwargs: Any,
     ) -> None:
@@ -88,8 +89,8 @@ class RobotVecEnv(VecEnv):
         self.features = Features.of(slices, problem.team.models[0])
         self.ways = ways
         self.num_worlds = num_worlds
-        self._sight = sight
         self._shape = (num_worlds, problem.num_robots)
+        self._hidden = self._out_of_sight([sight] * num_worlds if sight is None or isinstance(sight, int) else sight)
         count = num_worlds * problem.num_robots
         self.limits = np.tile(problem.team.control_limits, (num_worlds, 1))
         self._seed: int | None = seed
@@ -125,6 +126,7 @@ class RobotVecEnv(VecEnv):
         self._touched = infos["collided"].copy()
         self._return = np.zeros(self._shape)
         self._length = np.zeros(self._shape, np.int64)
+        self._finishing = np.empty((0, 2), np.int64)
         return self._in_sight(observations, [])
 
     def drive(self, controls: FloatArray) -> FloatArray:
@@ -186,10 +188,17 @@ class RobotVecEnv(VecEnv):
         """What the robots are to see now, and what those whose episodes have ended saw last."""
         seen = observations.reshape(self.num_envs, -1)
         seen = np.concatenate([seen, last]) if last else seen
-        if self._sight is not None:
-            seen = seen.copy() if not last else seen
-            self.features.slices.neighbors(seen)[:, self._sight :] = 0
+        if self._hidden.any():
+            seen, ended = seen if last else seen.copy(), self._finishing @ [self._shape[1], 1]
+            self.features.slices.neighbors(seen)[np.concatenate([self._hidden, self._hidden[ended]])] = 0
         return seen
+
+    def _out_of_sight(self, sights: Sequence[int | None]) -> BoolArray:
+        """``(B * K, N)`` which of the observed robots each robot is not shown, by what those of each world are."""
+        observed = self.features.slices.num_neighbors
+        shown = np.repeat([observed if sight is None else sight for sight in sights], self._shape[1])
+        hidden: BoolArray = np.arange(observed) >= shown[:, None]
+        return hidden
 
     def _finish_worlds(self, ended: BoolArray, infos: Info) -> None:
         self.finished = []

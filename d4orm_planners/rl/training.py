@@ -29,7 +29,7 @@ from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm
 from d4orm_planners.rl.checkpoints import Checkpoints
 from d4orm_planners.rl.curriculum import Lesson, common_batch, make_lessons, team_sizes
 from d4orm_planners.rl.curve import Evaluation, evaluate_network, write_curve
-from d4orm_planners.rl.mixture import Exercise, Instances, MixedVecEnv, parse_mixture
+from d4orm_planners.rl.mixture import Exercise, Instances, MixedVecEnv, gather_parts, parse_mixture
 from d4orm_planners.rl.network import CLIP, EPSILON, Network, load_network
 from d4orm_planners.rl.practice import VALIDATION_SEED, Many, Practice
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
@@ -135,12 +135,12 @@ class TrainingSettings(Practice):
         sizes = team_sizes(self.num_robots) if self.curriculum else (self.num_robots,)
         return common_batch(sizes, self.num_envs or ALGORITHMS[self.algorithm].num_envs)
 
-    def parts(self, lesson: Lesson) -> list[tuple[int, Exercise, str | None]]:
-        """What is practised in a lesson: so many worlds of an exercise, with robots of a model."""
+    def parts(self, lesson: Lesson) -> list[tuple[Exercise, list[int | None], str | None]]:
+        """What is practised in a lesson: exercises, with the sight of each of their worlds and the robots' model."""
         if self.mixture:
-            return [(*part, self.model) for part in zip(self.worlds_of_exercises, self.exercises, strict=True)]
+            return [(*part, self.model) for part in gather_parts(self.exercises, self.worlds_of_exercises)]
         exercise = self.exercise(lesson.scenario, lesson.num_robots)
-        return [(self.batch // lesson.num_robots, exercise, self.model_in(lesson.scenario))]
+        return [(exercise, [None] * (self.batch // lesson.num_robots), self.model_in(lesson.scenario))]
 
     def worlds(
         self, lesson: Lesson, number: int = 0, done: int = 0, drawn: Drawn | None = None
@@ -155,7 +155,8 @@ class TrainingSettings(Practice):
                 and new ones added when they are drawn.
         """
         seed, drawn, parts = derived_seed(self.seed, Stream.TRAINING_WORLDS, number), {} if drawn is None else drawn, []
-        for part, (count, exercise, model) in enumerate(self.parts(lesson)):
+        for part, (exercise, sights, model) in enumerate(self.parts(lesson)):
+            count = len(sights)
             size = min(_INSTANCES, 2 * count)
             own_steps = done * count * exercise.num_robots // self.batch
             first = own_steps // _STEPS_PER_INSTANCE if self.ways else number * size
@@ -164,7 +165,7 @@ class TrainingSettings(Practice):
             drawn[key] = {own: problem for own, problem in drawn.get(key, {}).items() if own in seeds}
             instances = Instances(partial(exercise.problem, model=model), seeds, drawn[key])
             own_seed = derived_seed(seed, Stream.TRAINING_WORLDS, part)
-            parts.append(exercise.worlds(count, own_seed, instances, model, **self._options))
+            parts.append(exercise.worlds(sights, own_seed, instances, model, **self._options))
         return MixedVecEnv(parts) if self.mixture else parts[0]
 
     def validation(self, **options: Any) -> RobotVecEnv | MixedVecEnv:
