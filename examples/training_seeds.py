@@ -33,6 +33,7 @@ CROWDS = TrainingSettings(
 LEARNERS: Mapping[str, TrainingSettings] = {
     "PPO, holonomic2d, crowds": replace(CROWDS, model="holonomic2d"),
     "PPO, differential_drive, crowds": replace(CROWDS, model="differential_drive"),
+    "PPO, holonomic2d, walls": replace(CROWDS, mixture=("walls",), ways=True, lessons=6, validation_worlds=210),
     "SAC, holonomic2d, crowds": TrainingSettings(
         algorithm="sac",
         network="sets",
