@@ -59,8 +59,7 @@ class RewardInput:
     def __post_init__(self) -> None:
         for attribute in fields(self):
             value = getattr(self, attribute.name)
-            # What is read-only and its own is what an input had before; see `along_ways`.
-            if isinstance(value, np.ndarray) and (value.flags.writeable or not value.flags.owndata):
+            if isinstance(value, np.ndarray):
                 copy = value.copy()
                 copy.setflags(write=False)
                 object.__setattr__(self, attribute.name, copy)

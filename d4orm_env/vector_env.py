@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import gymnasium
@@ -270,14 +269,6 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         counts = (worlds.docked, worlds.contacts, worlds.violations, arrival, self._disturbances.lost)
         return episode_metrics(EpisodeCounts(worlds.steps, worlds.total_reward, *counts), self.problem.dt)
 
-    @cached_property
-    def _single(self) -> list[WorldBatch]:
-        """The worlds one by one, views of what they are together."""
-        return [
-            type(self._worlds)._make(values[world : world + 1] for values in self._worlds)
-            for world in range(self.num_envs)
-        ]
-
     @property
     def _ended(self) -> BoolArray:
         ended: BoolArray = self._worlds.terminated | self._worlds.truncated
@@ -297,7 +288,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
 
     def _advance(self, orders: NDArray[np.uint8], observations: FloatArray | None = None) -> FloatArray:
         """Carry out ``orders`` ``(B,)``, and return what is seen ``(B, K * D)``, in ``observations`` if given."""
-        from d4orm_env.engine.episodes import SKIP, STEP
+        from d4orm_env.engine.episodes import SKIP, STEP, WorldBatch
 
         if observations is None:
             observations = np.empty_like(self._observations) if self._copy else self._observations
@@ -310,7 +301,8 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         else:
             for world in going.tolist():
                 one = slice(world, world + 1)
-                advance(true(self._arrays[world]), layout, cycles, orders[one], self._single[world], made[one])
+                part = WorldBatch._make(values[one] for values in self._worlds)
+                advance(true(self._arrays[world]), layout, cycles, orders[one], part, made[one])
         self._disturbances.meet(orders == STEP)
         altered = self._disturbances.alters_sight
         if self._template.along_ways or (layout.observed_way and not altered):
@@ -357,9 +349,8 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         self.robot_rewards = np.where(moved[:, None], worlds.rewards, np.float32(0))
         if reward is None or before is None:
             return
-        every = moved.all()
         step = RewardInput(
-            previous_states=before.state if every else np.where(moved[:, None, None], before.state, worlds.state),
+            previous_states=np.where(moved[:, None, None], before.state, worlds.state),
             states=worlds.state,
             controls=worlds.control,
             goals=worlds.goal,
