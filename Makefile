@@ -4,8 +4,8 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 EXTRAS ?= dev,rl,ipopt
 PYTEST_ARGS ?=
-STUDIES := ablation credit_by_update disturbance_study fewer_samples gradient_dilution lifelong multimodality \
-  multimodality_team policy_rates scaling solve_rates tune_learners warm_start
+STUDIES := ablation credit_by_update disturbance_study fewer_samples gradient_dilution imitate_expert lifelong \
+  multimodality multimodality_team policy_rates scaling solve_rates tune_learners warm_start
 FIGURES := amswarm coarseness nodes noise-schedule robustness selections team-size
 
 # A stamp is as new as the last install that succeeded, so an install is repeated only when what it reads has changed.
