@@ -574,7 +574,7 @@ def test_learners_are_trained_with_several_seeds_and_their_curves_read_again(tmp
     out, again = tmp_path / "out", tmp_path / "again"
     completed("training_seeds", out, "--seeds", "2")
     rows = table(out / "training_seeds.csv")
-    assert [row["learner"].split(",")[0] for row in rows] == ["PPO", "PPO", "SAC", "SAC"]
+    assert [row["learner"].split(",")[0] for row in rows] == ["PPO", "PPO", "PPO", "SAC", "SAC"]
     assert {row["seeds"] for row in rows} == {"2"}
     assert (out / "training_seeds.png").read_bytes().startswith(PNG)
     completed("training_seeds", again, "--curves", str(out / "training_curves.csv"))
