@@ -14,6 +14,7 @@ from scipy.optimize import nnls
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.disturbances import Bias, Delay, Dropout, LimitMismatch, Push, Stall, StateDelay
 from d4orm_env.engine.choice import get_engine
@@ -215,16 +216,59 @@ def test_who_is_nearly_there_drives_straight_home() -> None:
     states[:, 2] = [1.0, 1.0, 1.0, 1.0]
     controls = np.zeros((20, 4, 2), np.float32)
     window, engine = problem.resumed_at(states, problem.goal), get_engine("cpu")
-    chosen, home = drive_home(window, engine, controls, np.array([True, False, True, True]))
+    nobody = np.zeros(4, bool)
+    chosen, home = drive_home(window, engine, controls, np.array([True, False, True, True]), nobody)
     assert home.tolist() == [True, False, True, False]
     np.testing.assert_array_equal(chosen[:, ~home], controls[:, ~home])
     missed, met = engine.rollout(window, controls).arrived, engine.rollout(window, chosen).arrived
     assert not missed[-1].any()
     assert met[-1].tolist() == home.tolist()
     assert np.argmax(met[:, 0]) == 9  # 0.9 m at 1 m/s, but for the goal's radius and the turn
-    again, home = drive_home(window, engine, chosen, np.array([True, False, False, False]))
+    again, home = drive_home(window, engine, chosen, np.array([True, False, False, False]), nobody)
     assert home.tolist() == [True, False, False, False]
     np.testing.assert_array_equal(again, chosen)
+
+
+def parked_cars(*, beside: float) -> Problem:
+    """A car at rest so far beside its goal [m], and one that has docked a metre further on that side."""
+    start = np.zeros((2, 5), np.float32)
+    start[1, 1] = -1
+    return Problem(Team(("car", "car")), start, np.float32([[0, beside], [0, -1]]), horizon=100, margin=0.05)
+
+
+@pytest.mark.parametrize("beside", [0.1, 0.3, 0.6])
+def test_a_car_beside_its_goal_drives_away_and_comes_again(beside: float) -> None:
+    """Within its turning circle there is no way home that does not lead away first."""
+    problem, docked = parked_cars(beside=beside), np.array([False, True])
+    window, still = problem.replace(horizon=20), np.zeros((20, 2, 2), np.float32)
+    controls, home = drive_home(window, get_engine("cpu"), still, np.zeros(2, bool), docked)
+    assert home.tolist() == [True, False]
+    places = get_engine("cpu").rollout(window, controls).positions[:, 0]
+    assert np.linalg.norm(places - problem.goal[0], axis=1).max() > beside + 0.05
+    env = navigation_v0.parallel_env(problem=problem, control_noise_std=0.2)
+    assert run_episode(env, controller(), seed=0).metrics["success"]
+
+
+def test_no_manoeuvre_leads_through_what_stands() -> None:
+    around = 2 * np.pi / 6 * np.arange(6)
+    start = np.zeros((7, 5), np.float32)
+    start[1:, :2] = 0.36 * np.stack([np.cos(around), np.sin(around)], axis=1)
+    goal = start[:, :2].copy()
+    goal[0] = [0, 1]
+    problem = Problem(Team(("car",) * 7), start, goal, horizon=30)
+    controls, docked = np.zeros((problem.horizon, 7, 2), np.float32), np.arange(7) > 0
+    chosen, home = drive_home(problem, get_engine("cpu"), controls, ~docked, docked)
+    assert not home.any()
+    np.testing.assert_array_equal(chosen, controls)
+
+
+@pytest.mark.parametrize(("model", "within"), [("unicycle", 0.1), ("differential_drive", 0.4)])
+def test_robots_of_first_order_stray_until_their_next_command_only(model: str, within: float) -> None:
+    policy, problem = controller(), make_problem("random", num_robots=2, seed=1, model=model)
+    run_episode(navigation_v0.parallel_env(problem=problem, control_noise_std=0.2), policy, seed=0)
+    deviation = policy._deviation
+    assert deviation.room(0.4) == pytest.approx(within * deviation.speed.max())
+    assert 0 < deviation.room(0.4) < 0.15
 
 
 def test_who_stands_whatever_it_is_told_is_taken_for_docked_until_it_moves() -> None:
@@ -340,6 +384,15 @@ def test_with_caution_robots_could_still_brake_a_step_later_and_faster(wide: flo
     wanted = np.array([[-0.9, 0.2]], np.float32)
     safe = safe_velocities(problem, joint(problem, np.zeros((1, 4))), wanted, np.ones(1, bool), 0.02, 0.3)
     np.testing.assert_allclose(safe, [[-allowed, 0.2]], atol=1e-4)
+
+
+def test_robots_of_first_order_stop_within_a_time_step() -> None:
+    world = World(2, boxes=[[-1, -5, -0.25, 5]])
+    problem = Problem(Team(("velocity2d",)), [[0, 0]], [[2, 0]], world, horizon=30)
+    wanted, still = np.array([[-0.9, 0.2]], np.float32), np.zeros((1, 2), np.float32)
+    safe = safe_velocities(problem, joint(problem, still), wanted, np.ones(1, bool), 0.02, 0.3)
+    # As if by 1 m/s in 0.1 s: sqrt(2 * 10 * 0.08 + 1) - 1 - 0.3.
+    np.testing.assert_allclose(safe, [[1.3 - np.sqrt(2.6), 0.2]], atol=1e-4)
 
 
 def test_in_a_corner_both_walls_count() -> None:

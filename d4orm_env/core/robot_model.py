@@ -232,6 +232,11 @@ class Model:
         return (*STANDARD_LIMITS, *(limit.name for limit in self.own_limits))
 
     @property
+    def first_order(self) -> bool:
+        """Whether it takes any velocity at once, so that its state holds none."""
+        return not self.speed_indices
+
+    @property
     def turns_in_place(self) -> bool:
         """Whether it can turn where it stands, or need not turn at all."""
         return self.heading_index is None or self._turn_rate([1.0] * len(self.limit_names), moving=False) > 0

@@ -43,7 +43,8 @@ def safe_velocities(
     ``n (v_i - v_j) >= -sqrt(2 (a_i + a_j) (d - gap))``: the braking-distance barrier of Wang, Ames and Egerstedt
     (Safety barrier certificates for collisions-free multirobot systems, IEEE Trans. Robotics 33, 2017), here for the
     velocities of the next step. On a body that obeys nobody, a side of the bounds, or the nearest obstacle, the robot
-    does all the braking. Taken are the nearest velocities to those wanted.
+    does all the braking. Robots of first order can stop within a time step. Taken are the nearest velocities to those
+    wanted.
 
     Args:
         problem: The robots and obstacles.
@@ -94,7 +95,9 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
     """What the velocities of those who are ``free`` have to keep to."""
     d = problem.dimension
     places, radius = joint.states[:, :d].astype(np.float64), np.asarray(problem.team.radius, np.float64)
-    braking = np.where(free, problem.team.limits[:, ACCELERATION].astype(np.float64), 0)
+    acceleration, speed = (problem.team.limits[:, limit].astype(np.float64) for limit in (ACCELERATION, SPEED))
+    at_once = np.array([model.first_order for model in problem.team.robot_models])
+    braking = np.where(free, np.where(at_once, speed / problem.dt, acceleration), 0)
     rows: list[tuple[int, int, Array, float]] = []
 
     def add(one: int, other: int, normal: Array, room: float, brakes: float, speed: float = 0.0) -> None:
@@ -119,8 +122,8 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
             away = float(np.linalg.norm(offset))
             if 0 < away < NEAR:
                 normal = offset / away
-                speed = float((normal * body[d : 2 * d]).sum())
-                add(i, -1, normal, away - radius[i] - float(body[-1]) - gap, braking[i], speed)
+                leaving = float((normal * body[d : 2 * d]).sum())
+                add(i, -1, normal, away - radius[i] - float(body[-1]) - gap, braking[i], leaving)
     for i, normal, room in _walls(problem, places[able], able):
         add(i, -1, normal, room - radius[i] - gap, braking[i])
     one, other, normals, least = zip(*rows) if rows else ((), (), (), ())

@@ -47,7 +47,7 @@ class Deviation:
         docks: Whether robots dock at their goals, rather than drive through them to others.
 
     Attributes:
-        speed: The largest deviation of a robot in a time step, over its length, of late [m/s].
+        speed: ``(K,)`` the largest deviation of each robot in a time step, over its length, of late [m/s].
         drift: The largest change of a robot's velocity from what was expected within a few steps of late [m/s].
         problem: The robots with the limits that they are believed to have now.
         lateness: How late commands are executed.
@@ -66,7 +66,9 @@ class Deviation:
         self._estimated: JointState | None = None
         self._expected: tuple[FloatArray, FloatArray] | None = None
         self._changes = np.zeros((RUN, problem.num_robots, problem.dimension), np.float32)
-        self.speed = self.drift = 0.0
+        self.speed = np.zeros(problem.num_robots)
+        self._first_order = np.array([model.first_order for model in problem.team.robot_models])
+        self.drift = 0.0
 
     def observe(self, joint: JointState) -> JointState:
         """Compare where the robots are with where they were expected; where they will be once commands arrive."""
@@ -91,7 +93,7 @@ class Deviation:
         """Note how far robots are from the ``places`` and the ``velocities`` ``(K, d)`` that were expected."""
         d, going = self.problem.dimension, ~joint.arrived[:, None]
         away = np.linalg.norm(np.where(going, joint.states[:, :d] - places, 0), axis=1)
-        self.speed = max(DECAY * self.speed, float(away.max()) / self.problem.dt)
+        self.speed = np.maximum(DECAY * self.speed, away.astype(np.float64) / self.problem.dt)
         change = np.where(going, present_velocities(self.problem, joint.states, joint.controls) - velocities, 0)
         self._changes = np.concatenate([change[None], self._changes[:-1]])
         sums = np.linalg.norm(np.cumsum(self._changes, axis=0), axis=2)
@@ -139,5 +141,10 @@ class Deviation:
         return 0.0 if self.drift < STEADY else min(self.drift, FASTEST)
 
     def room(self, reaction_time: float) -> float:
-        """How far robots get from where they are expected within so many seconds [m]."""
-        return min(reaction_time * self.speed, MOST)
+        """How far robots get from where they are expected within so many seconds [m].
+
+        What makes a robot of first order stray is over with the next command to arrive.
+        """
+        next_command = min((1 + len(self.lateness.under_way)) * self.problem.dt, reaction_time)
+        within = np.where(self._first_order, next_command, reaction_time)
+        return min(float((within * self.speed).max()), MOST)

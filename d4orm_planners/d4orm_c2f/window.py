@@ -11,16 +11,12 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.base import Engine, MovingObstacles, SamplingRules, SamplingTask
 from d4orm_env.joint_state import JointState
-from d4orm_planners.d4orm_c2f.homing import docking_radius, drive_home
+from d4orm_planners.d4orm_c2f.homing import ROUNDING, docking_radius, drive_home
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.steering import track_velocities
 
 SHORTER = 3
 """How many times fewer fresh steps a robot takes before it stops if it would violate the margin otherwise."""
-
-
-ROUNDING = 1e-5
-"""Allowance for it [m]."""
 
 
 class Prediction(NamedTuple):
@@ -110,7 +106,7 @@ class Window:
         special = now.stuck
         if config.drive_home and self._docks:
             near = self._near_goals(now) & ~now.docked & ~now.stuck
-            controls, home = drive_home(truth, self._engine, controls, near)
+            controls, home = drive_home(truth, self._engine, controls, near, now.docked)
             special = special | home
         return self._safe_mix(truth, controls, special, sampled, now)
 
