@@ -32,6 +32,7 @@ from d4orm_env.core.transition import TimeStep, advance
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.worlds import kernels_of_codes, world_kernels
 from d4orm_env.models import OWN_LIMITS, SPEED, Limit, Model, ModelFunctions, clip
+from d4orm_env.verify import integrated
 from d4orm_env.verify.integrated import Integrated
 from d4orm_env.verify.motion import TeamMotion
 from d4orm_planners import make_planner
@@ -295,6 +296,21 @@ def test_the_judge_integrates_what_it_has_equations_for_to_the_same_motion() -> 
     acceleration = np.sqrt((inner**2).sum(axis=-1)).max(axis=1)
     assert (found.bend >= acceleration).all()
     assert (found.bend <= 2 * acceleration + 0.1).all()
+
+
+@pytest.mark.parametrize("scale", [0.3, 30.0])
+@pytest.mark.parametrize("name", MODELS)
+def test_the_judge_integrates_all_steps_at_once_as_one_after_another(
+    name: str, scale: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = make_problem("circle" if MODELS[name].dimension == 2 else "sphere", num_robots=3, model=name)
+    controls = np.cumsum(scale * random_controls(problem, 2).astype(np.float64), axis=0)
+    arguments = np.arange(3), np.asarray(problem.start, np.float64), controls, problem.team.limits, problem.dt
+    at_once = Integrated(MODELS[name], *arguments)
+    monkeypatch.setattr(integrated, "CORRECTIONS", 0)
+    one_by_one = Integrated(MODELS[name], *arguments)
+    np.testing.assert_allclose(at_once.way(slice(None), 5), one_by_one.way(slice(None), 5), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(at_once.pace, one_by_one.pace, rtol=0, atol=1e-9)
 
 
 def test_the_judge_names_the_control_of_a_car_that_exceeds_its_limit() -> None:

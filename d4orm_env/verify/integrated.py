@@ -21,6 +21,12 @@ SUB_STEPS = 20
 """To find how much the way bends within a control step."""
 STATE_ERROR = 1e-7
 """Largest error of a control step's integration that one with more sub-steps reveals, in SI units."""
+GAP = 1e-10
+"""What steps may miss each other by in the end, in SI units, or as a share of the largest state."""
+CORRECTIONS = 5
+"""Times that it is tried to make good what they miss each other by: two suffice mostly."""
+ASIDE = 1e-6
+"""Differences of states by which is found out what a step makes of them, in SI units."""
 BEND_MARGIN = 1.5
 """The acceleration is measured between sub-steps, and may be this much larger at one of them."""
 LARGEST_CONTROL = 1e100
@@ -60,21 +66,60 @@ class Integrated:
         self.step_error: Floats = norm(np.moveaxis(coarse[: model.dimension], 0, 2) - way[:, -1])
 
     def _states(self, start: Floats) -> Floats:
-        """``(n, H+1, R)`` at the beginning of every step and after the last, integrated as finely as it takes."""
+        """``(n, H+1, R)`` at the beginning of every step and after the last, integrated as finely as it takes.
+
+        Roughly at first, one step after another. From there all steps are integrated at once, finely, and what they
+        miss each other by is made good (multiple shooting); one after another, finely, only where that finds no end.
+        """
+        states = self._one_by_one(start, 1)
+        sub_steps = self._sub_steps(states[:, :-1])
+        for _ in range(CORRECTIONS):
+            gaps = self._stepped(states[:, :-1], sub_steps) - states[:, 1:]
+            if not np.isfinite(gaps).all():
+                break
+            if float(np.abs(gaps).max()) <= GAP * max(1.0, float(np.abs(states).max())):
+                return states
+            states = states.copy()
+            states[:, 1:] += self._carried(states[:, :-1], gaps)
+        return self._one_by_one(start, sub_steps)
+
+    def _one_by_one(self, start: Floats, sub_steps: int) -> Floats:
+        states = [start]
+        for u in np.moveaxis(self._commands, 1, 0):
+            ends = self._integrated(states[-1], u, sub_steps)
+            states.append(self._call(self._model.functions.limit_state, ends))
+        return np.stack(states, axis=1)
+
+    def _sub_steps(self, begins: Floats) -> int:
+        """How many sub-steps a step takes; ``begins`` ``(n, H, R)`` are about where steps begin."""
         sub_steps = 2
-        while True:
-            states, ends = [start], []
-            for u in np.moveaxis(self._commands, 1, 0):
-                ends.append(self._integrated(states[-1], u, sub_steps))
-                states.append(self._call(self._model.functions.limit_state, ends[-1]))
-            found = np.stack(states, axis=1)
-            finer = self._integrated(found[:, :-1], self._commands, 2 * sub_steps)
-            error = float(np.abs(np.stack(ends, axis=1) - finer).max())
-            if sub_steps >= SUB_STEPS or error <= STATE_ERROR:
-                return found
+        while sub_steps < SUB_STEPS:
+            coarse, fine = (self._integrated(begins, self._commands, times * sub_steps) for times in (1, 2))
+            error = float(np.abs(coarse - fine).max())
+            if error <= STATE_ERROR:
+                break
             # Of order four: so many times finer, and one more.
             times_finer = (error / STATE_ERROR) ** 0.25 if np.isfinite(error) else SUB_STEPS
             sub_steps = int(min(sub_steps * times_finer + 1, SUB_STEPS))
+        return sub_steps
+
+    def _stepped(self, begins: Floats, sub_steps: int) -> Floats:
+        """``(n, H, R)`` states after every step from where it begins."""
+        return self._call(self._model.functions.limit_state, self._integrated(begins, self._commands, sub_steps))
+
+    def _carried(self, begins: Floats, gaps: Floats) -> Floats:
+        """``(n, H, R)`` what ``gaps`` after every step come to when all later steps begin that much elsewhere."""
+        ends, slopes = self._stepped(begins, 1), []
+        for column in range(len(begins)):
+            aside = begins.copy()
+            aside[column] += ASIDE
+            slopes.append((self._stepped(aside, 1) - ends) / ASIDE)
+        carried, total = np.empty_like(gaps), np.zeros_like(gaps[:, 0])
+        for t in range(gaps.shape[1]):
+            # Sums of a fixed order, which a product of matrices is not.
+            total = sum((slope[:, t] * moved for slope, moved in zip(slopes, total, strict=True)), gaps[:, t])
+            carried[:, t] = total
+        return carried
 
     def _integrated(self, x: Floats, u: Floats, sub_steps: int) -> Floats:
         for _ in range(sub_steps):
