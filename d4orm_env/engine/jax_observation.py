@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from d4orm_env.core import transition
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.dynamics import MODELS
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem_arrays import ProblemArrays
@@ -116,16 +116,16 @@ class _Nearest(NamedTuple):
 
 def _neighbors(arrays: ProblemArrays, place: Columns, velocity: Columns, count: int) -> Columns:
     """``2 d + 2`` for each."""
-    robots = jnp.arange(len(arrays.radius))
+    robots = np.arange(len(arrays.radius))
 
-    def look(other: tuple[Array, Array, Array | FloatArray]) -> tuple[Array, Columns]:
+    def look(other: tuple[IntArray, Columns, Array | FloatArray]) -> tuple[Array, Columns]:
         number, motion, radius = other
         relative = [theirs - own for theirs, own in zip(motion, (*place, *velocity))]
         key = jnp.where(robots == number, jnp.inf, _square(relative[: len(place)]))
         return key, [*relative, jnp.broadcast_to(radius, key.shape)]
 
     nearest = _Nearest.nothing(len(robots), count, 2 * len(place) + 1)
-    return nearest.with_all(look, (robots, jnp.stack([*place, *velocity], axis=1), arrays.radius)).columns()
+    return nearest.with_all(look, (robots, [*place, *velocity], arrays.radius)).columns()
 
 
 def _obstacles(arrays: ProblemArrays, place: Columns, count: int) -> Columns:
