@@ -27,6 +27,9 @@ SCENARIOS: dict[str, dict[str, Any]] = {
     "forest": {},
     "corridor": {},
     "doorway": {},
+    "mmd_conveyor": {},
+    "mmd_highways": {},
+    "mmd_drop_region": {},
     "map": {"map": Path(__file__).parent / "maps" / "office.map"},
 }
 

@@ -15,6 +15,9 @@ WALLED = {
     "forest": ("holonomic2d", "holonomic3d"),
     "corridor": ("differential_drive",),
     "doorway": ("velocity2d",),
+    "mmd_conveyor": ("holonomic2d",),
+    "mmd_highways": ("differential_drive",),
+    "mmd_drop_region": ("velocity2d",),
     "map": ("holonomic2d",),
 }
 """The scenarios with walls, which are tested with a model or two each."""

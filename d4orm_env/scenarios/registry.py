@@ -8,7 +8,7 @@ from functools import partial
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.registry import Registry
-from d4orm_env.scenarios import corridors, forest, generators, maps, maze, paper, rooms, warehouse
+from d4orm_env.scenarios import corridors, forest, generators, maps, maze, mmd_maps, paper, rooms, warehouse
 from d4orm_env.scenarios.scenario import BuiltIn, Scenario
 
 FILE_SUFFIXES = (".yaml", ".yml")
@@ -63,6 +63,9 @@ for _scenario in (
     BuiltIn(forest.forest, draws=True),
     BuiltIn(corridors.corridor, draws=True),
     BuiltIn(corridors.doorway, draws=True),
+    BuiltIn(mmd_maps.mmd_conveyor, draws=True),
+    BuiltIn(mmd_maps.mmd_highways, draws=True),
+    BuiltIn(mmd_maps.mmd_drop_region, draws=True),
     BuiltIn(maps.map),
 ):
     register_scenario(_scenario.__name__, _scenario)
