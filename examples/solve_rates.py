@@ -94,7 +94,7 @@ SETS: Mapping[str, Cases] = {
         Case("rooms, 4", "rooms", {"num_robots": 4}),
         Case("rooms, 8", "rooms", {"num_robots": 8}),
     )),
-    "mmd": Cases(("mmd", "d4orm-d", "guided"), 60, tuple(
+    "mmd": Cases(("mmd", "d4orm-d", "guided"), 300, tuple(
         Case(f"{name}, {k}", f"mmd_{name.replace(' ', '_')}", {"num_robots": k})
         for name in ("conveyor", "highways", "drop region") for k in (6, 12, 20)
     )),
