@@ -86,7 +86,7 @@ def default_horizon(team: Team, dt: float, distance: float) -> int:
         ValueError: If that takes more than a million steps.
     """
     speed, acceleration = np.float64(team.max_speed), np.float64(team.max_acceleration)
-    has_inertia = np.array([bool(model.speed_indices) for model in team.robot_models])
+    has_inertia = np.array([not model.first_order for model in team.robot_models])
     peak = np.where(has_inertia, np.minimum(speed, np.sqrt(acceleration * distance)), speed)
     drive = float((distance / peak + np.where(has_inertia, peak / acceleration, 0.0)).max())
     # The tolerance keeps limits that float32 cannot hold exactly from adding a step.

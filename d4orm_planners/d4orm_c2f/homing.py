@@ -1,4 +1,4 @@
-"""The last metres: robots that are nearly there drive straight home."""
+"""The last metres: robots that are nearly there drive straight home, or away and come again."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def docking_radius(problem: Problem, docks: bool) -> float:
 def drive_home(
     window: Problem, engine: Engine, controls: FloatArray, near: BoolArray, docked: BoolArray
 ) -> tuple[FloatArray, BoolArray]:
-    """The controls, but straight drives for robots that dock by these no later.
+    """The controls, but straight drives for robots that dock by these no later, or manoeuvres (:func:`come_again`).
 
     Samples head for a goal only roughly, and who misses it at full speed has to turn.
 
