@@ -30,8 +30,8 @@ def run_or_abandon(work: Callable[[Callable[[], bool]], Result], should_stop: Ca
     """
     ending = Event()
     pool = ThreadPoolExecutor(1)
-    future = pool.submit(work, ending.is_set)
     try:
+        future = pool.submit(work, ending.is_set)
         while not should_stop():
             if wait([future], LOOK).done:
                 return future.result()

@@ -622,6 +622,21 @@ def test_ctrl_c_loses_nothing_that_a_node_has_found(mode: str, monkeypatch: pyte
     assert plan.controls.any()
 
 
+@MODE
+def test_ctrl_c_while_a_node_starts_leaves_no_thread(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    start = threading.Thread.start
+
+    def interrupted(thread: threading.Thread) -> None:
+        start(thread)
+        if thread.name == "d-d4orm-1":
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(threading.Thread, "start", interrupted)
+    plan = distributed(mode=mode, num_steps=10**6, patience=60).solve(walled_in_problem())
+    assert plan.status == "interrupted"
+    assert not node_threads()
+
+
 def test_no_thread_outlives_a_solve() -> None:
     for mode in ("sync", "async"):
         distributed(mode=mode, patience=10).solve(walled_in_problem(), max_iterations=2)

@@ -68,6 +68,8 @@ class Process:
         """Its exit status."""
         status = self.process.wait(3 * PATIENCE)
         self._reader.join(PATIENCE)
+        if status < 0:
+            print(*self.lines, sep="\n")  # which pytest shows if the test fails
         return status
 
 

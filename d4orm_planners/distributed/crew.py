@@ -31,36 +31,59 @@ LAST_WAIT = 30.0
 
 
 class _Job:
-    """Work of a node in a thread of its own; an exception is kept instead of lost."""
+    """Work of a node, to be done in a thread of its own; an exception is kept instead of lost."""
 
     def __init__(self, node: Node, work: Callable[[Node], object]) -> None:
         self.node = node
         self.error: Exception | None = None
-        self._begin = time.perf_counter()
+        self._work = work
+        self._begin: float | None = None
         self._end: float | None = None
+        self._over = threading.Event()
         # A node that hangs must not keep the process from ending for ever.
-        self.thread = threading.Thread(target=self._run, args=(work,), daemon=True, name=f"d-d4orm-{node.number}")
-        self.thread.start()
+        self._thread = threading.Thread(target=self._run, daemon=True, name=f"d-d4orm-{node.number}")
 
-    def _run(self, work: Callable[[Node], object]) -> None:
+    def start(self) -> None:
+        """Begin.
+
+        Ctrl-C may come while the thread starts, so whoever has to wait for it must know of this job before.
+        """
+        self._begin = time.perf_counter()
+        self._thread.start()
+
+    def _run(self) -> None:
         try:
-            work(self.node)
+            self._work(self.node)
         except Stopped:
             pass
         except Exception as error:  # whatever it is, it concerns this node only
             self.error = error
         finally:
             self._end = time.perf_counter()
+            self._over.set()
+
+    @property
+    def running(self) -> bool:
+        """Whether it has begun and is not over."""
+        return self._begin is not None and not self._over.is_set()
 
     @property
     def seconds(self) -> float:
         """How long it has taken."""
+        if self._begin is None:
+            return 0.0
         return (self._end or time.perf_counter()) - self._begin
 
+    def wait(self, timeout: float | None) -> None:
+        """Wait while it runs, no longer than ``timeout`` [s]."""
+        # A thread whose start was interrupted cannot be joined before it has run.
+        if self._begin is not None and self._over.wait(timeout):
+            self._thread.join()
+
     def leave(self) -> None:
-        """Wait for it no longer."""
-        if self.thread.is_alive():
-            atexit.register(self.thread.join, LAST_WAIT)
+        """Wait for it no longer, except at the end of the process."""
+        if self.running:
+            atexit.register(self.wait, LAST_WAIT)
 
 
 class Crew(ABC):
@@ -129,7 +152,7 @@ class Crew(ABC):
         deadline = time.perf_counter() + self.patience
         for job in self._jobs:
             if job.node in self.alive:
-                job.thread.join(max(deadline - time.perf_counter(), 0))
+                job.wait(max(deadline - time.perf_counter(), 0))
             job.leave()
         return max((node.search.best for node in self._nodes), key=lambda candidate: candidate.rank)
 
@@ -213,12 +236,14 @@ class SyncCrew(Crew):
         begin = time.perf_counter()
         self._jobs = [_Job(node, work) for node in self.alive]
         for job in self._jobs:
-            while job.thread.is_alive():
+            job.start()
+        for job in self._jobs:
+            while job.running:
                 left = time_left()
                 if left is not None and left + self.patience <= 0:
                     break
-                job.thread.join(None if left is None else left + self.patience)
-            if job.thread.is_alive():
+                job.wait(None if left is None else left + self.patience)
+            if job.running:
                 job.leave()
                 self._lose(job, "did not finish in time")
             elif job.error is not None:
@@ -258,7 +283,7 @@ class AsyncCrew(Crew):
         heard: set[int] = set()
         first = None
         while True:
-            ended = not any(job.thread.is_alive() for job in self._jobs)
+            ended = not any(job.running for job in self._jobs)
             heard |= {report.node for report in self._observer.receive(GLANCE)}
             self._lose_dead()
             now = time.perf_counter()
@@ -277,7 +302,7 @@ class AsyncCrew(Crew):
     def _run(self, improve: bool) -> None:
         """Start whoever does not run: at first all, later those who stopped at what proved to be no solution here."""
         self._judge.solution_ends = not improve
-        running = [job for job in self._jobs if job.thread.is_alive()]
+        running = [job for job in self._jobs if job.running]
         failed = [job for job in self._jobs if job.error is not None]
         self._seconds += sum(job.seconds for job in self._jobs if job not in running + failed)
         idle = [node for node in self.alive if node not in {job.node for job in running + failed}]
@@ -287,7 +312,10 @@ class AsyncCrew(Crew):
         def run(node: Node) -> None:
             node.run(self._judge.stop, self.patience, improve)
 
-        self._jobs = [*running, *failed, *(_Job(node, run) for node in idle)]
+        begun = [_Job(node, run) for node in idle]
+        self._jobs = [*running, *failed, *begun]
+        for job in begun:
+            job.start()
 
     def _lose_dead(self) -> None:
         for job in self._jobs:

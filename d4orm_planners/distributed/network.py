@@ -35,7 +35,7 @@ class NetworkCrew(SyncCrew):
         self._judge.stop.set()
         try:
             for job in self._jobs:
-                job.thread.join(self.patience)
+                job.wait(self.patience)
             self._node.settle(self._linger)
             self._report_new_nodes()
         except KeyboardInterrupt:
