@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 from disturbance_study import DISTURBANCES, NOTHING, ROBOTS, SCENARIOS, names_by_text, successes, tell
-from outputs import argument_parser, count, existing_file, save_table, trials_argument
+from outputs import argument_parser, count, go_on_argument, save_table, stored, trials_argument
 
 from d4orm_planners.evaluation.comparison import in_common, paired
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.report import read_parquet, write_parquet
-from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
+from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
 
 ALL, WITHOUT_ALL = "d4orm-c2f", "all of them"
@@ -112,7 +112,7 @@ def main() -> int:
     parser = argument_parser(__doc__)
     parser.add_argument("--seeds", type=count, default=30)
     parser.add_argument("--workers", type=count, help="processes, by default one per core")
-    parser.add_argument("--go-on-from", type=existing_file, help="a Parquet file of trials that need not be run again")
+    go_on_argument(parser)
     trials_argument(parser)
     arguments = parser.parse_args()
     if arguments.trials is not None:
@@ -121,9 +121,7 @@ def main() -> int:
         scenarios, names, seeds = SCENARIOS, tuple(MEANT_FOR), arguments.seeds
         if arguments.quick:
             scenarios, names, seeds = scenarios[:1], names[:1], 1
-        arguments.out.mkdir(parents=True, exist_ok=True)
-        if arguments.go_on_from is not None:
-            TrialStore(arguments.out / STORE).add(*read_parquet(arguments.go_on_from))
+        stored(arguments.go_on_from, arguments.out)
         trials = [
             trial
             for study in studies(scenarios, names, seeds)

@@ -8,8 +8,8 @@ paper's. Every trial has the same budget of denoising steps of 1024 samples, whi
 its credit by groups, or in turn, is credit by robot). The table has success with its 95% interval (Wilson), the mean
 number of steps to the first solution, a trial without one counting twice the budget (PAR-2), and how likely it is that
 the cell and D4orm with the same credit are equally good (McNemar on successes, Wilcoxon on steps, paired by seed).
-Trials are stored in the folder, and a call that was broken off goes on from there. `--trials FILE` makes the table and
-the curves of trials that are in a Parquet file, such as those in `data/`.
+Trials are stored in the folder, and a call that was broken off goes on from there. `--go-on-from FILE` takes trials of a
+Parquet file, such as `data/credit_by_update.parquet`; `--trials FILE` makes the table and the curves of such a file.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from outputs import argument_parser, count, plt, save_figure, save_table, trials_argument
+from outputs import argument_parser, count, go_on_argument, plt, save_figure, save_table, stored, trials_argument
 
 from d4orm_planners.evaluation.comparison import paired, penalised_steps, steps_to_solution, survival
 from d4orm_planners.evaluation.evaluate import run_study
@@ -120,10 +120,12 @@ def main() -> int:
     """Run every cell on every team, write the table and draw the curves."""
     parser = argument_parser(__doc__)
     parser.add_argument("--seeds", type=count, default=50)
+    go_on_argument(parser)
     trials_argument(parser)
     arguments = parser.parse_args()
     if arguments.trials is None:
         teams, seeds, budget = (TEAMS[:1], 1, TINY) if arguments.quick else (TEAMS, arguments.seeds, BUDGET)
+        stored(arguments.go_on_from, arguments.out)
         trials = run(teams, seeds, budget, arguments.out)
         write_parquet(arguments.out / "credit_by_update.parquet", trials)
     else:

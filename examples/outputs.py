@@ -20,6 +20,8 @@ import matplotlib.pyplot as plt
 
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners._machine import commit, describe_machine
+from d4orm_planners.evaluation.report import read_parquet
+from d4orm_planners.evaluation.store import STORE, TrialStore
 
 COLOURS = {"d4orm": "#0072B2", "default": "#56B4E9", "mppi": "#D55E00", "cem": "#009E73", "i-mbd": "#CC79A7"}
 """One colour per method in every plot, told apart by the colour-blind too."""
@@ -51,6 +53,18 @@ def argument_parser(description: str | None) -> argparse.ArgumentParser:
 def trials_argument(parser: argparse.ArgumentParser) -> None:
     """Let a study make its table and plot of what :func:`measured` wrote before."""
     parser.add_argument("--trials", type=existing_file, help="run nothing; a Parquet file of trials")
+
+
+def go_on_argument(parser: argparse.ArgumentParser) -> None:
+    """Let a study take what :func:`stored` puts into its store."""
+    parser.add_argument("--go-on-from", type=existing_file, help="a Parquet file of trials that need not be run again")
+
+
+def stored(trials: Path | None, folder: Path) -> None:
+    """Put trials of a Parquet file into the store of a study that runs in ``folder``."""
+    if trials is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        TrialStore(folder / STORE).add(*read_parquet(trials))
 
 
 def existing_file(text: str) -> Path:

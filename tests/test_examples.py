@@ -17,6 +17,7 @@ from PIL import Image
 from d4orm_env import make_problem
 from d4orm_env.joint_state import JointState
 from d4orm_planners import Plan
+from d4orm_planners.evaluation.report import read_parquet
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
@@ -201,8 +202,13 @@ def test_credit_and_update_are_crossed(tmp_path: Path) -> None:
     assert len({(row["update"], row["credit"]) for row in rows}) == len(rows) == 20
     assert all(row["p (steps)"] == "1" for row in rows if row["update"] == "d4orm")
     assert (out / "credit_by_update.png").read_bytes().startswith(PNG)
-    completed("credit_by_update", tmp_path / "again", "--trials", str(out / "credit_by_update.parquet"))
-    assert table(tmp_path / "again" / "credit_by_update.csv") == rows
+    for option in ("--trials", "--go-on-from"):
+        again = tmp_path / option
+        completed("credit_by_update", again, option, str(out / "credit_by_update.parquet"))
+        assert table(again / "credit_by_update.csv") == rows
+    # Nothing was run again.
+    files = [read_parquet(folder / "credit_by_update.parquet") for folder in (out, again)]
+    assert [trial.wall_time for trial in files[0]] == [trial.wall_time for trial in files[1]]
 
 
 def test_samples_are_counted_for_every_setting(tmp_path: Path) -> None:
