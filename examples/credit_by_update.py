@@ -8,8 +8,8 @@ paper's. Every trial has the same budget of denoising steps of 1024 samples, whi
 its credit by groups, or in turn, is credit by robot). The table has success with its 95% interval (Wilson), the mean
 number of steps to the first solution, a trial without one counting twice the budget (PAR-2), and how likely it is that
 the cell and D4orm with the same credit are equally good (McNemar on successes, Wilcoxon on steps, paired by seed).
-Trials are stored in the folder, and a call that was broken off goes on from there. `--go-on-from FILE` takes trials of a
-Parquet file, such as `data/credit_by_update.parquet`; `--trials FILE` makes the table and the curves of such a file.
+Trials are stored in the folder, and a call that was broken off goes on from there. `--go-on-from FILE` takes trials
+from a Parquet file, such as `data/credit_by_update.parquet`; `--trials FILE` makes the table and the curves of one.
 """
 
 from __future__ import annotations
