@@ -16,15 +16,16 @@ from d4orm_planners.sampling.optimizer import DenoisingPlanner, standard_normal
 from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, Credit, DenoisingConfig
 from d4orm_planners.sampling.tuned import TUNED
 from d4orm_planners.search import Search
-from d4orm_planners.settings import Samples, Share, ShareOrNone, Steps, one_of
+from d4orm_planners.settings import Positive, Samples, Share, ShareOrNone, Steps, one_of
 
 SPELL, PATIENT_SAMPLES = 8, 4
-"""Iterations without a solution after which the default weights by the team's reward for as many, in turn; and how many
-times as many samples it draws meanwhile."""
+"""Iterations without a solution after which ``"alternate"`` weights by the team's reward for as many, in turn; and how
+many times as many samples it draws meanwhile."""
 
 PAPER_DEFORMATION = {
     **PAPER,
     "credit": "team",
+    "penalty": 1.0,
     "late_samples": 1.0,
     "shorten": False,
     "start": "team",
@@ -40,8 +41,9 @@ class D4ormConfig(ContinuationSettings, DenoisingConfig):
     Attributes:
         num_samples: ``M``.
         num_steps: ``N``.
-        credit: ``"alternate"`` by default: per-robot weights find their way soonest. Where robots must yield to each
-            other, which no robot's own reward asks of it, the next iteration's team weights do.
+        credit: ``"group"`` by default: each robot's own reward at first, then that of those it is in conflict with.
+            ``"alternate"`` goes on by the team's reward after its first iteration, and every other one.
+        penalty: 2 by default, what a contact costs the two that touch.
         clip_between_iterations: True by default: with the default's credit that solves slightly sooner. The paper clips
             in the rollout only.
         late_steps: Share of the steps, the last ones, at which the noise is small enough for fewer samples.
@@ -57,7 +59,8 @@ class D4ormConfig(ContinuationSettings, DenoisingConfig):
 
     num_samples: Samples = 256
     num_steps: Steps = 100
-    credit: Credit = "alternate"
+    credit: Credit = "group"
+    penalty: Positive = 2.0
     clip_between_iterations: bool = True
     late_steps: ShareOrNone = 0.7
     late_samples: Share = 0.5

@@ -3,7 +3,8 @@
     python examples/credit_by_update.py --seeds 50 --out factorial
 
 Credit: samples are weighted by the reward of the team, of the group that a robot was in conflict with, of the robot, or
-of robot and team in turn. Update: MPPI, CEM with adaptive variance, MBD, i-MBD or D4orm, everything else being the
+of robot and team in turn; and by that of the group with contacts that cost twice as much, as much as they cost the two
+that touch. Update: MPPI, CEM with adaptive variance, MBD, i-MBD or D4orm, everything else being the
 paper's. Every trial has the same budget of denoising steps of 1024 samples, which MBD spends in one iteration (so that
 its credit by groups, or in turn, is credit by robot). The table has success with its 95% interval (Wilson), the mean
 number of steps to the first solution, a trial without one counting twice the budget (PAR-2), and how likely it is that
@@ -30,7 +31,13 @@ from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import wilson_interval
 
 TEAMS = (("paper_circle", 8), ("paper_circle", 16), ("paper_random", 16), ("paper_heterogeneous", 8))
-CREDITS = {"team": "team", "group": "group", "robot": "robot", "in turn": "alternate"}
+CREDITS: dict[str, dict[str, Any]] = {
+    "team": {"credit": "team"},
+    "group": {"credit": "group"},
+    "robot": {"credit": "robot"},
+    "in turn": {"credit": "alternate"},
+    "group, penalty 2": {"credit": "group", "penalty": 2.0},
+}
 UPDATES: dict[str, dict[str, Any]] = {
     "mppi": {},
     "cem": {"adapt_variance": True},
@@ -50,11 +57,11 @@ def policies(budget: int) -> dict[str, dict[str, Any]]:
     steps = min(ITERATION, budget)
     return {
         f"{update}, {credit}": {
-            "policy": update, "preset": "paper", "engine": "cpu", "credit": value,
+            "policy": update, "preset": "paper", "engine": "cpu", **scoring,
             "num_steps": budget if update == "mbd" else steps, "max_iterations": budget // steps, **settings,
         }
         for update, settings in UPDATES.items()
-        for credit, value in CREDITS.items()
+        for credit, scoring in CREDITS.items()
     }  # fmt: skip
 
 
@@ -96,7 +103,7 @@ def rows_of(team: str, cells: Cells) -> list[dict[str, Any]]:
 def draw(teams: dict[str, Cells], path: Path) -> None:
     """The share of seeds without a solution against the steps spent: a row per team, a column per credit."""
     figure, axes = plt.subplots(
-        len(teams), len(CREDITS), figsize=(11, 2.4 * len(teams)), sharex=True, sharey=True, squeeze=False
+        len(teams), len(CREDITS), figsize=(13, 2.4 * len(teams)), sharex=True, sharey=True, squeeze=False
     )
     for row, (team, cells) in zip(axes, teams.items(), strict=True):
         budget = max(penalised_steps(trial) for trials in cells.values() for trial in trials) / 2

@@ -199,7 +199,7 @@ def test_credit_and_update_are_crossed(tmp_path: Path) -> None:
     out = tmp_path / "out"
     completed("credit_by_update", out)
     rows = table(out / "credit_by_update.csv")
-    assert len({(row["update"], row["credit"]) for row in rows}) == len(rows) == 20
+    assert len({(row["update"], row["credit"]) for row in rows}) == len(rows) == 25
     assert all(row["p (steps)"] == "1" for row in rows if row["update"] == "d4orm")
     assert (out / "credit_by_update.png").read_bytes().startswith(PNG)
     for option in ("--trials", "--go-on-from"):

@@ -69,7 +69,7 @@ class Process:
         status = self.process.wait(3 * PATIENCE)
         self._reader.join(PATIENCE)
         if status < 0:
-            print(*self.lines, sep="\n")  # which pytest shows if the test fails
+            sys.stdout.write("\n".join(self.lines))  # which pytest shows if the test fails
         return status
 
 

@@ -149,7 +149,7 @@ class D4ormD(D4orm):
     def task(self, search: Search, base: FloatArray) -> SamplingTask:
         """See :meth:`SamplingPlanner.task`."""
         task = super().task(search, base)
-        return replace(task, collisions=search.iteration > 0 or self.config.first_collisions)
+        return replace(task, penalty=1.0, collisions=search.iteration > 0 or self.config.first_collisions)
 
     def straight_start(self, problem: Problem) -> FloatArray | None:
         """Controls ``(H, K, m)`` that send everybody straight to its goal, or ``None`` to start with the whole team."""

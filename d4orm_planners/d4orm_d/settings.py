@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from d4orm_planners.d4orm import D4ormConfig
+from d4orm_planners.sampling.settings import Credit
 from d4orm_planners.settings import Count, Positive, Samples, Steps, one_of
 
 Decoupling = Annotated[str, one_of(("independent", "groups"))]
@@ -33,8 +34,9 @@ class D4ormDConfig(D4ormConfig):
         first_collisions: Whether the first iteration over the whole team minds collisions.
         repair_samples: ``M`` of an independent repair. A few are better than many: their error is a search of its own.
         repair_steps: ``N`` of an independent repair.
-        penalty: What a violation costs per step in an independent repair. At the paper's one it can be cheaper to brush
-            past a robot than to wait for it.
+        credit: Of iterations over the whole team.
+        penalty: What a violation costs per step in an independent repair, and 1 elsewhere. At the paper's one it can be
+            cheaper to brush past a robot than to wait for it.
     """
 
     big_team: Count | None = 32
@@ -44,6 +46,7 @@ class D4ormDConfig(D4ormConfig):
     first_collisions: bool = True
     repair_samples: Samples = 128
     repair_steps: Steps = 50
+    credit: Credit = "alternate"
     penalty: Positive = 3.0
 
 

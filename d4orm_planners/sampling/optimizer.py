@@ -48,7 +48,7 @@ class SamplingPlanner(Planner):
             credit = "team" if search.iteration % 2 else "robot"
         elif credit == "group":  # the rules sum the robots' rewards
             credit = "robot"
-        return SamplingTask(search.problem, base, credit=credit)
+        return SamplingTask(search.problem, base, credit=credit, penalty=self.config.penalty)
 
     def num_samples(self, search: Search) -> int:
         """``M`` of this iteration."""

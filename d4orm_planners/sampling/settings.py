@@ -32,11 +32,15 @@ class SamplingConfig(PlannerConfig):
             part of a sample by the robot's own reward, which keeps the signal from diluting with the number of robots;
             ``"alternate"`` does the second in the first iteration, the first in the next, and so on; ``"group"``
             weights by the reward of those that a robot was in conflict with, directly or by others, in the last plan.
+        penalty: What a violation of the margin costs a robot per step, 1 in the paper. A robot's own reward does not
+            tell what touching it costs the other, so that going through can be cheaper than making way; 2 makes up for
+            that.
     """
 
     num_samples: Samples = 1024
     num_steps: Steps = 100
     credit: Credit = "team"
+    penalty: Positive = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
