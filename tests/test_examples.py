@@ -225,6 +225,19 @@ def test_samples_are_counted_for_every_setting(tmp_path: Path) -> None:
     assert table(tmp_path / "again" / "fewer_samples.csv") == list(rows.values())
 
 
+def test_contacts_are_charged_by_every_credit(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("contact_penalty", out)
+    rows = table(out / "contact_penalty.csv")
+    assert len({(row["team"], row["credit, penalty"]) for row in rows}) == len(rows) == 4 * 8
+    # In its first iteration everybody is a group of its own.
+    by_credit = {(row["team"], row["credit, penalty"].partition(" (")[0]): row["travel time [s]"] for row in rows}
+    assert all(by_credit[team, "robot, 2"] == by_credit[team, "group, 2"] for team, _ in by_credit)
+    assert any(by_credit[team, "group, 1"] != by_credit[team, "group, 2"] for team, _ in by_credit)
+    completed("contact_penalty", tmp_path / "again", "--trials", str(out / "contact_penalty.parquet"))
+    assert table(tmp_path / "again" / "contact_penalty.csv") == rows
+
+
 @pytest.mark.slow
 def test_policies_meet_every_disturbance(tmp_path: Path) -> None:
     out = tmp_path / "out"
@@ -247,9 +260,9 @@ def test_policies_meet_every_disturbance(tmp_path: Path) -> None:
         ("disturbance_study", "disturbance_study disturbance_overview"),
         ("policy_rates", "policy_rates policy_rates_walls"),
         ("solve_rates", " ".join(["solve_rates", *(f"solve_rates_{name}" for name in SOLVE_RATES)])),
-        *((program, program) for program in ("ablation", "credit_by_update", "fewer_samples", "gradient_dilution",
-                                             "lifelong", "multimodality", "multimodality_team", "scaling",
-                                             "tune_learners", "warm_start")),
+        *((program, program) for program in ("ablation", "contact_penalty", "credit_by_update", "fewer_samples",
+                                             "gradient_dilution", "lifelong", "multimodality",
+                                             "multimodality_team", "scaling", "tune_learners", "warm_start")),
     ],
 )  # fmt: skip
 def test_the_tables_of_the_docs_are_those_of_the_data(tmp_path: Path, program: str, names: str) -> None:

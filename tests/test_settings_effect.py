@@ -76,7 +76,7 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "first_collisions": (False, TEAM),
     "repair_samples": (16, REPAIRING),
     "repair_steps": (9, REPAIRING),
-    "penalty": (0.5, REPAIRING),
+    "penalty": (0.5, {"max_iterations": 6, "repair_samples": 64, "repair_steps": 20}),
     "planner": ("d4orm-d", {}),
     "nodes": (3, {}),
     "selection": ("max", {"nodes": 4, "k": 4, "max_iterations": 4}),
