@@ -142,6 +142,27 @@ def test_robot_credit_learns_faster_than_team_credit() -> None:
     assert gained["robot"] > gained["team"] + 0.1
 
 
+def test_who_pays_for_both_sides_of_a_contact_makes_way() -> None:
+    # Fast drives cross each other between slower robots: going through costs each less than making way.
+    problem = make_problem("paper_heterogeneous", num_robots=8)
+    iterations = {
+        penalty: [
+            make_planner("d4orm", engine="cpu", penalty=penalty).solve(problem, seed=seed, max_iterations=8).iterations
+            for seed in range(6)
+        ]
+        for penalty in (1.0, 2.0)
+    }
+    assert np.mean(iterations[2.0]) < np.mean(iterations[1.0])
+    assert max(iterations[2.0]) < 8
+
+
+@pytest.mark.parametrize("name", ["d4orm", "i-mbd", "mbd", "mppi", "cem", "d4orm-d"])
+def test_a_violation_costs_what_is_asked(name: str) -> None:
+    search = Search(make_planner(name, engine="cpu", penalty=4.0), hop_problem(2), 0, None)
+    # D4orm-D's is that of its repairs.
+    assert search.planner.task(search, search.current.controls).penalty == (1.0 if name == "d4orm-d" else 4.0)
+
+
 def test_both_engines_plan_the_same() -> None:
     # Half a second, in which nobody comes near its goal or another: no reward jumps, so that rounding stays rounding.
     problem = hop_problem(2, horizon=5)
