@@ -28,7 +28,7 @@ from d4orm_planners.evaluation import pool as pool_module
 from d4orm_planners.evaluation import store as store_module
 from d4orm_planners.evaluation import trials as trials_module
 from d4orm_planners.evaluation.evaluate import run_study
-from d4orm_planners.evaluation.report import HEADER, markdown
+from d4orm_planners.evaluation.report import HEADER, markdown, read_parquet, write_parquet
 from d4orm_planners.evaluation.robustness import write_robustness
 from d4orm_planners.evaluation.store import APPLICATION_ID, STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
@@ -166,6 +166,31 @@ def test_a_store_of_the_version_before_is_read_as_it_is_and_goes_on(tmp_path: Pa
     assert not store.add(trial())
     assert store.add(trial(2))
     assert TrialStore.existing(path).trials() == [trial(), trial(1), trial(2)]
+
+
+@pytest.mark.parametrize(
+    ("config", "now"),
+    [
+        ('{"credit": "team", "num_steps": 9}', '{"credit": "team", "num_steps": 9, "penalty": 1.0}'),
+        ('{"credit": "team", "penalty": 3.0}', '{"credit": "team", "penalty": 3.0}'),
+        ('{"time_horizon": 2}', '{"time_horizon": 2}'),
+    ],
+)
+def test_settings_of_before_a_violation_had_a_price_are_those_with_its_former_one(
+    config: str, now: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "before.sqlite"
+    TrialStore(path).add(trial(config=config))
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("PRAGMA user_version = 8")
+    content = path.read_bytes()
+    store = TrialStore.existing(path)
+    assert (store.trials(), store.finished()) == ([trial(config=now)], {trial(config=now).key})
+    assert path.read_bytes() == content
+    assert not TrialStore(path).add(trial(config=now))
+    assert TrialStore.existing(path).trials() == [trial(config=now)]
+    write_parquet(tmp_path / "before.parquet", [trial(config=config)])
+    assert read_parquet(tmp_path / "before.parquet") == [trial(config=now)]
 
 
 LATER = ("stretch", "disturbances", "physics", "training_time")

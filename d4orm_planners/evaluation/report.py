@@ -10,7 +10,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from d4orm_env.core.files import replaced_when_done
-from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
+from d4orm_planners.evaluation.store import STORE, Trial, TrialStore, config_now
 from d4orm_planners.evaluation.summary import SuccessRate, SuccessWithin
 
 PARQUET_HINT = 'trials.parquet is not written, which needs pyarrow; install it with pip install "d4orm-env[evaluate]"'
@@ -97,8 +97,8 @@ def read_parquet(path: str | os.PathLike[str]) -> list[Trial]:
 
     try:
         rows = parquet.read_table(path).to_pylist()
-        return [Trial(**row) for row in rows]
-    except (pyarrow.ArrowInvalid, TypeError) as error:
+        return [Trial(**{**row, "config": config_now(row["config"])}) for row in rows]
+    except (pyarrow.ArrowInvalid, TypeError, KeyError) as error:
         raise ValueError(f"{os.fspath(path)} is no Parquet file of trials: {str(error).splitlines()[0]}") from error
 
 

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 
 APPLICATION_ID = 0x64346F72
 """Marks the file as one of ours, in its header ("d4or")."""
-VERSION = 8
-READABLE = (4, 5, 6, 7, VERSION)
-"""Of versions before some columns have other names, and some are missing."""
+VERSION = 9
+READABLE = (4, 5, 6, 7, 8, VERSION)
+"""Of versions before some columns have other names, and some, and a setting, are missing."""
 STORE = "trials.sqlite"
 """Name of the file in a folder of results."""
 LARGEST_NUMBER = 2**63 - 1
@@ -266,7 +266,8 @@ class TrialStore:
     def finished(self) -> set[TrialKey]:
         """Keys of all trials that ran to their end."""
         with self._connection() as connection:
-            return {TrialKey(*row) for row in connection.execute(f"SELECT {_KEY} FROM trials WHERE error = ''")}
+            rows = connection.execute(f"SELECT {_KEY} FROM (SELECT {_as_now(connection)} FROM trials) WHERE error = ''")
+            return {TrialKey(*row) for row in rows}
 
     @contextmanager
     def _connection(self) -> Iterator[sqlite3.Connection]:
@@ -296,7 +297,9 @@ class TrialStore:
         if self._read_only and not os.access(self.path.parent, os.W_OK) and not (log.exists() and log.stat().st_size):
             # SQLite cannot make the files that it keeps beside the store, and no writer has left anything in them.
             name += "?mode=ro&immutable=1"
-        return sqlite3.connect(name, uri=True, timeout=PATIENCE, isolation_level=None)
+        connection = sqlite3.connect(name, uri=True, timeout=PATIENCE, isolation_level=None)
+        connection.create_function("config_now", 1, config_now, deterministic=True)
+        return connection
 
     def _make(self, connection: sqlite3.Connection) -> None:
         """Make the table in a new file, or give one from before the columns of now."""
@@ -308,10 +311,10 @@ class TrialStore:
                 connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
                 connection.execute(f"PRAGMA user_version = {VERSION}")
             connection.execute("COMMIT")
-        elif _pragma(connection, "user_version") in READABLE and set(_NAMES) - _columns(connection):
+        elif _is_former(connection):
             connection.execute("BEGIN IMMEDIATE")
             # Another process may have been quicker.
-            if set(_NAMES) - _columns(connection):
+            if _is_former(connection):
                 # Columns of the key cannot be added.
                 connection.execute(f"CREATE TABLE anew {_TABLE}")
                 columns = f"({', '.join(_NAMES)})"
@@ -341,13 +344,30 @@ def _columns(connection: sqlite3.Connection) -> set[str]:
     return {row[1] for row in connection.execute("PRAGMA table_info(trials)")}
 
 
+def _is_former(connection: sqlite3.Connection) -> bool:
+    version = _pragma(connection, "user_version")
+    return version in READABLE and (version < VERSION or bool(set(_NAMES) - _columns(connection)))
+
+
 def _as_now(connection: sqlite3.Connection) -> str:
-    """The columns of now, taken from those that a file has."""
+    """The columns of now, taken from those that a file has, and its settings as they are now."""
     there = _columns(connection)
     former = {name: name if name in there else _FORMER.get(name, _FORMERLY.get(name, "NULL")) for name in _NAMES}
     # A column may have been missing in a file that has the names of now.
     found = {name: column if column in there or name not in _FORMER else "NULL" for name, column in former.items()}
+    if _pragma(connection, "user_version") < VERSION and "config" in there:
+        found["config"] = "config_now(config)"
     return ", ".join(f"{column} AS {name}" for name, column in found.items())
+
+
+def config_now(config: str | bytes | float | None) -> str | bytes | float | None:
+    """Settings of a trial, as JSON, with the one that sampling methods had not before version 9 and that meant this."""
+    if not isinstance(config, str) or '"credit": ' not in config or '"penalty": ' in config:
+        return config
+    try:
+        return json.dumps({**json.loads(config), "penalty": 1.0}, sort_keys=True)
+    except (ValueError, TypeError):  # damaged, which whoever reads it says
+        return config
 
 
 def _use_wal(connection: sqlite3.Connection) -> None:
