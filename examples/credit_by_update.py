@@ -113,11 +113,12 @@ def draw(teams: dict[str, Cells], path: Path) -> None:
                 steps = np.concatenate([[0], curve.costs, [budget]])
                 left = np.concatenate([[1.0], curve.unsolved])
                 axis.stairs(left, steps, baseline=None, label=update, color=f"C{number}")
-            axis.set(title=f"{team}, credit: {credit}", ylim=(-0.02, 1.02))
+            axis.set_ylim(-0.02, 1.02)
+        row[0].set_ylabel(f"{team}\nunsolved")
     for axis in axes[-1]:
         axis.set_xlabel("denoising steps")
-    for axis in axes[:, 0]:
-        axis.set_ylabel("unsolved")
+    for axis, credit in zip(axes[0], CREDITS, strict=True):
+        axis.set_title(f"credit: {credit}")
     axes[0, 0].legend()
     figure.tight_layout()
     save_figure(figure, path)
