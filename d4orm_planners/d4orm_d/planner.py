@@ -55,6 +55,7 @@ class D4ormD(D4orm):
             "start": "team",
             "first_collisions": False,
             "big_team": None,
+            "penalty": D4ormDConfig.penalty,  # of independent repairs, which it has not
         }
     }
     config: D4ormDConfig
