@@ -746,6 +746,7 @@ def test_the_paper_preset_is_algorithm_5_with_a_node_per_robot() -> None:
         "sync",
     )
     assert (inner.num_samples, inner.num_steps, inner.credit, inner.random_start) == (2048, 100, "team", False)
+    assert inner.penalty == 1.0
     assert inner.clip_between_iterations is False
     search = Search(make_planner("d-d4orm", preset="paper", engine="cpu", num_steps=2), hop_problem(3), 0, None)
     search.advance()

@@ -45,6 +45,7 @@ class DD4orm(Planner):
     presets: ClassVar = {
         "paper": {
             **D4ormD.presets["paper"],
+            "penalty": 1.0,
             "clip_between_iterations": False,
             "num_samples": 2048,
             "planner": "d4orm",
