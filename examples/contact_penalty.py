@@ -17,11 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from outputs import argument_parser, count, save_table, trials_argument
+from outputs import argument_parser, count, measured_trials, save_table, trials_argument
 
 from d4orm_planners.evaluation.comparison import paired, penalised_steps, steps_to_solution
 from d4orm_planners.evaluation.evaluate import run_study
-from d4orm_planners.evaluation.report import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import wilson_interval
@@ -91,12 +90,11 @@ def main() -> int:
     parser.add_argument("--seeds", type=count, default=50)
     trials_argument(parser)
     arguments = parser.parse_args()
-    if arguments.trials is not None:
-        trials = read_parquet(arguments.trials)
-    else:
-        tiny: tuple[Any, ...] = (2, 1, {"max_iterations": 1, "num_steps": 20})
-        trials = run(*tiny if arguments.quick else (NUM_ROBOTS, arguments.seeds, {}), out=arguments.out)
-        write_parquet(arguments.out / "contact_penalty.parquet", trials)
+    tiny: tuple[Any, ...] = (2, 1, {"max_iterations": 1, "num_steps": 20})
+    size = tiny if arguments.quick else (NUM_ROBOTS, arguments.seeds, {})
+    trials = measured_trials(
+        arguments.trials, lambda: run(*size, out=arguments.out), arguments.out / "contact_penalty.parquet"
+    )
     teams: dict[str, list[Trial]] = {}
     for trial in trials:
         teams.setdefault(f"{trial.scenario}, {trial.model}", []).append(trial)

@@ -18,11 +18,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from outputs import argument_parser, count, save_table, trials_argument
+from outputs import argument_parser, count, measured_trials, save_table, trials_argument
 
 from d4orm_planners.evaluation.comparison import paired, penalised_steps, steps_to_solution
 from d4orm_planners.evaluation.evaluate import run_study
-from d4orm_planners.evaluation.report import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import wilson_interval
@@ -93,12 +92,11 @@ def main() -> int:
     parser.add_argument("--seeds", type=count, default=50)
     trials_argument(parser)
     arguments = parser.parse_args()
-    if arguments.trials is not None:
-        trials = read_parquet(arguments.trials)
-    else:
-        tiny: tuple[Any, ...] = ((2,), 1, {"max_iterations": 1})
-        trials = run(*tiny if arguments.quick else (TEAMS, arguments.seeds, {}), out=arguments.out)
-        write_parquet(arguments.out / "fewer_samples.parquet", trials)
+    tiny: tuple[Any, ...] = ((2,), 1, {"max_iterations": 1})
+    size = tiny if arguments.quick else (TEAMS, arguments.seeds, {})
+    trials = measured_trials(
+        arguments.trials, lambda: run(*size, out=arguments.out), arguments.out / "fewer_samples.parquet"
+    )
     rows = []
     for num_robots in sorted({trial.num_robots for trial in trials}):
         team = [trial for trial in trials if trial.num_robots == num_robots]

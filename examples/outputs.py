@@ -20,8 +20,8 @@ import matplotlib.pyplot as plt
 
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners._machine import commit, describe_machine
-from d4orm_planners.evaluation.report import read_parquet
-from d4orm_planners.evaluation.store import STORE, TrialStore
+from d4orm_planners.evaluation.report import read_parquet, write_parquet
+from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
 
 COLOURS = {"d4orm": "#0072B2", "default": "#56B4E9", "mppi": "#D55E00", "cem": "#009E73", "i-mbd": "#CC79A7"}
 """One colour per method in every plot, told apart by the colour-blind too."""
@@ -65,6 +65,15 @@ def stored(trials: Path | None, folder: Path) -> None:
     if trials is not None:
         folder.mkdir(parents=True, exist_ok=True)
         TrialStore(folder / STORE).add(*read_parquet(trials))
+
+
+def measured_trials(trials: Path | None, measure: Callable[[], list[Trial]], path: Path) -> list[Trial]:
+    """The trials of the Parquet file ``trials``, or without it those of ``measure()``, written to ``path``."""
+    if trials is not None:
+        return read_parquet(trials)
+    found = measure()
+    write_parquet(path, found)
+    return found
 
 
 def existing_file(text: str) -> Path:
