@@ -16,14 +16,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from outputs import argument_parser, count, measured_trials, save_table, trials_argument
+from outputs import argument_parser, count, first_solutions, measured_trials, save_table, trials_argument
 
-from d4orm_planners.evaluation.comparison import paired, penalised_steps, steps_to_solution
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
-from d4orm_planners.evaluation.summary import wilson_interval
 
 TEAMS: Sequence[tuple[str, dict[str, Any]]] = (
     ("paper_circle", {"model": "holonomic2d"}),
@@ -45,24 +42,6 @@ SETTINGS: dict[str, dict[str, Any]] = {
     for penalty in penalties
 }
 DEFAULT = "group, 2"
-
-
-def rows_of(team: str, groups: dict[str, list[Trial]]) -> list[dict[str, Any]]:
-    """A row per setting."""
-    rows = []
-    for label, trials in groups.items():
-        solved = sum(steps_to_solution(trial) is not None for trial in trials)
-        lower, upper = wilson_interval(solved, len(trials))
-        travel = [trial.travel_time for trial in trials if trial.success and trial.travel_time is not None]
-        test = paired(trials, groups[DEFAULT], penalised_steps)
-        rows.append(
-            {"team": team, "credit, penalty": f"{label} (default)" if label == DEFAULT else label,
-             "solved": f"{solved} of {len(trials)}", "interval": f"{lower:.0%} to {upper:.0%}",
-             "steps": round(float(np.mean([*map(penalised_steps, trials)]))),
-             "travel time [s]": f"{np.mean(travel):.2f}" if travel else "-",
-             "p (solved)": f"{test.success_p:.2g}", "p (steps)": f"{test.cost_p:.2g}"}
-        )  # fmt: skip
-    return rows
 
 
 def run(num_robots: int, seeds: int, own: dict[str, Any], out: Path) -> list[Trial]:
@@ -100,7 +79,11 @@ def main() -> int:
         teams.setdefault(f"{trial.scenario}, {trial.model}", []).append(trial)
     rows = []
     for team, members in teams.items():
-        rows += rows_of(team, {label: [one for one in members if one.label == label] for label in SETTINGS})
+        groups = {
+            f"{label} (default)" if label == DEFAULT else label: [one for one in members if one.label == label]
+            for label in SETTINGS
+        }
+        rows += first_solutions(team, "credit, penalty", groups, f"{DEFAULT} (default)")
     save_table(rows, arguments.out / "contact_penalty.csv")
     return 0
 

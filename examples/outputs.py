@@ -20,8 +20,10 @@ import matplotlib.pyplot as plt
 
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners._machine import commit, describe_machine
+from d4orm_planners.evaluation.comparison import paired, penalised_steps, steps_to_solution
 from d4orm_planners.evaluation.report import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
+from d4orm_planners.evaluation.summary import wilson_interval
 
 COLOURS = {"d4orm": "#0072B2", "default": "#56B4E9", "mppi": "#D55E00", "cem": "#009E73", "i-mbd": "#CC79A7"}
 """One colour per method in every plot, told apart by the colour-blind too."""
@@ -74,6 +76,28 @@ def measured_trials(trials: Path | None, measure: Callable[[], list[Trial]], pat
     found = measure()
     write_parquet(path, found)
     return found
+
+
+def first_solutions(team: str, column: str, groups: dict[str, list[Trial]], reference: str) -> list[dict[str, Any]]:
+    """A row for each label of ``groups``, in ``column``: success, denoising steps, travel time, and tests.
+
+    Tests are against the label ``reference``: McNemar on successes, Wilcoxon on steps, paired by seed. A trial without a
+    solution counts twice its budget of steps (PAR-2).
+    """
+    rows = []
+    for label, trials in groups.items():
+        solved = sum(steps_to_solution(trial) is not None for trial in trials)
+        lower, upper = wilson_interval(solved, len(trials))
+        travel = [trial.travel_time for trial in trials if trial.success and trial.travel_time is not None]
+        test = paired(trials, groups[reference], penalised_steps)
+        rows.append(
+            {"team": team, column: label, "solved": f"{solved} of {len(trials)}",
+             "interval": f"{lower:.0%} to {upper:.0%}",
+             "steps": round(float(np.mean([*map(penalised_steps, trials)]))),
+             "travel time [s]": f"{np.mean(travel):.2f}" if travel else "-",
+             "p (solved)": f"{test.success_p:.2g}", "p (steps)": f"{test.cost_p:.2g}"}
+        )  # fmt: skip
+    return rows
 
 
 def existing_file(text: str) -> Path:
