@@ -5,7 +5,7 @@
 Four teams of 16, D4orm's defaults but for `credit` and `penalty`, at most 20 iterations. The table has success with its
 95% interval (Wilson), the mean number of denoising steps to the first solution, a trial without one counting twice the
 budget (PAR-2), the mean travel time of the solutions, and how likely it is that a row and the defaults are equally good
-(McNemar on successes, Wilcoxon on steps, paired by seed). Trials are stored in the folder, and a call that was broken
+(McNemar on solutions, Wilcoxon on steps, paired by seed). Trials are stored in the folder, and a call that was broken
 off goes on from there. `--trials FILE` makes the table of trials that are in a Parquet file, such as those in `data/`.
 """
 

@@ -8,7 +8,7 @@ that touch. Update: MPPI, CEM with adaptive variance, MBD, i-MBD or D4orm, every
 paper's. Every trial has the same budget of denoising steps of 1024 samples, which MBD spends in one iteration (so that
 its credit by groups, or in turn, is credit by robot). The table has success with its 95% interval (Wilson), the mean
 number of steps to the first solution, a trial without one counting twice the budget (PAR-2), and how likely it is that
-the cell and D4orm with the same credit are equally good (McNemar on successes, Wilcoxon on steps, paired by seed).
+the cell and D4orm with the same credit are equally good (McNemar on solutions, Wilcoxon on steps, paired by seed).
 Trials are stored in the folder, and a call that was broken off goes on from there. `--go-on-from FILE` takes trials
 from a Parquet file, such as `data/credit_by_update.parquet`; `--trials FILE` makes the table and the curves of one.
 """
@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from outputs import argument_parser, count, go_on_argument, plt, save_figure, save_table, stored, trials_argument
 
-from d4orm_planners.evaluation.comparison import paired, penalised_steps, steps_to_solution, survival
+from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_steps, steps_to_solution, survival
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.report import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import Trial
@@ -89,9 +89,9 @@ def rows_of(team: str, cells: Cells) -> list[dict[str, Any]]:
     rows = []
     for update, credit in ((update, credit) for update in UPDATES for credit in CREDITS):
         trials = cells[update, credit]
-        solved = sum(steps_to_solution(trial) is not None for trial in trials)
+        solved = sum(map(is_solved, trials))
         lower, upper = wilson_interval(solved, len(trials))
-        test = paired(trials, cells[REFERENCE, credit], penalised_steps)
+        test = paired(trials, cells[REFERENCE, credit], penalised_steps, is_solved)
         rows.append(
             {"team": team, "update": update, "credit": credit, "solved": f"{solved} of {len(trials)}",
              "interval": f"{lower:.0%} to {upper:.0%}", "steps": round(float(np.mean([*map(penalised_steps, trials)]))),

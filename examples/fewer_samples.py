@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from outputs import argument_parser, count, measured_trials, save_table, trials_argument
 
-from d4orm_planners.evaluation.comparison import paired, penalised_steps, steps_to_solution
+from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_steps
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
@@ -60,10 +60,10 @@ def rows_of(num_robots: int, groups: dict[str, list[Trial]]) -> list[dict[str, A
     """A row per setting."""
     rows = []
     for label, trials in groups.items():
-        solved = sum(steps_to_solution(trial) is not None for trial in trials)
+        solved = sum(map(is_solved, trials))
         lower, upper = wilson_interval(solved, len(trials))
         quartiles = np.percentile([cost(trial) for trial in trials], (25, 50, 75)) / 1000
-        travel = [trial.travel_time for trial in trials if trial.success and trial.travel_time is not None]
+        travel = [trial.travel_time for trial in trials if is_solved(trial) and trial.travel_time is not None]
         rows.append(
             {"robots": num_robots, "steps x samples": label, "solved": f"{solved} of {len(trials)}",
              "interval": f"{lower:.0%} to {upper:.0%}", "1000 samples": f"{quartiles[1]:.0f}",

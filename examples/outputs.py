@@ -20,7 +20,7 @@ import matplotlib.pyplot as plt
 
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners._machine import commit, describe_machine
-from d4orm_planners.evaluation.comparison import paired, penalised_steps, steps_to_solution
+from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_steps
 from d4orm_planners.evaluation.report import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
 from d4orm_planners.evaluation.summary import wilson_interval
@@ -81,17 +81,17 @@ def measured_trials(trials: Path | None, measure: Callable[[], list[Trial]], pat
 def first_solutions(team: str, column: str, groups: dict[str, list[Trial]], reference: str) -> list[dict[str, Any]]:
     """A row for each label of ``groups``, in ``column``: success, denoising steps, travel time, and tests.
 
-    Tests are against the label ``reference``: McNemar on successes, Wilcoxon on steps, paired by seed. A trial without a
-    solution counts twice its budget of steps (PAR-2).
+    Tests are against the label ``reference``: McNemar on solutions, Wilcoxon on steps, paired by seed. A trial without
+    a solution counts twice its budget of steps (PAR-2).
     """
     rows = []
     for label, trials in groups.items():
-        solved = sum(steps_to_solution(trial) is not None for trial in trials)
-        lower, upper = wilson_interval(solved, len(trials))
-        travel = [trial.travel_time for trial in trials if trial.success and trial.travel_time is not None]
-        test = paired(trials, groups[reference], penalised_steps)
+        solved = [trial for trial in trials if is_solved(trial)]
+        lower, upper = wilson_interval(len(solved), len(trials))
+        travel = [trial.travel_time for trial in solved if trial.travel_time is not None]
+        test = paired(trials, groups[reference], penalised_steps, is_solved)
         rows.append(
-            {"team": team, column: label, "solved": f"{solved} of {len(trials)}",
+            {"team": team, column: label, "solved": f"{len(solved)} of {len(trials)}",
              "interval": f"{lower:.0%} to {upper:.0%}",
              "steps": round(float(np.mean([*map(penalised_steps, trials)]))),
              "travel time [s]": f"{np.mean(travel):.2f}" if travel else "-",

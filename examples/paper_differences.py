@@ -6,7 +6,7 @@
 setting of the defaults in turn, or with what the paper leaves open decided otherwise, and the defaults with one setting
 of the preset in turn. The table has success with its 95% interval (Wilson), the mean number of denoising steps to the
 first solution, a trial without one counting twice the budget (PAR-2), the mean travel time of the solutions, and how
-likely it is that a row and the first of its kind are equally good (McNemar on successes, Wilcoxon on steps, paired by
+likely it is that a row and the first of its kind are equally good (McNemar on solutions, Wilcoxon on steps, paired by
 seed). Trials are stored in the folder, and a call that was broken off goes on from there. `--trials FILE` makes the
 table of trials that are in a Parquet file, such as those in `data/`.
 """

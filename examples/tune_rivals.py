@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from outputs import argument_parser, count, save_table, trials_argument
 
-from d4orm_planners.evaluation.comparison import penalised_steps, steps_to_solution
+from d4orm_planners.evaluation.comparison import is_solved, penalised_steps
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.report import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import Trial, TrialStore
@@ -120,7 +120,7 @@ def rows_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:
     for (method, config), group in groups.items():
         settings = json.loads(config)
         steps = float(np.mean([penalised_steps(trial) for trial in group]))
-        solved = sum(steps_to_solution(trial) is not None for trial in group)
+        solved = sum(map(is_solved, group))
         rows.append(
             {"method": method, "trials": len(group), "solved": solved, "steps": round(steps, 1),
              "settings": ", ".join(f"{name}={settings[name]}" for name in SPACES[method])}

@@ -44,6 +44,15 @@ def test_the_tests_are_mcnemars_and_wilcoxons() -> None:
     assert (turned.success_p, turned.cost_p) == (found.success_p, found.cost_p)
 
 
+def test_what_success_is_may_be_said() -> None:
+    first, second = trials([1, 2, None]), trials([3, 4, 5])
+    assert paired(first, second, spent).only_second == 1
+    found = paired(first, second, spent, lambda trial: spent(trial) < 5)
+    assert (found.only_first, found.only_second) == (0, 0)
+    found = paired(first, second, spent, lambda trial: spent(trial) < 3)
+    assert (found.only_first, found.only_second, found.success_p) == (2, 0, 0.5)
+
+
 def test_only_what_both_met_counts() -> None:
     first, second = trials([1, 2, None, 3]), trials([1, 2, None])[1:] + trials([5], problem="sphere")
     found = paired(first, second, spent)

@@ -246,7 +246,8 @@ def test_defaults_and_the_paper_differ_by_one_setting_at_a_time(tmp_path: Path) 
     assert len({(row["team"], row["settings"]) for row in rows}) == len(rows) == 2 * 12
     trials = read_parquet(out / "paper_differences.parquet")
     configs = {trial.label: json.loads(trial.config) for trial in trials}
-    assert configs["preset paper"]["num_samples"] == 1024 and configs["defaults"]["credit"] == "group"
+    assert configs["preset paper"]["num_samples"] == 1024
+    assert configs["defaults"]["credit"] == "group"
     for reference, kind in (("preset paper", "preset"), ("defaults", "defaults")):
         others = [label for label in configs if label.startswith(f"{kind}, ")]
         changed = [{key for key, value in configs[one].items() if value != configs[reference][key]} for one in others]
@@ -282,7 +283,8 @@ def test_policies_meet_every_disturbance(tmp_path: Path) -> None:
         ("solve_rates", " ".join(["solve_rates", *(f"solve_rates_{name}" for name in SOLVE_RATES)])),
         *((program, program) for program in ("ablation", "contact_penalty", "credit_by_update", "fewer_samples",
                                              "gradient_dilution", "lifelong", "multimodality",
-                                             "multimodality_team", "paper_differences", "scaling", "tune_learners", "warm_start")),
+                                             "multimodality_team", "paper_differences", "scaling", "tune_learners",
+                                             "warm_start")),
     ],
 )  # fmt: skip
 def test_the_tables_of_the_docs_are_those_of_the_data(tmp_path: Path, program: str, names: str) -> None:

@@ -357,6 +357,12 @@ def test_policies_are_compared_with_the_reference_trial_by_trial() -> None:
     assert "| mppi | 8 | 6 | 0 | 1 | 1 | +3.50 | 0.031 |" in page
     assert page.count("| mppi | 8 | 6 |") == 1, "where the reference is"
     assert "Compared with" not in markdown(figure(), groups)
+    # Within the margin, though nothing is touched: no solution, in this table as in that of success.
+    rival[5] = replace(rival[5], success=True)
+    groups = [Group("Circle", "d4orm", ours), Group("Circle", "mppi", rival)]
+    page = markdown(figure(reference="d4orm"), groups)
+    assert "| success | mppi | 5 of 6 (44% to 97%) |" in page
+    assert "| mppi | 8 | 6 | 0 | 1 | 1 | +3.50 | 0.031 |" in page
     slower = [replace(one, travel_time=one.travel_time + 0.5) for one in ours]
     groups = [Group("Circle", "d4orm", ours), Group("Circle", "mppi", slower)]
     page = markdown(figure(reference="d4orm", compared_by="travel_time", across="policy"), groups)

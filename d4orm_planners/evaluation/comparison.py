@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from operator import attrgetter
 
 import numpy as np
 
@@ -38,13 +39,20 @@ class Paired:
     cost_p: float
 
 
-def paired(first: Sequence[Trial], second: Sequence[Trial], cost: Callable[[Trial], float]) -> Paired:
+def paired(
+    first: Sequence[Trial],
+    second: Sequence[Trial],
+    cost: Callable[[Trial], float],
+    succeeded: Callable[[Trial], bool] = attrgetter("success"),
+) -> Paired:
     """Compare two policies by the trials that they have in common.
 
     Args:
         first: Trials of one policy.
         second: Trials of another.
         cost: What counts, less being better, such as steps to the first solution with twice the budget for none.
+        succeeded: What success is; by default that everyone arrived and nothing was touched. A plan that touches
+            nothing and does not keep the margin is no solution, see :func:`is_solved`.
 
     Raises:
         ValueError: If they have none in common.
@@ -54,8 +62,9 @@ def paired(first: Sequence[Trial], second: Sequence[Trial], cost: Callable[[Tria
     common = in_common(first, second)
     if not common:
         raise ValueError("the two policies have no problem, seed and noise in common; give trials of the same study")
-    only_first = sum(one.success and not other.success for one, other in common)
-    only_second = sum(other.success and not one.success for one, other in common)
+    wins = [(succeeded(one), succeeded(other)) for one, other in common]
+    only_first = sum(one and not other for one, other in wins)
+    only_second = sum(other and not one for one, other in wins)
     differences = np.array([cost(one) - cost(other) for one, other in common])
     moved = differences[differences != 0]
     return Paired(
@@ -206,6 +215,11 @@ def steps_to_solution(trial: Trial) -> int | None:
     if first is not None and first.steps is not None:
         return first.steps
     return steps_spent(trial) if trial.status == "solved" else None
+
+
+def is_solved(trial: Trial) -> bool:
+    """Whether a sampling planner found a solution: everyone arrives, the margin is kept and ``verify()`` agrees."""
+    return steps_to_solution(trial) is not None
 
 
 def steps_spent(trial: Trial) -> int | None:

@@ -100,7 +100,7 @@ def _pairs(figure: Figure, groups: Sequence[Group]) -> list[str]:
         others = placed.get((section, str(figure.reference) if one_column else place, str(figure.reference)))
         if others is None or label == figure.reference:
             continue
-        test = paired(trials, others, _cost(figure, [*trials, *others]))
+        test = paired(trials, others, _cost(figure, [*trials, *others]), lambda one: first_solution(one) is not None)
         counts = (str(count) for count in (test.pairs, test.only_first, test.only_second))
         blocks.setdefault(section, []).append(
             (label, *[place] * (not one_column), *counts, f"{test.success_p:.2g}", f"{test.difference:+.2f}",
