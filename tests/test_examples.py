@@ -19,6 +19,7 @@ from d4orm_env import make_problem
 from d4orm_env.joint_state import JointState
 from d4orm_planners import Plan
 from d4orm_planners.evaluation.report import read_parquet
+from d4orm_planners.sampling.tuned import TUNED
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
@@ -257,6 +258,24 @@ def test_defaults_and_the_paper_differ_by_one_setting_at_a_time(tmp_path: Path) 
         )  # fmt: skip
     completed("paper_differences", tmp_path / "again", "--trials", str(out / "paper_differences.parquet"))
     assert table(tmp_path / "again" / "paper_differences.csv") == rows
+
+
+def test_rivals_meet_the_same_seeds_tuned_and_as_the_paper_has_them(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("tuned_rivals", out)
+    rows = table(out / "tuned_rivals.csv")
+    methods = [row["method"] for row in rows]
+    assert set(methods) >= {"d4orm, defaults", "mbd, tuned", *(f"{name}, paper" for name in TUNED if name != "mbd")}
+    assert len(methods) == len(set(methods))
+    assert [row["p (steps)"] for row in rows if row["method"] == "d4orm, tuned"] == ["1"]
+    configs = {trial.label: json.loads(trial.config) for trial in read_parquet(out / "tuned_rivals.parquet")}
+    assert {config["num_steps"] * config["max_iterations"] for config in configs.values()} == {20}
+    for label, tuned in (("d4orm, tuned", TUNED["d4orm"]), ("cem, tuned", TUNED["cem"])):
+        assert {key: configs[label][key] for key in tuned if key != "num_steps"} == {
+            key: value for key, value in tuned.items() if key != "num_steps"
+        }
+    completed("tuned_rivals", tmp_path / "again", "--trials", str(out / "tuned_rivals.parquet"))
+    assert table(tmp_path / "again" / "tuned_rivals.csv") == rows
 
 
 @pytest.mark.slow
