@@ -24,7 +24,7 @@ from outputs import argument_parser, count, save_table, trials_argument
 from d4orm_planners.evaluation.comparison import is_solved, penalised_steps
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.report import read_parquet, write_parquet
-from d4orm_planners.evaluation.store import Trial, TrialStore
+from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
 
 TEAMS = (("paper_circle", 8), ("paper_random", 16), ("paper_heterogeneous", 8), ("paper_obstacles", 8))
@@ -86,29 +86,35 @@ def policy(method: str, settings: Settings, budget: int) -> Settings:
     return {**chosen, "max_iterations": budget // chosen["num_steps"]}
 
 
-def scores(method: str, chosen: Sequence[Settings], seeds: int, budget: int, out: Path) -> list[float]:
-    """Of each of these settings the mean number of steps needed, over all teams and seeds."""
+def run(method: str, chosen: Sequence[Settings], seeds: int, budget: int, out: Path) -> list[list[Trial]]:
+    """The trials of each of these settings, of all teams and seeds."""
     policies = {f"{method} {index}": policy(method, settings, budget) for index, settings in enumerate(chosen)}
-    needed: dict[str, list[int]] = {label: [] for label in policies}
+    found: dict[str, list[Trial]] = {label: [] for label in policies}
     for scenario, num_robots in TEAMS:
         study = Study(
             policies=policies, scenarios=(scenario,), num_robots=num_robots, seeds=range(FIRST_SEED, FIRST_SEED + seeds)
         )
         for label, trials, *_ in run_study(study, out, workers=1):
-            needed[label] += map(penalised_steps, trials)
-    return [float(np.mean(values)) for values in needed.values()]
+            found[label] += trials
+    return list(found.values())
 
 
-def tune(method: str, number: int, seeds: int, budget: int, out: Path) -> None:
-    """Run all rounds of a method."""
+def tune(method: str, number: int, seeds: int, budget: int, out: Path) -> list[Trial]:
+    """Run all rounds of a method; the trials of all settings, each of its last round, which has those before."""
     chosen = candidates(method, number)
+    trials: list[Trial] = []
     for turn in range(ROUNDS):
-        found = scores(method, chosen, seeds << turn, budget, out)
-        order = np.argsort(found, kind="stable")
+        found = run(method, chosen, seeds << turn, budget, out)
+        needed = [float(np.mean([*map(penalised_steps, group)])) for group in found]
+        order = np.argsort(needed, kind="stable")
         print(
-            f"{method}, round {turn + 1}: {found[order[0]]:g} steps with {chosen[order[0]] or 'the preset'}", flush=True
+            f"{method}, round {turn + 1}: {needed[order[0]]:g} steps with {chosen[order[0]] or 'the preset'}",
+            flush=True,
         )
-        chosen = [chosen[i] for i in order[: max(1, round(KEPT * len(chosen)))]]
+        kept = order[: max(1, round(KEPT * len(chosen)))] if turn < ROUNDS - 1 else []
+        trials += [trial for index, group in enumerate(found) if index not in kept for trial in group]
+        chosen = [chosen[index] for index in kept]
+    return trials
 
 
 def rows_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:
@@ -139,9 +145,8 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.trials is None:
         number, seeds, budget = (2, 1, TINY) if arguments.quick else (arguments.candidates, arguments.seeds, BUDGET)
-        for method in arguments.method or SPACES:
-            tune(method, number, seeds, budget, arguments.out)
-        trials = TrialStore.existing(arguments.out).trials()
+        methods = arguments.method or SPACES
+        trials = [trial for method in methods for trial in tune(method, number, seeds, budget, arguments.out)]
         write_parquet(arguments.out / "tuning.parquet", trials)
     else:
         trials = read_parquet(arguments.trials)
