@@ -7,7 +7,8 @@ with the same seeds; the better third meets twice as many, and a third of that f
 K. Jamieson and A. Talwalkar, AISTATS 2016). A trial has a budget of denoising steps of 1024 samples. What counts is the
 mean number of steps to the first solution, a trial without one counting twice the budget (PAR-2). Seeds are 100 and up:
 evaluations use those below. Trials are stored in the folder, and a call that was broken off goes on from there.
-`--trials FILE` makes the table of trials that are in a Parquet file, such as those in `data/`.
+`--trials FILE` makes the tables, of all settings and of the best, of trials that are in a Parquet file, such as those
+in `data/`.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from outputs import argument_parser, count, save_table, trials_argument
 
+from d4orm_planners import make_planner
 from d4orm_planners.evaluation.comparison import is_solved, penalised_steps
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.report import read_parquet, write_parquet
@@ -117,6 +119,11 @@ def tune(method: str, number: int, seeds: int, budget: int, out: Path) -> list[T
     return trials
 
 
+def described(method: str, settings: Mapping[str, Any]) -> str:
+    """What is tuned of these settings."""
+    return ", ".join(f"{name}={settings[name]}" for name in SPACES[method])
+
+
 def rows_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:
     """A row per method and settings: those that came furthest first, and of these the best."""
     groups: dict[tuple[str, str], list[Trial]] = {}
@@ -129,10 +136,21 @@ def rows_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:
         solved = sum(map(is_solved, group))
         rows.append(
             {"method": method, "trials": len(group), "solved": solved, "steps": round(steps, 1),
-             "settings": ", ".join(f"{name}={settings[name]}" for name in SPACES[method])}
+             "settings": described(method, settings)}
         )  # fmt: skip
     order = list(SPACES)
     return sorted(rows, key=lambda row: (order.index(row["method"]), -row["trials"], row["steps"], row["settings"]))
+
+
+def shortlist(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Of every method the settings that came furthest, and the preset."""
+    furthest: dict[str, int] = {}
+    for row in rows:
+        furthest[row["method"]] = max(row["trials"], furthest.get(row["method"], 0))
+    presets = {name: described(name, make_planner(name, preset="paper").config.keywords()) for name in furthest}
+    return [
+        row for row in rows if row["trials"] == furthest[row["method"]] or row["settings"] == presets[row["method"]]
+    ]
 
 
 def main() -> int:
@@ -150,7 +168,9 @@ def main() -> int:
         write_parquet(arguments.out / "tuning.parquet", trials)
     else:
         trials = read_parquet(arguments.trials)
-    save_table(rows_of(trials), arguments.out / "tuning.csv")
+    rows = rows_of(trials)
+    save_table(rows, arguments.out / "tuning.csv")
+    save_table(shortlist(rows), arguments.out / "tuning_best.csv")
     return 0
 
 

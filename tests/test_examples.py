@@ -189,6 +189,7 @@ def test_rivals_are_tuned_and_a_second_call_runs_nothing(tmp_path: Path) -> None
     # Two settings at first, on four teams; the better one goes on to four seeds.
     assert [(row["method"], row["trials"]) for row in rows] == [("cem", "16"), ("cem", "4")]
     assert sum(row["settings"].startswith("sigma=1.0, elite_fraction=0.05, adapt_variance=False") for row in rows) == 1
+    assert table(out / "tuning_best.csv") == rows
     trials = (out / "trials.sqlite").read_bytes()
     completed("tune_rivals", out, "--method", "cem")
     assert (out / "trials.sqlite").read_bytes() == trials
@@ -296,7 +297,7 @@ def test_policies_meet_every_disturbance(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("program", "names"),
     [
-        ("tune_rivals", "tuning"),
+        ("tune_rivals", "tuning tuning_best"),
         ("disturbance_study", "disturbance_study disturbance_overview"),
         ("policy_rates", "policy_rates policy_rates_walls"),
         ("solve_rates", " ".join(["solve_rates", *(f"solve_rates_{name}" for name in SOLVE_RATES)])),
