@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 EXTRAS ?= dev,rl,ipopt
 PYTEST_ARGS ?=
 STUDIES := ablation contact_penalty credit_by_update disturbance_study fewer_samples gradient_dilution imitate_expert lifelong \
-  multimodality multimodality_team paper_differences policy_rates scaling solve_rates tune_learners warm_start
+  multimodality multimodality_team paper_differences policy_rates scaling solve_rates tune_learners tuned_rivals warm_start
 FIGURES := amswarm coarseness nodes noise-schedule robustness selections team-size
 
 # A stamp is as new as the last install that succeeded, so an install is repeated only when what it reads has changed.
