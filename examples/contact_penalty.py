@@ -16,9 +16,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from outputs import argument_parser, count, first_solutions, measured_trials, save_table, trials_argument
+from outputs import argument_parser, count, first_solutions, measured_trials, save_table, trials_argument, trials_of
 
-from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
 
@@ -60,7 +59,7 @@ def run(num_robots: int, seeds: int, own: dict[str, Any], out: Path) -> list[Tri
         )
         for scenario, own_model in TEAMS
     )
-    return [trial for study in studies for group in run_study(study, out, workers=1) for trial in group.trials]
+    return trials_of(studies, out)
 
 
 def main() -> int:

@@ -21,10 +21,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from outputs import argument_parser, count, go_on_argument, plt, save_figure, save_table, stored, trials_argument
+from outputs import (
+    argument_parser,
+    count,
+    go_on_argument,
+    plt,
+    save_figure,
+    save_table,
+    stored,
+    trials_argument,
+    trials_of,
+)
 
 from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_steps, steps_to_solution, survival
-from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.report import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
@@ -72,7 +81,7 @@ def run(teams: Iterable[tuple[str, int]], seeds: int, budget: int, out: Path) ->
         Study(policies=chosen, scenarios=(scenario,), num_robots=num_robots, seeds=range(seeds))
         for scenario, num_robots in teams
     )
-    return [trial for study in studies for group in run_study(study, out, workers=1) for trial in group.trials]
+    return trials_of(studies, out)
 
 
 def by_team(trials: Iterable[Trial]) -> dict[str, Cells]:

@@ -18,10 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from outputs import argument_parser, count, measured_trials, save_table, trials_argument
+from outputs import argument_parser, count, measured_trials, save_table, trials_argument, trials_of
 
 from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_steps
-from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import wilson_interval
@@ -83,7 +82,7 @@ def run(teams: Sequence[int], seeds: int, own: dict[str, Any], out: Path) -> lis
     study = Study(
         policies=policies, scenarios=("circle",), num_robots=teams, seeds=range(FIRST_SEED, FIRST_SEED + seeds)
     )
-    return [trial for group in run_study(study, out, workers=1) for trial in group.trials]
+    return trials_of([study], out)
 
 
 def main() -> int:

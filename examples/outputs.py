@@ -6,7 +6,7 @@ import argparse
 import csv
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -21,8 +21,10 @@ import matplotlib.pyplot as plt
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners._machine import commit, describe_machine
 from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_steps
+from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.report import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
+from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import wilson_interval
 
 COLOURS = {"d4orm": "#0072B2", "default": "#56B4E9", "mppi": "#D55E00", "cem": "#009E73", "i-mbd": "#CC79A7"}
@@ -67,6 +69,11 @@ def stored(trials: Path | None, folder: Path) -> None:
     if trials is not None:
         folder.mkdir(parents=True, exist_ok=True)
         TrialStore(folder / STORE).add(*read_parquet(trials))
+
+
+def trials_of(studies: Iterable[Study], out: Path) -> list[Trial]:
+    """Run studies one after the other in this process; their trials are kept in the folder ``out``."""
+    return [trial for study in studies for group in run_study(study, out, workers=1) for trial in group.trials]
 
 
 def measured_trials(trials: Path | None, measure: Callable[[], list[Trial]], path: Path) -> list[Trial]:

@@ -18,9 +18,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from outputs import argument_parser, count, first_solutions, measured_trials, save_table, trials_argument
+from outputs import argument_parser, count, first_solutions, measured_trials, save_table, trials_argument, trials_of
 
-from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
 
@@ -67,7 +66,7 @@ def run(sizes: Mapping[str, Sequence[int]], seeds: int, own: dict[str, Any], out
         )
         for scenario, num_robots in sizes.items()
     )
-    return [trial for study in studies for group in run_study(study, out, workers=1) for trial in group.trials]
+    return trials_of(studies, out)
 
 
 def main() -> int:

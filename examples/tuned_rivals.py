@@ -19,11 +19,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from outputs import argument_parser, count, first_solutions, measured_trials, save_table, trials_argument
+from outputs import argument_parser, count, first_solutions, measured_trials, save_table, trials_argument, trials_of
 from tune_rivals import TEAMS as TUNED_ON
 
 from d4orm_planners import make_planner
-from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.sampling.tuned import TUNED
@@ -55,7 +54,7 @@ def run(teams: Sequence[tuple[str, int]], seeds: int, budget: int, out: Path) ->
         Study(policies=policies(budget), scenarios=(scenario,), num_robots=num_robots, seeds=range(seeds))
         for scenario, num_robots in teams
     )
-    return [trial for study in studies for group in run_study(study, out, workers=1) for trial in group.trials]
+    return trials_of(studies, out)
 
 
 def main() -> int:
