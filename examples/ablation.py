@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from disturbance_study import DISTURBANCES, NOTHING, ROBOTS, SCENARIOS, names_by_text, successes, tell
+from disturbance_study import DISTURBANCES, FIRST_SEED, NOTHING, ROBOTS, SCENARIOS, names_by_text, successes, tell
 from outputs import argument_parser, count, go_on_argument, save_table, stored, trials_argument
 
 from d4orm_planners.evaluation.comparison import in_common, paired
@@ -64,7 +64,7 @@ def studies(scenarios: Sequence[str], disturbances: Sequence[str], seeds: int) -
                 label: {"policy": ALL, "refine": "sync", **SETTINGS[label]}
                 for label in (ALL, MEANT_FOR[name], WITHOUT_ALL)
             },
-            scenarios=scenarios, num_robots=ROBOTS, seeds=range(seeds),
+            scenarios=scenarios, num_robots=ROBOTS, seeds=range(FIRST_SEED, FIRST_SEED + seeds),
             disturbances={name: [[] if name == NOTHING else [DISTURBANCES[name]]]},
         )
         for name in disturbances
