@@ -1,6 +1,7 @@
 """Robots that get a new goal whenever they arrive, under D4orm-C2F, for some minutes of simulated time.
 
     python examples/lifelong.py --minutes 1
+    python examples/lifelong.py --minutes 10 --seeds 10
     python examples/lifelong.py --minutes 5 --scenario warehouse --num-robots 32
 
 The throughput is compared with a bound that robots cannot beat in the long run: if nobody were in its way, a robot
@@ -11,7 +12,7 @@ pass through. It would drive straight, or among walls along the shortest free wa
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from d4orm_env.joint_state import JointState, split_state
 from d4orm_env.lifelong import goal_region
 from d4orm_env.render import FrameRenderer
 from d4orm_planners import make_policy
+from d4orm_planners.evaluation.summary import mean_interval
 
 
 def least_times(problem: Problem, joint: JointState) -> np.ndarray:
@@ -106,34 +108,39 @@ def drive(problem: Problem, seed: int, minutes: float, film: float) -> tuple[dic
     return row, pictures.frames
 
 
-def summary(row: Mapping[str, Any]) -> dict[str, Any]:
-    """The table's row of a drive."""
-    rate, bound = 60 * row["goals"] / (row["robots"] * row["seconds"]), 60 / row["least_time"]
-    loops = 1000 * np.array(row["loop_seconds"])
+def summary(drives: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The table's row of drives that differ in their seeds: means, sums, and all loops taken together."""
+    rates = [60 * drive["goals"] / (drive["robots"] * drive["seconds"]) for drive in drives]
+    bounds = [60 / drive["least_time"] for drive in drives]
+    share, lower, upper = mean_interval([rate / bound for rate, bound in zip(rates, bounds, strict=True)])
+    loops = 1000 * np.concatenate([drive["loop_seconds"] for drive in drives])
     return {
-        "scenario": row["scenario"],
-        "robots": row["robots"],
-        "simulated [s]": f"{row['seconds']:.1f}",
-        "goals reached": row["goals"],
-        "goals per robot-minute": f"{rate:.2f}",
-        "bound": f"{bound:.2f}",
-        "share of the bound": f"{rate / bound:.0%}",
-        "robots that touched": row["touched"],
-        "robot-steps in contact": row["contacts"],
+        "scenario": drives[0]["scenario"],
+        "robots": drives[0]["robots"],
+        "seeds": len(drives),
+        "simulated [s]": f"{sum(drive['seconds'] for drive in drives):.1f}",
+        "goals reached": sum(drive["goals"] for drive in drives),
+        "goals per robot-minute": f"{np.mean(rates):.2f}",
+        "bound": f"{np.mean(bounds):.2f}",
+        "share of the bound": f"{share:.1%}",
+        "interval": "-" if lower is None else f"{lower:.1%} to {upper:.1%}",
+        "robots that touched": sum(drive["touched"] for drive in drives),
+        "robot-steps in contact": sum(drive["contacts"] for drive in drives),
         "loop, median [ms]": f"{np.median(loops):.0f}",
         "loop, 95th percentile [ms]": f"{np.percentile(loops, 95):.0f}",
         "loop, slowest [ms]": f"{loops.max():.0f}",
-        "guidance planned anew": row["replanned"],
+        "guidance planned anew": sum(drive["replanned"] for drive in drives),
     }
 
 
 def main() -> None:
-    """Run the loop, print the throughput and write the table and the animation."""
+    """Run the loop, print the throughput and write the table and the animation of the first seed."""
     parser = argument_parser(__doc__)
-    parser.add_argument("--minutes", type=float, default=1.0, help="simulated time")
+    parser.add_argument("--minutes", type=float, default=1.0, help="simulated time per seed")
     parser.add_argument("--scenario", default="random")
     parser.add_argument("--num-robots", "--robots", type=count, default=16)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="the first")
+    parser.add_argument("--seeds", type=count, default=1, help="how many, one after the other")
     parser.add_argument("--film", type=float, default=20.0, help="seconds of the animation")
     trials_argument(parser)
     arguments = parser.parse_args()
@@ -142,13 +149,17 @@ def main() -> None:
         num_robots, minutes, film = 4, 0.1, 2.0
 
     def measure() -> list[dict[str, Any]]:
-        problem = make_problem(arguments.scenario, num_robots=num_robots, seed=arguments.seed)
-        row, frames = drive(problem, arguments.seed, minutes, film)
-        save_gif(frames, arguments.out / "lifelong.gif", problem.dt)
-        return [{"scenario": arguments.scenario, "seed": arguments.seed, **row}]
+        drives: list[dict[str, Any]] = []
+        for seed in range(arguments.seed, arguments.seed + arguments.seeds):
+            problem = make_problem(arguments.scenario, num_robots=num_robots, seed=seed)
+            row, frames = drive(problem, seed, minutes, 0.0 if drives else film)
+            drives.append({"scenario": arguments.scenario, "seed": seed, **row})
+            if seed == arguments.seed:
+                save_gif(frames, arguments.out / "lifelong.gif", problem.dt)
+        return drives
 
-    rows = measured(arguments.trials, measure, arguments.out / "lifelong.parquet")
-    save_table([summary(row) for row in rows], arguments.out / "lifelong.csv")
+    drives = measured(arguments.trials, measure, arguments.out / "lifelong.parquet")
+    save_table([summary(drives)], arguments.out / "lifelong.csv")
 
 
 if __name__ == "__main__":

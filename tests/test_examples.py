@@ -535,6 +535,22 @@ def test_lifelong_bound_is_the_time_of_a_straight_drive(
     assert lifelong.least_times(problem, joint) == pytest.approx([seconds], abs=1e-5)
 
 
+def test_lifelong_drives_are_summed_up_over_their_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    lifelong = importlib.import_module("lifelong")
+    drive = {"scenario": "random", "robots": 2, "seconds": 60.0, "touched": 1, "contacts": 3, "replanned": 4}
+    first = {**drive, "goals": 20, "least_time": 3.0, "loop_seconds": [0.01, 0.03]}
+    second = {**drive, "goals": 24, "least_time": 3.75, "loop_seconds": [0.02]}
+    row = lifelong.summary([first, second])
+    assert (row["seeds"], row["simulated [s]"], row["goals reached"]) == (2, "120.0", 44)
+    assert (row["goals per robot-minute"], row["bound"]) == ("11.00", "18.00")
+    # Shares of 1/2 and 3/4: their mean, and 12.706 (Student's t of one degree of freedom) standard errors of 1/8.
+    assert (row["share of the bound"], row["interval"]) == ("62.5%", "-96.3% to 221.3%")
+    assert (row["robots that touched"], row["robot-steps in contact"], row["guidance planned anew"]) == (2, 6, 8)
+    assert (row["loop, median [ms]"], row["loop, slowest [ms]"]) == ("20", "30")
+    assert lifelong.summary([first])["interval"] == "-"
+
+
 @pytest.fixture
 def multimodality(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(EXAMPLES)
