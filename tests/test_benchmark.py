@@ -16,7 +16,7 @@ from d4orm_env.core.dynamics import COMMON, MODEL_CODES, NUM_BUILT_IN
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import cli
 from d4orm_planners.benchmark import benchmark, report, timing
-from d4orm_planners.benchmark.benchmark import MODELS, BenchmarkSettings, parts, run_parts
+from d4orm_planners.benchmark.benchmark import MODELS, BenchmarkSettings, parts, run_parts, thread_counts
 from d4orm_planners.benchmark.probes import measure_startup
 from d4orm_planners.benchmark.timing import Spread, measure
 
@@ -34,6 +34,7 @@ TINY: dict[str, Any] = {
     "plan_robots": (2,),
     "seeds": 2,
     "plan_time_limit": 5.0,
+    "thread_robots": (3,),
     "memory_robots": 2,
     "obstacles": (3,),
     "far_obstacles": (5,),
@@ -44,7 +45,9 @@ TINY: dict[str, Any] = {
 @pytest.fixture(scope="module")
 def results() -> dict[str, list[Any]]:
     """One benchmark on sizes that take no time, but for the compiling of everything from nothing."""
-    todo = [part for part in parts(BenchmarkSettings(**TINY)) if part[0] != "startup"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("D4ORM_NUM_THREADS", "3")
+        todo = [part for part in parts(BenchmarkSettings(**TINY)) if part[0] != "startup"]
     seen: list[tuple[int, int]] = []
     results = run_parts(todo, lambda what, done, total: seen.append((done, total)))
     assert seen == [(done, len(todo)) for done in range(len(todo) + 1)]
@@ -89,7 +92,13 @@ def test_every_engine_rule_and_size_is_measured(results: dict[str, list[Any]]) -
         ("cpu", "default", 2), ("cpu", "paper", 2), ("jax", "paper", 2), ("plain", "paper", 2),
         ("cpu", "default", 3), ("cpu", "paper", 3),
     }  # fmt: skip
-    assert set(results) == {"denoising", "environments", "obstacles", "index", "memory", "plans"}
+    assert set(results) == {"denoising", "threads", "environments", "obstacles", "index", "memory", "plans"}
+
+
+@pytest.mark.parametrize(("cores", "counts"), [(1, []), (2, [2]), (3, [2, 3]), (8, [2, 4, 8]), (12, [2, 4, 8, 12])])
+def test_threads_double_up_to_the_cores(monkeypatch: pytest.MonkeyPatch, cores: int, counts: list[int]) -> None:
+    monkeypatch.setenv("D4ORM_NUM_THREADS", str(cores))
+    assert thread_counts() == counts
 
 
 def test_the_numbers_hang_together(results: dict[str, list[Any]]) -> None:
@@ -98,6 +107,9 @@ def test_the_numbers_hang_together(results: dict[str, list[Any]]) -> None:
         assert 0 < row["step"].smallest <= row["step"].median <= row["step"].largest
     for row in results["environments"]:
         assert row["steps_per_second"] == pytest.approx(1 / row["seconds_per_step"].median)
+    assert [(row["num_robots"], row["threads"]) for row in results["threads"]] == [(3, 2), (3, 3)]
+    for row in results["threads"]:
+        assert row["speedup"].count == row["iteration"].count == row["one_thread"].count >= 1
     for row in results["obstacles"]:
         assert row["ratio"].count == row["iteration"].count >= 1
     walls = make_problem("rooms", 8).world.num_obstacles

@@ -18,9 +18,10 @@ from d4orm_env.disturbances import Delay, Dropout, StateNoise
 from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.engine.base import SamplingTask
 from d4orm_env.engine.choice import get_engine
+from d4orm_env.engine.threads import available_cores
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.benchmark.probes import measure_memory, measure_startup
-from d4orm_planners.benchmark.timing import Row, Spread, measure
+from d4orm_planners.benchmark.timing import Row, Spread, in_turn, measure
 from d4orm_planners.benchmark.walls import Where, boxed_problem, measure_index, measure_obstacles
 from d4orm_planners.d4orm import D4orm
 from d4orm_planners.episode import open_env
@@ -58,6 +59,7 @@ class BenchmarkSettings(CheckedSettings):
         plan_robots: Team sizes for the first feasible plan.
         seeds: Seeds ``0, 1, ...`` per team size.
         plan_time_limit: Seconds per plan.
+        thread_robots: Team sizes whose iterations are timed with several threads and with one.
         memory_robots: Team size of the memory measurement.
         obstacles: How many boxes stand among the ways of 8 robots.
         far_obstacles: The same of boxes far away; also what environments are stepped among.
@@ -82,6 +84,7 @@ class BenchmarkSettings(CheckedSettings):
     plan_robots: tuple[Robots, ...] = (4, 8, 12, 16)
     seeds: Count = 20
     plan_time_limit: Positive = 20.0
+    thread_robots: tuple[Robots, ...] = (8, 16, 64)
     memory_robots: Robots = 64
     obstacles: tuple[Count, ...] = (4, 200, 1000, 5000)
     far_obstacles: tuple[Count, ...] = (200,)
@@ -109,6 +112,7 @@ QUICK: Mapping[str, object] = {
     "plan_robots": (4, 8),
     "seeds": 2,
     "plan_time_limit": 5.0,
+    "thread_robots": (8,),
     "memory_robots": 16,
     "obstacles": (4, 200),
     "map_cells": (32,),
@@ -140,6 +144,12 @@ def diameter(num_robots: int) -> float:
     return max(5.0, 0.18 * num_robots)
 
 
+def thread_counts() -> list[int]:
+    """Two, four and so on, to as many as this process has cores."""
+    cores = available_cores()
+    return sorted({cores, *(2**power for power in range(1, cores.bit_length()))} - {1})
+
+
 def parts(settings: BenchmarkSettings) -> Iterator[Part]:
     """``(section, what, measurement)`` for everything that the settings ask for."""
     for model in settings.models:
@@ -152,6 +162,10 @@ def parts(settings: BenchmarkSettings) -> Iterator[Part]:
                 for preset in PRESETS if engine == "cpu" else ("paper",):
                     label = f"{num_robots} {model} on {engine}"
                     yield "denoising", label, partial(_measure_denoising, settings, engine, preset, num_robots, model)
+    for num_robots in settings.thread_robots:
+        for threads in thread_counts():
+            work = partial(_measure_threads, settings, num_robots, threads)
+            yield "threads", f"{num_robots} robots on {threads} threads", work
     for num_boxes in (0, *settings.far_obstacles):
         among = f" among {num_boxes} boxes" if num_boxes else ""
         yield "environments", f"one environment{among}", partial(_measure_env, settings, num_boxes)
@@ -224,9 +238,11 @@ def _measure_denoising(
     }
 
 
-def _engine_run(problem: Problem, settings: BenchmarkSettings, name: str, preset: str | None) -> Run:
+def _engine_run(
+    problem: Problem, settings: BenchmarkSettings, name: str, preset: str | None, num_threads: int | None = None
+) -> Run:
     planner = _d4orm(preset=preset, num_samples=settings.num_samples)
-    engine, rules = get_engine(name), planner.rules()
+    engine, rules = get_engine(name, num_threads), planner.rules()
     base = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
 
     def run(noise_scale: FloatArray, collisions: bool) -> None:
@@ -244,6 +260,23 @@ def _plain_run(problem: Problem, settings: BenchmarkSettings) -> Run:
     return lambda noise_scale, collisions: plain.denoise_around_rest(
         problem, noise_scale, settings.num_samples, temperature, 0, collisions
     )
+
+
+def _measure_threads(settings: BenchmarkSettings, num_robots: int, threads: int) -> Row:
+    """An iteration of the default planner on several threads, beside one on a single thread."""
+    problem = circle(num_robots, "holonomic2d", settings.horizon)
+    noise_scale = _d4orm(num_steps=settings.num_steps).noise_scale()
+    several, single = (_engine_run(problem, settings, "cpu", None, count) for count in (threads, 1))
+    with_several, with_one = in_turn(
+        lambda: several(noise_scale, True), lambda: single(noise_scale, True), settings.repetitions, settings.time_limit
+    )
+    return {
+        "num_robots": num_robots,
+        "threads": threads,
+        "iteration": Spread.of(with_several),
+        "one_thread": Spread.of(with_one),
+        "speedup": Spread.of(np.divide(with_one, with_several).tolist()),
+    }
 
 
 def _measure_obstacles(settings: BenchmarkSettings, num_boxes: int, where: Where) -> Row:

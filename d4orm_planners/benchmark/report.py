@@ -113,6 +113,13 @@ def _tabulated(title: str, columns: Mapping[str, Callable[[Row], object]]) -> Ca
 
 _SECTIONS: dict[str, Callable[[list[Row]], str]] = {
     "denoising": _denoising,
+    "threads": _tabulated("Threads", {
+        "robots": itemgetter("num_robots"),
+        "threads": itemgetter("threads"),
+        "iteration, ms": lambda row: milliseconds(row["iteration"]),
+        "on one thread, ms": lambda row: milliseconds(row["one_thread"]),
+        "times as fast": lambda row: f"{row['speedup'].median:.2f}",
+    }),
     "environments": _tabulated("Environment steps", {
         "environment": itemgetter("environment"),
         "worlds": itemgetter("num_worlds"),

@@ -71,3 +71,25 @@ def measure(work: Callable[[], object], repetitions: int, time_limit: float) -> 
         work()
         seconds.append(time.perf_counter() - begin)
     return Spread.of(seconds)
+
+
+def in_turn(
+    first: Callable[[], object], second: Callable[[], object], repetitions: int, time_limit: float
+) -> tuple[list[float], list[float]]:
+    """Seconds that each of two things takes, done in turn after once that does not count.
+
+    Args:
+        first: What to time.
+        second: What to compare it with.
+        repetitions: Pairs at most, at least one.
+        time_limit: No further pair begins once the counted ones have taken this long [s].
+    """
+    first()
+    second()
+    seconds: tuple[list[float], list[float]] = [], []
+    while not seconds[0] or (len(seconds[0]) < repetitions and sum(map(sum, seconds)) < time_limit):
+        for work, taken in zip((first, second), seconds, strict=True):
+            begin = time.perf_counter()
+            work()
+            taken.append(time.perf_counter() - begin)
+    return seconds

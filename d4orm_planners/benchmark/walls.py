@@ -13,7 +13,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.core.world_index import build_index
 from d4orm_env.scenarios import make_problem
-from d4orm_planners.benchmark.timing import Row, Spread
+from d4orm_planners.benchmark.timing import Row, Spread, in_turn
 
 Where = Literal["near", "far"]
 
@@ -53,8 +53,8 @@ def measure_obstacles(
     open_world = problem.replace(world=World())
     controls = np.zeros((problem.horizon, NUM_ROBOTS, problem.control_size), np.float32)
     controls[:40] = 0.5 * (problem.goal - problem.start[:, :2]) / np.linalg.norm(problem.goal, axis=1)[:, None]
-    among, alone = _in_turn(lambda: iterate(problem), lambda: iterate(open_world), repetitions, time_limit)
-    judging, _ = _in_turn(lambda: verify(problem, controls), lambda: None, repetitions, time_limit)
+    among, alone = in_turn(lambda: iterate(problem), lambda: iterate(open_world), repetitions, time_limit)
+    judging, _ = in_turn(lambda: verify(problem, controls), lambda: None, repetitions, time_limit)
     return {
         "obstacles": num_boxes,
         "where": where,
@@ -72,18 +72,3 @@ def measure_index(cells: int) -> Row:
     begin = time.perf_counter()
     index = build_index(shapes, 0.0625, 0.25)
     return {"cells": cells, "obstacles": shapes.count, "seconds": time.perf_counter() - begin, "bytes": index.num_bytes}
-
-
-def _in_turn(
-    first: Callable[[], object], second: Callable[[], object], repetitions: int, time_limit: float
-) -> tuple[list[float], list[float]]:
-    """Seconds of each of two things, done in turn after once that does not count."""
-    first()
-    second()
-    seconds: tuple[list[float], list[float]] = [], []
-    while not seconds[0] or (len(seconds[0]) < repetitions and sum(map(sum, seconds)) < time_limit):
-        for work, taken in zip((first, second), seconds, strict=True):
-            begin = time.perf_counter()
-            work()
-            taken.append(time.perf_counter() - begin)
-    return seconds
