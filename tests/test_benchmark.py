@@ -15,6 +15,7 @@ import pytest
 from d4orm_env.core.dynamics import COMMON, MODEL_CODES, NUM_BUILT_IN
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import cli
+from d4orm_planners._machine import commit
 from d4orm_planners.benchmark import benchmark, report, timing
 from d4orm_planners.benchmark.benchmark import MODELS, BenchmarkSettings, parts, run_parts, thread_counts
 from d4orm_planners.benchmark.probes import measure_startup
@@ -151,6 +152,7 @@ def test_report_files(results: dict[str, list[Any]], tmp_path: Path) -> None:
     document = json.loads((tmp_path / "bench.json").read_text())
     assert document["format"] == report.FORMAT
     assert document["settings"]["num_robots"] == [2, 3]
+    assert document["commit"] == commit()
     assert document["machine"]["processor"]
     assert document["machine"]["libraries"]["numba"]
     step = results["denoising"][0]["step"]

@@ -173,7 +173,7 @@ def parts(settings: BenchmarkSettings) -> Iterator[Part]:
     for what, measurement in (("one environment", _measure_env), (f"{settings.num_worlds} worlds", _measure_worlds)):
         disturbed = partial(measurement, settings, 0, DISTURBANCES)
         yield "environments", f"{what} with {len(DISTURBANCES)} disturbances", disturbed
-    yield "environments", "rooms, each world its own, along ways", partial(_measure_rooms, settings)
+    yield "environments", "rooms, along ways", partial(_measure_rooms, settings)
     yield "environments", f"{settings.num_worlds} worlds in JAX", partial(_measure_functional, settings)
     for model in RIGID if find_spec("mujoco") else ():
         yield "environments", f"one environment of {model} in MuJoCo", partial(_measure_rigid, settings, model)
@@ -246,7 +246,9 @@ def _engine_run(
     base = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
 
     def run(noise_scale: FloatArray, collisions: bool) -> None:
-        task = SamplingTask(problem, base, collisions=collisions, credit=planner.config.credit)
+        # Groups are those of the last plan's conflicts; before there is one, robots have the credit by themselves.
+        credit = "team" if planner.config.credit == "team" else "robot"
+        task = SamplingTask(problem, base, collisions=collisions, credit=credit, penalty=planner.config.penalty)
         engine.denoise(task, rules, base, noise_scale, settings.num_samples, 0)
 
     return run
@@ -334,7 +336,7 @@ def _measure_worlds(settings: BenchmarkSettings, num_boxes: int, disturbances: S
 
 
 def _measure_rooms(settings: BenchmarkSettings) -> Row:
-    """The same in rooms, every world with walls of its own, where robots see their ways and are paid along them."""
+    """The same in eight rooms that worlds draw from, where robots see their ways and are paid along them."""
     size = max(1, settings.num_worlds // 8)
     along = {"observed_way": True, "progress": "way", "reward": "training"}
     seconds = _measure_batch(settings, size, scenario="rooms", num_robots=8, num_instances=8, **along)

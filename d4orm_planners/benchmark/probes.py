@@ -19,8 +19,9 @@ from d4orm_planners import make_planner
 from d4orm_planners.commands.warmup import compile_for_planning
 imported = time.perf_counter()
 problem = make_problem("circle", num_robots=int(sys.argv[1]))
-compile_for_planning(problem.team.models)  # as the command line does
-plan = make_planner("d4orm", engine="cpu").solve(problem, seed=0)
+planner = make_planner(engine="cpu")
+compile_for_planning(problem.team.models, drives=planner.drives_straight)  # as the command line does
+plan = planner.solve(problem, seed=0)
 done = time.perf_counter()
 print(json.dumps({"import": imported - begin, "solve": done - imported, "planning": plan.wall_time,
                   "solved": plan.solved}))

@@ -11,7 +11,7 @@ from operator import itemgetter
 from pathlib import Path
 
 from d4orm_env.core.files import replaced_when_done
-from d4orm_planners._machine import describe_machine, versions
+from d4orm_planners._machine import commit, describe_machine, versions
 from d4orm_planners.benchmark.benchmark import BenchmarkSettings
 from d4orm_planners.benchmark.timing import Row, Spread
 from d4orm_planners.evaluation.report import table
@@ -21,10 +21,11 @@ LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "gymnasium", "pettingzoo")
 
 
 def circumstances(command: str) -> Row:
-    """Under which a benchmark runs that begins now: date, command, machine with its load, and libraries."""
+    """Under which a benchmark runs that begins now: date, command, commit, machine with its load, and libraries."""
     load = list(os.getloadavg()) if hasattr(os, "getloadavg") else None
     machine = {**describe_machine(), "load_average": load, "libraries": versions(LIBRARIES)}
-    return {"date": datetime.now(UTC).isoformat(timespec="seconds"), "command": command, "machine": machine}
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    return {"date": date, "command": command, "commit": commit(), "machine": machine}
 
 
 def write_report(
@@ -57,8 +58,11 @@ def markdown(settings: BenchmarkSettings, begun: Row, results: dict[str, list[Ro
     machine = begun["machine"]
     libraries = ", ".join(f"{name} {version}" for name, version in machine["libraries"].items())
     blocks = [
-        f"- date: {begun['date']}\n- command: `{begun['command']}`\n- processor: {machine['processor']}, "
-        f"{machine['cores_used']} of {machine['cores']} cores\n- Python {machine['python']}, {libraries}",
+        f"- date: {begun['date']}\n"
+        f"- command: `{begun['command']}`\n"
+        f"- commit: {begun['commit'] or 'none'}\n"
+        f"- processor: {machine['processor']}, {machine['cores_used']} of {machine['cores']} cores\n"
+        f"- Python {machine['python']}, {libraries}",
         f"M = {settings.num_samples} samples, H = {settings.horizon} steps, {settings.num_steps} denoising steps in an "
         "iteration. Medians, quartiles in brackets.",
     ]
