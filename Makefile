@@ -6,7 +6,7 @@ EXTRAS ?= dev,rl,ipopt
 PYTEST_ARGS ?=
 STUDIES := ablation contact_penalty credit_by_update disturbance_study fewer_samples gradient_dilution imitate_expert lifelong \
   multimodality multimodality_team paper_differences policy_rates scaling solve_rates tune_learners tuned_rivals warm_start
-FIGURES := amswarm coarseness nodes noise-schedule robustness selections team-size
+FIGURES := amswarm nodes noise-schedule robustness selections team-size
 
 # A stamp is as new as the last install that succeeded, so an install is repeated only when what it reads has changed.
 CORE_STAMP := $(VENV)/.core-installed
@@ -62,7 +62,7 @@ results: $(DEV_STAMP) ## Make the tables and figures in docs/tables from the tri
 	$(BIN)/python examples/training_seeds.py --curves data/training_curves.csv --out docs/tables
 	for figure in $(FIGURES); do \
 	  $(BIN)/d4orm reproduce $$figure --trials data/$$figure.parquet --no-times --out docs/tables --quiet || exit 1; done
-	for figure in big-teams ipopt; do \
+	for figure in big-teams coarseness ipopt; do \
 	  $(BIN)/d4orm reproduce $$figure --trials data/$$figure.parquet --out docs/tables --quiet || exit 1; done
 	$(BIN)/d4orm leaderboard data/leaderboard.parquet --out docs/tables/leaderboard.md
 
