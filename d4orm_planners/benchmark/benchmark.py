@@ -265,7 +265,7 @@ def _plain_run(problem: Problem, settings: BenchmarkSettings) -> Run:
 
 
 def _measure_threads(settings: BenchmarkSettings, num_robots: int, threads: int) -> Row:
-    """An iteration of the default planner on several threads, beside one on a single thread."""
+    """An iteration by the rules of D4orm's defaults on several threads, beside one on a single thread."""
     problem = circle(num_robots, "holonomic2d", settings.horizon)
     noise_scale = _d4orm(num_steps=settings.num_steps).noise_scale()
     several, single = (_engine_run(problem, settings, "cpu", None, count) for count in (threads, 1))
