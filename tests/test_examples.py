@@ -242,6 +242,17 @@ def test_contacts_are_charged_by_every_credit(tmp_path: Path) -> None:
     assert table(tmp_path / "again" / "contact_penalty.csv") == rows
 
 
+def test_robots_fit_between_the_cylinders_that_are_further_apart(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("amswarm_gaps", out)
+    rows = table(out / "amswarm_gaps.csv")
+    fits = {row["cylinders"]: float(row["gap [m]"]) > float(row["a robot needs [m]"]) for row in rows}
+    assert fits == {"as it is": False, "1.1 times as far apart": True, "1.2 times as far apart": True,
+                    "robots of 0.24 m": True, "without those on the left": False}  # fmt: skip
+    completed("amswarm_gaps", tmp_path / "again", "--trials", str(out / "amswarm_gaps.parquet"))
+    assert table(tmp_path / "again" / "amswarm_gaps.csv") == rows
+
+
 def test_defaults_and_the_paper_differ_by_one_setting_at_a_time(tmp_path: Path) -> None:
     out = tmp_path / "out"
     completed("paper_differences", out)
@@ -302,8 +313,8 @@ def test_policies_meet_every_disturbance(tmp_path: Path) -> None:
         ("disturbance_study", "disturbance_study disturbance_overview"),
         ("policy_rates", "policy_rates policy_rates_walls"),
         ("solve_rates", " ".join(["solve_rates", *(f"solve_rates_{name}" for name in SOLVE_RATES)])),
-        *((program, program) for program in ("ablation", "contact_penalty", "credit_by_update", "fewer_samples",
-                                             "gradient_dilution", "lifelong", "multimodality",
+        *((program, program) for program in ("ablation", "amswarm_gaps", "contact_penalty", "credit_by_update",
+                                             "fewer_samples", "gradient_dilution", "lifelong", "multimodality",
                                              "multimodality_team", "paper_differences", "scaling", "tune_learners",
                                              "tuned_rivals", "warm_start")),
     ],
