@@ -88,7 +88,7 @@ def main() -> int:
         rows.append(
             {"cylinders": name, "gap [m]": f"{free:.2f}", "a robot needs [m]": f"{needed:.2f}",
              "solved": f"{len(solved)} of {len(mine)}", "interval": f"{lower:.0%} to {upper:.0%}",
-             "iterations": f"{np.median([trial.iterations or 0 for trial in mine]):g}",
+             "iterations": f"{np.median([trial.iterations for trial in mine if trial.iterations is not None]):g}",
              "makespan [s]": f"{np.mean(makespans):.2f}" if makespans else "-"}
         )  # fmt: skip
     save_table(rows, arguments.out / "amswarm_gaps.csv")
