@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 from collections.abc import Callable
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from gymnasium.utils import seeding
 from hypothesis import settings
 
 # A rank mismatch that JAX would broadcast silently is a bug here, so it is an error in the suite.
@@ -44,6 +46,13 @@ def pytest_configure(config: pytest.Config) -> None:
     if examples is not None:
         # Read where the tests are imported, and by the processes of pytest-xdist.
         os.environ["FUZZ_EXAMPLES"] = str(examples)
+
+
+@pytest.fixture(autouse=True)
+def unseeded_draws_repeat(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spaces and environments that no test seeds draw the same in every run: what fails once can be seen again."""
+    np_random, seeds = seeding.np_random, itertools.count(2**32)
+    monkeypatch.setattr(seeding, "np_random", lambda seed=None: np_random(next(seeds) if seed is None else seed))
 
 
 class Outcome(NamedTuple):

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from env_support import line_problem, sampled_actions
+from env_support import line_problem, sampled_actions, straight_drive
 
 from d4orm_env import navigation_v0
 from d4orm_env.joint_env import ENV_ID, register_environments
@@ -19,9 +19,9 @@ ignore_torchrl_version = pytest.mark.filterwarnings("ignore:PettingZoo in TorchR
 UNIT_MODELS = ("holonomic2d", "velocity2d", "holonomic3d")
 
 
-def one_after_another(model: str = "holonomic2d") -> Any:
-    """A team whose robots drift into their goals one by one under random actions."""
-    return line_problem([0.3, 0.4, 0.9], model, goal_radius=0.25)
+def one_after_another(model: str) -> Any:
+    """A team whose robots arrive one by one, driven straight or drifting under random actions."""
+    return line_problem([0.3, 0.5, 0.9], model, goal_radius=0.25)
 
 
 @pytest.mark.parametrize("model", [*UNIT_MODELS, "differential_drive"])
@@ -49,17 +49,17 @@ def test_stable_baselines3_trains_on_the_joint_env() -> None:
 @pytest.mark.parametrize("model", ["holonomic2d", "differential_drive"])
 def test_supersuit_pipeline(base_class: str, model: str) -> None:
     supersuit = pytest.importorskip("supersuit")
-    env = navigation_v0.parallel_env(problem=one_after_another(model), max_cycles=25)
+    problem = one_after_another(model)
+    env = navigation_v0.parallel_env(problem=problem, max_cycles=25)
     size = env.observation_space("robot_0").shape[0]
     vec = supersuit.pettingzoo_env_to_vec_env_v1(supersuit.black_death_v3(env))
     envs = supersuit.concat_vec_envs_v1(vec, 2, num_cpus=0, base_class=base_class)
-    envs.action_space.seed(0)
     result = envs.reset()
     observations = result if base_class == "stable_baselines3" else result[0]
     assert observations.shape == (6, size)
     ended, gone = 0, 0
+    actions = np.tile(straight_drive(problem)[0], (2, 1))
     for _ in range(120):
-        actions = np.stack([vec.action_space.sample() for _ in range(6)])
         observations, rewards, *ends, _infos = envs.step(actions)
         assert observations.shape == (6, size)
         assert observations.dtype == np.float32
