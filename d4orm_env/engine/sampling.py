@@ -53,6 +53,7 @@ class Workspace(NamedTuple):
         places: Their places in a block, see :func:`~d4orm_env.engine.proximity.place_of`.
         draws: ``(BLOCK 4 DRAWS,)`` one robot's noise in a block.
         controls: ``(BLOCK CONTROL_ROWS TILE,)`` one robot's controls in a block.
+        moved: ``(DOCKED TILE,)`` one robot's states, moved and not docked yet.
         keys: ``(2, K H P)`` keys of the noise streams, ``P`` pairs of components each.
         standing: ``(K,)`` whether a robot has docked in all samples.
         scratch: What is noted of who is near what.
@@ -62,6 +63,7 @@ class Workspace(NamedTuple):
     places: FloatArray
     draws: FloatArray
     controls: FloatArray
+    moved: FloatArray
     keys: NDArray[np.uint32]
     standing: BoolArray
     scratch: Scratch
@@ -94,7 +96,7 @@ def make_workspace(shape: tuple[int, ...], dimension: int) -> Workspace:
     num_steps, num_robots, num_controls = shape
     return Workspace(
         aligned_zeros(num_robots * STRIDE), aligned_zeros(num_robots * BLOCK * dimension * TILE),
-        aligned_zeros(BLOCK * 4 * DRAWS), aligned_zeros(BLOCK * CONTROL_ROWS * TILE),
+        aligned_zeros(BLOCK * 4 * DRAWS), aligned_zeros(BLOCK * CONTROL_ROWS * TILE), aligned_zeros(DOCKED * TILE),
         np.empty((2, num_robots * num_steps * ((num_controls + 1) // 2)), np.uint32), np.empty(num_robots, np.bool_),
         make_scratch(num_robots, dimension),
     )  # fmt: skip
@@ -122,7 +124,7 @@ def _runner(name: str) -> Callable[..., None]:
     @compiled
     def run(
         all_limits: FloatArray, h: TimeStep, docking: Docking, goal: Row, inverse: np.float32, offset: FloatArray,
-        scale: FloatArray, draws: FloatArray, controls: FloatArray, places: FloatArray, w: FloatArray,
+        scale: FloatArray, draws: FloatArray, controls: FloatArray, moved: FloatArray, places: FloatArray, w: FloatArray,
     ) -> None:  # fmt: skip
         use_wide_registers()
         limits = to_fixed_tuple(all_limits, num_limits)
@@ -136,16 +138,17 @@ def _runner(name: str) -> Callable[..., None]:
                 write_u(u, DRAWS, s, limit_control(u2, limits, OPS))
                 write_u(u, 2 * DRAWS, s, limit_control(u3, limits, OPS))
                 write_u(u, 3 * DRAWS, s, limit_control(u4, limits, OPS))
-        # Two loops for the same reason as in tiles.
+        # Two loops for the same reason as in tiles. They read rows and write others: to store a choice between a new
+        # number and the one that is there becomes a masked store, which takes long on AMD's processors without AVX-512.
         for i in range(count):
             u = controls[i * CONTROL_ROWS * TILE : (i + 1) * CONTROL_ROWS * TILE]
             for s in range(TILE):
                 standing = transition.stands(w[DOCKED * TILE + s] > ZERO, docking[2])
                 x = move(standing, read_x(w, STATE * TILE, s), read_u(u, 0, s), limits, h)
-                write_x(w, STATE * TILE, s, x)
+                write_x(moved, 0, s, x)
             for s in range(TILE):
                 standing = transition.stands(w[DOCKED * TILE + s] > ZERO, docking[2])
-                x, gap2, docked = dock(standing, read_x(w, STATE * TILE, s), read_u(u, 0, s), limits, goal, docking)
+                x, gap2, docked = dock(standing, read_x(moved, 0, s), read_u(u, 0, s), limits, goal, docking)
                 write_x(w, STATE * TILE, s, x)
                 w[DOCKED * TILE + s] = ONE if docked else ZERO
                 w[TOTAL * TILE + s] += reward.step_reward(np.sqrt(gap2), inverse, ZERO, ZERO, ONE)
@@ -213,7 +216,7 @@ def _score_tile(
 ) -> None:
     """Roll out a tile of samples, noise beginning with this counter; leave summed rewards in rows TOTAL."""
     w, places, draws, controls, standing = space.w, space.places, space.draws, space.controls, space.standing
-    keys, scratch, offset, scale = space.keys, space.scratch, drawing.offset, drawing.scale
+    moved, keys, scratch, offset, scale = space.moved, space.keys, space.scratch, drawing.offset, drawing.scale
     penalty, bounds = scoring.penalty, scoring.bounds
     num_steps, num_robots, num_controls = offset.shape
     num_pairs = (num_controls + 1) // 2
@@ -242,7 +245,7 @@ def _score_tile(
             last = first + count
             run_robot(
                 codes[k], all_limits[k], h, docking, goal, inverse[k], offset[first:last, k], scale[first:last, k],
-                draws, controls, own_places, robot,
+                draws, controls, moved, own_places, robot,
             )  # fmt: skip
             # Once a robot stands in every sample nothing about it changes any more: neither its place nor its flags
             # towards static obstacles.
