@@ -11,11 +11,17 @@ from pathlib import Path
 
 
 def describe_machine() -> dict[str, object]:
-    """Processor, its cores and how many of them are used, system, and version of Python."""
+    """Processor, its cores and how many of them are used, system, and version of Python.
+
+    A virtual processor may hide its model, so LLVM's name of what kernels are compiled for stands behind it.
+    """
+    from llvmlite.binding import get_host_cpu_name
+    from numba.core import config
+
     from d4orm_env.engine.threads import available_cores
 
     return {
-        "processor": _processor(),
+        "processor": f"{_processor()} ({config.CPU_NAME or get_host_cpu_name()})",
         "cores": os.cpu_count(),
         "cores_used": available_cores(),
         "system": platform.platform(),

@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from numba.core import config
 
 from d4orm_env.core.dynamics import COMMON, MODEL_CODES, NUM_BUILT_IN
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import cli
-from d4orm_planners._machine import commit
+from d4orm_planners._machine import commit, describe_machine
 from d4orm_planners.benchmark import benchmark, report, timing
 from d4orm_planners.benchmark.benchmark import MODELS, BenchmarkSettings, parts, run_parts, thread_counts
 from d4orm_planners.benchmark.probes import measure_startup
@@ -143,6 +144,13 @@ def test_whole_iterations_that_would_take_too_long_are_left_out(results: dict[st
     row = work()
     assert row["iteration"] is None
     assert report.milliseconds(row["iteration"]) == "-"
+
+
+def test_the_record_tells_processors_of_one_name_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(config, "CPU_NAME", None)
+    assert re.fullmatch(r".+ \([\w.+-]+\)", str(describe_machine()["processor"]))
+    monkeypatch.setattr(config, "CPU_NAME", "generic")
+    assert str(describe_machine()["processor"]).endswith(" (generic)")
 
 
 def test_report_files(results: dict[str, list[Any]], tmp_path: Path) -> None:
