@@ -123,8 +123,9 @@ def _runner(name: str) -> Callable[..., None]:
 
     @compiled
     def run(
-        all_limits: FloatArray, h: TimeStep, docking: Docking, goal: Row, inverse: np.float32, offset: FloatArray,
-        scale: FloatArray, draws: FloatArray, controls: FloatArray, moved: FloatArray, places: FloatArray, w: FloatArray,
+        all_limits: FloatArray, h: TimeStep, docking: Docking, goal: Row, inverse: np.float32,
+        offset: FloatArray, scale: FloatArray, draws: FloatArray, controls: FloatArray, moved: FloatArray,
+        places: FloatArray, w: FloatArray,
     ) -> None:  # fmt: skip
         use_wide_registers()
         limits = to_fixed_tuple(all_limits, num_limits)
