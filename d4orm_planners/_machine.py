@@ -20,8 +20,9 @@ def describe_machine() -> dict[str, object]:
 
     from d4orm_env.engine.threads import available_cores
 
+    target = getattr(config, "CPU_NAME", None) or get_host_cpu_name()
     return {
-        "processor": f"{_processor()} ({config.CPU_NAME or get_host_cpu_name()})",
+        "processor": f"{_processor()} ({target})",
         "cores": os.cpu_count(),
         "cores_used": available_cores(),
         "system": platform.platform(),
