@@ -192,4 +192,6 @@ for (let robot = 0; robot < Math.max(...shows.map((show) => show.scene.robots));
 }
 setTheme(window.matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
 paintMarks();
-requestAnimationFrame((now) => { player.last = now; play(data.autoplay); frame(now); });
+player.last = performance.now();
+play(data.autoplay);
+frame(player.last);
