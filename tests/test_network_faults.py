@@ -247,7 +247,7 @@ def test_a_partition_that_heals(
 def test_what_arrives_while_a_node_hangs_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     endpoint, go = free_endpoint(), hold(monkeypatch, 1)
     try:
-        hanging = Solve(CIRCLE, node=1, nodes=2, time_limit=3, zenoh={"listen": [endpoint]}, **STRONG)
+        hanging = Solve(CIRCLE, node=1, nodes=2, time_limit=10, zenoh={"listen": [endpoint]}, **STRONG)
         other = Solve(CIRCLE, node=0, nodes=2, zenoh={"connect": [endpoint]}, **STRONG)
         assert_verified(other.plan)
         assert_verified(hanging.plan)
