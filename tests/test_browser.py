@@ -186,6 +186,7 @@ def click(page: Page, text: str) -> None:
 def drag_until(
     condition: Callable[[], object], page: Page, start: tuple[float, float], end: tuple[float, float], **keys: bool
 ) -> None:
+    """Drag from one place of the page to another until something has come of it."""
     repeat_until(condition, lambda: page.drag(start, end, **keys))
 
 

@@ -129,9 +129,8 @@ def test_the_others_go_on_when_a_node_is_killed_while_it_plans(start: Any, tmp_p
     endpoint = free_endpoint()
     save_problem(hop_problem(2), tmp_path / "hop.yaml")
     settings = {"engine": "cpu", "num_samples": 192, "num_steps": 20, "improve": True, "patience": 0.2}
-    common = {"nodes": 3, "problem": "hop.yaml", "settings": settings}
     # All would plan on for long, and the others know each other only by the one that is killed.
-    common["time_limit"] = 10 * PATIENCE
+    common = {"nodes": 3, "problem": "hop.yaml", "settings": settings, "time_limit": 10 * PATIENCE}
     victim = start(node=0, zenoh={"listen": [endpoint]}, **common)
     victim.says("iteration 1 ")
     nodes = {node: start(node=node, out=f"plan{node}.npz", zenoh={"connect": [endpoint]}, **common) for node in (1, 2)}
