@@ -18,8 +18,9 @@ from d4orm_env.scenarios import make_problem
 from d4orm_planners import cli
 from d4orm_planners._machine import commit, describe_machine
 from d4orm_planners.benchmark import benchmark, report, timing
-from d4orm_planners.benchmark.benchmark import MODELS, BenchmarkSettings, parts, run_parts, thread_counts
+from d4orm_planners.benchmark.benchmark import parts, run_parts, thread_counts
 from d4orm_planners.benchmark.probes import measure_startup
+from d4orm_planners.benchmark.settings import MODELS, QUICK, BenchmarkSettings
 from d4orm_planners.benchmark.timing import Spread, measure
 
 TINY: dict[str, Any] = {
@@ -185,7 +186,7 @@ def test_the_command_takes_its_lists(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert call("bench", "--out", str(tmp_path / "new"), *options) == 0
     (settings,) = seen
     assert (settings.num_robots, settings.models, settings.engines) == ((4, 8), ("velocity2d",), ("cpu", "jax"))
-    assert (settings.seeds, settings.num_steps) == (3, benchmark.QUICK["num_steps"])
+    assert (settings.seeds, settings.num_steps) == (3, QUICK["num_steps"])
     document = json.loads((tmp_path / "new" / "bench.json").read_text())
     assert document["settings"]["seeds"] == 3
     assert document["memory"] == [{"num_robots": 1, "imported": 2**20, "peak": 2**21}]

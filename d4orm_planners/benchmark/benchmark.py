@@ -2,131 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
-from pydantic import Field
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.dynamics import COMMON, get_model
+from d4orm_env.core.dynamics import COMMON
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances import Delay, Dropout, StateNoise
-from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.engine.base import SamplingTask
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.threads import available_cores
 from d4orm_env.scenarios import make_problem
+from d4orm_planners.benchmark.environments import (
+    DISTURBANCES,
+    RIGID,
+    measure_env,
+    measure_functional,
+    measure_rigid,
+    measure_rooms,
+    measure_worlds,
+)
 from d4orm_planners.benchmark.probes import measure_memory, measure_startup
+from d4orm_planners.benchmark.settings import BenchmarkSettings
 from d4orm_planners.benchmark.timing import Row, Spread, in_turn, measure
-from d4orm_planners.benchmark.walls import Where, boxed_problem, measure_index, measure_obstacles
+from d4orm_planners.benchmark.walls import Where, measure_index, measure_obstacles
 from d4orm_planners.d4orm import D4orm
-from d4orm_planners.episode import open_env
 from d4orm_planners.registry import make_planner
-from d4orm_planners.settings import CheckedSettings, Count, Positive, Samples, Steps, Whole
 
-if TYPE_CHECKING:
-    from pettingzoo import ParallelEnv
-
-ENGINES = ("cpu", "jax", "plain")
-MODELS = (*COMMON, "unicycle", "car")
 PRESETS = (None, "paper")
-
-Robots = Annotated[Count, Field(le=10_000)]
-"""As many as scenarios make."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class BenchmarkSettings(CheckedSettings):
-    """What to measure, and how long.
-
-    Attributes:
-        num_robots: Team sizes.
-        models: Robot models.
-        engines: Of :data:`ENGINES`; ``"plain"`` is :mod:`d4orm_planners.benchmark.plain`, which has the common models.
-        num_samples: ``M``.
-        horizon: ``H``.
-        num_steps: Denoising steps in an iteration.
-        repetitions: Calls per measurement at most.
-        time_limit: Seconds per measurement, after which no further call begins.
-        iteration_limit: Whole iterations expected to take longer than this are left out [s].
-        most_robots_slow: Largest team for the engines other than the CPU engine.
-        env_steps: Environment steps per repetition.
-        num_worlds: Worlds in the batched environment.
-        plan_robots: Team sizes for the first feasible plan.
-        seeds: Seeds ``0, 1, ...`` per team size.
-        plan_time_limit: Seconds per plan.
-        thread_robots: Team sizes whose iterations are timed with several threads and with one.
-        memory_robots: Team size of the memory measurement.
-        obstacles: How many boxes stand among the ways of 8 robots.
-        far_obstacles: The same of boxes far away; also what environments are stepped among.
-        map_cells: Cells along a side of the maps whose index of obstacles is timed.
-
-    Raises:
-        ValueError: If a value makes no sense; the message names it.
-    """
-
-    num_robots: tuple[Robots, ...] = (4, 8, 16, 32, 64, 100)
-    models: tuple[str, ...] = MODELS
-    engines: tuple[str, ...] = ENGINES
-    num_samples: Samples = 1024
-    horizon: Steps = 100
-    num_steps: Steps = 100
-    repetitions: Count = 20
-    time_limit: Positive = 2.0
-    iteration_limit: Positive = 20.0
-    most_robots_slow: Annotated[Whole, Field(ge=0)] = 16
-    env_steps: Count = 2000
-    num_worlds: Steps = 1024
-    plan_robots: tuple[Robots, ...] = (4, 8, 12, 16)
-    seeds: Count = 20
-    plan_time_limit: Positive = 20.0
-    thread_robots: tuple[Robots, ...] = (8, 16, 64)
-    memory_robots: Robots = 64
-    obstacles: tuple[Count, ...] = (4, 200, 1000, 5000)
-    far_obstacles: tuple[Count, ...] = (200,)
-    map_cells: tuple[Count, ...] = (32, 256)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for model in self.models:
-            get_model(model)
-        for engine in self.engines:
-            if engine not in ENGINES:
-                raise ValueError(f"engine {engine!r} is no engine of the benchmark; choose from {', '.join(ENGINES)}")
-
-
-QUICK: Mapping[str, object] = {
-    "num_robots": (4, 8),
-    "models": ("holonomic2d", "differential_drive"),
-    "num_steps": 20,
-    "repetitions": 3,
-    "time_limit": 0.5,
-    "iteration_limit": 2.0,
-    "most_robots_slow": 8,
-    "env_steps": 500,
-    "num_worlds": 128,
-    "plan_robots": (4, 8),
-    "seeds": 2,
-    "plan_time_limit": 5.0,
-    "thread_robots": (8,),
-    "memory_robots": 16,
-    "obstacles": (4, 200),
-    "map_cells": (32,),
-}
-"""What differs in a benchmark of about a minute, for a first look."""
 
 FIRST_STEPS = 5
 """Steps at the largest noise that are run together to time one."""
-
-DISTURBANCES: tuple[AnyDisturbance, ...] = (Delay(2), Dropout(0.3), StateNoise(0.02, 0.05))
-"""With what environments are stepped beside those that nothing disturbs."""
-
-RIGID = ("holonomic2d", "differential_drive")
-"""Models that are stepped as rigid bodies, where MuJoCo is installed."""
 
 Run: TypeAlias = Callable[[FloatArray, bool], object]
 """``(noise_scale, collisions)`` to what is timed."""
@@ -168,15 +77,15 @@ def parts(settings: BenchmarkSettings) -> Iterator[Part]:
             yield "threads", f"{num_robots} robots on {threads} threads", work
     for num_boxes in (0, *settings.far_obstacles):
         among = f" among {num_boxes} boxes" if num_boxes else ""
-        yield "environments", f"one environment{among}", partial(_measure_env, settings, num_boxes)
-        yield "environments", f"{settings.num_worlds} worlds{among}", partial(_measure_worlds, settings, num_boxes)
-    for what, measurement in (("one environment", _measure_env), (f"{settings.num_worlds} worlds", _measure_worlds)):
+        yield "environments", f"one environment{among}", partial(measure_env, settings, num_boxes)
+        yield "environments", f"{settings.num_worlds} worlds{among}", partial(measure_worlds, settings, num_boxes)
+    for what, measurement in (("one environment", measure_env), (f"{settings.num_worlds} worlds", measure_worlds)):
         disturbed = partial(measurement, settings, 0, DISTURBANCES)
         yield "environments", f"{what} with {len(DISTURBANCES)} disturbances", disturbed
-    yield "environments", "rooms, along ways", partial(_measure_rooms, settings)
-    yield "environments", f"{settings.num_worlds} worlds in JAX", partial(_measure_functional, settings)
+    yield "environments", "rooms, along ways", partial(measure_rooms, settings)
+    yield "environments", f"{settings.num_worlds} worlds in JAX", partial(measure_functional, settings)
     for model in RIGID if find_spec("mujoco") else ():
-        yield "environments", f"one environment of {model} in MuJoCo", partial(_measure_rigid, settings, model)
+        yield "environments", f"one environment of {model} in MuJoCo", partial(measure_rigid, settings, model)
     surroundings: dict[Where, tuple[int, ...]] = {"near": settings.obstacles, "far": settings.far_obstacles}
     for where, counts in surroundings.items():
         for count in counts:
@@ -290,123 +199,6 @@ def _measure_obstacles(settings: BenchmarkSettings, num_boxes: int, where: Where
         _engine_run(problem, settings, "cpu", "paper")(noise_scale, True)
 
     return measure_obstacles(iterate, num_boxes, where, settings.repetitions, settings.time_limit)
-
-
-def _measure_env(settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[AnyDisturbance] = ()) -> Row:
-    """One PettingZoo environment of 8 robots under random controls, resets included."""
-    from d4orm_env import navigation_v0
-
-    env = navigation_v0.parallel_env(problem=boxed_problem(num_boxes, "near"), disturbances=disturbances)
-    return _rate("parallel_env", 1, num_boxes, disturbances, _measure_steps(settings, env, settings.env_steps))
-
-
-def _measure_rigid(settings: BenchmarkSettings, model: str) -> Row:
-    """The same of rigid bodies in MuJoCo."""
-    env = open_env(circle(8, model, settings.horizon), "mujoco")
-    seconds = _measure_steps(settings, env, max(1, settings.env_steps // 10))
-    return _rate(f"mujoco, {model}", 1, 0, (), seconds)
-
-
-def _measure_steps(settings: BenchmarkSettings, env: ParallelEnv, count: int) -> Spread:
-    """Seconds per step of an environment, ``count`` of them with each repetition."""
-    env.reset(seed=0)
-    space = env.action_space(env.possible_agents[0])
-    random = np.random.default_rng(0)
-    table = [
-        {agent: random.uniform(space.low, space.high).astype(np.float32) for agent in env.possible_agents}
-        for _ in range(64)
-    ]
-
-    def steps() -> None:
-        for index in range(count):
-            if not env.agents:
-                env.reset()
-            env.step(table[index % len(table)])
-
-    spread = measure(steps, settings.repetitions, settings.time_limit)
-    env.close()
-    return spread.times(1 / count)
-
-
-def _measure_worlds(settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[AnyDisturbance] = ()) -> Row:
-    """The batched environment of 8 robots per world under random controls, auto-reset included."""
-    size, problem = settings.num_worlds, boxed_problem(num_boxes, "near")
-    seconds = _measure_batch(settings, size, problem=problem, disturbances=disturbances)
-    return _rate("make_vec", size, num_boxes, disturbances, seconds)
-
-
-def _measure_rooms(settings: BenchmarkSettings) -> Row:
-    """The same in eight rooms that worlds draw from, where robots see their ways and are paid along them."""
-    size = max(1, settings.num_worlds // 8)
-    along = {"observed_way": True, "progress": "way", "reward": "training"}
-    seconds = _measure_batch(settings, size, scenario="rooms", num_robots=8, num_instances=8, **along)
-    num_boxes = make_problem("rooms", num_robots=8).world.num_obstacles
-    return _rate("make_vec, rooms along ways", size, num_boxes, (), seconds)
-
-
-def _measure_batch(settings: BenchmarkSettings, size: int, **options: Any) -> Spread:
-    """Seconds per step of a world of the batched environment, of ``size`` worlds."""
-    import gymnasium
-
-    env = gymnasium.make_vec("d4orm/Navigation-v0", num_envs=size, vectorization_mode="vector_entry_point", **options)
-    env.reset(seed=0)
-    space = env.single_action_space
-    assert isinstance(space, gymnasium.spaces.Box)
-    low, high = space.low, space.high
-    random = np.random.default_rng(0)
-    table = [random.uniform(low, high, (size, *low.shape)).astype(np.float32) for _ in range(16)]
-    calls = max(1, settings.env_steps // 10)
-
-    def steps() -> None:
-        for index in range(calls):
-            env.step(table[index % len(table)])
-
-    spread = measure(steps, settings.repetitions, settings.time_limit)
-    env.close()
-    return spread.times(1 / (calls * size))
-
-
-def _measure_functional(settings: BenchmarkSettings) -> Row:
-    """Worlds of 8 robots as pure functions of JAX, all in one program: random controls, observations, auto-reset."""
-    import jax
-
-    from d4orm_env.functional_env import EnvState, FunctionalEnv
-
-    size, calls = settings.num_worlds, max(1, settings.env_steps // 10)
-    env = FunctionalEnv(problem=boxed_problem(0, "near"))
-    limits, begin = env.action_limits, jax.jit(jax.vmap(env.reset))
-
-    def move(carry: tuple[EnvState, Any], key: jax.Array) -> tuple[tuple[EnvState, Any], None]:
-        (state, total), keys = carry, jax.random.split(key, 1 + size)
-        controls = jax.random.uniform(keys[0], (size, *limits.shape), minval=-limits, maxval=limits)
-        state, transition = jax.vmap(env.step)(keys[1:], state, controls)
-        # What nobody reads would not be computed.
-        return (state, total + transition.rewards.sum() + transition.observations.sum()), None
-
-    @jax.jit
-    def steps(state: EnvState, key: jax.Array) -> tuple[EnvState, float]:
-        return jax.lax.scan(move, (state, 0.0), jax.random.split(key, calls))[0]
-
-    state, _ = begin(jax.random.split(jax.random.key(0), size))
-    spread = measure(
-        lambda: jax.block_until_ready(steps(state, jax.random.key(1))), settings.repetitions, settings.time_limit
-    )
-    return _rate("FunctionalEnv", size, 0, (), spread.times(1 / (calls * size)))
-
-
-def _rate(
-    environment: str, num_worlds: int, num_boxes: int, disturbances: Sequence[AnyDisturbance], seconds: Spread
-) -> Row:
-    """Seconds per environment step, and steps per second at the median."""
-    return {
-        "environment": environment,
-        "num_worlds": num_worlds,
-        "num_robots": 8,
-        "obstacles": num_boxes,
-        "disturbances": len(disturbances),
-        "seconds_per_step": seconds,
-        "steps_per_second": 1 / seconds.median,
-    }
 
 
 def _measure_plans(settings: BenchmarkSettings, preset: str | None, num_robots: int) -> Row:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners._machine import commit, describe_machine, versions
-from d4orm_planners.benchmark.benchmark import BenchmarkSettings
+from d4orm_planners.benchmark.settings import BenchmarkSettings
 from d4orm_planners.benchmark.timing import Row, Spread
 from d4orm_planners.evaluation.report import table
 

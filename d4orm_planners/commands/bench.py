@@ -28,8 +28,9 @@ def bench(
     quiet: Quiet = False,
 ) -> None:
     """Measure the engines, the environments and the planner on this machine."""
-    from d4orm_planners.benchmark.benchmark import QUICK, BenchmarkSettings, parts, run_parts
+    from d4orm_planners.benchmark.benchmark import parts, run_parts
     from d4orm_planners.benchmark.report import circumstances, write_report
+    from d4orm_planners.benchmark.settings import QUICK, BenchmarkSettings
     from d4orm_planners.commands.progress import parts_progress
 
     given = {

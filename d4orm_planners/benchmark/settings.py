@@ -1,0 +1,99 @@
+"""What to measure, and how long: in full, and for a first look."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import Field
+
+from d4orm_env.core.dynamics import COMMON, get_model
+from d4orm_planners.settings import CheckedSettings, Count, Positive, Samples, Steps, Whole
+
+ENGINES = ("cpu", "jax", "plain")
+MODELS = (*COMMON, "unicycle", "car")
+
+Robots = Annotated[Count, Field(le=10_000)]
+"""As many as scenarios make."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkSettings(CheckedSettings):
+    """What to measure, and how long.
+
+    Attributes:
+        num_robots: Team sizes.
+        models: Robot models.
+        engines: Of :data:`ENGINES`; ``"plain"`` is :mod:`d4orm_planners.benchmark.plain`, which has the common models.
+        num_samples: ``M``.
+        horizon: ``H``.
+        num_steps: Denoising steps in an iteration.
+        repetitions: Calls per measurement at most.
+        time_limit: Seconds per measurement, after which no further call begins.
+        iteration_limit: Whole iterations expected to take longer than this are left out [s].
+        most_robots_slow: Largest team for the engines other than the CPU engine.
+        env_steps: Environment steps per repetition.
+        num_worlds: Worlds in the batched environment.
+        plan_robots: Team sizes for the first feasible plan.
+        seeds: Seeds ``0, 1, ...`` per team size.
+        plan_time_limit: Seconds per plan.
+        thread_robots: Team sizes whose iterations are timed with several threads and with one.
+        memory_robots: Team size of the memory measurement.
+        obstacles: How many boxes stand among the ways of 8 robots.
+        far_obstacles: The same of boxes far away; also what environments are stepped among.
+        map_cells: Cells along a side of the maps whose index of obstacles is timed.
+
+    Raises:
+        ValueError: If a value makes no sense; the message names it.
+    """
+
+    num_robots: tuple[Robots, ...] = (4, 8, 16, 32, 64, 100)
+    models: tuple[str, ...] = MODELS
+    engines: tuple[str, ...] = ENGINES
+    num_samples: Samples = 1024
+    horizon: Steps = 100
+    num_steps: Steps = 100
+    repetitions: Count = 20
+    time_limit: Positive = 2.0
+    iteration_limit: Positive = 20.0
+    most_robots_slow: Annotated[Whole, Field(ge=0)] = 16
+    env_steps: Count = 2000
+    num_worlds: Steps = 1024
+    plan_robots: tuple[Robots, ...] = (4, 8, 12, 16)
+    seeds: Count = 20
+    plan_time_limit: Positive = 20.0
+    thread_robots: tuple[Robots, ...] = (8, 16, 64)
+    memory_robots: Robots = 64
+    obstacles: tuple[Count, ...] = (4, 200, 1000, 5000)
+    far_obstacles: tuple[Count, ...] = (200,)
+    map_cells: tuple[Count, ...] = (32, 256)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for model in self.models:
+            get_model(model)
+        for engine in self.engines:
+            if engine not in ENGINES:
+                raise ValueError(f"engine {engine!r} is no engine of the benchmark; choose from {', '.join(ENGINES)}")
+
+
+QUICK: Mapping[str, object] = {
+    "num_robots": (4, 8),
+    "models": ("holonomic2d", "differential_drive"),
+    "num_steps": 20,
+    "repetitions": 3,
+    "time_limit": 0.5,
+    "iteration_limit": 2.0,
+    "most_robots_slow": 8,
+    "env_steps": 500,
+    "num_worlds": 128,
+    "plan_robots": (4, 8),
+    "seeds": 2,
+    "plan_time_limit": 5.0,
+    "thread_robots": (8,),
+    "memory_robots": 16,
+    "obstacles": (4, 200),
+    "map_cells": (32,),
+}
+"""What differs in a benchmark of about a minute, for a first look."""
