@@ -36,7 +36,7 @@ Start = Annotated[str, one_of(("auto", "team", "guided"))]
 
 @dataclass(frozen=True, kw_only=True)
 class D4ormConfig(ContinuationSettings, DenoisingConfig):
-    """Settings of D4orm. The defaults find a first solution soonest; the preset ``"paper"`` has the paper's.
+    """Settings of D4orm. The defaults are meant for a first solution soon; the preset ``"paper"`` has the paper's.
 
     Attributes:
         num_samples: ``M``.

@@ -9,8 +9,8 @@ from functools import cache
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+import pytest
 from claims_support import ROOT, WORDS, listed, says, span, trials
-from pyarrow import parquet
 from scipy import stats
 
 from d4orm_planners.evaluation.comparison import in_common, is_solved, mcnemar
@@ -31,6 +31,8 @@ PUCKS, WHEELS = "holonomic2d", "differential_drive"
 ALL = "all of them"
 PPO, DRIVES = "PPO, holonomic2d, crowds", "PPO, differential_drive, crowds"
 INDOORS, SAC = "PPO, holonomic2d, walls", "SAC, holonomic2d, crowds"
+
+parquet = pytest.importorskip("pyarrow.parquet")
 
 Row = Mapping[str, Any]
 Item = TypeVar("Item")
@@ -233,11 +235,14 @@ def test_ppo_and_orca_in_rooms() -> None:
         for policy in ("ppo", "orca")
     )
     most = [what for what in ppo if what not in (NOTHING, "delay")]
-    assert contacts(cells("ppo")["rooms", "delay"]) == 50 - ppo["delay"]
+    first = [trial.violation.partition(" contact")[0] for trial in cells("ppo")["rooms", "delay"] if trial.collided]
+    assert len(first) == 50 - ppo["delay"]
+    walls = first.count("obstacle") + first.count("bounds")
     says(
         ROBUSTNESS,
         f"it brings {ppo[NOTHING]} of 50 teams home undisturbed and {span(ppo[what] for what in most)} under most",
-        f"end in contact ({ppo['delay']} succeed; in the other {50 - ppo['delay']} it is",
+        f"end in contact ({ppo['delay']} succeed; in the other {len(first)} it is with a wall in {walls}, and "
+        f"with a robot in {first.count('robot')}, that they touch first)",
         f"brings home {orca[NOTHING]} of 50 in rooms undisturbed, {span(orca[what] for what in most)} under most "
         f"disturbances, {orca['delay']} with late commands.",
     )
@@ -325,14 +330,16 @@ def test_no_other_measure_decides_by_itself() -> None:
     )
     stalls = [effects()[place, "stall", "stalls"] for place in (*OPEN, "rooms")]
     assert limits.kept == limits.without
-    assert max(states.success_p, *(one.success_p for one in stalls)) == 1
+    assert min(one.success_p for one in stalls) > 0.99
     says(
         ROBUSTNESS,
         f"`expect_losses` saves {WORDS[lost.kept - lost.without]} of 20 teams in rooms (p = {lost.success_p:.1g}), "
         f"the last resort {WORDS[resort.kept - resort.without]} (p = {resort.success_p:.2g})",
         f"**Learning limits** saves {limits.longer:.1f} s in rooms, filtered states save {states.longer:.1f} s there, "
-        f"and `stalls` {stalls[2].longer:.1f} s there (p = {stalls[2].longer_p:.1g}), but no team: "
-        f"{listed(one.without for one in stalls)} succeed without, {listed(one.kept for one in stalls)} with.",
+        f"and `stalls` {stalls[2].longer:.1f} s there (p = {stalls[2].longer_p:.1g}) and no significant "
+        "number of teams: on the circle, on random places and in rooms "
+        f"{listed(one.without for one in stalls)} succeed without it, {listed(one.kept for one in stalls)} with it "
+        "(p = 1 each).",
     )
 
 
@@ -704,7 +711,7 @@ def test_recipes_succeed_as_their_table_says() -> None:
         last = rows(f"recipes/{path.name}")[-1]
         steps, power = int(last["robot-steps"]), round(np.log10(int(last["robot-steps"])))
         factor = f"{steps / 10**power:.1f}"
-        ending = f"{'' if factor == '1.0' else f'{factor}·'}10{'⁴⁵⁶'[power - 4]} | {last['success']} |"
+        ending = f"| {'' if factor == '1.0' else f'{factor}·'}10{'⁴⁵⁶'[power - 4]} | {last['success']} |"
         table = [line for line in (ROOT / RECIPES).read_text().splitlines() if line.startswith(f"| `{path.stem}.py`")]
         assert [line.endswith(ending) for line in table] == [True], ending
     (earlier,) = (row["success"] for row in rows("recipes/jax_ppo.csv") if row["robot-steps"] == "983040")

@@ -15,7 +15,7 @@ Start = Annotated[str, one_of(("auto", "team", "straight", "guided"))]
 
 @dataclass(frozen=True, kw_only=True)
 class D4ormDConfig(D4ormConfig):
-    """Settings of D4orm-D. The defaults find a first solution soonest; the preset ``"paper"`` is Algorithm 3.
+    """Settings of D4orm-D. The defaults are meant for a first solution soon; the preset ``"paper"`` is Algorithm 3.
 
     Attributes:
         num_samples: ``M`` of an iteration over the whole team or a group.
@@ -32,7 +32,7 @@ class D4ormDConfig(D4ormConfig):
             obstacles lead somebody far round, or repairs have not helped for some time; else it is straight where
             robots so meet less than half of the others on average.
         first_collisions: Whether the first iteration over the whole team minds collisions.
-        repair_samples: ``M`` of an independent repair. A few are better than many: their error is a search of its own.
+        repair_samples: ``M`` of an independent repair. A few may be better than many: their error is a search of its own.
         repair_steps: ``N`` of an independent repair.
         credit: Of iterations over the whole team.
         penalty: What a violation costs per step in an independent repair, and 1 elsewhere. At the paper's one it can be
