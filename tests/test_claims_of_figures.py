@@ -785,13 +785,14 @@ def test_top_k_and_max_by_number_of_nodes() -> None:
     pairs = {nodes: (rows("nodes", "max", nodes=nodes), rows("nodes", "top-k", nodes=nodes)) for nodes in NODES[1:]}
     more = {nodes: further(*pair) for nodes, pair in pairs.items()}
     p = {nodes: p_rounds(*pair) for nodes, pair in pairs.items()}
-    assert p[16] < 0.05 < p[8]
+    assert 0.05 / 2 < p[16] < 0.05 < p[8]  # by Holm, the other two being smaller
     assert max(more[2], more[4]) < 0
     says(
         RESULTS,
         f"With 16 it is (max takes {more[16]:.1f} more, p = {probability(p[16])}), with 8 no difference is seen "
         f"({more[8]:.1f} more, p = {probability(p[8])}), and with 2 and 4 max takes {-more[2]:.1f} and {-more[4]:.1f} "
-        f"less (p = {probability(p[2])} and {probability(p[4])};",
+        f"less (p = {probability(p[2])} and {probability(p[4])}; no correction for four tests, with which that of 16 "
+        "nodes would not be significant)",
     )
 
 
@@ -836,8 +837,9 @@ def test_rows_of_nodes_that_are_other_trials_too() -> None:
     alone = alike(rows("nodes", "top-k", nodes=1), rows("selections", "d4orm"))
     says(
         DATA,
-        f"with our defaults, all {listed(counts['top-k, defaults'])} are alike, and one node did as D4orm without "
-        f"nodes in all {alone}",
+        f"with our defaults, all {counts['top-k, defaults'][0]} are alike. With one node, which has nothing to select, "
+        f"all {counts['top-k, defaults'][1]} of the defaults and {counts['top-k'][1]} of the preset are alike by every "
+        f"selection, and as D4orm's without nodes in all {alone}",
     )
 
 

@@ -32,7 +32,8 @@ class D4ormDConfig(D4ormConfig):
             obstacles lead somebody far round, or repairs have not helped for some time; else it is straight where
             robots so meet less than half of the others on average.
         first_collisions: Whether the first iteration over the whole team minds collisions.
-        repair_samples: ``M`` of an independent repair. A few may be better than many: their error is a search of its own.
+        repair_samples: ``M`` of an independent repair. A few may be better than many: their error is a search of
+            its own.
         repair_steps: ``N`` of an independent repair.
         credit: Of iterations over the whole team.
         penalty: What a violation costs per step in an independent repair, and 1 elsewhere. At the paper's one it can be
