@@ -22,6 +22,7 @@ ROBUSTNESS, LEADERBOARD, MUJOCO, RECIPES = (
     f"docs/{page}.md" for page in ("robustness", "leaderboard", "mujoco", "recipes")
 )
 RL, DISTURBANCES, PERFORMANCE = "docs/rl.md", "docs/disturbances.md", "docs/performance.md"
+DISTRIBUTED = "docs/distributed.md"
 PLANNERS, D4ORM, D4ORM_D, D4ORM_C2F, MMD = (
     f"docs/planners/{page}.md" for page in ("index", "d4orm", "d4orm-d", "d4orm-c2f", "mmd")
 )
@@ -700,6 +701,33 @@ def test_tuned_settings_differ_little_from_ours() -> None:
         "neither setting learns anything in that time",
         f"**PPO with lower learning rates** than its 5e-4 has {span(first, '.0%')} after a first look, within what its "
         "own seeds have, and is not further after two million.",
+    )
+
+
+# Robots on a network
+
+
+def test_the_run_of_robots_that_plan_while_they_drive() -> None:
+    (run,) = rows("onboard_lifelong.csv")
+    assert run["robot-steps in contact"] == run["ticks with different plans"] == "0"
+    wall, simulated = float(run["wall clock [s]"]), float(run["simulated [s]"])
+    says(
+        DISTRIBUTED,
+        f"{run['goals reached']} goals reached ({float(run['goals per robot-minute']):.1f} per robot-minute), no "
+        f"contact, {run['plans taken over']} of {run['rounds ended']} rounds ended with a plan that all took over; "
+        f"{run['messages']} messages, {float(run['kB sent']) / 1000:.1f} MB. The run took {wall:.0f} s, "
+        f"{wall / simulated:.1f} times real time, and an iteration of a node "
+        f"{float(run['iteration, median [ms]']) / 1000:.2f} s (median) with all six",
+    )
+
+
+def test_what_a_message_costs() -> None:
+    costs = {int(row["robots"]): row for row in rows("message_overhead.csv") if row["transport"] == "zenoh"}
+    says(
+        DISTRIBUTED,
+        f"{float(costs[16]['overhead']):.2f} ms for writing, sending and reading a candidate of 16 robots "
+        f"({float(costs[16]['bytes']) / 1000:.0f} kB), and {float(costs[16]['judge']):.1f} ms for judging it",
+        f"{float(costs[32]['judge']):.1f} ms for 32 robots where it does not",
     )
 
 
