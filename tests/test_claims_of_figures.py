@@ -762,6 +762,7 @@ def test_more_nodes_need_more_iterations() -> None:
     worse = [nodes for nodes, value in zip(NODES[1:], p["max"]) if value < 0.05]
     assert worse == [nodes for nodes in NODES if nodes >= worse[0]]
     assert max(p["top-k"]) < 0.05
+    assert all(max(told, key=float) == told[-1] for told in means.values())
     says(
         RESULTS,
         f"by max from {worse[0]} nodes on: 16 robots of the four environments take {means['top-k'][0]} with one node "
