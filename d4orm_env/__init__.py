@@ -5,18 +5,19 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from d4orm_env.core.dynamics import register_model
+from d4orm_env.dynamics.models import register_model
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
-from d4orm_env.joint_env import register_environments
+from d4orm_env.envs.joint_env import register_environments
 from d4orm_env.rollout import rollout
 from d4orm_env.scenarios import list_scenarios, load_map, make_problem, register_scenario
 from d4orm_env.verify import VerificationReport, verify
 
 if TYPE_CHECKING:
-    from d4orm_env import functional, navigation_v0
+    from d4orm_env import navigation_v0
+    from d4orm_env.jax import functional
     from d4orm_env.scenarios import load_problem, save_problem
 
 __version__ = "0.1.0"

@@ -16,13 +16,13 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import OrderEnforcingWrapper
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
-from d4orm_env._viewer import RENDER_MODES
+from d4orm_env.envs.viewer import RENDER_MODES
 from d4orm_env.core.arrays import FloatArray, as_float32, whole_number
-from d4orm_env.env_inputs import MAX_ACTION, check_options, checked_cycles, usable
-from d4orm_env.options import EnvOptions
+from d4orm_env.envs.inputs import MAX_ACTION, check_options, checked_cycles, usable
+from d4orm_env.envs.options import EnvOptions
 from d4orm_env.scenarios.problems import ScenarioLike
-from d4orm_env.shell import EnvironmentShell
-from d4orm_env.team_step import AgentInfos, TeamStep, agent_infos
+from d4orm_env.envs.base_env import EnvironmentShell
+from d4orm_env.envs.team_step import AgentInfos, TeamStep, agent_infos
 
 __all__ = ["env", "parallel_env", "raw_env"]
 
@@ -36,9 +36,9 @@ class parallel_env(EnvironmentShell, ParallelEnv[str, FloatArray, FloatArray]):
     in the world at its goal. When ``max_cycles`` steps have been taken the others are truncated.
 
     Args:
-        scenario: As in :class:`~d4orm_env.options.EnvOptions`, like all others.
+        scenario: As in :class:`~d4orm_env.envs.options.EnvOptions`, like all others.
         num_robots: Size of the team.
-        **options: Further attributes of :class:`~d4orm_env.options.EnvOptions`, and arguments of the scenario, such as
+        **options: Further attributes of :class:`~d4orm_env.envs.options.EnvOptions`, and arguments of the scenario, such as
             ``model`` or ``seed``. ``max_cycles`` may be assigned later too.
 
     Raises:

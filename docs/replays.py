@@ -9,7 +9,7 @@ from d4orm_env import make_problem, navigation_v0
 from d4orm_env.disturbances import Delay, Intruder, Push, StateNoise
 from d4orm_env.render import Replay
 from d4orm_planners import make_planner, make_policy, run_episode
-from d4orm_planners.denoising import DenoisingFilm
+from d4orm_planners.sampling.denoising import DenoisingFilm
 
 
 def planned(scenario: str, planner: str = "d4orm-d", **arguments: object) -> Replay:

@@ -34,7 +34,7 @@ from outputs import (
 )
 
 from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_steps, steps_to_solution, survival
-from d4orm_planners.evaluation.report import read_parquet, write_parquet
+from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import wilson_interval

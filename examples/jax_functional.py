@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 from outputs import argument_parser, save_table
 
-from d4orm_env import Problem, functional, make_problem
+from d4orm_env import Problem, make_problem
+from d4orm_env.jax import functional
 
 
 def controls_of(gains: Any, problem: Problem, state: functional.State) -> Any:

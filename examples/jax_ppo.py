@@ -22,7 +22,7 @@ require("jaxrl", "optax")
 
 import optax
 
-from d4orm_env.functional_env import FunctionalEnv
+from d4orm_env.jax.functional_env import FunctionalEnv
 
 NUM_WORLDS, NUM_ROBOTS, HORIZON = 256, 2, 32
 GAMMA, LAMBDA, CLIP, EPOCHS, MINIBATCHES = 0.98, 0.95, 0.2, 4, 4

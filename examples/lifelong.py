@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from outputs import argument_parser, count, measured, save_gif, save_table, trials_argument
 
 from d4orm_env import Problem, make_problem, navigation_v0
-from d4orm_env.joint_state import JointState, split_state
-from d4orm_env.lifelong import goal_region
+from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_env.envs.lifelong import goal_region
 from d4orm_env.render import FrameRenderer
 from d4orm_planners import make_policy
 from d4orm_planners.evaluation.summary import mean_interval

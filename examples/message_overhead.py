@@ -20,10 +20,10 @@ from outputs import argument_parser, count, require, save_table
 from d4orm_env import make_problem
 from d4orm_env.engine.choice import get_engine
 from d4orm_planners import make_planner
-from d4orm_planners.candidate import evaluate_controls
-from d4orm_planners.distributed.messages import Message, decode, encode
-from d4orm_planners.distributed.transport import LocalNetwork, Transport
-from d4orm_planners.distributed.zenoh_transport import ZenohSettings, ZenohTransport
+from d4orm_planners.base.candidate import evaluate_controls
+from d4orm_planners.d_d4orm.messages import Message, decode, encode
+from d4orm_planners.d_d4orm.transport import LocalNetwork, Transport
+from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings, ZenohTransport
 
 
 def seconds(work: Callable[[], Any], repetitions: int) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 from outputs import COLOURS, argument_parser, count, plt, save_figure, save_table
 
 from d4orm_env import Problem, navigation_v0
-from d4orm_env.joint_state import split_state
+from d4orm_env.envs.joint_state import split_state
 from d4orm_planners import make_policy
 
 POLICIES = {"d4orm-d": "open loop: the plan of D4orm-D", "d4orm-c2f": "closed loop: D4orm-C2F"}

@@ -32,7 +32,7 @@ from onboard.world import World
 from outputs import argument_parser, count, require, save_figure, save_gif, save_table
 
 from d4orm_env.core.files import replaced_when_done
-from d4orm_planners.distributed.transport import LocalNetwork
+from d4orm_planners.d_d4orm.transport import LocalNetwork
 
 REPORT = 10.0
 """Simulated seconds between lines on how it goes."""

@@ -19,10 +19,10 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 from d4orm_env.core.files import replaced_when_done
-from d4orm_planners._machine import commit, describe_machine
+from d4orm_planners.base.machine import commit, describe_machine
 from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_steps
 from d4orm_planners.evaluation.evaluate import run_study
-from d4orm_planners.evaluation.report import read_parquet, write_parquet
+from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import wilson_interval

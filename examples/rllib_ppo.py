@@ -23,7 +23,7 @@ from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from d4orm_env import navigation_v0
 from d4orm_env.integrations.rllib import RLlibNavigation
 from d4orm_planners import run_episode
-from d4orm_planners.adapters import from_rllib
+from d4orm_planners.base.adapters import from_rllib
 
 WORLDS = 64
 

@@ -22,7 +22,7 @@ import numpy as np
 from outputs import argument_parser, count, measured, save_table, trials_argument
 
 from d4orm_env import Problem, make_problem, verify
-from d4orm_env.core.robot_model import ACCELERATION, SPEED
+from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 from d4orm_planners import make_planner
 
 

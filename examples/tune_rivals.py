@@ -25,7 +25,7 @@ from outputs import argument_parser, count, save_table, trials_argument
 from d4orm_planners import make_planner
 from d4orm_planners.evaluation.comparison import is_solved, penalised_steps
 from d4orm_planners.evaluation.evaluate import run_study
-from d4orm_planners.evaluation.report import read_parquet, write_parquet
+from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
 

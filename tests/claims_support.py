@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from d4orm_planners.evaluation.report import read_parquet
+from d4orm_planners.evaluation.tables import read_parquet
 from d4orm_planners.evaluation.store import Trial
 
 pytest.importorskip("pyarrow", reason="needs pip install d4orm-env[evaluate]")

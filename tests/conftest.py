@@ -66,7 +66,7 @@ def d4orm(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., Outcome]:
     """Runs the command line inside ``tmp_path``; gives exit status, output and errors."""
-    from d4orm_planners import cli
+    from d4orm_planners.cli import app as cli
 
     monkeypatch.chdir(tmp_path)
 

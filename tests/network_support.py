@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from d4orm_planners.distributed.transport import Transport
+from d4orm_planners.d_d4orm.transport import Transport
 
 PATIENCE = 120.0
 """Seconds that anything may take on a busy machine before a test gives up on it."""

@@ -14,9 +14,9 @@ import numpy as np
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_planners.plan import IterationRecord
-from d4orm_planners.planner import Planner
-from d4orm_planners.registry import PLANNERS, make_planner
+from d4orm_planners.base.plan import IterationRecord
+from d4orm_planners.base.planner import Planner
+from d4orm_planners.base.planner_registry import PLANNERS, make_planner
 
 CHEAP = {
     "engine": "cpu",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from d4orm_env.core.dynamics import MODEL_CODES
+from d4orm_env.dynamics.models import MODEL_CODES
 from d4orm_env.core.registry import Registry
 
 

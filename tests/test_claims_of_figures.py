@@ -18,7 +18,7 @@ from d4orm_planners.evaluation.comparison import Paired, in_common, paired, step
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import wilson_interval
 from d4orm_planners.reproduction.numbers import first_solution
-from d4orm_planners.reproduction.paper import FIGURES, SIZES
+from d4orm_planners.reproduction.paper_figures import FIGURES, SIZES
 
 RESULTS = "docs/results.md"
 REPRODUCTION = "docs/reproduction.md"

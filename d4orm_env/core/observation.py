@@ -12,7 +12,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.core.world_index import WIDER, WorldIndex
+from d4orm_env.geometry.world_index import WIDER, WorldIndex
 
 
 class Sensed(NamedTuple):

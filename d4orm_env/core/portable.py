@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import Floats
-from d4orm_env.core.robot_model import Ops
+from d4orm_env.dynamics.robot_model import Ops
 
 Real: TypeAlias = Any
 """An array or a number, float32 or float64, whichever the arguments are."""

@@ -21,17 +21,17 @@ from d4orm_env.core.arrays import (
     shown,
     whole_number,
 )
-from d4orm_env.core.dynamics import MODEL_CODES, NUM_BUILT_IN, model_digest
+from d4orm_env.dynamics.models import MODEL_CODES, NUM_BUILT_IN, model_digest
 from d4orm_env.core.problem_arrays import ProblemArrays, inverse_initial_distance
 from d4orm_env.core.problem_checks import check_places, check_resolution, check_states, check_turning
-from d4orm_env.core.summary import Row, count, joined, team_text
+from d4orm_env.core.summary_line import Row, count, joined, team_text
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from d4orm_env.ways import Ways
+    from d4orm_env.paths.shortest_paths import Ways
 
 Arrival = Literal["dock", "stay"]
 """What it means to arrive."""
@@ -210,9 +210,9 @@ class Problem(Frozen):
 
     @cached_property
     def ways(self) -> Ways:
-        """The shortest free way of every robot; see :func:`d4orm_env.ways.shortest_ways`."""
+        """The shortest free way of every robot; see :func:`d4orm_env.paths.shortest_paths.shortest_ways`."""
         # The one road up from here: it is compiled.
-        from d4orm_env.ways import shortest_ways
+        from d4orm_env.paths.shortest_paths import shortest_ways
 
         return shortest_ways(self)
 

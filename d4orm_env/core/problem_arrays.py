@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.world_index import WorldIndex
+from d4orm_env.geometry.world_index import WorldIndex
 
 
 class ProblemArrays(NamedTuple):
@@ -21,7 +21,7 @@ class ProblemArrays(NamedTuple):
         start: ``(K, n)``.
         goal: ``(K, d)``.
         inverse_initial_distance: ``(K,)`` one over the distance from start to goal (at least the goal radius).
-        boxes: ``(., 2 d + 1)`` obstacles, see :class:`~d4orm_env.core.shapes.Shapes`.
+        boxes: ``(., 2 d + 1)`` obstacles, see :class:`~d4orm_env.geometry.shapes.Shapes`.
         triangles: ``(., 6)`` more of them.
         grid: Where they are.
         bounds: ``(2, d)``, infinite where open.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.robot_model import SPEED, STANDARD_LIMITS, TURN_RATE, Model
+from d4orm_env.dynamics.robot_model import SPEED, STANDARD_LIMITS, TURN_RATE, Model
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 

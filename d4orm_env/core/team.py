@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray, Frozen, frozen_per_robot, shown
-from d4orm_env.core.dynamics import get_model
-from d4orm_env.core.robot_model import STANDARD_LIMITS, Limit, Model
+from d4orm_env.dynamics.models import get_model
+from d4orm_env.dynamics.robot_model import STANDARD_LIMITS, Limit, Model
 
 
 @dataclass(frozen=True, eq=False, init=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
-from d4orm_env.core.summary import Row, count, joined
+from d4orm_env.core.summary_line import Row, count, joined
 
 
 @dataclass(frozen=True, eq=False, repr=False)

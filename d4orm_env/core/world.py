@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import LARGEST, FloatArray, Frozen, frozen_array
-from d4orm_env.core.polygon import check_polygon, triangulate
-from d4orm_env.core.shapes import Shapes
-from d4orm_env.core.world_index import WorldIndex, build_index, nearest_distance
+from d4orm_env.geometry.polygon import check_polygon, triangulate
+from d4orm_env.geometry.shapes import Shapes
+from d4orm_env.geometry.world_index import WorldIndex, build_index, nearest_distance
 
 _LEVELS, _FEW = 3, 2048
 """Grids of an index that finds obstacles for robots wherever they drive, the last 16 times as wide as the first, where

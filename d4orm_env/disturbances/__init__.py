@@ -11,7 +11,7 @@ from d4orm_env.disturbances.disturbance import Disturbance, Effect, Scene, Seen
 from d4orm_env.disturbances.draws import Draws
 from d4orm_env.disturbances.intruder import Intruder
 from d4orm_env.disturbances.perception import Occlusion, StateDelay, StateNoise
-from d4orm_env.disturbances.world import Drag, LimitMismatch, Push, Stall
+from d4orm_env.disturbances.robot_faults import Drag, LimitMismatch, Push, Stall
 
 __all__ = [
     "Bias",

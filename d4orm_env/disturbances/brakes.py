@@ -6,7 +6,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.portable import NUMPY_OPS
-from d4orm_env.core.robot_model import TimeStep
+from d4orm_env.dynamics.robot_model import TimeStep
 from d4orm_env.disturbances.disturbance import Scene
 
 

@@ -246,7 +246,7 @@ class DisturbedWorlds:
 @cache
 def _judge() -> Callable[..., None]:
     # Here, because importing the compiler takes longer than importing all the rest of the package.
-    from d4orm_env.engine.bodies import meet_bodies
+    from d4orm_env.engine.moving_obstacles import meet_bodies
 
     judge: Callable[..., None] = meet_bodies
     return judge

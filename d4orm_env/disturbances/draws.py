@@ -33,7 +33,7 @@ def episode_keys(seeds: Sequence[int]) -> Keys:
 @cache
 def _kernels() -> tuple[Kernel, Kernel]:
     # Here, because importing the compiler takes longer than importing all the rest of the package.
-    from d4orm_env.engine.draws import draw_normals, draw_uniforms
+    from d4orm_env.engine.counter_draws import draw_normals, draw_uniforms
 
     return draw_normals, draw_uniforms
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from importlib.util import find_spec
 
-from d4orm_env.engine.base import Engine
+from d4orm_env.engine.types import Engine
 
 ENGINES = ("auto", "cpu", "jax")
 
@@ -25,7 +25,7 @@ def get_engine(name: str = "auto", num_threads: int | None = None) -> Engine:
     if name == "auto":
         name = "jax" if _accelerator_visible() else "cpu"
     if name == "jax":
-        from d4orm_env.engine.jax import JaxEngine
+        from d4orm_env.jax.jax_engine import JaxEngine
 
         return JaxEngine()
     from d4orm_env.engine.cpu import CpuEngine

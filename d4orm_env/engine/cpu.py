@@ -12,8 +12,10 @@ from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.engine import averaging, noise, sampling
-from d4orm_env.engine.base import (
+from d4orm_env.engine import noise
+from d4orm_planners.engine import average as averaging
+from d4orm_planners.engine import score as sampling
+from d4orm_env.engine.types import (
     WATCHED_SAMPLES,
     DenoisingStep,
     MovingObstacles,
@@ -26,10 +28,10 @@ from d4orm_env.engine.base import (
     checked_controls,
 )
 from d4orm_env.engine.episodes import WorldBatch
-from d4orm_env.engine.lanes import TILE
+from d4orm_env.engine.simd import TILE
 from d4orm_env.engine.noise import DRAWS, TURNS
 from d4orm_env.engine.observing import ObservationSpec
-from d4orm_env.engine.proximity import bound_boxes, make_bodies
+from d4orm_planners.engine.proximity import bound_boxes, make_bodies
 from d4orm_env.engine.sample_noise import Drawing
 from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_env.engine.world_tiles import WorldArrays
@@ -45,20 +47,20 @@ class CpuEngine:
         self._threads = Threads(num_threads or available_cores())
 
     def step(self, arrays: ProblemArrays, states: FloatArray, arrived: BoolArray, controls: FloatArray) -> StepResult:
-        """See :meth:`d4orm_env.engine.base.Engine.step`."""
+        """See :meth:`d4orm_env.engine.types.Engine.step`."""
         after = _rolled_out(arrays, states, arrived, np.asarray(controls)[None])
         return StepResult(
             after.state[1], after.control[1], after.docked[1], after.collided[1], after.violated[1], after.rewards[1]
         )
 
     def contacts(self, arrays: ProblemArrays, states: FloatArray) -> tuple[BoolArray, BoolArray]:
-        """See :meth:`d4orm_env.engine.base.WorldEngine.contacts`."""
+        """See :meth:`d4orm_env.engine.types.WorldEngine.contacts`."""
         robots = len(states)
         here = _rolled_out(arrays, states, np.zeros(robots, bool), np.zeros((0, robots, 1), np.float32))
         return here.collided[0], here.violated[0]
 
     def observe_worlds(self, arrays: ProblemArrays, layout: ObservationLayout, sight: Sight, out: FloatArray) -> None:
-        """See :meth:`d4orm_env.engine.base.WorldEngine.observe_worlds`."""
+        """See :meth:`d4orm_env.engine.types.WorldEngine.observe_worlds`."""
         arrays = _typed(arrays)
         kernel, view = _kernels(arrays).observe_worlds, _view(layout)
         self._threads.over(-(-len(out) // TILE), lambda part: kernel(arrays, sight, view, part, out))
@@ -72,7 +74,7 @@ class CpuEngine:
         batch: WorldBatch,
         out: FloatArray,
     ) -> None:
-        """See :meth:`d4orm_env.engine.base.WorldEngine.advance`."""
+        """See :meth:`d4orm_env.engine.types.WorldEngine.advance`."""
         arrays = _typed(arrays)
         kernel, view = _kernels(arrays).advance_worlds, _view(layout)
         self._threads.over(
@@ -80,7 +82,7 @@ class CpuEngine:
         )
 
     def rollout(self, problem: Problem, controls: ArrayLike) -> Trajectory:
-        """See :meth:`d4orm_env.engine.base.Engine.rollout`.
+        """See :meth:`d4orm_env.engine.types.Engine.rollout`.
 
         Raises:
             ValueError: If the controls have another shape than ``(H, K, m)`` or are not finite.
@@ -98,7 +100,7 @@ class CpuEngine:
         )
 
     def prepare(self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int) -> None:
-        """See :meth:`d4orm_env.engine.base.Engine.prepare`; one compilation serves all teams of the same models."""
+        """See :meth:`d4orm_env.engine.types.Engine.prepare`; one compilation serves all teams of the same models."""
         del noise_scale, num_samples
         if not (sampling.score_kernel(task.problem.team.models).signatures and averaging.average_noise.signatures):
             self.denoise(task, rules, task.base, np.ones(1, np.float32), TILE, 0)
@@ -114,7 +116,7 @@ class CpuEngine:
         should_stop: Callable[[], bool] | None = None,
         watcher: StepWatcher | None = None,
     ) -> SamplingResult:
-        """See :meth:`d4orm_env.engine.base.Engine.denoise`."""
+        """See :meth:`d4orm_env.engine.types.Engine.denoise`."""
         run = Sampling(task, rules, num_samples, seed, self._threads)
         factor = np.ones_like(task.base)
         mean_rewards = np.empty(len(noise_scale), np.float32)

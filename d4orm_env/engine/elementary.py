@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from d4orm_env.core.robot_model import Ops
+from d4orm_env.dynamics.robot_model import Ops
 from d4orm_env.engine.compiling import ONE, ZERO, compiled
 
 

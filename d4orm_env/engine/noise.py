@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from d4orm_env.core.portable import Real
-from d4orm_env.core.robot_model import N
+from d4orm_env.dynamics.robot_model import N
 
 Word: TypeAlias = Any
 """32 bits as a library has them: a whole number, or an array of them."""

@@ -9,14 +9,18 @@ import numba
 import numpy as np
 from numba.extending import register_jitable
 
-from d4orm_env.core import collision, observation, reward, robot_model, transition
+from d4orm_env.core import observation
+from d4orm_env.dynamics import collision
+from d4orm_env.dynamics import reward
+from d4orm_env.dynamics import robot_model
+from d4orm_env.dynamics import transition
 from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine import world_tiles
-from d4orm_env.engine.base import Sight
+from d4orm_env.engine.types import Sight
 from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
 from d4orm_env.engine.compiling import INLINED, ONE, OPTIONS, ZERO, aligned_zeros, compiled, inlined
-from d4orm_env.engine.lanes import TILE
+from d4orm_env.engine.simd import TILE
 from d4orm_env.engine.stepping import models_key
 from d4orm_env.engine.tiles import STATE, STRIDE, MotionReader, motion_reader
 from d4orm_env.engine.world_tiles import WorldArrays, load
@@ -123,7 +127,7 @@ def observe_worlds_kernel(
     Args:
         names: Models that the kernel is for.
         arrays: The problem that the worlds share; its starts and goals are not looked at.
-        sight: What there is to see, a :class:`~d4orm_env.engine.base.Sight`.
+        sight: What there is to see, a :class:`~d4orm_env.engine.types.Sight`.
         view: What an observation is made of, a :class:`ObservationSpec`.
         tile_range: First tile of worlds and the one after the last.
     """

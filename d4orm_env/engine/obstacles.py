@@ -1,7 +1,7 @@
 """Contacts of a tile with obstacles and bounds, compiled with numba: a lookup a sample, however many there are.
 
 The clearance at the centre of a sample's cell decides for nearly all of them. Where it does not, the cell's obstacles
-are tested one by one, with the arithmetic of :mod:`d4orm_env.core.collision`: the outcome is that of testing all.
+are tested one by one, with the arithmetic of :mod:`d4orm_env.dynamics.collision`: the outcome is that of testing all.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ import numpy as np
 from numba.cpython.unsafe import numbers
 from numpy.typing import NDArray
 
-from d4orm_env.core import collision
+from d4orm_env.dynamics import collision
 from d4orm_env.core.arrays import FloatArray, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.core.world_index import WorldIndex
+from d4orm_env.geometry.world_index import WorldIndex
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
-from d4orm_env.engine.lanes import CHUNK, NOWHERE, TILE, at_most, use_wide_registers
+from d4orm_env.engine.simd import CHUNK, NOWHERE, TILE, at_most, use_wide_registers
 
 _HALF = np.float32(0.5)
 _BIT = np.uint64(1)
@@ -168,7 +168,7 @@ def may_touch(
     axis_step: int,
     spare: FloatArray,
 ) -> bool:
-    """Whether a body may touch an obstacle anywhere in the lanes of :func:`~d4orm_env.engine.lanes.enclose`.
+    """Whether a body may touch an obstacle anywhere in the lanes of :func:`~d4orm_env.engine.simd.enclose`.
 
     Args:
         index: Where the obstacles are; there must be some.

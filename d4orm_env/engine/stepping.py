@@ -7,9 +7,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from d4orm_env.core import transition
-from d4orm_env.core.dynamics import COMMON, MODEL_CODES, MODELS, model_digest
-from d4orm_env.core.robot_model import (
+from d4orm_env.dynamics import transition
+from d4orm_env.dynamics.models import COMMON, MODEL_CODES, MODELS, model_digest
+from d4orm_env.dynamics.robot_model import (
     MOVED,
     Model,
     ModelFunction,
@@ -20,10 +20,12 @@ from d4orm_env.core.robot_model import (
     Vector,
     runge_kutta,
 )
-from d4orm_env.engine import compiling, elementary, lanes, rows
+from d4orm_env.engine import compiling, elementary
+from d4orm_env.engine import simd as lanes
+from d4orm_env.engine import tile_layout as rows
 from d4orm_env.engine.compiling import ZERO, inlined
 from d4orm_env.engine.elementary import OPS
-from d4orm_env.engine.rows import PICK, SQUARED_GAP, SQUARED_NORM, Row
+from d4orm_env.engine.tile_layout import PICK, SQUARED_GAP, SQUARED_NORM, Row
 
 PARTS = (lanes, compiling, elementary, rows)
 """Modules that steps are made of, for fingerprints."""
@@ -92,7 +94,7 @@ def make_stepper(model: Model) -> tuple[Mover, Docker]:
 def dispatch(branches: Mapping[str, Callable[..., None]]) -> Callable[..., None]:
     """``call(code, *arguments)``: the compiled function of the model with that code, of a table by models' names.
 
-    The codes are those of :data:`~d4orm_env.core.dynamics.MODEL_CODES`. Nothing is done for one not in the table, so
+    The codes are those of :data:`~d4orm_env.dynamics.models.MODEL_CODES`. Nothing is done for one not in the table, so
     a kernel is chosen by the codes that it is called with.
     """
     (name, branch), *others = branches.items()

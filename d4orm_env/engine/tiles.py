@@ -1,6 +1,6 @@
 """The step of a tile of worlds, compiled with numba from the scalar functions of :mod:`d4orm_env.core`.
 
-A tile is a block of :data:`~d4orm_env.engine.lanes.TILE` worlds (samples of a plan, or environments) that differ in
+A tile is a block of :data:`~d4orm_env.engine.simd.TILE` worlds (samples of a plan, or environments) that differ in
 their numbers only. All a tile needs lies in one flat float32 array, the workspace: for every robot :data:`ROWS` rows,
 every row one number per world. So every inner loop runs over worlds with distances between its operands that the
 compiler knows, which is what lets it vectorise without checking for overlap, and the tile stays in cache while all
@@ -16,16 +16,16 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core import transition
+from d4orm_env.dynamics import transition
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.dynamics import MODEL_CODES, MODELS
+from d4orm_env.dynamics.models import MODEL_CODES, MODELS
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.core.robot_model import Model, TimeStep
+from d4orm_env.dynamics.robot_model import Model, TimeStep
 from d4orm_env.engine import stepping
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS, cosine, sine
-from d4orm_env.engine.lanes import TILE, at_most, use_wide_registers, within_2, within_3
-from d4orm_env.engine.rows import PICK, READ, WRITE, read2, read3, squared_gap2, squared_gap3
+from d4orm_env.engine.simd import TILE, at_most, use_wide_registers, within_2, within_3
+from d4orm_env.engine.tile_layout import PICK, READ, WRITE, read2, read3, squared_gap2, squared_gap3
 from d4orm_env.engine.stepping import Docking, dispatch, make_stepper
 
 PARTS = (*stepping.PARTS, stepping)

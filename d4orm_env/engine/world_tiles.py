@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core import reward
+from d4orm_env.dynamics import reward
 from d4orm_env.core.arrays import BoolArray, FloatArray, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine import obstacles, tiles
-from d4orm_env.engine.base import Sight
+from d4orm_env.engine.types import Sight
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
-from d4orm_env.engine.lanes import NOWHERE, TILE
+from d4orm_env.engine.simd import NOWHERE, TILE
 from d4orm_env.engine.tiles import (
     CONTROL,
     DISTANCE2,

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from d4orm_env.functional_env import EnvState, FunctionalEnv
+from d4orm_env.jax.functional_env import EnvState, FunctionalEnv
 from d4orm_env.scenarios.problems import ScenarioLike
 
 try:
@@ -30,7 +30,7 @@ ByAgent = dict[str, jax.Array]
 
 
 class JaxMARLNavigation(MultiAgentEnv):
-    """A :class:`~d4orm_env.functional_env.FunctionalEnv` with a dictionary for every robot's part.
+    """A :class:`~d4orm_env.jax.functional_env.FunctionalEnv` with a dictionary for every robot's part.
 
     A robot that has finished stays among the agents, as JaxMARL has it: its reward is zero, its action counts for
     nothing, and ``dones`` goes on saying so until the episode ends for all. ``step`` begins the next one then.
@@ -39,7 +39,7 @@ class JaxMARLNavigation(MultiAgentEnv):
     ``success`` ``()``.
 
     Args:
-        scenario: As for :class:`~d4orm_env.functional_env.FunctionalEnv`, like all others.
+        scenario: As for :class:`~d4orm_env.jax.functional_env.FunctionalEnv`, like all others.
         num_robots: Size of the team.
         **options: Further arguments of it.
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.team_step import AgentInfos
+from d4orm_env.envs.team_step import AgentInfos
 
 try:
     from ray.rllib.env.multi_agent_env import MultiAgentEnv

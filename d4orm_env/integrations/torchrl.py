@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.scenarios.problems import ScenarioLike
-from d4orm_env.team_step import Info
-from d4orm_env.vector_env import NavigationVectorEnv
+from d4orm_env.envs.team_step import Info
+from d4orm_env.envs.vector_env import NavigationVectorEnv
 
 try:
     import torch
@@ -48,7 +48,7 @@ class TorchRLNavigation(EnvBase):
 
     Args:
         num_worlds: ``B``.
-        scenario: As for :class:`~d4orm_env.vector_env.NavigationVectorEnv`, like all others but for its auto-reset,
+        scenario: As for :class:`~d4orm_env.envs.vector_env.NavigationVectorEnv`, like all others but for its auto-reset,
             which is TorchRL's.
         num_robots: ``K``.
         seed: Of the first world; the others have the numbers that follow.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.robot_model import ACCELERATION, SPEED, TimeStep
+from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TimeStep
 from d4orm_env.mujoco.physics import Physics
 from d4orm_env.mujoco.scene import DRIVES, HALF_TRACK, NOT_SOLID, OBSTACLE, PUCKS, WHEEL_RADIUS, build_scene
 from d4orm_env.mujoco.wheels import GRAVITY, Commands, WheelControl

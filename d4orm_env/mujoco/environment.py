@@ -6,15 +6,15 @@ from pettingzoo import AECEnv
 from pettingzoo.utils import OrderEnforcingWrapper
 
 from d4orm_env import navigation_v0
-from d4orm_env._viewer import RENDER_MODES
+from d4orm_env.envs.viewer import RENDER_MODES
 from d4orm_env.core.arrays import FloatArray, shown
 from d4orm_env.mujoco.physics import Physics
-from d4orm_env.mujoco.simulation import MujocoSimulation
-from d4orm_env.mujoco.viewer import RENDERERS, MujocoViewer
+from d4orm_env.mujoco.mujoco_simulation import MujocoSimulation
+from d4orm_env.mujoco.mujoco_viewer import RENDERERS, MujocoViewer
 from d4orm_env.navigation_v0 import TurnByTurn
-from d4orm_env.options import EnvOptions
+from d4orm_env.envs.options import EnvOptions
 from d4orm_env.scenarios.problems import ScenarioLike
-from d4orm_env.simulation import Simulation
+from d4orm_env.envs.simulation import Simulation
 
 
 class parallel_env(navigation_v0.parallel_env):
@@ -25,13 +25,13 @@ class parallel_env(navigation_v0.parallel_env):
     ``unicycle``, which stand on two wheels and a caster. ``collided`` is contact at any moment of a step.
 
     Args:
-        scenario: As in :class:`~d4orm_env.options.EnvOptions`, like all arguments not named here.
+        scenario: As in :class:`~d4orm_env.envs.options.EnvOptions`, like all arguments not named here.
         num_robots: Size of the team.
         physics: What the bodies are made of.
         renderer: Who draws ``"rgb_array"`` frames: ``"mujoco"``; ``"pictures"``, which are those of the other
             environments; or by default ``"auto"``, MuJoCo where EGL or OSMesa is there, else pictures. A window is
             always of pictures.
-        **options: Further attributes of :class:`~d4orm_env.options.EnvOptions`, and arguments of the scenario.
+        **options: Further attributes of :class:`~d4orm_env.envs.options.EnvOptions`, and arguments of the scenario.
 
     Raises:
         TypeError: For an argument that neither the environment nor the scenario has.

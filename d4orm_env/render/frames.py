@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.marks import Marks
+from d4orm_env.core.disturbance_events import Marks
 from d4orm_env.core.problem import Problem
-from d4orm_env.render.marks import MarkLayer
+from d4orm_env.render.event_marks import MarkLayer
 from d4orm_env.render.panels import INK, Array, Panel, TeamLayer, make_axes, view_limits
 
 

@@ -10,7 +10,7 @@ from io import BytesIO
 from matplotlib.figure import Figure
 
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.summary import Row
+from d4orm_env.core.summary_line import Row
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.render.pictures import plot_problem, plot_trajectory
 

@@ -12,12 +12,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from d4orm_env.core.files import replaced_when_done
-from d4orm_env.core.marks import Marks
+from d4orm_env.core.disturbance_events import Marks
 from d4orm_env.core.metrics import arrival_times
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.summary import count
+from d4orm_env.core.summary_line import count
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.render.marks import MarkLayer, mark_legend
+from d4orm_env.render.event_marks import MarkLayer, mark_legend
 from d4orm_env.render.panels import (
     CONTACT,
     INK,

@@ -18,7 +18,7 @@ from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.metrics import arrival_times
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.render.denoising import Denoising
+from d4orm_env.render.denoising_frames import Denoising
 from d4orm_env.render.panels import robot_colors, view_limits
 from d4orm_env.render.pictures import checked_trajectory
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 from d4orm_env.scenarios.maps import load_map
 from d4orm_env.scenarios.problems import make_problem
-from d4orm_env.scenarios.registry import describe_scenario, list_scenarios, register_scenario
+from d4orm_env.scenarios.scenario_registry import describe_scenario, list_scenarios, register_scenario
 
 if TYPE_CHECKING:
-    from d4orm_env.scenarios.files import load_problem, save_problem
+    from d4orm_env.scenarios.problem_files import load_problem, save_problem
 
 __all__ = [
     "describe_scenario", "list_scenarios", "load_map", "load_problem", "make_problem", "register_scenario",
@@ -21,5 +21,5 @@ __all__ = [
 def __getattr__(name: str) -> object:
     """Import the file schema on first use only: building it takes as long as importing everything else."""
     if name in ("load_problem", "save_problem"):
-        return getattr(import_module("d4orm_env.scenarios.files"), name)
+        return getattr(import_module("d4orm_env.scenarios.problem_files"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TypeAlias, TypeGuard
 
 from d4orm_env.core.problem import Problem
-from d4orm_env.scenarios.registry import FILE_SUFFIXES, SCENARIOS
+from d4orm_env.scenarios.scenario_registry import FILE_SUFFIXES, SCENARIOS
 from d4orm_env.scenarios.scenario import Scenario, complain
 
 ScenarioLike: TypeAlias = str | os.PathLike[str] | Callable[..., Problem] | Scenario
@@ -22,7 +22,7 @@ class _File:
         self._path = path
 
     def __call__(self, seed: int = 0, num_robots: int | None = None) -> Problem:
-        from d4orm_env.scenarios.files import load_problem
+        from d4orm_env.scenarios.problem_files import load_problem
 
         return load_problem(self._path)
 

@@ -10,13 +10,13 @@ from typing import TypeAlias
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.dynamics import COMMON
+from d4orm_env.dynamics.models import COMMON
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.base import SamplingTask
+from d4orm_env.engine.types import SamplingTask
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.threads import available_cores
 from d4orm_env.scenarios import make_problem
-from d4orm_planners.benchmark.environments import (
+from d4orm_planners.benchmark.env_steps import (
     DISTURBANCES,
     RIGID,
     measure_env,
@@ -29,8 +29,8 @@ from d4orm_planners.benchmark.probes import measure_memory, measure_startup
 from d4orm_planners.benchmark.settings import BenchmarkSettings
 from d4orm_planners.benchmark.timing import Row, Spread, in_turn, measure
 from d4orm_planners.benchmark.walls import Where, measure_index, measure_obstacles
-from d4orm_planners.d4orm import D4orm
-from d4orm_planners.registry import make_planner
+from d4orm_planners.sampling.d4orm import D4orm
+from d4orm_planners.base.planner_registry import make_planner
 
 PRESETS = (None, "paper")
 
@@ -164,7 +164,7 @@ def _engine_run(
 
 
 def _plain_run(problem: Problem, settings: BenchmarkSettings) -> Run:
-    from d4orm_planners.benchmark import plain
+    from d4orm_planners import reference as plain
 
     planner = _d4orm(preset="paper")
     temperature = float(planner.config.temperature)

@@ -8,8 +8,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from d4orm_env.core.dynamics import COMMON, get_model
-from d4orm_planners.settings import CheckedSettings, Count, Positive, Samples, Steps, Whole
+from d4orm_env.dynamics.models import COMMON, get_model
+from d4orm_planners.base.settings import CheckedSettings, Count, Positive, Samples, Steps, Whole
 
 ENGINES = ("cpu", "jax", "plain")
 MODELS = (*COMMON, "unicycle", "car")
@@ -25,7 +25,7 @@ class BenchmarkSettings(CheckedSettings):
     Attributes:
         num_robots: Team sizes.
         models: Robot models.
-        engines: Of :data:`ENGINES`; ``"plain"`` is :mod:`d4orm_planners.benchmark.plain`, which has the common models.
+        engines: Of :data:`ENGINES`; ``"plain"`` is :mod:`d4orm_planners.reference`, which has the common models.
         num_samples: ``M``.
         horizon: ``H``.
         num_steps: Denoising steps in an iteration.

@@ -11,7 +11,7 @@ import numpy as np
 from d4orm_env import verify
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
-from d4orm_env.core.world_index import build_index
+from d4orm_env.geometry.world_index import build_index
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.benchmark.timing import Row, Spread, in_turn
 

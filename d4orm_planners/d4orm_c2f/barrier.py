@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.robot_model import ACCELERATION, SPEED
+from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine import compiling
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS
-from d4orm_env.joint_state import JointState
+from d4orm_env.envs.joint_state import JointState
 
 NEAR = 1.5
 """Only what is this near is minded [m]."""

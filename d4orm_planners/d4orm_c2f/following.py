@@ -6,9 +6,9 @@ import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.base import Engine
-from d4orm_env.joint_state import JointState
-from d4orm_planners.steering import track_velocities
+from d4orm_env.engine.types import Engine
+from d4orm_env.envs.joint_state import JointState
+from d4orm_planners.tracking.steering import track_velocities
 
 STUCK_WITHIN, STUCK_AFTER = 3, 25
 """How many waypoints a robot has to get on in so many time steps not to be stuck."""

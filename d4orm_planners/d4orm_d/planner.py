@@ -9,14 +9,14 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.base import SamplingTask
-from d4orm_planners.d4orm import D4orm
+from d4orm_env.engine.types import SamplingTask
+from d4orm_planners.sampling.d4orm import D4orm
 from d4orm_planners.d4orm_d.groups import Groups
 from d4orm_planners.d4orm_d.repairs import Repairs
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
-from d4orm_planners.d4orm_d.team import DeformedTeam
-from d4orm_planners.grouping import conflicts
-from d4orm_planners.guidance.planner import (
+from d4orm_planners.d4orm_d.deformed_plan import DeformedTeam
+from d4orm_planners.base.conflict_groups import conflicts
+from d4orm_planners.mapf.planner import (
     Guide,
     GuidedConfig,
     better_ways,
@@ -24,11 +24,11 @@ from d4orm_planners.guidance.planner import (
     going_on_from_best,
     guided_iteration,
 )
-from d4orm_planners.planner import Iteration
-from d4orm_planners.refinement.iteration import FIRST_ROUNDS, GUIDED_ROUNDS, refined_iteration, shorten_first_ways
-from d4orm_planners.refinement.team import TeamPaths
-from d4orm_planners.search import Search
-from d4orm_planners.steering import prepare_drives, straight_drives
+from d4orm_planners.base.planner import Iteration
+from d4orm_planners.mapf.improvement import FIRST_ROUNDS, GUIDED_ROUNDS, refined_iteration, shorten_first_ways
+from d4orm_planners.mapf.working_plan import TeamPaths
+from d4orm_planners.base.solve import Search
+from d4orm_planners.tracking.steering import prepare_drives, straight_drives
 
 State = Groups | Repairs | Guide
 """What is kept between iterations, by the way of decoupling, or once ways have been found on a roadmap."""
@@ -63,7 +63,7 @@ class D4ormD(D4orm):
     def init(self, search: Search) -> State:
         """See :meth:`Planner.init`."""
         # Here, because importing numba takes long.
-        from d4orm_planners.refinement.beams import prepare_beams
+        from d4orm_planners.mapf.beams import prepare_beams
 
         with search.watch.paused():
             prepare_drives(search.problem)

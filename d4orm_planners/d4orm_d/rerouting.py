@@ -7,13 +7,13 @@ import numpy as np
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import IntArray
 from d4orm_env.core.seeds import Stream
-from d4orm_env.engine.beam_search import BeamRules
-from d4orm_env.engine.path_index import BLOCK
+from d4orm_planners.mapf.beam_search import BeamRules
+from d4orm_planners.engine.path_index import BLOCK
 from d4orm_planners.d4orm_d.settings import REROUTE_RULES
-from d4orm_planners.grouping import components
-from d4orm_planners.refinement.beams import Company, Manner, find_ways
-from d4orm_planners.refinement.team import TeamPaths
-from d4orm_planners.steering import drives, standing
+from d4orm_planners.base.conflict_groups import components
+from d4orm_planners.mapf.beams import Company, Manner, find_ways
+from d4orm_planners.mapf.working_plan import TeamPaths
+from d4orm_planners.tracking.steering import drives, standing
 
 AWAY = np.float32(1e6)
 """Where a robot is that is in nobody's way [m]."""

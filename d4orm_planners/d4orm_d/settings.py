@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from d4orm_planners.d4orm import D4ormConfig
+from d4orm_planners.sampling.d4orm import D4ormConfig
 from d4orm_planners.sampling.settings import Credit
-from d4orm_planners.settings import Count, Positive, Samples, Steps, one_of
+from d4orm_planners.base.settings import Count, Positive, Samples, Steps, one_of
 
 Decoupling = Annotated[str, one_of(("independent", "groups"))]
 Start = Annotated[str, one_of(("auto", "team", "straight", "guided"))]
@@ -28,7 +28,7 @@ class D4ormDConfig(D4ormConfig):
         reroute: Whether robots that fail look for ways among all others' before they are repaired independently.
         start: What the first iteration does without initial controls. ``"team"`` deforms the whole team at once;
             ``"straight"`` sends everybody straight to its goal and leaves the rest to repairs; ``"guided"`` finds ways
-            on a roadmap and goes on making them better (:mod:`d4orm_planners.guidance`). ``"auto"`` is guided where
+            on a roadmap and goes on making them better (:mod:`d4orm_planners.mapf`). ``"auto"`` is guided where
             obstacles lead somebody far round, or repairs have not helped for some time; else it is straight where
             robots so meet less than half of the others on average.
         first_collisions: Whether the first iteration over the whole team minds collisions.

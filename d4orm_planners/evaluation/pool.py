@@ -18,7 +18,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple, Protocol
 
 from d4orm_env.core.errors import describe
-from d4orm_planners.distributed.ray_connection import RayConnection
+from d4orm_planners.d_d4orm.ray_connection import RayConnection
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.trials import Job, run_job
 

@@ -36,7 +36,7 @@ class TrialKey(NamedTuple):
         control_noise_std: Standard deviation of the execution noise, in the controls' units.
         seed: Seed of the episode: of the policy and of the noise.
         disturbances: What else goes wrong, as JSON: a list of ``[name, attributes]``.
-        physics: What moved the robots, one of :data:`d4orm_planners.episode.PHYSICS`.
+        physics: What moved the robots, one of :data:`d4orm_planners.base.episode.PHYSICS`.
     """
 
     policy: str
@@ -92,7 +92,7 @@ class Trial:
         mean_squared_jerk: See :func:`d4orm_env.core.metrics.mean_squared_jerk` [m^2/s^6].
         steps: Steps of the episode.
         iterations: Iterations of the planner; ``None`` for a policy that executes no plan.
-        status: How its solve ended, see :class:`d4orm_planners.plan.Plan`.
+        status: How its solve ended, see :class:`d4orm_planners.base.plan.Plan`.
         wall_time: Seconds spent planning, or choosing actions.
         preparation: Those of ``wall_time`` before the first action: the whole solve of a plan, the coarse plan of a
             controller; ``None`` in rows that older versions wrote.

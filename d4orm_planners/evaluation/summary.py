@@ -44,7 +44,7 @@ class Compared:
         control_noise_std: Standard deviation of the execution noise, in the controls' units.
         disturbance: What else went wrong, such as ``"push.speed"``; empty for nothing.
         level: How much of it.
-        physics: What moved the robots, one of :data:`d4orm_planners.episode.PHYSICS`.
+        physics: What moved the robots, one of :data:`d4orm_planners.base.episode.PHYSICS`.
         trials: Trials, those with an error included.
         successes: Those that succeeded.
         lower: Lower end of the 95% confidence interval of the success rate (Wilson).

@@ -18,14 +18,14 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.errors import UnknownKeywordError, describe
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import AnyDisturbance
-from d4orm_env.disturbances.registry import attributes_of, name_of
-from d4orm_planners._machine import commit, describe_machine, versions
-from d4orm_planners.episode import Episode, open_env, run_episode
+from d4orm_env.disturbances.disturbance_registry import attributes_of, name_of
+from d4orm_planners.base.machine import commit, describe_machine, versions
+from d4orm_planners.base.episode import Episode, open_env, run_episode
 from d4orm_planners.evaluation.store import Trial, TrialKey
-from d4orm_planners.plan import IterationRecord, Plan
-from d4orm_planners.policy import Actions, Observations, OpenLoop, Policy
-from d4orm_planners.references import source_digest
-from d4orm_planners.registry import is_planned, make_policy, policy_settings
+from d4orm_planners.base.plan import IterationRecord, Plan
+from d4orm_planners.base.policy import Actions, Observations, OpenLoop, Policy
+from d4orm_planners.base.import_paths import source_digest
+from d4orm_planners.base.planner_registry import is_planned, make_policy, policy_settings
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
@@ -42,7 +42,7 @@ class Condition:
         disturbances: What else goes wrong.
         name: What is varied, such as ``"push.speed"``; empty for nothing.
         level: How much of it; of disturbances that differ in more than a number, their place among the levels.
-        physics: What moves the robots, one of :data:`d4orm_planners.episode.PHYSICS`.
+        physics: What moves the robots, one of :data:`d4orm_planners.base.episode.PHYSICS`.
     """
 
     control_noise_std: float = 0.0

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_resolution
-from d4orm_env.lifelong import goal_region
+from d4orm_env.envs.lifelong import goal_region
 
 Edit = Callable[[Problem], Problem]
 

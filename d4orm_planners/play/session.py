@@ -18,14 +18,14 @@ from numpy.typing import ArrayLike
 
 from d4orm_env.core.errors import first_line
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.summary import count
-from d4orm_env.disturbances.registry import disturbances_at
+from d4orm_env.core.summary_line import count
+from d4orm_env.disturbances.disturbance_registry import disturbances_at
 from d4orm_env.render.replay import Replay
 from d4orm_planners.play.edits import Edit, followed
-from d4orm_planners.play.frame import Frame, Status
-from d4orm_planners.play.lane import Lane, Terms
-from d4orm_planners.policy import Policy
-from d4orm_planners.registry import make_policy, setting_names
+from d4orm_planners.play.scene_frame import Frame, Status
+from d4orm_planners.play.viewport import Lane, Terms
+from d4orm_planners.base.policy import Policy
+from d4orm_planners.base.planner_registry import make_policy, setting_names
 
 _IDLE = 0.1
 
@@ -206,7 +206,7 @@ class Session:
         """What goes wrong from the next step on.
 
         Args:
-            levels: Names and levels of :func:`~d4orm_env.disturbances.registry.disturbances_at`.
+            levels: Names and levels of :func:`~d4orm_env.disturbances.disturbance_registry.disturbances_at`.
         """
 
         def make() -> None:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core.files import replaced_when_done
-from d4orm_planners.rl.mixture import MixedVecEnv
+from d4orm_planners.rl.task_mixture import MixedVecEnv
 from d4orm_planners.rl.network import Network
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 

@@ -11,7 +11,7 @@ from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer, RolloutBu
 from stable_baselines3.common.type_aliases import ReplayBufferSamples, RolloutBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from d4orm_planners.rl.mixture import MixedVecEnv
+from d4orm_planners.rl.task_mixture import MixedVecEnv
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 
 

@@ -14,11 +14,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.dynamics import get_model
+from d4orm_env.dynamics.models import get_model
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.observation_layout import ObservationSlices
 from d4orm_planners.rl.features import Features
-from d4orm_planners.rl.sets import array_shapes, encode, encoded_size
+from d4orm_planners.rl.set_network import array_shapes, encode, encoded_size
 
 FORMAT = 1
 EPSILON = 0.1
@@ -44,7 +44,7 @@ class Header(BaseModel):
         activation: Between the layers.
         squashed: Whether the output goes through tanh.
         layers: Number of layers; those of sets come before them and are not counted.
-        encoder: ``"sets"`` if neighbours and obstacles are pooled first, see :mod:`d4orm_planners.rl.sets`. Such a
+        encoder: ``"sets"`` if neighbours and obstacles are pooled first, see :mod:`d4orm_planners.rl.set_network`. Such a
             policy acts for any number of observed robots.
         frame: Where the first axis of a robot's frame points; ``None`` is to the goal.
         ways: Whether it heads along the shortest free ways, see :meth:`Features.along`; ``None`` is straight.

@@ -14,9 +14,9 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.observation_layout import ObservationSlices
-from d4orm_env.rewards import RewardFunction
-from d4orm_env.team_step import Info
-from d4orm_env.vector_env import NavigationVectorEnv
+from d4orm_env.envs.rewards import RewardFunction
+from d4orm_env.envs.team_step import Info
+from d4orm_env.envs.vector_env import NavigationVectorEnv
 from d4orm_planners.rl.features import Features
 
 
@@ -37,12 +37,12 @@ class RobotVecEnv(VecEnv):
         num_robots: ``K``.
         scenario: As for :class:`d4orm_env.navigation_v0.parallel_env`, like ``**kwargs``. One model for all robots.
         seed: Of the first world.
-        reward: The reward to learn from, as in :class:`~d4orm_env.options.EnvOptions`.
+        reward: The reward to learn from, as in :class:`~d4orm_env.envs.options.EnvOptions`.
         sight: How many of the observed robots are shown at most, the others being marked absent; ``None`` is all. Or
             that of each world.
         ways: Whether robots see their goals along their shortest free ways, see :meth:`Features.along`, and are paid
             for the way made along those.
-        **kwargs: Further arguments of :class:`d4orm_env.vector_env.NavigationVectorEnv`.
+        **kwargs: Further arguments of :class:`d4orm_env.envs.vector_env.NavigationVectorEnv`.
 
     Attributes:
         ways: As above.

@@ -14,7 +14,7 @@ import numpy as np
 from d4orm_env.core.archives import ArrayArchive
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.files import replaced_when_done
-from d4orm_planners.policy import Policy, robot_indices
+from d4orm_planners.base.policy import Policy, robot_indices
 from d4orm_planners.rl.features import Features
 
 if TYPE_CHECKING:

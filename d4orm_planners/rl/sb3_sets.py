@@ -1,4 +1,4 @@
-"""A network of sets as a features extractor of Stable-Baselines3; :mod:`d4orm_planners.rl.sets` says what it does."""
+"""A network of sets as a features extractor of Stable-Baselines3; :mod:`d4orm_planners.rl.set_network` says what it does."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import nn
 
 from d4orm_planners.rl.features import Features
 from d4orm_planners.rl.network import EPSILON
-from d4orm_planners.rl.sets import KINDS, SUM_SCALE
+from d4orm_planners.rl.set_network import KINDS, SUM_SCALE
 
 WIDTHS = (64, 32)
 """Of the layers that neighbours go through, and of those of obstacles."""

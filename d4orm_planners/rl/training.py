@@ -24,18 +24,18 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
-from d4orm_env.rewards import TrainingReward
+from d4orm_env.envs.rewards import TrainingReward
 from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm
 from d4orm_planners.rl.checkpoints import Checkpoints
 from d4orm_planners.rl.curriculum import Lesson, common_batch, make_lessons, team_sizes
 from d4orm_planners.rl.curve import Evaluation, evaluate_network, write_curve
-from d4orm_planners.rl.mixture import Exercise, Instances, MixedVecEnv, gather_parts, parse_mixture
+from d4orm_planners.rl.task_mixture import Exercise, Instances, MixedVecEnv, gather_parts, parse_mixture
 from d4orm_planners.rl.network import CLIP, EPSILON, Network, load_network
-from d4orm_planners.rl.practice import VALIDATION_SEED, Many, Practice
+from d4orm_planners.rl.train_config import VALIDATION_SEED, Many, Practice
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 from d4orm_planners.rl.sb3_network import network_of, set_network
 from d4orm_planners.rl.sb3_sets import leave_as_they_are
-from d4orm_planners.settings import Count, Number, PathText, Positive, Whole, one_of
+from d4orm_planners.base.settings import Count, Number, PathText, Positive, Whole, one_of
 
 Progress = Callable[[str, int, int], object]
 _INSTANCES, _STEPS_PER_INSTANCE = 256, 25_000
@@ -64,17 +64,17 @@ class TrainingSettings(Practice):
         lessons: Parts of the training, each with a checkpoint and an evaluation at its end.
         start_from: A policy file of the same algorithm, whose network learns on; ``None`` begins with nothing.
         network: ``"flat"``, fully connected from all that is observed; or ``"sets"``, which pools neighbours and
-            obstacles, see :mod:`d4orm_planners.rl.sets`.
+            obstacles, see :mod:`d4orm_planners.rl.set_network`.
         observed_robots: In observations.
         ways: Whether robots see their goals along their shortest free ways, as is wanted among walls, see
             :meth:`~d4orm_planners.rl.features.Features.along`.
         learning_rate: At the beginning; ``None`` is the algorithm's own. It falls linearly to a tenth.
         learner_settings: Further settings of the algorithm, as Stable-Baselines3 calls them, where they are others than
             those of :mod:`d4orm_planners.rl.algorithms`: ``{"gradient_steps": 8}``.
-        reward_settings: Weights of the :class:`~d4orm_env.rewards.TrainingReward` to learn from, where they are others.
+        reward_settings: Weights of the :class:`~d4orm_env.envs.rewards.TrainingReward` to learn from, where they are others.
         mixture: Scenarios and team sizes to be practised all at once, in place of ``scenario`` and ``num_robots``:
-            texts as :meth:`~d4orm_planners.rl.mixture.Exercise.parse` takes them, or names of
-            :data:`~d4orm_planners.rl.mixture.MIXTURES`. Each has as many robots, as nearly as whole worlds allow, and
+            texts as :meth:`~d4orm_planners.rl.task_mixture.Exercise.parse` takes them, or names of
+            :data:`~d4orm_planners.rl.task_mixture.MIXTURES`. Each has as many robots, as nearly as whole worlds allow, and
             as many validation worlds as any other.
 
     Raises:

@@ -34,7 +34,7 @@ class SoftmaxWeights:
         """
         if xp is np:
             # Imported here: numba takes longer to import than most commands take.
-            from d4orm_env.engine.softmax import softmax_weights
+            from d4orm_planners.engine.softmax import softmax_weights
 
             return softmax_weights(rewards, self.temperature, self.cutoff, log_ratio)
         usable = rewards > -xp.inf

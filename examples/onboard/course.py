@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from d4orm_env import Problem, Team
-from d4orm_env.engine.base import Engine
-from d4orm_env.joint_state import JointState
-from d4orm_planners.candidate import Candidate, evaluate_controls
-from d4orm_planners.steering import straight_drives
+from d4orm_env.engine.types import Engine
+from d4orm_env.envs.joint_state import JointState
+from d4orm_planners.base.candidate import Candidate, evaluate_controls
+from d4orm_planners.tracking.steering import straight_drives
 
 LEAST_MARGIN = 0.01
 """Margin below which plans never go, however near to each other robots have come to stand [m]."""

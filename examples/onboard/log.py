@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from d4orm_planners.distributed.events import Event
+from d4orm_planners.d_d4orm.node_events import Event
 from onboard.course import reward
 
 COLUMNS = (

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from d4orm_env.engine.choice import get_engine
-from d4orm_env.joint_state import JointState, split_state
-from d4orm_planners.distributed.transport import Transport
+from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_planners.d_d4orm.transport import Transport
 from onboard import wire
 from onboard.course import Course, first_guess, goals_to_plan_for, present_problem
 from onboard.log import Log
@@ -168,7 +168,7 @@ def main() -> None:
     # Ctrl-C is for the one that started the robots, and the world tells them when it is over.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # Candidates that come too late for their round are counted, not worth a line each.
-    logging.getLogger("d4orm_planners.distributed").setLevel(logging.ERROR)
+    logging.getLogger("d4orm_planners.d_d4orm").setLevel(logging.ERROR)
     team = mission.join("team", listen=own == 0)
     world = mission.join("world", listen=False)
     try:

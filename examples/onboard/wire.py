@@ -16,7 +16,7 @@ class Tick:
 
     Attributes:
         number: Ticks since the start; -1 for the last message, which ends the run.
-        state: The joint state, see :mod:`d4orm_env.joint_state`.
+        state: The joint state, see :mod:`d4orm_env.envs.joint_state`.
         lost: Robots that have been given up; they stand where they stopped.
         ballots: What each robot announced last as the plan of its choice, ``""`` for none.
         rewards: What each of those is worth.

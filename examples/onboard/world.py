@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from d4orm_env import navigation_v0
-from d4orm_env.joint_state import JointState, split_state
-from d4orm_planners.distributed.transport import Transport
+from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_planners.d_d4orm.transport import Transport
 from onboard import wire
 from onboard.mission import Mission
 

@@ -21,8 +21,8 @@ from d4orm_env import load_problem, verify
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.choice import get_engine
 from d4orm_planners import Plan, make_planner
-from d4orm_planners.commands.node_file import load_node
-from d4orm_planners.distributed.messages import Message, decode, encode
+from d4orm_planners.cli.node_file import load_node
+from d4orm_planners.d_d4orm.messages import Message, decode, encode
 from d4orm_planners.evaluation.store import Trial, TrialStore
 
 PROBLEM = hop_problem(2, horizon=4)

@@ -13,9 +13,9 @@ from planner_support import CHEAP, hop_problem
 
 from d4orm_env import navigation_v0
 from d4orm_planners import make_planner, make_policy
-from d4orm_planners.planner import Planner
-from d4orm_planners.policy import Policy
-from d4orm_planners.registry import PLANNERS, POLICIES
+from d4orm_planners.base.planner import Planner
+from d4orm_planners.base.policy import Policy
+from d4orm_planners.base.planner_registry import PLANNERS, POLICIES
 
 NEEDS = {"ipopt": "casadi", "orca": "pyrvo", "ppo": "torch", "sac": "torch"}
 PROBLEM = hop_problem(2, horizon=4)

@@ -1,0 +1,25 @@
+"""Robot models, one file each, and what a model of one's own is made of: see ``docs/own_robot.md``."""
+
+from d4orm_env.dynamics.robot_model import (
+    ACCELERATION,
+    OWN_LIMITS,
+    SPEED,
+    TURN_RATE,
+    Limit,
+    Model,
+    ModelFunctions,
+    Ops,
+    clip,
+    control_scale,
+    first_order_approach,
+    norm_scale,
+    planar_approach,
+    share,
+    stopping_speed,
+    turn_towards,
+)
+
+__all__ = [
+    "ACCELERATION", "OWN_LIMITS", "SPEED", "TURN_RATE", "Limit", "Model", "ModelFunctions", "Ops", "clip",
+    "control_scale", "first_order_approach", "norm_scale", "planar_approach", "share", "stopping_speed", "turn_towards",
+]  # fmt: skip

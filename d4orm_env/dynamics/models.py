@@ -1,0 +1,164 @@
+"""The robot models by name: those that come with the package, one file each in :mod:`d4orm_env.dynamics`, and users'."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from functools import cache
+
+import numpy as np
+
+from d4orm_env.core.arrays import shown
+from d4orm_env.core.registry import Registry
+from d4orm_env.dynamics.robot_model import OWN_LIMITS, PYTHON_OPS, Model, RungeKutta
+from d4orm_env.dynamics.source_digest import pieces
+from d4orm_env.dynamics.transition import TimeStep
+from d4orm_env.dynamics.car import CAR
+from d4orm_env.dynamics.differential_drive import DIFFERENTIAL_DRIVE
+from d4orm_env.dynamics.holonomic2d import HOLONOMIC2D
+from d4orm_env.dynamics.holonomic3d import HOLONOMIC3D
+from d4orm_env.dynamics.unicycle import UNICYCLE
+from d4orm_env.dynamics.velocity2d import VELOCITY2D
+
+_BUILT_IN = (HOLONOMIC2D, HOLONOMIC3D, VELOCITY2D, DIFFERENTIAL_DRIVE, UNICYCLE, CAR)
+
+MODEL_CODES: dict[str, int] = {model.name: code for code, model in enumerate(_BUILT_IN)}
+"""What the engines call models by; a model gets its code when it is registered, or loaded from another package."""
+
+NUM_BUILT_IN = len(_BUILT_IN)
+"""Codes from this one on go to models in the order in which this process registers them."""
+
+COMMON = tuple(model.name for model in _BUILT_IN[:4])
+"""Models that share compiled kernels, whatever mixture of them a team is. Teams with others have kernels of their own,
+so that nobody waits for the compiler because of a model that they do not use.
+"""
+
+
+def get_model(name: str) -> Model:
+    """Look a model up by name: those registered, and those that installed packages offer.
+
+    Raises:
+        ValueError: If there is no such model, or it cannot be loaded; the message lists those there are.
+    """
+    return MODELS.look_up(name)
+
+
+def names_of_codes(codes: Iterable[int]) -> tuple[str, ...]:
+    """The names of the models with these codes.
+
+    Raises:
+        ValueError: If a code is no model's.
+    """
+    names = tuple(MODEL_CODES)
+    for code in codes:
+        if not 0 <= code < len(names):
+            raise ValueError(f"model code {code} is unknown; there are codes 0 to {len(names) - 1}: register the model")
+    return tuple(names[code] for code in codes)
+
+
+@cache
+def model_digest(model: Model) -> str:
+    """SHA-256 over all that a model is, its functions' sources and the constants that they name included."""
+    sha = hashlib.sha256(repr([value for name, value in vars(model).items() if name != "functions"]).encode())
+    for function in model.functions:
+        found = ["Runge-Kutta"] if isinstance(function, RungeKutta) else pieces(function)
+        sha.update(repr(list(found)).encode())
+    return sha.hexdigest()
+
+
+def register_model(model: Model) -> None:
+    """Add a robot model, which is then known by its name everywhere, to this process.
+
+    Processes that are started to work on problems with it have to register it too: do it where the module that defines
+    it is imported. A package that offers it as an entry point of the group ``d4orm.models`` need not.
+
+    Args:
+        model: The model.
+
+    Raises:
+        ValueError: If the name is taken or none, a size or an index does not fit, or a function fails on Python's
+            numbers, returns a wrong number of them or names a constant that is a float.
+    """
+    if not isinstance(model, Model):
+        raise ValueError(f"register_model takes a Model, not {shown(model)}; see docs/own_robot.md")
+    MODELS.add(model.name, model)
+
+
+def _admit(name: str, model: object) -> Model:
+    """A model with its code, checked if it does not come with this package."""
+    if model in _BUILT_IN:
+        return model
+    if not isinstance(model, Model):
+        raise ValueError(f"model {name!r} is {shown(model)}; it must be a Model, see docs/own_robot.md")
+    if model.name != name:
+        raise ValueError(f"model {name!r} calls itself {model.name!r}; offer it under that name")
+    _check_attributes(model)
+    _check_functions(model)
+    MODEL_CODES.setdefault(name, len(MODEL_CODES))
+    return model
+
+
+def _check_attributes(model: Model) -> None:
+    n, m, num_limits = model.state_size, model.control_size, len(model.limit_names)
+    indices = (*model.speed_indices, *(index for index, _ in model.state_limits), model.heading_index or 0)
+    columns = (*model.control_limits, *(column for _, column in model.state_limits))
+    name = model.name
+    checks = (
+        (
+            isinstance(name, str) and name.isidentifier(),
+            f"name is {name!r}; it must be an identifier such as 'my_robot'",
+        ),
+        (model.dimension in (2, 3), f"dimension is {model.dimension}; it must be 2 or 3"),
+        (model.dimension <= n <= 6, f"state_names has {n} names; it must have from {model.dimension} to 6"),
+        (m in (2, 3), f"control_names has {m} names; it must have 2 or 3"),
+        (len(model.control_limits) == m, f"control_limits has {len(model.control_limits)} columns; expected {m}"),
+        (all(0 <= index < n for index in indices), f"an index of a state component is not from 0 to {n - 1}"),
+        (all(0 <= column < num_limits for column in columns), f"a column of limits is not from 0 to {num_limits - 1}"),
+        (len({*model.limit_names, "radius"}) == num_limits + 1, "two limits have the same name; rename yours"),
+        (all(limit.default > 0 for limit in model.own_limits), "a default of own_limits is not positive"),
+    )
+    for holds, complaint in checks:
+        if not holds:
+            raise ValueError(f"model {name!r}: {complaint}")
+
+
+def _check_functions(model: Model) -> None:
+    n, m, d, functions = model.state_size, model.control_size, model.dimension, model.functions
+    x, u = (0.5,) * n, (0.25,) * m
+    limits = (1.0,) * OWN_LIMITS + tuple(limit.default for limit in model.own_limits)
+    h = TimeStep(0.1, 0.1 / 2, 0.1 / 3, 0.1 / 6)
+    calls: dict[str, tuple[int, tuple[object, ...]]] = {
+        "derivative": (n, (x, u, limits, PYTHON_OPS)),
+        "limit_control": (m, (u, limits, PYTHON_OPS)),
+        "limit_state": (n, (x, limits, PYTHON_OPS)),
+        "velocity": (d, (x, u, limits, PYTHON_OPS)),
+        "rest": (n, (x, 0.0)),
+        "integrate": (n, (x, u, limits, h, PYTHON_OPS)),
+        "approach": (d, (x, (1.0,) * d, limits, h, PYTHON_OPS)),
+        "track": (m, (x, (0.5,) * d, limits, h, PYTHON_OPS)),
+    }
+    for name, (size, arguments) in calls.items():
+        function = getattr(functions, name)
+        try:
+            result = function(*arguments)
+            numbers = np.array([float(value) for value in result])
+        except Exception as error:
+            raise ValueError(f"model {model.name!r}: {name} fails on Python's numbers: {error!r}") from error
+        if not isinstance(result, tuple) or len(result) != size or not np.isfinite(numbers).all():
+            raise ValueError(
+                f"model {model.name!r}: {name} returns {result!r}; expected a tuple of {size} finite numbers"
+            )
+        if not isinstance(function, RungeKutta):
+            floats = [value for value in pieces(function) if isinstance(value, float)]
+            if floats:
+                raise ValueError(
+                    f"model {model.name!r}: {name} uses the float {floats[0]:g}, which would change an engine's "
+                    f"precision; make it one of own_limits"
+                )
+
+
+MODELS = Registry("model", "d4orm.models", _admit, model_digest)
+"""All robot models by name; :func:`register_model` adds to them."""
+
+for _model in _BUILT_IN:
+    register_model(_model)

@@ -1,0 +1,32 @@
+"""One time step of one robot, in scalar style: clip, integrate, limit the speed, dock.
+
+The order is the definition of a step for every engine: the control is clipped to the limits, RK4 integrates the model
+over ``dt``, the speed limit is applied, and a robot within its goal radius at no more than the goal speed has arrived.
+From then on it stands where it docked (paper, section III; docking as in the paper's reference code), unless the
+problem says that who has arrived may be moved again: then it has arrived for as long as it is there.
+"""
+
+from __future__ import annotations
+
+from d4orm_env.dynamics.robot_model import Flag, ModelFunctions, N, Number, Ops, TimeStep, Truth
+
+__all__ = ["TimeStep", "advance", "arrives"]
+
+
+def advance(
+    model: ModelFunctions, x: tuple[N, ...], u: tuple[N, ...], limits: tuple[N, ...], h: TimeStep, ops: Ops
+) -> tuple[N, ...]:
+    """The state after one step under a control that :meth:`ModelFunctions.limit_control` has clipped."""
+    return model.limit_state(model.integrate(x, u, limits, h, ops), limits, ops)
+
+
+def arrives(
+    squared_distance: Number, squared_speed: Number, squared_goal_radius: Number, squared_goal_speed: Number
+) -> Flag:
+    """Whether a robot at this distance from its goal, at this speed, docks there."""
+    return (squared_distance <= squared_goal_radius) & (squared_speed <= squared_goal_speed)
+
+
+def stands(arrived: Truth, docks: Truth) -> Flag:
+    """Whether a robot that has arrived stays where it is, whatever its control; ``docks`` says whether any does."""
+    return arrived & docks

@@ -1,0 +1,85 @@
+"""What the environments of one team share: a simulation, and pictures of it."""
+
+from __future__ import annotations
+
+from d4orm_env.envs.viewer import Frame, Viewer
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.disturbances.disturbance import Effect
+from d4orm_env.envs.options import EnvOptions
+from d4orm_env.envs.simulation import Simulation
+
+
+class EnvironmentShell:
+    """A simulation, read and drawn; how it is reset and stepped is up to the environment."""
+
+    metadata: dict[str, object]
+    render_mode: str | None
+
+    def _begin(self, options: EnvOptions) -> None:
+        self.render_mode = options.render_mode
+        self._viewer = self._make_viewer(options)
+        self._simulation = self._make_simulation(options)
+        self.metadata = type(self).metadata | {"render_fps": max(1, round(1 / self.problem.dt))}
+
+    def _make_simulation(self, options: EnvOptions) -> Simulation:
+        """What the environment runs; one with another physics overrides it."""
+        return Simulation(options)
+
+    def _make_viewer(self, options: EnvOptions) -> Viewer:
+        return Viewer(options.render_mode)
+
+    @property
+    def problem(self) -> Problem:
+        """The problem being run; where every reset draws a new instance, that of the present episode."""
+        return self._simulation.problem
+
+    @property
+    def lifelong(self) -> bool:
+        """Whether robots that arrive get fresh goals instead of docking."""
+        return self._simulation.lifelong
+
+    def state(self) -> FloatArray:
+        """The joint state, all a planner needs to go on from here; see :mod:`d4orm_env.envs.joint_state`.
+
+        Raises:
+            RuntimeError: Before the first reset.
+        """
+        return self._simulation.state()
+
+    def true_state(self) -> FloatArray:
+        """:meth:`state` as it truly is, where a disturbance of what is seen has it told otherwise.
+
+        Raises:
+            RuntimeError: Before the first reset.
+        """
+        return self._simulation.true_state()
+
+    def effect(self) -> Effect:
+        """What disturbances have done up to now, as arrays with one world as their first axis.
+
+        Raises:
+            RuntimeError: Before the first reset.
+        """
+        return self._simulation.effect()
+
+    def metrics(self) -> dict[str, float]:
+        """The episode so far in numbers; see :meth:`d4orm_env.envs.episode_record.EpisodeRecord.metrics`.
+
+        Raises:
+            RuntimeError: Before the first reset.
+        """
+        return self._simulation.metrics()
+
+    def render(self) -> Frame | None:
+        """``(height, width, 3)`` uint8 frame in mode ``"rgb_array"``, else ``None``."""
+        return self._viewer.render(self._simulation)
+
+    def _show(self) -> None:
+        """Draw what has just happened, if somebody looks."""
+        if self.render_mode == "human":
+            self.render()
+
+    def close(self) -> None:
+        """Close the window or picture, if there is one."""
+        self._viewer.close()

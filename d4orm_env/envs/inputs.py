@@ -1,0 +1,115 @@
+"""What users hand to environments, checked."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, as_float32, frozen_array, whole_number
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_checks import check_states
+from d4orm_env.disturbances.levels import check_components, per_component
+
+MAX_ACTION = 1e15
+"""Largest magnitude of an action. float32 still holds the square of more, but no control of a robot is near it: an
+action so far outside its space is refused like one that is not finite, and less is clipped to the robot's limits."""
+MAX_CYCLES = 10**9
+
+
+def checked_cycles(value: object) -> int:
+    """``max_cycles`` as an int."""
+    return whole_number(value, "max_cycles", 1, MAX_CYCLES)
+
+
+def checked_states(
+    problem: Problem,
+    states: ArrayLike,
+    docked: BoolArray,
+    bounds: tuple[FloatArray, FloatArray],
+    shape: tuple[int, ...],
+) -> FloatArray:
+    """``states`` as an array of that shape, ``(..., K, n)``, as robots may be put into.
+
+    Args:
+        problem: The problem.
+        states: What was given.
+        docked: ``(..., K)`` bool.
+        bounds: Lowest and highest joint state; see :func:`d4orm_env.envs.joint_state.state_bounds`.
+        shape: The shape expected.
+
+    Raises:
+        ValueError: If a state is none that a robot may be in; the message names the robot.
+    """
+    array = frozen_array(states, "states", shape, largest=LARGEST)
+    low, high = (bound[: problem.start.size].reshape(problem.start.shape) for bound in bounds)
+    for team, parked in zip(array.reshape(-1, *problem.start.shape), docked.reshape(-1, problem.num_robots)):
+        check_states(problem.team, team, "state")
+        outside = ((team < low) | (team > high)).any(axis=1)
+        if outside.any():
+            robot = int(np.argmax(outside))
+            raise ValueError(
+                f"state of robot_{robot} is {team[robot].tolist()}, outside the state space; move it inside"
+            )
+        for robot in np.flatnonzero(parked).tolist():
+            if team[robot, list(problem.team.robot_models[robot].speed_indices)].any():
+                raise ValueError(f"state of robot_{robot} is moving, but the robot has docked; set its speed to zero")
+    return array
+
+
+def usable(actions: FloatArray) -> BoolArray:
+    """Where actions are finite, and at most :data:`MAX_ACTION` in magnitude."""
+    within: BoolArray = np.abs(actions) <= MAX_ACTION
+    return within
+
+
+def check_options(options: object, known: tuple[str, ...] = (), ignored: tuple[str, ...] = ()) -> None:
+    """Refuse what ``reset`` would otherwise ignore.
+
+    Raises:
+        TypeError: If ``options`` is no dictionary.
+        ValueError: For an option that is neither in ``known`` nor in ``ignored``.
+    """
+    if options is None:
+        return
+    if not isinstance(options, dict):
+        raise TypeError(f"options must be a dictionary or None, not {options!r}")
+    for name in options:
+        if name not in known + ignored:
+            raise ValueError(
+                f"reset takes no option {name!r}; it takes {', '.join(known) or 'none'}, and what is to differ between "
+                "environments goes to their constructors"
+            )
+
+
+def noise_std(value: ArrayLike, control_size: int) -> FloatArray | None:
+    """``(m,)`` standard deviations from one number or one per component; ``None`` where all are zero.
+
+    Raises:
+        ValueError: If it has another shape, or a value is negative, not finite or above 1e6.
+    """
+    std = per_component(value, "control_noise_std")
+    check_components(std, "control_noise_std", control_size)
+    return np.full(control_size, std, np.float32) if np.any(std) else None
+
+
+def joint_controls(actions: ArrayLike, shape: tuple[int, ...], num_robots: int) -> FloatArray:
+    """``(..., K, m)`` controls from joint actions of that shape, ``(..., K * m)``, as a checked copy.
+
+    Raises:
+        ValueError: If they have another shape, or a value that is not finite or beyond :data:`MAX_ACTION`.
+    """
+    noun, axes = ("action has", "(K * m,)") if len(shape) == 1 else ("actions have", "(B, K * m)")
+    try:
+        controls = as_float32(actions)
+    except ValueError as error:
+        raise ValueError(f"{noun.split()[0]} must be an array of {shape} numbers, not {actions!r}: {error}") from None
+    if controls.shape != shape:
+        raise ValueError(f"{noun} shape {controls.shape}; expected {axes} = {shape}")
+    controls = controls.reshape(*shape[:-1], num_robots, -1)
+    if not usable(controls).all():
+        *world, robot = np.argwhere(~usable(controls).all(axis=-1))[0].tolist()
+        raise ValueError(
+            f"action of robot_{robot}{f' in world {world[0]}' if world else ''} is "
+            f"{controls[*world, robot].tolist()}; every value must be finite and at most {MAX_ACTION:g} in magnitude"
+        )
+    return controls

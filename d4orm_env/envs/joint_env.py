@@ -1,0 +1,127 @@
+"""Multi-robot navigation as a Gymnasium environment: one agent steers the whole team."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+from numpy.typing import ArrayLike
+
+from d4orm_env.envs.viewer import RENDER_MODES
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.envs.inputs import check_options, joint_controls
+from d4orm_env.envs.options import EnvOptions
+from d4orm_env.scenarios.problems import ScenarioLike
+from d4orm_env.envs.base_env import EnvironmentShell
+from d4orm_env.envs.simulation import Simulation
+from d4orm_env.envs.team_step import Info, TeamStep, agent_infos
+
+__all__ = ["JointNavigationEnv", "register_environments"]
+
+ENV_ID = "d4orm/Navigation-v0"
+
+
+class JointNavigationEnv(EnvironmentShell, gymnasium.Env[FloatArray, FloatArray]):
+    """The joint environment, ``gymnasium.make("d4orm/Navigation-v0", scenario=..., num_robots=...)``.
+
+    The observation ``(K * D,)`` is all robots' local observations one after the other, the action ``(K * m,)`` all
+    their controls in physical units, the reward the team's mean reward (paper, section III-D). It terminates when every
+    robot has arrived, and truncates after ``max_cycles`` steps. Infos hold ``agents`` (one dictionary per robot, as in
+    :mod:`d4orm_env.navigation_v0`), ``metrics`` of the episode so far, and ``is_success``.
+
+    Args:
+        scenario: As in :class:`~d4orm_env.envs.options.EnvOptions`, like all others.
+        num_robots: Size of the team.
+        **options: Further attributes of :class:`~d4orm_env.envs.options.EnvOptions`, and arguments of the scenario.
+
+    Raises:
+        TypeError: For an argument that neither the environment nor the scenario has.
+        ValueError: For a bad argument, or when both a problem and a scenario's arguments are given.
+    """
+
+    metadata: dict[str, object] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012
+
+    def __init__(self, scenario: ScenarioLike | None = None, num_robots: int | None = None, **options: object) -> None:
+        self._begin(EnvOptions.of(scenario=scenario, num_robots=num_robots, **options))
+        self._agents = [f"robot_{robot}" for robot in range(self.problem.num_robots)]
+        self.observation_space, self.action_space = joint_spaces(self._simulation)
+        self._action_shape = (self.problem.num_robots * self.problem.control_size,)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, object] | None = None) -> tuple[FloatArray, Info]:
+        """Begin an episode; there are no ``options``.
+
+        Returns:
+            Observation ``(K * D,)`` and infos.
+
+        Raises:
+            ValueError: For any option.
+        """
+        check_options(options)
+        super().reset(seed=seed)
+        step = self._simulation.reset(self.np_random)
+        self._show()
+        return step.observations.ravel(), self._infos(step)
+
+    def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, Info]:
+        """Advance one time step under ``action`` ``(K * m,)``.
+
+        Returns:
+            Observation ``(K * D,)``, mean reward, whether all arrived, whether time is up, and infos.
+
+        Raises:
+            RuntimeError: Before the first reset, or after the end of an episode.
+            ValueError: If the action has another shape, or a value that is not finite or beyond 1e15. What is merely
+                outside the action space is clipped to the robots' limits.
+        """
+        simulation = self._simulation
+        simulation.require_reset()
+        if simulation.out_of_time or simulation.arrived.all():
+            raise RuntimeError("the episode is over; call reset() to begin another")
+        step = simulation.step(joint_controls(action, self._action_shape, self.problem.num_robots))
+        terminated = bool(simulation.arrived.all())
+        truncated = simulation.out_of_time and not terminated
+        self._show()
+        return step.observations.ravel(), float(step.rewards.mean()), terminated, truncated, self._infos(step)
+
+    def set_state(self, states: ArrayLike) -> tuple[FloatArray, Info]:
+        """Put the robots elsewhere; see :meth:`d4orm_env.navigation_v0.parallel_env.set_state`.
+
+        Args:
+            states: ``(K, n)`` of all robots.
+
+        Returns:
+            Observation ``(K * D,)`` and infos, as at a reset.
+
+        Raises:
+            RuntimeError: Before the first reset.
+            ValueError: If a state is none that the robot may be in; the message names it.
+        """
+        step = self._simulation.set_state(states)
+        return step.observations.ravel(), self._infos(step)
+
+    def _infos(self, step: TeamStep) -> Info:
+        metrics = self._simulation.metrics()
+        return {
+            "agents": agent_infos(self._agents, range(len(self._agents)), step),
+            "metrics": metrics,
+            "is_success": bool(metrics.get("success", 0.0)),
+        }
+
+
+def joint_spaces(simulation: Simulation) -> tuple[gymnasium.Space[FloatArray], gymnasium.Space[FloatArray]]:
+    """Spaces of the joint observation ``(K * D,)`` and of the joint action ``(K * m,)``."""
+    team, layout = simulation.problem.team, simulation.layout
+    limits = team.control_limits
+    # Padding has no limit of its own; a box must not be flat.
+    limits = np.where(limits > 0, limits, limits.max(axis=0)).ravel()
+    observations = gymnasium.spaces.Box(np.tile(layout.low, team.num_robots), np.tile(layout.high, team.num_robots))
+    return observations, gymnasium.spaces.Box(-limits, limits)
+
+
+def register_environments() -> None:
+    """Make the environments known to Gymnasium; a second call changes nothing."""
+    if ENV_ID not in gymnasium.registry:
+        gymnasium.register(
+            id=ENV_ID,
+            entry_point="d4orm_env.envs.joint_env:JointNavigationEnv",
+            vector_entry_point="d4orm_env.envs.vector_env:NavigationVectorEnv",
+        )

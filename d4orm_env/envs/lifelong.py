@@ -1,0 +1,90 @@
+"""Fresh goals for robots that never stop working."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32
+from d4orm_env.core.portable import NUMPY_OPS
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.core.team import Team
+from d4orm_env.dynamics.transition import arrives
+
+_BATCH = 256
+_ATTEMPTS = 20
+
+
+def goal_region(problem: Problem) -> FloatArray:
+    """``(2, d)`` the box that goals are drawn from [m]: the bounds, or in an open world where starts and goals lie.
+
+    An open world's box is grown by twice the largest diameter and the margin, so that a team on a line has room.
+    """
+    if problem.world.lower is not None:
+        return problem.world.bounds
+    places = np.concatenate([problem.start[:, : problem.dimension], problem.goal])
+    room = 2 * (2 * float(np.max(problem.team.radius)) + problem.margin)
+    return np.stack([places.min(axis=0) - room, places.max(axis=0) + room]).astype(np.float32)
+
+
+def reached_goals(team: Team, arrays: ProblemArrays, states: FloatArray, controls: FloatArray) -> BoolArray:
+    """``(K,)`` which robots are within the goal radius of their goals, at no more than the goal speed.
+
+    Args:
+        team: The robots.
+        arrays: The problem, with their present goals.
+        states: ``(K, n)``.
+        controls: ``(K, m)`` executed last, of which first-order robots' speed is read.
+    """
+    offsets = arrays.goal - states[:, : arrays.goal.shape[1]]
+    squared_speed = np.zeros(len(states), np.float32)
+    if np.isfinite(arrays.squared_goal_speed):
+        for robot, model in enumerate(team.robot_models):
+            velocity = model.functions.velocity(states[robot], controls[robot], arrays.limits[robot], NUMPY_OPS)
+            squared_speed[robot] = sum(component * component for component in velocity)
+    reached: BoolArray = arrives(
+        (offsets * offsets).sum(axis=1), squared_speed, arrays.squared_goal_radius, arrays.squared_goal_speed
+    )
+    return reached
+
+
+def fresh_goal(
+    problem: Problem, robot: int, positions: FloatArray, goals: FloatArray, random: np.random.Generator
+) -> FloatArray:
+    """A random goal where ``robot`` would keep the margin to every body, every other goal, obstacles and bounds.
+
+    Among obstacles it is one that has a free way to the robot's first goal, unless its start has none.
+
+    Args:
+        problem: The problem; its goals are not looked at.
+        robot: Who gets the goal.
+        positions: ``(K, d)`` where the robots are [m].
+        goals: ``(K, d)`` present goals; ``robot``'s own is ignored.
+        random: Where the draws come from.
+
+    Returns:
+        ``(d,)`` the goal, uniform over the free and reachable part of :func:`goal_region`.
+
+    Raises:
+        RuntimeError: If 5120 draws find no free place.
+    """
+    radius = np.asarray(problem.team.radius, np.float64)
+    reach = radius + radius[robot] + problem.margin
+    others = np.arange(problem.num_robots) != robot
+    bodies = np.concatenate([positions, goals[others]]).astype(np.float64)
+    keep_off = np.concatenate([reach, reach[others]])
+    keep_off[robot] = problem.goal_radius + radius[robot] + problem.margin
+    low, high = goal_region(problem).astype(np.float64)
+    for _ in range(_ATTEMPTS):
+        places = random.uniform(low, high, (_BATCH, problem.dimension))
+        free = problem.world.clearance(places) > radius[robot] + problem.margin
+        gaps = np.linalg.norm(places[:, None] - bodies, axis=-1) - keep_off
+        free &= (gaps > 0).all(axis=1)
+        if free.any() and problem.world.num_obstacles and np.isfinite(problem.ways.length[robot]):
+            free[free] = np.isfinite(problem.ways.distance_from(robot, places[free]))
+        if free.any():
+            return as_float32(places[np.argmax(free)])
+    raise RuntimeError(
+        f"no free place for a new goal of robot_{robot} between {low.tolist()} and {high.tolist()}; "
+        "use a larger world, fewer robots or a smaller margin for lifelong mode"
+    )

@@ -1,0 +1,159 @@
+"""The arguments that all environments share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from functools import partial
+from typing import Any
+
+from numpy.typing import ArrayLike
+
+from d4orm_env.core.arrays import shown
+from d4orm_env.core.errors import UnknownKeywordError
+from d4orm_env.core.problem import Problem
+from d4orm_env.disturbances.controls import ControlNoise
+from d4orm_env.disturbances.disturbance import AnyDisturbance
+from d4orm_env.disturbances.chosen import Disturbances, at_work, checked_disturbances
+from d4orm_env.envs.inputs import noise_std
+from d4orm_env.envs.rewards import RewardFunction
+from d4orm_env.scenarios.problems import ScenarioLike, find_scenario, make_problem, unknown_argument
+
+__all__ = ["EnvOptions"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EnvOptions:
+    """What an environment is made of; every environment takes these as keyword arguments.
+
+    Attributes:
+        scenario: ``"circle"`` unless a problem is given. The name of a scenario, the path of a YAML file, a callable
+            ``(seed, num_robots, **settings) -> Problem``, or where to import one, ``"package.module:function"``.
+        num_robots: Size of the team; the scenario's default (8 for most) unless given.
+        problem: The problem to run instead of a scenario.
+        render_mode: ``"rgb_array"``, ``"human"`` or ``None``.
+        control_noise_std: Standard deviation of Gaussian execution noise, in the controls' units, for all components
+            or one per component. It is added before the control is clipped.
+            It is short for ``ControlNoise(std)`` as the first of the disturbances.
+        disturbances: What goes wrong, in the order in which it acts: instances of :mod:`d4orm_env.disturbances`, or of
+            subclasses of your own. Those at level zero leave the environment as it is.
+        lifelong: A robot that arrives gets a fresh random goal, keeps moving and is not terminated; its info says
+            ``arrived`` at that step, and ``distance_to_goal`` is to the new goal.
+        max_cycles: Steps until truncation; the problem's horizon unless given.
+        randomize_instance: Draw a new instance of the scenario at every reset. By default wherever the scenario draws
+            at random, that is, where another seed gives another problem; ``False`` keeps the one of ``seed=``.
+        reward: ``"paper"``, ``"training"`` (:class:`~d4orm_env.envs.rewards.TrainingReward`), or a function from a
+            :class:`~d4orm_env.envs.rewards.RewardInput` to the rewards ``(..., K)`` of all robots.
+        progress: What the distances of rewards are, the paper's among them: ``"straight"``, or the length of the
+            shortest free ``"way"``, see :mod:`d4orm_env.paths.shortest_paths`; the same in a world without obstacles. Not for
+            ``lifelong``.
+        observed_way: Whether an observation ends with direction and length of the shortest free way. Not for
+            ``lifelong``.
+        observed_robots: Nearest robots in an observation; missing ones are marked absent.
+        observed_obstacles: Nearest obstacles in an observation; likewise.
+        scenario_settings: Arguments of the scenario, such as ``model`` or ``seed``: all other keyword arguments.
+    """
+
+    scenario: ScenarioLike | None = None
+    num_robots: int | None = None
+    problem: Problem | None = None
+    render_mode: str | None = None
+    control_noise_std: ArrayLike = 0.0
+    disturbances: Sequence[AnyDisturbance] = ()
+    lifelong: bool = False
+    max_cycles: int | None = None
+    randomize_instance: bool | None = None
+    reward: str | RewardFunction = "paper"
+    progress: str = "straight"
+    observed_way: bool = False
+    observed_robots: int = 4
+    observed_obstacles: int = 4
+    scenario_settings: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, **arguments: Any) -> EnvOptions:
+        """From the keyword arguments of an environment.
+
+        Raises:
+            TypeError: For one that neither the environments nor the scenario have; the message lists those they have.
+            ValueError: If both a problem and a scenario or its arguments are given, or the scenario is unknown.
+        """
+        own = [attribute.name for attribute in fields(cls) if attribute.name != "scenario_settings"]
+        given = {name: arguments.pop(name) for name in own if name in arguments}
+        options = cls(**given, scenario_settings=arguments)
+        for name in arguments:
+            complaint = unknown_argument(None if options.problem is not None else options._scenario, (name,), own)
+            if complaint:
+                # In Python's words first, by which TorchRL knows that it can do without an argument of its own.
+                raise UnknownKeywordError(f"unexpected keyword argument {name!r}: {complaint}")
+        options._check()
+        return options
+
+    def disturbances_of(self, problem: Problem) -> Disturbances:
+        """All disturbances that change anything in a problem, noise on the controls included.
+
+        Raises:
+            ValueError: If one of them makes no sense, or the robots or the world cannot have it.
+        """
+        std = noise_std(self.control_noise_std, problem.control_size)
+        noise = () if std is None else (ControlNoise(tuple(std.tolist())),)
+        return at_work((*noise, *self.disturbances), problem)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "disturbances", checked_disturbances(self.disturbances))
+
+    def _check(self) -> None:
+        if not isinstance(self.randomize_instance, bool | None):
+            raise ValueError(f"randomize_instance is {shown(self.randomize_instance)}; it must be True, False or None")
+        if self.progress not in ("straight", "way"):
+            raise ValueError(f"progress is {shown(self.progress)}; it must be 'straight' or 'way'")
+        if not isinstance(self.observed_way, bool):
+            raise ValueError(f"observed_way is {shown(self.observed_way)}; it must be True or False")
+        if self.lifelong and (self.progress == "way" or self.observed_way):
+            raise ValueError(
+                "progress='way' and observed_way need goals that stay; leave them out in lifelong mode, which draws "
+                "new ones all the time"
+            )
+        if self.problem is None:
+            return
+        beside = {"scenario": self.scenario, "num_robots": self.num_robots}
+        named = [name for name, value in beside.items() if value is not None]
+        named += [*self.scenario_settings, *["randomize_instance"] * bool(self.randomize_instance)]
+        if named:
+            raise ValueError(f"problem= excludes the scenario arguments ({', '.join(named)}); give one or the other")
+
+    @property
+    def _scenario(self) -> ScenarioLike:
+        return "circle" if self.scenario is None else self.scenario
+
+    @property
+    def vouched(self) -> bool:
+        """Whether the scenario is known to draw instances that differ in places and obstacles only."""
+        return self.problem is None and find_scenario(self._scenario).draws
+
+    def instances(self) -> tuple[Problem, Callable[[int], Problem] | None]:
+        """The problem to begin with, and ``seed -> Problem`` for drawing others; ``None`` where there is only one.
+
+        Raises:
+            ValueError: If the scenario's arguments are bad, or there is nothing to draw although
+                ``randomize_instance`` asks for it.
+        """
+        if self.problem is not None:
+            return self.problem, None
+        settings = {"num_robots": self.num_robots, **self.scenario_settings}
+        first = make_problem(self._scenario, **settings)
+        if self.randomize_instance is False:
+            return first, None
+        draw = partial(_draw, self._scenario, settings)
+        if self.vouched or draw(0 if self.scenario_settings.get("seed") else 1) != first:
+            return first, draw
+        if self.randomize_instance:
+            raise ValueError(
+                f"scenario {first.name!r} is the same for every seed, so randomize_instance has nothing to draw; "
+                "use a scenario with random starts and goals, or leave randomize_instance off"
+            )
+        return first, None
+
+
+def _draw(scenario: ScenarioLike, settings: Mapping[str, Any], seed: int) -> Problem:
+    return make_problem(scenario, **(dict(settings) | {"seed": seed}))

@@ -1,0 +1,265 @@
+"""The environment as pure JAX functions, which jit, vmap and grad.
+
+>>> import jax
+>>> from d4orm_env import functional, make_problem
+>>> problem = make_problem("circle", num_robots=8)
+>>> state = functional.reset(problem, jax.random.key(0))
+>>> state, step = jax.jit(functional.step)(problem, state, controls)
+>>> observations = functional.observe(problem, state, ObservationLayout.for_problem(problem))
+
+Importing this module registers :class:`~d4orm_env.core.problem.Problem` as a JAX pytree: a problem is an ordinary
+traced argument, whose starts, goals, limits and obstacles may be mapped over or differentiated. Models, shapes and the
+horizon are static.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from d4orm_env.core.observation_layout import ObservationLayout
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.dynamics.robot_model import STANDARD_LIMITS
+from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
+from d4orm_env.jax.jax_engine import Worlds, advance_worlds, goal_distance, judge
+from d4orm_env.jax.jax_observation import observe_team
+from d4orm_env.envs.rewards import RewardFunction, RewardInput, find_reward
+
+__all__ = ["State", "Step", "observe", "reset", "step"]
+
+
+class State(NamedTuple):
+    """Where a team is.
+
+    Attributes:
+        states: ``(K, n)``.
+        arrived: ``(K,)`` bool, docked.
+        steps: ``()`` int32, steps taken.
+        controls: ``(K, m)`` executed last, zero after a reset: what the speed of first-order robots is read from.
+    """
+
+    states: jax.Array
+    arrived: jax.Array
+    steps: jax.Array
+    controls: jax.Array
+
+
+class Step(NamedTuple):
+    """What one step brought.
+
+    Attributes:
+        rewards: ``(K,)``.
+        arrived: ``(K,)`` bool.
+        collided: ``(K,)`` bool, hard contact.
+        margin_violated: ``(K,)`` bool.
+        truncated: ``()`` bool, the horizon is reached.
+        controls: ``(K, m)`` as executed.
+        distances: ``(K,)`` to the goals [m].
+    """
+
+    rewards: jax.Array
+    arrived: jax.Array
+    collided: jax.Array
+    margin_violated: jax.Array
+    truncated: jax.Array
+    controls: jax.Array
+    distances: jax.Array
+
+
+def reset(problem: Problem, key: jax.Array) -> State:
+    """The team at its start.
+
+    Args:
+        problem: The problem.
+        key: A JAX random key; problems start where they say, so it has no effect, but APIs that vmap resets need it.
+
+    Returns:
+        The state at time zero.
+    """
+    del key
+    num_robots = len(problem.team.models)
+    idle = jnp.zeros((num_robots, problem.control_size))
+    return State(jnp.asarray(problem.start), jnp.zeros(num_robots, bool), jnp.int32(0), idle)
+
+
+def step(
+    problem: Problem, state: State, controls: ArrayLike, reward: str | RewardFunction = "paper"
+) -> tuple[State, Step]:
+    """One time step, as every engine takes it.
+
+    Args:
+        problem: The problem.
+        state: Where the team is.
+        controls: ``(K, m)``, clipped here.
+        reward: ``"paper"``, ``"training"``, or a function of a :class:`~d4orm_env.envs.rewards.RewardInput` that JAX can
+            trace; static.
+
+    Returns:
+        The next state and what happened.
+
+    Raises:
+        ValueError: If there is no such reward.
+    """
+    function = find_reward(reward)
+    arrays = _arrays(problem)
+    d = arrays.goal.shape[1]
+    worlds = Worlds(state.states[..., None], state.arrived[..., None], jnp.zeros_like(controls)[..., None])
+    worlds = advance_worlds(problem.team.models, arrays, worlds, jnp.asarray(controls)[..., None])
+    collided, margin_violated, rewards = judge(arrays, worlds.state[:, :d])
+    before, after = (goal_distance(arrays, states[:, :d])[:, 0] for states in (state.states[..., None], worlds.state))
+    steps = state.steps + 1
+    happened = Step(
+        rewards[:, 0],
+        worlds.docked[:, 0],
+        collided[:, 0],
+        margin_violated[:, 0],
+        steps >= problem.horizon,
+        worlds.control[..., 0],
+        after,
+    )
+    following = State(worlds.state[..., 0], worlds.docked[..., 0], steps, happened.controls)
+    if function is None:
+        return following, happened
+    given = _reward_input(problem, state, following, happened, before)
+    return following, happened._replace(rewards=jnp.asarray(function(given)))
+
+
+def _reward_input(problem: Problem, state: State, after: State, happened: Step, distances: jax.Array) -> RewardInput:
+    """What a reward is told of a step that began in ``state``, at these distances ``(K,)`` from the goals."""
+    arrays = _arrays(problem)
+    traced: dict[str, Any] = {
+        "previous_states": state.states,
+        "states": after.states,
+        "controls": happened.controls,
+        "goals": arrays.goal,
+        "previous_distances": distances,
+        "distances": happened.distances,
+        "initial_distances": 1 / arrays.inverse_initial_distance,
+        "previously_arrived": state.arrived,
+        "arrived": after.arrived,
+        "collided": happened.collided,
+        "margin_violated": happened.margin_violated,
+        "paper": happened.rewards,
+    }
+    return RewardInput(**traced, team=problem.team, dt=problem.dt)
+
+
+def observe(problem: Problem, state: State, layout: ObservationLayout, max_cycles: int | None = None) -> jax.Array:
+    """What every robot sees, as in the environments.
+
+    Args:
+        problem: The problem.
+        state: Where the team is.
+        layout: What observations are made of, as ``ObservationLayout.for_problem(problem)``; static.
+        max_cycles: Steps until truncation; the problem's horizon unless given.
+
+    Returns:
+        ``(K, D)``.
+
+    Raises:
+        ValueError: If the layout has the shortest free way, which is not known here.
+    """
+    if layout.observed_way:
+        raise ValueError("the functional API does not know the shortest free ways; leave observed_way out")
+    cycles = problem.horizon if max_cycles is None else max_cycles
+    time_left = jnp.maximum(0, 1 - state.steps / cycles)
+    world = Worlds(state.states, state.arrived, state.controls)
+    arrays = _arrays(problem)
+    if problem.world.lower is None:
+        arrays = arrays._replace(bounds=None)  # type: ignore[arg-type] # there is nothing to see of them
+    return observe_team(problem.team.models, arrays, world, layout, time_left)
+
+
+def _arrays(problem: Problem) -> ProblemArrays:
+    """:attr:`Problem.arrays` for a problem whose numbers may be traced."""
+    team, world = problem.team, problem.world
+    place = jnp.asarray(problem.start)[:, : team.dimension]
+    gap2 = ((place - problem.goal) ** 2).sum(axis=-1)
+    distance = jnp.sqrt(jnp.maximum(gap2, problem.goal_radius**2))
+    goal_speed = jnp.inf if problem.goal_speed is None else problem.goal_speed
+    dt = problem.dt
+    if world.lower is None:
+        bounds = jnp.array([[-jnp.inf] * team.dimension, [jnp.inf] * team.dimension], jnp.float32)
+    else:
+        bounds = jnp.stack([jnp.asarray(world.lower), jnp.asarray(world.upper)])
+    arrays: dict[str, Any] = {  # traced, which the engine does not mind
+        "model_codes": None,
+        "limits": _limits(team),
+        "radius": jnp.asarray(team.radius),
+        "start": problem.start,
+        "goal": jnp.asarray(problem.goal),
+        "inverse_initial_distance": 1 / distance,
+        "boxes": _rounded_boxes(world),
+        "triangles": _triangles(world),
+        "grid": None,
+        "bounds": bounds,
+        "time_step": jnp.stack([jnp.asarray(dt / part, jnp.float32) for part in (1, 2, 3, 6)]),
+        "margin": jnp.asarray(problem.margin, jnp.float32),
+        "squared_goal_radius": jnp.asarray(problem.goal_radius**2, jnp.float32),
+        "squared_goal_speed": jnp.asarray(goal_speed**2, jnp.float32),
+        "docks": problem.arrival == "dock",
+    }
+    return ProblemArrays(**arrays)
+
+
+def _rounded_boxes(world: World) -> jax.Array:
+    """The boxes of :attr:`World.shapes` of a world whose numbers may be traced."""
+    d = world.dimension
+    balls, cylinders = jnp.asarray(world.balls), jnp.asarray(world.cylinders)
+    rows = [jnp.concatenate([balls[:, :d], balls], axis=1)]
+    if d == 3:
+        end = jnp.full((len(cylinders), 1), jnp.inf)
+        rows.append(jnp.concatenate([cylinders[:, :2], -end, cylinders[:, :2], end, cylinders[:, 2:]], axis=1))
+    rows.append(jnp.pad(jnp.asarray(world.boxes), ((0, 0), (0, 1))))
+    return jnp.concatenate(rows)
+
+
+def _triangles(world: World) -> jax.Array:
+    """The triangles of :attr:`World.shapes` of a world whose numbers may be traced."""
+    pairs = zip(world.polygons, world.triangles, strict=True)
+    corners = [jnp.asarray(polygon)[np.array(own)].reshape(-1, 6) for polygon, own in pairs]
+    return jnp.concatenate([jnp.zeros((0, 6)), *corners])
+
+
+def _limits(team: Team) -> jax.Array:
+    """:attr:`Team.limits` of a team whose numbers may be traced."""
+    columns = [jnp.asarray(getattr(team, name)) for name in STANDARD_LIMITS]
+    models = team.robot_models
+    for column in range(max(len(model.own_limits) for model in models)):
+        values = [
+            team.own_limits[model.own_limits[column].name][robot] if column < len(model.own_limits) else 1.0
+            for robot, model in enumerate(models)
+        ]
+        columns.append(jnp.stack([jnp.asarray(value, jnp.float32) for value in values]))
+    return jnp.stack(columns, axis=1)
+
+
+_STATIC = {Problem: ("horizon", "arrival", "name"), Team: ("models",), World: ("dimension", "triangles")}
+
+
+def _register(kind: type) -> None:
+    static = _STATIC[kind]
+    names = tuple(field.name for field in fields(kind) if field.name not in static)
+
+    def flatten(value: object) -> tuple[tuple[object, ...], tuple[object, ...]]:
+        return tuple(getattr(value, name) for name in names), tuple(getattr(value, name) for name in static)
+
+    def unflatten(metadata: tuple[object, ...], children: tuple[object, ...]) -> object:
+        # Not through __init__: tracers cannot be validated, and the problem they stand for has been.
+        value: object = object.__new__(kind)
+        for name, part in zip((*names, *static), (*children, *metadata), strict=True):
+            object.__setattr__(value, name, part)
+        return value
+
+    jax.tree_util.register_pytree_node(kind, flatten, unflatten)
+
+
+for _kind in _STATIC:
+    _register(_kind)

@@ -1,0 +1,224 @@
+"""Whole environments as pure JAX functions: instances, observations, rewards and auto-reset, for training in one jit.
+
+>>> env = FunctionalEnv("random", num_robots=8, reward="training")
+>>> state, observations = jax.vmap(env.reset)(jax.random.split(key, 1024))
+>>> state, transition = jax.vmap(env.step)(keys, state, actions)
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import PyTreeDef
+from numpy.typing import ArrayLike
+
+from d4orm_env.jax import functional
+from d4orm_env.core.arrays import whole_number
+from d4orm_env.core.observation_layout import ObservationLayout
+from d4orm_env.core.problem import Problem
+from d4orm_env.disturbances.controls import ControlNoise
+from d4orm_env.envs.options import EnvOptions
+from d4orm_env.envs.rewards import find_reward
+from d4orm_env.scenarios.problems import ScenarioLike
+from d4orm_env.envs.simulation import Simulation
+
+__all__ = ["EnvState", "FunctionalEnv", "Transition"]
+
+MAX_INSTANCES = 1_000_000
+
+
+class EnvState(NamedTuple):
+    """A world in the middle of an episode.
+
+    Attributes:
+        team: Where the team is.
+        instance: ``()`` int32, which of the instances it runs.
+        touched: ``(K,)`` bool: who has been in contact.
+    """
+
+    team: functional.State
+    instance: jax.Array
+    touched: jax.Array
+
+
+class Transition(NamedTuple):
+    """What a step brought.
+
+    Attributes:
+        observations: ``(K, D)``; after the end of an episode those of the next one.
+        rewards: ``(K,)`` of all robots, docked ones too, as ``robot_rewards`` of the batched environment.
+        acted: ``(K,)`` bool: who was still under way when the step began.
+        finished: ``(K,)`` bool: who is done, which is terminated.
+        done: ``()`` bool: the episode is over; all have finished, or the time is up.
+        success: ``()`` bool: all have arrived, and none was ever in contact.
+        step: What happened, as :func:`d4orm_env.jax.functional.step` tells it.
+    """
+
+    observations: jax.Array
+    rewards: jax.Array
+    acted: jax.Array
+    finished: jax.Array
+    done: jax.Array
+    success: jax.Array
+    step: functional.Step
+
+
+class FunctionalEnv:
+    """One world; ``jax.vmap`` makes many of it. World for world it is the environment of the same arguments.
+
+    Where the scenario draws at random, so many instances are drawn when it is made, and every reset takes one of them
+    by its key: the scenario's own generator draws until places are free, which no traced function does quickly.
+
+    Args:
+        scenario: As in :class:`~d4orm_env.envs.options.EnvOptions`, like all arguments not named here.
+        num_robots: Size of the team.
+        num_instances: How many instances there are to choose among, for a scenario that draws at random; ``seed=``
+            draws others.
+        **options: Further attributes of :class:`~d4orm_env.envs.options.EnvOptions`, and arguments of the scenario. Not
+            ``render_mode``, ``lifelong``, ``progress="way"``, ``observed_way``, nor disturbances but
+            :class:`~d4orm_env.disturbances.ControlNoise`: they are not pure functions.
+
+    Attributes:
+        problem: The first instance.
+        layout: What the components of one robot's observation mean.
+        max_cycles: Steps until truncation.
+
+    Raises:
+        TypeError: For an argument that neither the environment nor the scenario has.
+        ValueError: For a bad argument, one that is not possible here, or instances that differ in shape.
+    """
+
+    def __init__(
+        self,
+        scenario: ScenarioLike | None = None,
+        num_robots: int | None = None,
+        *,
+        num_instances: int = 256,
+        **options: object,
+    ) -> None:
+        chosen = EnvOptions.of(scenario=scenario, num_robots=num_robots, **options)
+        _refuse(chosen)
+        count = whole_number(num_instances, "num_instances", 1, MAX_INSTANCES)
+        template = Simulation(chosen)
+        self.problem: Problem = template.problem
+        self.layout: ObservationLayout = template.layout
+        self.max_cycles: int = template.max_cycles
+        self._reward = find_reward(chosen.reward) or "paper"
+        noise = [one.std for one in template.disturbances if isinstance(one, ControlNoise)]
+        if len(noise) < len(template.disturbances):
+            raise ValueError("disturbances other than ControlNoise are no pure functions; use gymnasium.make_vec")
+        self._noise = np.sqrt(np.sum([np.square(std) for std in noise], axis=0)).astype(np.float32)
+        random = np.random.default_rng(chosen.scenario_settings.get("seed") or 0)
+        drawn = [template.draw_instance(random) for _ in range(count)] if template.redraws else [template.problem]
+        self._num_instances, self._varying, self._common, self._structure = len(drawn), *_stacked(drawn)
+
+    @cached_property
+    def observation_shape(self) -> tuple[int, int]:
+        """``(K, D)``."""
+        return self.problem.num_robots, self.layout.size
+
+    @cached_property
+    def action_limits(self) -> np.ndarray:
+        """``(K, m)`` largest controls, in physical units; zero where a robot has no such component."""
+        return self.problem.team.control_limits
+
+    def instance(self, number: int | jax.Array) -> Problem:
+        """One of the instances; the number may be traced."""
+        chosen = {place: stack[number] for place, stack in self._varying.items()}
+        leaves = [chosen.get(place, leaf) for place, leaf in enumerate(self._common)]
+        problem: Problem = jax.tree.unflatten(self._structure, leaves)
+        return problem
+
+    def reset(self, key: jax.Array) -> tuple[EnvState, jax.Array]:
+        """Begin an episode; the key chooses the instance.
+
+        Returns:
+            The state, and observations ``(K, D)``.
+        """
+        state = self._begin(key)
+        return state, self.observe(state)
+
+    def observe(self, state: EnvState) -> jax.Array:
+        """``(K, D)`` what every robot sees."""
+        return functional.observe(self.instance(state.instance), state.team, self.layout, self.max_cycles)
+
+    def advance(self, key: jax.Array, state: EnvState, actions: jax.Array) -> tuple[EnvState, Transition]:
+        """One step, without reset at the end of an episode.
+
+        Args:
+            key: What the noise is drawn from.
+            state: The world.
+            actions: ``(K, m)`` controls in physical units, clipped to the robots' limits.
+        """
+        after, transition = self._move(key, state, actions)
+        return after, transition._replace(observations=self.observe(after))
+
+    def step(self, key: jax.Array, state: EnvState, actions: jax.Array) -> tuple[EnvState, Transition]:
+        """The same; where the episode is over the state returned is the first of the next."""
+        noise, fresh = jax.random.split(key)
+        after, transition = self._move(noise, state, actions)
+        after = jax.tree.map(lambda new, old: jnp.where(transition.done, new, old), self._begin(fresh), after)
+        return after, transition._replace(observations=self.observe(after))
+
+    def _begin(self, key: jax.Array) -> EnvState:
+        number = jax.random.randint(key, (), 0, self._num_instances)
+        problem = self.instance(number)
+        return EnvState(functional.reset(problem, key), number, jnp.zeros(problem.num_robots, bool))
+
+    def _move(self, key: jax.Array, state: EnvState, actions: jax.Array) -> tuple[EnvState, Transition]:
+        problem, team = self.instance(state.instance), state.team
+        if np.any(self._noise):
+            actions = actions + self._noise * jax.random.normal(key, actions.shape)
+        after, step = functional.step(problem, team, actions, self._reward)
+        before, finished = (self._finished(arrived) for arrived in (team.arrived, step.arrived))
+        touched = state.touched | step.collided
+        everyone = step.arrived.all()
+        transition = Transition(
+            observations=jnp.zeros(()),
+            rewards=step.rewards,
+            acted=~before,
+            finished=finished,
+            done=finished.all() | (after.steps >= self.max_cycles),
+            success=everyone & ~touched.any(),
+            step=step._replace(truncated=(after.steps >= self.max_cycles) & ~finished.all()),
+        )
+        return EnvState(after, state.instance, touched), transition
+
+    def _finished(self, arrived: jax.Array) -> jax.Array:
+        return arrived if self.problem.docks else arrived & arrived.all()
+
+
+def _refuse(options: EnvOptions) -> None:
+    """Raise ``ValueError`` for what the environments have and this has not."""
+    refused = {
+        "render_mode": options.render_mode is not None,
+        "lifelong": options.lifelong,
+        "progress='way'": options.progress == "way",
+        "observed_way": options.observed_way,
+    }
+    for name, given in refused.items():
+        if given:
+            raise ValueError(f"{name} is not possible in pure functions of JAX; use gymnasium.make_vec or parallel_env")
+
+
+def _stacked(problems: list[Problem]) -> tuple[dict[int, jax.Array], list[ArrayLike], PyTreeDef]:
+    """Leaves that differ from instance to instance, stacked, by their place; those of the first; and the structure.
+
+    Raises:
+        ValueError: If the instances differ in shapes, or in what is not an array.
+    """
+    flattened: list[tuple[list[ArrayLike], PyTreeDef]] = [jax.tree.flatten(problem) for problem in problems]
+    common, structure = flattened[0]
+    shapes = [np.shape(leaf) for leaf in common]
+    if any(other != structure or [np.shape(leaf) for leaf in leaves] != shapes for leaves, other in flattened):
+        raise ValueError(
+            f"instances of scenario {problems[0].name!r} differ in more than numbers, as in how many obstacles there "
+            "are; use gymnasium.make_vec, or one instance with randomize_instance=False"
+        )
+    columns = [np.stack([np.asarray(leaves[place]) for leaves, _ in flattened]) for place in range(len(common))]
+    varying = {place: jnp.asarray(column) for place, column in enumerate(columns) if (column != column[0]).any()}
+    return varying, common, structure

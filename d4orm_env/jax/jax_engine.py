@@ -1,0 +1,444 @@
+"""The JAX engine: the same physics as pure array functions, for GPUs and TPUs, and for those who jit, vmap and grad.
+
+Arrays keep the samples on the last axis, ``(K, component, S)``, as on the CPU engine. A whole denoising run is one
+compiled loop; nothing returns to the host before it ends, or before the next look at whether it is to be stopped.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from d4orm_env.dynamics import collision
+from d4orm_env.dynamics import reward
+from d4orm_env.dynamics import transition
+from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.dynamics.models import MODELS, names_of_codes
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.dynamics.robot_model import Ops
+from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.engine import noise
+from d4orm_env.engine.types import (
+    MovingObstacles,
+    SamplingResult,
+    SamplingRules,
+    SamplingTask,
+    StepResult,
+    StepWatcher,
+    checked_controls,
+)
+
+LOOK = 0.03
+"""Seconds between looks at whether a run is to be stopped, if that is more than a step; at most twice as many."""
+
+OPS = Ops(jnp.cos, jnp.sin, jnp.sqrt, jnp.minimum, jnp.maximum, jnp.arctan2, jnp.where)
+BIT_OPS = noise.BitOps(
+    uint32=lambda x: x.astype(jnp.uint32),
+    int32=lambda x: x.astype(jnp.int32),
+    to_float=lambda x: x.astype(jnp.float32),
+    float_bits=lambda x: jax.lax.bitcast_convert_type(x, jnp.int32),
+    bits_float=lambda x: jax.lax.bitcast_convert_type(x, jnp.float32),
+    sqrt=jnp.sqrt,
+)
+
+
+class Worlds(NamedTuple):
+    """A block of worlds on the way.
+
+    Attributes:
+        state: ``(K, n, S)``.
+        docked: ``(K, S)`` bool.
+        control: ``(K, m, S)`` executed last.
+    """
+
+    state: Array
+    docked: Array
+    control: Array
+
+
+Given: TypeAlias = Array | FloatArray
+"""Of the problem: inside a compiled function it is traced."""
+Verdict: TypeAlias = tuple[Array, Array, Array]
+"""Who collided, who violated the margin, and rewards, each ``(K, S)``."""
+
+
+def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, control: Array) -> Worlds:
+    """One step of every robot in every world, docking included.
+
+    Args:
+        models: The team's model names; static.
+        arrays: The problem.
+        worlds: Before the step.
+        control: ``(K, m, S)`` not yet clipped.
+    """
+    h = transition.TimeStep(*arrays.time_step)
+    state, executed, docked = worlds.state, jnp.zeros_like(control), worlds.docked
+    for name in dict.fromkeys(models):
+        model = MODELS[name]
+        functions = model.functions
+        robots = np.flatnonzero(np.array(models) == name)
+        limits = tuple(arrays.limits[robots, i][:, None] for i in range(len(model.limit_names)))
+        x = tuple(worlds.state[robots, i] for i in range(model.state_size))
+        u = functions.limit_control(tuple(control[robots, i] for i in range(model.control_size)), limits, OPS)
+        y = transition.advance(functions, x, u, limits, h, OPS)
+        gap2 = sum((y[i] - arrays.goal[robots, i][:, None]) ** 2 for i in range(model.dimension))
+        speed2 = sum(v * v for v in functions.velocity(y, u, limits, OPS))
+        arrives = transition.arrives(gap2, speed2, arrays.squared_goal_radius, arrays.squared_goal_speed)
+        standing = transition.stands(worlds.docked[robots], arrays.docks)
+        docks = transition.stands(arrives, arrays.docks)
+        zero = jnp.zeros_like(gap2)
+        for i, (old, rest, new) in enumerate(zip(x, functions.rest(y, zero), y, strict=True)):
+            state = state.at[robots, i].set(jnp.where(standing, old, jnp.where(docks, rest, new)))
+        for i, component in enumerate(u):
+            executed = executed.at[robots, i].set(jnp.where(standing, zero, component))
+        docked = docked.at[robots].set(standing | arrives)
+    return Worlds(state, docked, executed)
+
+
+def robot_contacts(arrays: ProblemArrays, place: Array, extra: Array | np.float32) -> Array:
+    """``(K, S)`` bool: whether a robot at ``place`` ``(K, d, S)`` is within the radii plus ``extra`` of another."""
+    gaps = (place[:, None] - place[None, :]) ** 2
+    reach = arrays.radius[:, None] + arrays.radius[None, :] + extra
+    reach2 = jnp.where(jnp.eye(len(arrays.radius), dtype=bool), -1, reach * reach)
+    return (gaps.sum(axis=2) <= reach2[..., None]).any(axis=1)
+
+
+def moving_contacts(
+    arrays: ProblemArrays, place: Array, obstacle: Given, radius: Given, extra: Array | np.float32
+) -> Array:
+    """``(K, S)`` bool: the same towards bodies at ``obstacle`` ``(O, d)`` of ``radius`` ``(O,)``."""
+    gaps = (place[:, None] - obstacle[None, :, :, None]) ** 2
+    reach = arrays.radius[:, None] + radius[None, :] + extra
+    return (gaps.sum(axis=2) <= (reach * reach)[..., None]).any(axis=1)
+
+
+def obstacle_contacts(arrays: ProblemArrays, place: Array, extra: Array | np.float32) -> Array:
+    """``(K, S)`` bool: the same towards static obstacles and bounds."""
+    reach = (arrays.radius + extra)[:, None]
+    hit = jnp.zeros((place.shape[0], place.shape[2]), bool)
+    for axis in range(place.shape[1]):
+        hit |= collision.leaves(place[:, axis], reach, arrays.bounds[0, axis], arrays.bounds[1, axis])
+    if len(arrays.boxes) + len(arrays.triangles) > FEW and arrays.grid is not None:
+        return hit | _indexed_contacts(arrays, place, reach)
+    if len(arrays.boxes):
+        box = jnp.moveaxis(arrays.boxes, 1, 0)[..., None, :, None]
+        hit |= _touches_box(box, reach[:, None], place[:, None]).any(axis=1)
+    if len(arrays.triangles):
+        corners = jnp.moveaxis(arrays.triangles, 1, 0)[..., None, :, None]
+        hit |= _touches_triangle(corners, reach[:, None], place[:, None]).any(axis=1)
+    return hit
+
+
+FEW = 8
+"""So many obstacles are sooner tested all than looked up."""
+
+
+def _touches_box(box: Given, reach: Given, place: Array) -> Array:
+    """Where places ``(K, ., d, S)`` are within reach of rounded boxes, ``box`` being their ``2 d + 1`` columns."""
+    d, gap2 = place.shape[-2], jnp.float32(0)
+    for axis in range(d):
+        gap = collision.axis_gap(place[..., axis, :], box[axis], box[d + axis], jnp.float32(0), OPS)
+        gap2 = gap2 + gap * gap
+    total = reach + box[2 * d]
+    return gap2 <= total * total
+
+
+def _touches_triangle(corners: Given, reach: Given, place: Array) -> Array:
+    """The same for triangles, ``corners`` being their six columns."""
+    return collision.meets_triangle(tuple(corners), place[..., 0, :], place[..., 1, :], reach, jnp.float32(0), OPS)
+
+
+def _indexed_contacts(arrays: ProblemArrays, place: Array, reach: Given) -> Array:
+    """``(K, S)`` bool: contacts with obstacles, see :mod:`d4orm_env.engine.obstacles`."""
+    index, cell = arrays.grid, jnp.int32(0)
+    for axis in range(place.shape[1]):
+        step = (place[:, axis] - index.low[axis]) * index.scale
+        # Asked this way round, what is not a number counts as zero.
+        step = jnp.minimum(jnp.where(step > 0, step, 0), (index.size[axis] - 1).astype(jnp.float32))
+        cell = cell * index.size[axis] + step.astype(jnp.int32)
+    clearance, begin, end = index.clearance[cell], index.first[cell], index.first[cell + 1]
+    sure, near = clearance <= reach - index.slack, clearance <= reach + index.slack
+    num_boxes = len(arrays.boxes)
+
+    def test(number: Array, hit: Array) -> Array:
+        item = index.items[jnp.minimum(begin + number, end - 1)]
+        here = jnp.zeros_like(hit)
+        if num_boxes:
+            box = jnp.moveaxis(arrays.boxes[jnp.minimum(item, num_boxes - 1)], -1, 0)
+            here |= _touches_box(box, reach, place) & (item < num_boxes)
+        if len(arrays.triangles):
+            corners = jnp.moveaxis(arrays.triangles[jnp.maximum(item - num_boxes, 0)], -1, 0)
+            here |= _touches_triangle(corners, reach, place) & (item >= num_boxes)
+        return hit | (near & here)
+
+    return jax.lax.fori_loop(jnp.int32(0), index.longest, test, sure)
+
+
+def goal_distance(arrays: ProblemArrays, place: Array) -> Array:
+    """``(K, S)`` distance of every robot to its goal; its gradient at the goal itself is zero."""
+    gap2 = ((place - arrays.goal[..., None]) ** 2).sum(axis=1)
+    tiny = jnp.float32(1e-12)
+    # Asked this way round, a place that is not a number stays one: it must not pass for the goal.
+    return jnp.where(gap2 <= tiny, jnp.float32(0), jnp.sqrt(jnp.maximum(gap2, tiny)))
+
+
+def rewards_of(
+    arrays: ProblemArrays, place: Array, pair_violation: Array, obstacle_violation: Array, penalty: Array | np.float32
+) -> Array:
+    """``(K, S)`` reward of one step; a violation costs ``penalty``."""
+    return reward.step_reward(
+        goal_distance(arrays, place),
+        arrays.inverse_initial_distance[:, None],
+        penalty * pair_violation.astype(jnp.float32),
+        penalty * obstacle_violation.astype(jnp.float32),
+        jnp.float32(1),
+    )
+
+
+def judge(arrays: ProblemArrays, place: Array) -> Verdict:
+    """``(collided, margin violated, reward)`` of teams standing at ``place`` ``(K, d, S)``, each ``(K, S)``."""
+    zero = jnp.float32(0)
+    contact = robot_contacts(arrays, place, zero) | obstacle_contacts(arrays, place, zero)
+    pair, obstacle = robot_contacts(arrays, place, arrays.margin), obstacle_contacts(arrays, place, arrays.margin)
+    return contact, pair | obstacle, rewards_of(arrays, place, pair, obstacle, np.float32(1))
+
+
+@partial(jax.jit, static_argnums=0)
+def _step(models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, control: Array) -> tuple[Worlds, Verdict]:
+    worlds = advance_worlds(models, arrays, worlds, control)
+    return worlds, judge(arrays, worlds.state[:, : arrays.goal.shape[1]])
+
+
+@partial(jax.jit, static_argnums=0)
+def _rollout(
+    models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, controls: Array
+) -> tuple[Verdict, tuple[Worlds, Verdict]]:
+    def advance(worlds: Worlds, control: Array) -> tuple[Worlds, tuple[Worlds, Verdict]]:
+        worlds, verdict = _step(models, arrays, worlds, control)
+        return worlds, (worlds, verdict)
+
+    first = judge(arrays, worlds.state[:, : arrays.goal.shape[1]])
+    return first, jax.lax.scan(advance, worlds, controls)[1]
+
+
+class _Static(NamedTuple):
+    """What a compiled denoising run depends on besides shapes."""
+
+    models: tuple[str, ...]
+    rules: SamplingRules
+    num_samples: int
+    collisions: bool
+    credit: str
+
+
+class _Inputs(NamedTuple):
+    """What it is called with."""
+
+    arrays: ProblemArrays
+    base: Array
+    docked: Array
+    moving: MovingObstacles | None
+    penalty: Array
+    seed: tuple[Array, Array]
+
+
+def _deformations(static: _Static, inputs: _Inputs, step: Array, time: Array, mean: Array, scale: Array) -> Array:
+    """``(K, m, M)`` samples of the deformation at one time step."""
+    num_robots, size = mean.shape
+    counters, cosine, sine = noise.turned(jnp.arange(static.num_samples, dtype=jnp.uint32)[None, :], BIT_OPS)
+    robots = jnp.arange(num_robots, dtype=jnp.uint32)[:, None]
+    low, high = inputs.seed
+    draws: list[Array] = []
+    for pair in range((size + 1) // 2):
+        key = noise.stream_key(low, high, step, robots, time, jnp.uint32(pair), BIT_OPS)
+        x, y = noise.normal_pair(counters, key, BIT_OPS)
+        draws += [cosine * x - sine * y, sine * x + cosine * y]
+    return mean[..., None] + scale[..., None] * jnp.stack(draws[:size], axis=1)
+
+
+def _score(static: _Static, inputs: _Inputs, step: Array, mean: Array, scale: Array) -> tuple[Array, Array]:
+    """Roll all samples out; returns rewards ``(K, M)`` summed over time and the deformations ``(H, K, m, M)``."""
+    arrays = inputs.arrays
+    d = arrays.goal.shape[1]
+    num_robots = arrays.goal.shape[0]
+
+    def advance(
+        carry: tuple[Worlds, Array], xs: tuple[Array, Array, Array, Array, FloatArray | None]
+    ) -> tuple[tuple[Worlds, Array], Array]:
+        worlds, total = carry
+        time, base, mean_now, scale_now, obstacle = xs
+        deformation = _deformations(static, inputs, step, time, mean_now, scale_now)
+        worlds = advance_worlds(static.models, arrays, worlds, base[..., None] + deformation)
+        place = worlds.state[:, :d]
+        near_robot = jnp.zeros((num_robots, static.num_samples), bool)
+        if static.collisions:
+            near_robot = robot_contacts(arrays, place, arrays.margin)
+            if inputs.moving is not None and obstacle is not None:
+                near_robot |= moving_contacts(arrays, place, obstacle, inputs.moving.radius, arrays.margin)
+        near_obstacle = obstacle_contacts(arrays, place, arrays.margin)
+        return (worlds, total + rewards_of(arrays, place, near_robot, near_obstacle, inputs.penalty)), deformation
+
+    worlds = Worlds(
+        jnp.broadcast_to(arrays.start[..., None], (*arrays.start.shape, static.num_samples)),
+        jnp.broadcast_to(inputs.docked[:, None], (num_robots, static.num_samples)),
+        jnp.zeros((num_robots, mean.shape[2], static.num_samples)),
+    )
+    times = jnp.arange(len(mean), dtype=jnp.uint32)
+    obstacles = None if inputs.moving is None else inputs.moving.positions
+    carry = (worlds, jnp.zeros((num_robots, static.num_samples)))
+    (_, total), deformations = jax.lax.scan(advance, carry, (times, inputs.base, mean, scale, obstacles))
+    return total / len(mean), deformations
+
+
+class _Run(NamedTuple):
+    """A denoising run on its way: means, factors on the schedule, rewards ``(N,)`` so far, samples left out."""
+
+    mean: Array
+    factor: Array
+    rewards: Array
+    excluded: Array
+
+
+def _denoise(static: _Static, inputs: _Inputs, noise_scale: Array, run: _Run, begin: Array, end: Array) -> _Run:
+    """The steps from ``begin`` to before ``end``; both are arguments, so that one compilation serves all parts."""
+
+    def update(step: Array, run: _Run) -> _Run:
+        mean, factor, sigma = run.mean, run.factor, noise_scale[step]
+        rewards, deformations = _score(static, inputs, step.astype(jnp.uint32), mean, factor * sigma)
+        if static.credit == "team":
+            rewards = rewards.mean(axis=0, keepdims=True)
+        finite = jnp.isfinite(rewards)
+        # A sample that blew up has weight zero, and zero times infinity must not reach the mean.
+        usable = jnp.where(jnp.isfinite(deformations), deformations, 0)
+        extra: tuple[Array, ...] = ()
+        if static.rules.importance:
+            slope = (inputs.base + mean) / (factor * sigma) ** 2
+            ratio = -jnp.einsum("tkms,tkm->ks", usable - mean[..., None], slope)
+            ratio = ratio.sum(axis=0, keepdims=True) if static.credit == "team" else ratio
+            extra = (static.rules.importance * ratio,)
+        weights = static.rules.weights(jnp.where(finite, rewards, -jnp.inf), jnp, *extra)
+        weights = jnp.broadcast_to(weights, (mean.shape[1], static.num_samples))
+        new_mean = jnp.einsum("tkms,ks->tkm", usable, weights)
+        # Nothing to go by: every sample was excluded.
+        new_mean = jnp.where((weights.sum(axis=-1) > 0)[None, :, None], new_mean, mean)
+        if static.rules.adapt is not None:
+            deviation2 = jnp.einsum("tkms,ks->tkm", (usable - new_mean[..., None]) ** 2, weights)
+            factor = static.rules.adapt(deviation2, jnp)
+        average = jnp.where(finite, rewards, 0).sum() / jnp.maximum(finite.sum(), 1)
+        return _Run(new_mean, factor, run.rewards.at[step].set(average), run.excluded + (~finite).sum())
+
+    return jax.lax.fori_loop(begin, end, update, run)
+
+
+@lru_cache(maxsize=256)
+def _compiled_denoise(
+    static: _Static, treedef: jax.tree_util.PyTreeDef, shapes: tuple[tuple[tuple[int, ...], np.dtype[np.generic]], ...]
+) -> jax.stages.Compiled:
+    """The denoising run compiled for arguments of these shapes, ahead of the call."""
+    arguments = jax.tree.unflatten(treedef, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes])
+    return jax.jit(partial(_denoise, static)).lower(*arguments).compile()
+
+
+class JaxEngine:
+    """The physics in JAX, on whatever device JAX has chosen. Stateless: all instances are alike."""
+
+    name = "jax"
+
+    def step(self, arrays: ProblemArrays, states: FloatArray, arrived: BoolArray, controls: FloatArray) -> StepResult:
+        """See :meth:`d4orm_env.engine.types.Engine.step`."""
+        models = names_of_codes(arrays.model_codes)
+        before = states[..., None], np.asarray(arrived)[..., None], np.zeros_like(controls)[..., None]
+        worlds, verdict = _step(models, arrays, Worlds(*map(jnp.asarray, before)), jnp.asarray(controls)[..., None])
+        collided, margin_violated, rewards = (np.asarray(value)[..., 0] for value in verdict)
+        state, docked, control = (np.asarray(value)[..., 0] for value in worlds)
+        return StepResult(state, control, docked, collided, margin_violated, rewards)
+
+    def rollout(self, problem: Problem, controls: ArrayLike) -> Trajectory:
+        """See :meth:`d4orm_env.engine.types.Engine.rollout`.
+
+        Raises:
+            ValueError: If the controls have another shape than ``(H, K, m)`` or are not finite.
+        """
+        wanted = checked_controls(problem, controls)
+        num_robots = problem.num_robots
+        start = Worlds(
+            jnp.asarray(problem.start[..., None]),
+            jnp.zeros((num_robots, 1), bool),
+            jnp.zeros((num_robots, problem.control_size, 1), jnp.float32),
+        )
+        first, (worlds, verdicts) = _rollout(problem.team.models, problem.arrays, start, jnp.asarray(wanted[..., None]))
+        states = np.concatenate([problem.start[None], np.asarray(worlds.state)[..., 0]])
+        collided, margin_violated = (
+            np.concatenate([np.asarray(first[i])[None, :, 0], np.asarray(verdicts[i])[..., 0]]) for i in range(2)
+        )
+        return Trajectory(
+            states=states,
+            positions=np.ascontiguousarray(states[..., : problem.dimension]),
+            controls=np.asarray(worlds.control)[..., 0],
+            rewards=np.asarray(verdicts[2])[..., 0],
+            arrived=np.concatenate([np.zeros((1, num_robots), bool), np.asarray(worlds.docked)[..., 0]]),
+            collided=collided,
+            margin_violated=margin_violated,
+        )
+
+    def _lower(
+        self,
+        task: SamplingTask,
+        rules: SamplingRules,
+        mean: FloatArray,
+        noise_scale: FloatArray,
+        num_samples: int,
+        seed: int,
+    ) -> tuple[jax.stages.Compiled, tuple[_Inputs, Array, _Run, Array, Array]]:
+        problem = task.problem
+        docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
+        scored = (task.arrays, task.base, docked, task.moving, np.float32(task.penalty), noise.seed_words(seed))
+        static = _Static(problem.team.models, rules, num_samples, task.collisions, task.credit)
+        scale = np.asarray(noise_scale, np.float32)
+        begun = (mean, np.ones_like(mean), np.zeros_like(scale), np.int32(0))
+        scored, scale, begun = jax.tree.map(jnp.asarray, (scored, scale, begun))
+        arguments = (_Inputs(*scored), scale, _Run(*begun), jnp.int32(0), jnp.int32(len(scale)))
+        leaves, treedef = jax.tree.flatten(arguments)
+        return _compiled_denoise(static, treedef, tuple((leaf.shape, leaf.dtype) for leaf in leaves)), arguments
+
+    def prepare(self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int) -> None:
+        """See :meth:`d4orm_env.engine.types.Engine.prepare`."""
+        self._lower(task, rules, task.base, noise_scale, num_samples, 0)
+
+    def denoise(
+        self,
+        task: SamplingTask,
+        rules: SamplingRules,
+        mean: FloatArray,
+        noise_scale: FloatArray,
+        num_samples: int,
+        seed: int,
+        should_stop: Callable[[], bool] | None = None,
+        watcher: StepWatcher | None = None,
+    ) -> SamplingResult:
+        """See :meth:`d4orm_env.engine.types.Engine.denoise`.
+
+        Raises:
+            ValueError: If there is a watcher: the steps are compiled into one program.
+        """
+        if watcher is not None:
+            raise ValueError("engine 'jax' runs all denoising steps as one program; to watch them, use engine='cpu'")
+        compiled, (inputs, scale, run, *_) = self._lower(task, rules, mean, noise_scale, num_samples, seed)
+        done, total = 0, len(noise_scale)
+        part = total if should_stop is None else 1
+        while done < total and not (should_stop is not None and should_stop()):
+            start, first = time.perf_counter(), done
+            done = min(done + part, total)
+            run = jax.block_until_ready(compiled(inputs, scale, run, jnp.int32(first), jnp.int32(done)))
+            if time.perf_counter() - start < LOOK:
+                part *= 2
+        return SamplingResult(np.asarray(run.mean), np.asarray(run.rewards)[:done], int(run.excluded))

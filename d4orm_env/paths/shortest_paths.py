@@ -1,0 +1,237 @@
+"""The shortest ways to the goals through the space that obstacles leave free."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.core.observation_layout import ObservationLayout
+from d4orm_env.core.problem import Problem
+
+if TYPE_CHECKING:
+    from d4orm_env.paths.wavefront import Fields, Front, Lattice, Space
+
+
+MAX_NODES, MAX_NODES_IN_ALL = 2**21, 2**24
+"""Most nodes of a grid, and of the grids of all robots together; coarser ones where there would be more."""
+
+STEP = 0.5
+"""Distance of neighbouring nodes, as a share of the robot's radius and margin."""
+REFINEMENTS = 2
+"""How often a robot that seems to have no way is tried again on a grid that is twice as fine."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ways:
+    """The shortest free way of every robot of a problem to its goal, other robots not counted.
+
+    A free way keeps the radius of the robot and the margin to obstacles and bounds. A place that is nearer to something
+    already (a goal may be, and a robot may have got there) is left and reached on lines that come no nearer than it is.
+    Lengths are at most 2% above the least. Gaps that are wider than radius and margin need by less than a sixteenth
+    of that may be missed.
+
+    Attributes:
+        problem: The problem.
+        length: ``(K,)`` float64 from start to goal [m]; infinite where there is no way.
+    """
+
+    problem: Problem
+    length: Floats
+    _world: tuple[Space, Fields] | None
+
+    def distance(self, points: ArrayLike) -> Floats:
+        """``(..., K)`` float64 length of the ways from points ``(..., K, d)`` to the goals [m]."""
+        return self._look(points)[1]
+
+    def distance_from(self, robot: int, places: Floats) -> Floats:
+        """``(Q,)`` float64 length of the ways of one robot from places ``(Q, d)`` to its goal [m]."""
+        if self._world is None:
+            return np.linalg.norm(places - self.problem.goal[robot], axis=1)
+        return _find(self._world, robot, in_space(places)[None])[1][0]
+
+    def direction(self, points: ArrayLike) -> Floats:
+        """``(..., K, d)`` float64 unit vectors along the ways; zero at a goal and where there is no way."""
+        return self.ahead(points)[0]
+
+    def ahead(self, points: ArrayLike) -> tuple[Floats, Floats]:
+        """:meth:`direction` and :meth:`distance` at once."""
+        places = np.asarray(points, np.float64)
+        target, length = self._look(places)
+        return _towards(places, target), length
+
+    def path(self, robot: int) -> Floats:
+        """``(w, d)`` float64 corners of the way of a robot, its start first and its goal last; empty if there is none.
+
+        Args:
+            robot: Its number.
+        """
+        d = self.problem.dimension
+        start, goal = self.problem.start[robot, :d].astype(np.float64), self.problem.goal[robot].astype(np.float64)
+        if not np.isfinite(self.length[robot]):
+            return np.empty((0, d))
+        if self._world is None:
+            return np.stack([start, goal])
+        target, _, anchors = _find(self._world, robot, in_space(start[None])[None])
+        corners, anchor, fields = [start, target[0, 0, :d]], int(anchors[0, 0]), self._world[1]
+        first = fields.first_point[robot]
+        while anchor >= 0:
+            corners.append(fields.points[first + anchor, :d])
+            anchor = int(fields.parents[first + anchor])
+        way = np.stack(corners)
+        return way[np.append(True, (np.diff(way, axis=0) != 0).any(axis=1))]
+
+    def _look(self, points: ArrayLike) -> tuple[Floats, Floats]:
+        """Where to go first, and how far it is in all."""
+        places: Floats = np.asarray(points, np.float64)
+        goal = self.problem.goal.astype(np.float64)
+        if self._world is None:
+            offset = goal - places
+            straight: Floats = np.sqrt((offset * offset).sum(axis=-1))
+            return np.broadcast_to(goal, places.shape), straight
+        num_robots, d = places.shape[-2:]
+        spatial = in_space(places.reshape(-1, d)).reshape(-1, num_robots, 3).swapaxes(0, 1)
+        target, length, _ = _find(self._world, 0, np.ascontiguousarray(spatial))
+        return target.swapaxes(0, 1)[..., :d].reshape(places.shape), length.T.reshape(places.shape[:-1])
+
+
+def _find(world: tuple[Space, Fields], robot: int, places: Floats) -> tuple[Floats, Floats, NDArray[np.int32]]:
+    """Where robots from this number on go first from places ``(R, Q, 3)``, how far it is in all, and their anchors."""
+    from d4orm_env.paths.wavefront import look
+
+    shape = places.shape[:2]
+    target, length, anchor = np.empty(places.shape), np.empty(shape), np.empty(shape, np.int32)
+    look(*world, robot, places, target, length, anchor)
+    return target, length, anchor
+
+
+def shortest_ways(problem: Problem) -> Ways:
+    """The shortest free ways of a team.
+
+    In a world without obstacles they are straight, and there is nothing to compute. Otherwise a wavefront spreads from
+    every goal over a grid; see :mod:`d4orm_env.paths.wavefront`.
+
+    Args:
+        problem: The team, its starts and goals, and the world.
+    """
+    start = problem.start[:, : problem.dimension].astype(np.float64)
+    if not problem.world.num_obstacles:
+        return Ways(problem, np.linalg.norm(problem.goal - start, axis=1), None)
+    # Here, because importing the compiler takes longer than importing all the rest of the package.
+    from d4orm_env.paths.wavefront import gather, make_space, spread
+
+    space, starts = make_space(problem), in_space(start)[:, None]
+    reaches = np.asarray(problem.team.radius, np.float64) + problem.margin
+    lattices: dict[tuple[float, int], Lattice] = {}
+    chosen: list[tuple[float, int]] = []
+    fronts: list[Front] = []
+    for reach, goal, place in zip(reaches.tolist(), in_space(problem.goal.astype(np.float64)), starts):
+        for refinement in range(1 + REFINEMENTS):
+            if (reach, refinement) not in lattices:
+                step, most = STEP * reach / 2**refinement, min(MAX_NODES, MAX_NODES_IN_ALL // problem.num_robots)
+                lattices[reach, refinement] = lay_lattice(problem, space, reach, step, most)
+            lattice = lattices[reach, refinement]
+            front = spread(space, lattice, reach, goal)
+            own = gather(np.array([reach]), [lattice], np.array([0]), [front])
+            if np.isfinite(_find((space, own), 0, place[None])[1]).all():
+                break
+        chosen.append((reach, refinement))
+        fronts.append(front)
+    number = {key: n for n, key in enumerate(lattices)}
+    world = space, gather(reaches, list(lattices.values()), np.array([number[key] for key in chosen]), fronts)
+    length = _find(world, 0, starts)[1][:, 0]
+    length.setflags(write=False)
+    return Ways(problem, length, world)
+
+
+def _towards(places: Floats, targets: Floats) -> Floats:
+    """Unit vectors ``(..., d)`` from places to targets; zero where these are the same."""
+    offset = targets - places
+    norm = np.sqrt((offset * offset).sum(axis=-1, keepdims=True))
+    direction: Floats = offset / np.where(norm > 0, norm, 1.0)
+    return direction
+
+
+def ahead_in_each(ways: Sequence[Ways], places: FloatArray) -> tuple[Floats, Floats]:
+    """:meth:`Ways.ahead` in ``B`` worlds, each with ways of its own, from places ``(B, K, d)``."""
+    from d4orm_env.paths.wavefront import look
+
+    given = places.astype(np.float64)
+    target, length = np.empty(given.shape), np.empty(given.shape[:-1])
+    # Each robot is one row of one place.
+    spatial = in_space(given.reshape(-1, given.shape[-1])).reshape(*given.shape[:-1], 1, 3)
+    found, lengths, anchors = np.empty(spatial.shape), length[:, :, None], np.empty(spatial.shape[:3], np.int32)
+    for world, own in enumerate(ways):
+        if own._world is None:
+            target[world], length[world] = own._look(given[world])
+        else:
+            look(*own._world, 0, spatial[world], found[world], lengths[world], anchors[world])
+            target[world] = found[world, :, 0, : given.shape[-1]]
+    return _towards(given, target), length
+
+
+def observe_ways(observations: FloatArray, layout: ObservationLayout, direction: Floats, length: Floats) -> None:
+    """Fill in what robots see of their ways.
+
+    Args:
+        observations: ``(..., K, D)``.
+        layout: What is in them.
+        direction: ``(..., K, d)`` of the ways, unit vectors.
+        length: ``(..., K)`` of the ways [m].
+    """
+    seen, parts = layout.ways(observations), layout.way
+    seen[..., parts.direction] = direction
+    seen[..., parts.length] = np.minimum(length, layout.high[-1])[..., None]
+
+
+def lay_lattice(
+    problem: Problem, space: Space | None, reach: float, step: float, most: int, pad: float = 0.0
+) -> Lattice:
+    """Nodes so far apart wherever ways may lead; farther apart where there would be too many.
+
+    Args:
+        problem: The starts, goals and bounds.
+        space: Its obstacles; ``None`` where there are none.
+        reach: What must fit at a node [m].
+        step: Distance of neighbouring nodes [m].
+        most: Most nodes.
+        pad: How far beyond starts, goals and obstacles ways may lead, at least twice the reach [m].
+    """
+    from d4orm_env.paths.wavefront import Lattice, settle_nodes
+
+    d, bounds, pad = problem.dimension, problem.world.bounds.astype(np.float64), max(pad, 2 * reach)
+    places = np.concatenate([problem.start[:, :d], problem.goal]).astype(np.float64)
+    if space is not None:
+        obstacles = space.extent[:, :d]
+        places = np.concatenate([places, np.where(np.isinf(obstacles), problem.goal[0], obstacles)])
+    low = np.maximum(places.min(axis=0) - pad, bounds[0])
+    high = np.minimum(places.max(axis=0) + pad, bounds[1])
+    while np.floor((high - low) / step + 1).prod() > most:
+        step *= 1.05
+    size = np.floor((high - low) / step).astype(np.int64) + 1
+    flat = [0] * (3 - d)
+    lattice = Lattice(
+        low=np.append((low + high - (size - 1) * step) / 2, flat).astype(np.float64),
+        step=step,
+        size=np.append(size, [1] * (3 - d)).astype(np.int64),
+        moves=np.array([(*move, *flat) for move in product((-1, 0, 1), repeat=d) if any(move)]),
+        places=np.empty((size.prod(), 3)),
+        free=np.empty(size.prod(), np.bool_),
+    )
+    if space is None:
+        lattice.places[:] = lattice.low + np.indices(tuple(lattice.size)).reshape(3, -1).T * step
+        inside = (lattice.places[:, :d] >= bounds[0] + reach) & (lattice.places[:, :d] <= bounds[1] - reach)
+        lattice.free[:] = inside.all(axis=1)
+    else:
+        settle_nodes(space, lattice, reach)
+    return lattice
+
+
+def in_space(places: Floats) -> Floats:
+    """Places ``(Q, d)`` in three dimensions."""
+    return np.hstack([places, np.zeros((len(places), 3 - places.shape[1]))])

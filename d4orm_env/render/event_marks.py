@@ -1,0 +1,88 @@
+"""Where an execution was disturbed: pushes as arrows, robots that have stalled as crosses, intruders as grey bodies."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.lines import Line2D
+
+from d4orm_env.core.disturbance_events import Marks
+from d4orm_env.core.problem import Problem
+from d4orm_env.render.panels import BODY, INK, PUSH, Array, Panel
+
+_ARROW_SECONDS = 1.0
+"""An arrow is as long as the way at its speed in this time."""
+_SHOWN_SECONDS = 0.5
+"""How long a moving picture shows a push."""
+
+
+class MarkLayer:
+    """The marks of one panel, drawn once and then moved.
+
+    Attributes:
+        artists: The matplotlib artists, in drawing order.
+    """
+
+    def __init__(self, panel: Panel, problem: Problem) -> None:
+        self.panel, self.problem = panel, problem
+        self.radius = np.asarray(problem.team.radius, np.float64)
+        empty = np.empty((0, 4, len(panel.right)))
+        self.ways = panel.segments(empty, colors=BODY, linewidths=1.0, linestyles=":", zorder=1.6)
+        self.bodies = panel.polygons(empty, facecolors=BODY, edgecolors=INK, linewidths=0.7, zorder=4.8)
+        self.pushes = panel.segments(empty, colors=PUSH, linewidths=1.8, zorder=6.6)
+        self.stalls = panel.segments(empty, colors=INK, linewidths=1.8, zorder=6.7)
+        self.artists = [self.ways, self.bodies, self.pushes, self.stalls]
+
+    def show_last(self, marks: Marks, positions: Array) -> None:
+        """Show the last moment of ``marks``, with ``(T + 1, K, d)`` positions of the robots."""
+        shown = max(1, round(_SHOWN_SECONDS / self.problem.dt))
+        self._draw_bodies(marks)
+        self._draw_pushes(marks.pushed, positions, max(0, len(positions) - shown))
+        self._draw_stalls(positions[-1:], marks.stalled[-1:])
+
+    def show_all(self, marks: Marks, positions: Array) -> None:
+        """Show the whole execution; arguments as for :meth:`show_last`."""
+        self._draw_bodies(marks)
+        self._draw_pushes(marks.pushed, positions, 0)
+        self._draw_stalls(positions, marks.stall_starts)
+
+    def _draw_bodies(self, marks: Marks) -> None:
+        d, bodies = self.problem.dimension, np.asarray(marks.bodies, np.float64)
+        self.bodies.set_verts(self.panel.outlines(bodies[-1, :, :d], bodies[-1, :, -1]))
+        # A body that has left comes again somewhere else.
+        turns = (bodies[1:, :, d : 2 * d] != bodies[:-1, :, d : 2 * d]).any(axis=-1)
+        ways = self.panel.flatten(bodies[..., :d])
+        parts = [np.split(ways[:, i], np.flatnonzero(turns[:, i]) + 1) for i in range(bodies.shape[1])]
+        self.ways.set_segments([path for paths in parts for path in paths if len(path) > 1])
+
+    def _draw_pushes(self, pushed: Array, positions: Array, begin: int) -> None:
+        given = np.asarray(pushed[begin:], np.float64)
+        hit = given.any(axis=-1)
+        # Where the robot was when it was pushed: the step before.
+        before = positions[np.maximum(np.arange(begin, len(positions)) - 1, 0)]
+        tails, arrows = before[hit].astype(np.float64), _ARROW_SECONDS * given[hit]
+        self.pushes.set_segments([path for tail, arrow in zip(tails, arrows) for path in self._arrow(tail, arrow)])
+
+    def _arrow(self, tail: Array, arrow: Array) -> list[Array]:
+        start, tip = self.panel.flatten(tail), self.panel.flatten(tail + arrow)
+        along = tip - start
+        normal = self.panel.right * along.dot(self.panel.up) - self.panel.up * along.dot(self.panel.right)
+        barbs = [tip, tip - 0.35 * along + 0.2 * normal], [tip, tip - 0.35 * along - 0.2 * normal]
+        return [np.array([start, tip]), *map(np.array, barbs)]
+
+    def _draw_stalls(self, positions: Array, where: Array) -> None:
+        centres = self.panel.flatten(positions[where])
+        reach = 1.2 * np.broadcast_to(self.radius, where.shape)[where][:, None]
+        one, other = self.panel.right + self.panel.up, self.panel.right - self.panel.up
+        crosses = [np.stack([centres - reach * way, centres + reach * way], axis=1) for way in (one, other)]
+        self.stalls.set_segments(np.concatenate(crosses))
+
+
+def mark_legend(marks: Marks) -> list[Line2D]:
+    """Entries of a legend for what there is."""
+    entries = [
+        (marks.pushed.any(), Line2D([], [], color=PUSH, linewidth=1.8, label="push")),
+        (marks.stalled.any(), Line2D([], [], linestyle="none", marker="x", color=INK, ms=8, mew=1.8, label="stalls")),
+        (marks.bodies.shape[1] > 0, Line2D([], [], linestyle="none", marker="o", mfc=BODY, mec=INK, ms=8,
+                                           label="intruder")),
+    ]  # fmt: skip
+    return [line for shown, line in entries if shown]

@@ -1,0 +1,58 @@
+"""Controls and what they lead to: how every planner's results are judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from d4orm_env.core.arrays import LARGEST, LARGEST_NUMBER, BoolArray, FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.engine.types import Engine
+from d4orm_env.verify import verify
+from d4orm_planners.base.plan import failed_robots
+
+PLAN_REACH = LARGEST_NUMBER / LARGEST
+"""Times its limit that a planned control may be, so that no square of it overflows: some methods scale theirs up."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Controls and what they lead to.
+
+    Attributes:
+        planned: ``(H, K, m)`` as the method left them, at most :data:`PLAN_REACH` times the limits; zero once docked.
+        controls: ``(H, K, m)`` as executed: inside the limits, zero once docked.
+        trajectory: Their rollout.
+        solved: Whether everyone arrives, the margin is kept at every step, and :func:`d4orm_env.verify` agrees.
+        failed: ``(K,)`` robots that do not arrive, or violate the margin at some step that was checked.
+    """
+
+    planned: FloatArray
+    controls: FloatArray
+    trajectory: Trajectory
+    solved: bool
+    failed: BoolArray
+
+    @property
+    def reward(self) -> float:
+        """Mean reward of all robots and steps."""
+        return float(self.trajectory.rewards.mean())
+
+    @property
+    def rank(self) -> tuple[bool, int, float]:
+        """Larger is better: solved before unsolved, then fewer failed robots, then more reward."""
+        return (True, 0, self.reward) if self.solved else (False, -int(self.failed.sum()), self.reward)
+
+
+def evaluate_controls(engine: Engine, problem: Problem, controls: FloatArray, check_interval: int = 1) -> Candidate:
+    """Roll controls ``(H, K, m)`` out and judge them: who fails by every so-manyth step, the solution by all."""
+    reach = PLAN_REACH * problem.team.control_limits
+    bounded = np.clip(controls, -reach, reach)
+    trajectory = engine.rollout(problem, bounded)
+    docked = trajectory.arrived[:-1, :, None] & problem.docks
+    planned = np.where(docked, np.float32(0), bounded)
+    failed = failed_robots(trajectory, check_interval)
+    solved = not failed_robots(trajectory).any() and verify(problem, trajectory.controls).ok
+    return Candidate(planned, trajectory.controls, trajectory, solved, failed)

@@ -1,0 +1,104 @@
+"""Which robots of an infeasible plan to replan together (paper, section V, failure-aware grouping): pure functions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TypeAlias
+
+from numpy.typing import ArrayLike
+
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+
+Graph: TypeAlias = tuple[frozenset[int], ...]
+"""For each robot those that it is in conflict with."""
+
+Groups = tuple[tuple[int, ...], ...]
+
+
+def conflicts(positions: FloatArray, radius: ArrayLike, margin: float) -> Graph:
+    """Which robots come within the margin of each other at any step after the start.
+
+    Args:
+        positions: ``(H+1, K, d)`` [m].
+        radius: ``(K,)`` [m].
+        margin: [m].
+    """
+    # Here, because importing numba takes long.
+    from d4orm_planners.engine.path_index import PathIndex
+
+    return graph_of(positions.shape[1], PathIndex(positions, radius, margin).pairs())
+
+
+def graph_of(num_robots: int, pairs: IntArray) -> Graph:
+    """The graph of conflicts between pairs ``(P, 2)``."""
+    neighbours: list[set[int]] = [set() for _ in range(num_robots)]
+    for first, second in pairs.tolist():
+        neighbours[first].add(second)
+        neighbours[second].add(first)
+    return tuple(map(frozenset, neighbours))
+
+
+def reconnected(graph: Graph, previous: Graph | None) -> Graph:
+    """The graph of conflicts with those of the previous iteration added that are likely to come back.
+
+    A robot of a previous group that now conflicts with a robot outside that group is joined again to those of its
+    previous direct neighbours that are free of conflicts now.
+
+    Args:
+        graph: Conflicts now.
+        previous: Conflicts in the previous iteration, or ``None``.
+    """
+    if previous is None:
+        return graph
+    joined = [set(neighbours) for neighbours in graph]
+    for group in components(previous):
+        for robot in group if len(group) > 1 else ():
+            if not graph[robot] <= set(group):
+                for other in previous[robot]:
+                    if not graph[other]:
+                        joined[robot].add(other)
+                        joined[other].add(robot)
+    return tuple(map(frozenset, joined))
+
+
+def components(graph: Graph) -> Groups:
+    """Connected components, singletons included, in order of their first members."""
+    seen: set[int] = set()
+    groups = []
+    for first in range(len(graph)):
+        if first in seen:
+            continue
+        members, frontier = {first}, {first}
+        while frontier:
+            frontier = set().union(*(graph[robot] for robot in frontier)) - members
+            members |= frontier
+        seen |= members
+        groups.append(tuple(sorted(members)))
+    return tuple(groups)
+
+
+def failure_groups(failed: BoolArray, graph: Graph) -> Groups:
+    """Groups to replan: the components of the graph that hold a failed robot.
+
+    Args:
+        failed: ``(K,)`` robots that do not arrive, or violate the margin to anything.
+        graph: Conflicts, after :func:`reconnected`.
+
+    Returns:
+        Disjoint groups of robots, each in ascending order. A robot that fails without conflict is a group of its own.
+    """
+    return tuple(group for group in components(graph) if failed[list(group)].any())
+
+
+def independent_robots(candidates: Iterable[int], graph: Graph) -> tuple[int, ...]:
+    """Those of the candidates, taken in order, that conflict with none taken before; sorted.
+
+    Args:
+        candidates: Robots, the most wanted first.
+        graph: Conflicts.
+    """
+    taken: set[int] = set()
+    for robot in candidates:
+        if taken.isdisjoint(graph[robot]):
+            taken.add(int(robot))
+    return tuple(sorted(taken))

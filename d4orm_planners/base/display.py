@@ -1,0 +1,93 @@
+"""What plans and episodes have in common for whoever looks at them: text, pictures, replays."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.summary_line import Row, joined
+from d4orm_env.core.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from d4orm_env.render.denoising_frames import Denoising
+    from d4orm_env.render.replay import Replay, ReplayMotion
+
+
+class _HasMotion(Protocol):
+    @property
+    def problem(self) -> Problem: ...
+    @property
+    def trajectory(self) -> Trajectory: ...
+    @property
+    def title(self) -> str: ...
+    @property
+    def key_figures(self) -> list[Row]: ...
+    def motion(self, title: str | None = None, denoising: Denoising | None = None) -> ReplayMotion: ...
+    def animate(self) -> Replay: ...
+
+
+class Shown:
+    """A motion of a team in a world, with a title and key figures. What draws is imported when it is asked for."""
+
+    def __repr__(self: _HasMotion) -> str:
+        return f"{type(self).__name__}: {self.title}\n  {joined(self.key_figures)}"
+
+    def _repr_html_(self: _HasMotion) -> str:
+        from d4orm_env.render.notebook import motion_html
+
+        return motion_html(self.problem, self.trajectory, self.title, self.key_figures)
+
+    def plot(self: _HasMotion, axes: Axes | None = None) -> Axes:
+        """Draw the motion with matplotlib; see :func:`d4orm_env.render.pictures.plot`.
+
+        Args:
+            axes: Where to draw; by default axes of a new figure of ``matplotlib.pyplot``.
+
+        Returns:
+            The axes, spatial for a spatial problem.
+
+        Raises:
+            ValueError: If the axes are spatial and the problem is not.
+        """
+        from d4orm_env.render.pictures import plot
+
+        return plot(self.problem, self.trajectory, axes)
+
+    def motion(self: _HasMotion, title: str | None = None, denoising: Denoising | None = None) -> ReplayMotion:
+        """What a replay shows; :class:`d4orm_env.render.replay.Replay` puts several side by side.
+
+        Args:
+            title: What to call it there; by default what it is called everywhere.
+            denoising: How a plan came about, shown before the motion; see :mod:`d4orm_planners.sampling.denoising`.
+        """
+        from d4orm_env.render.replay import motion
+
+        title = self.title if title is None else title
+        goals, marks = getattr(self, "goals", None), getattr(self, "marks", None)
+        bodies = None if marks is None else marks.bodies
+        figures = joined(self.key_figures)
+        return motion(self.problem, self.trajectory, title, figures, goals=goals, denoising=denoising, bodies=bodies)
+
+    def animate(self: _HasMotion) -> Replay:
+        """A replay that notebooks show where it is the last value of a cell."""
+        from d4orm_env.render.replay import Replay
+
+        return Replay(self.title, (self.motion(),))
+
+    def to_html(self: _HasMotion, path: str | Path) -> Path:
+        """Write a replay to play, pause and scrub in any browser: one file that loads nothing from a network.
+
+        Args:
+            path: An ``.html`` file.
+
+        Returns:
+            The path.
+
+        Raises:
+            ValueError: For another suffix.
+            OSError: If it cannot be written; nothing is left behind then.
+        """
+        return self.animate().save(path)

@@ -1,0 +1,184 @@
+"""Running a policy through an environment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from d4orm_env import navigation_v0
+from d4orm_env.core.arrays import BoolArray, FloatArray, shown, whole_number
+from d4orm_env.core.disturbance_events import Marks
+from d4orm_env.core.metrics import mean_squared_jerk, mean_stretch
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.summary_line import Row, count, outcome_rows
+from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.disturbances.recorded_events import marks_of
+from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_env.envs.team_step import AgentInfos
+from d4orm_planners.base.planner_registry import PolicyLike, make_policy
+from d4orm_planners.base.display import Shown
+
+if TYPE_CHECKING:
+    from pettingzoo import ParallelEnv
+
+PHYSICS = ("model", "mujoco")
+"""What moves robots: the equations that planners know, or rigid bodies in MuJoCo."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Episode(Shown):
+    """What happened.
+
+    Attributes:
+        problem: What the environment ran.
+        trajectory: The executed motion, ``T`` steps long; ``T`` is at most the horizon.
+        metrics: The environment's own, see :meth:`d4orm_env.envs.episode_record.EpisodeRecord.metrics`, and
+            ``mean_squared_jerk``, see :func:`d4orm_env.core.metrics.mean_squared_jerk`.
+        observations: Observations of all agents at the reset and after every step.
+        infos: Infos likewise.
+        goals: ``(T+1, K, d)`` where the robots were to go; it changes in lifelong mode.
+        marks: Where it was disturbed, for pictures; ``None`` without disturbances.
+    """
+
+    problem: Problem
+    trajectory: Trajectory
+    metrics: dict[str, float]
+    observations: tuple[dict[str, FloatArray], ...]
+    infos: tuple[AgentInfos, ...]
+    goals: FloatArray
+    marks: Marks | None = None
+
+    @property
+    def title(self) -> str:
+        """What happened where."""
+        seconds = len(self.trajectory.controls) * self.problem.dt
+        return f"{self.problem.name}, {count(self.problem.num_robots, 'robot')}, {seconds:.1f} s"
+
+    @property
+    def key_figures(self) -> list[Row]:
+        """How the team did."""
+        return outcome_rows(self.metrics, self.problem.num_robots)
+
+    @property
+    def controls(self) -> FloatArray:
+        """``(H, K, m)`` what was executed within the horizon, then zeros: a planner's ``initial_controls``."""
+        executed = self.trajectory.controls[: self.problem.horizon]
+        controls = np.zeros((self.problem.horizon, *executed.shape[1:]), np.float32)
+        controls[: len(executed)] = executed
+        return controls
+
+    @cached_property
+    def stretch(self) -> float:
+        """Way travelled over the shortest free way, see :func:`d4orm_env.core.metrics.mean_stretch`.
+
+        In lifelong mode, where goals change, it means nothing.
+        """
+        return mean_stretch(self.problem, self.trajectory)
+
+
+def check_physics(problem: Problem, physics: str) -> None:
+    """Refuse what is no physics, or none for a problem.
+
+    Raises:
+        ValueError: If it is not one of :data:`PHYSICS`, or robots have no bodies in it.
+        ImportError: If it needs a library that is not installed.
+    """
+    if physics not in PHYSICS:
+        raise ValueError(f"physics is {shown(physics)}; choose one of {', '.join(PHYSICS)}")
+    if physics == "mujoco":
+        from d4orm_env.mujoco import check_problem
+
+        check_problem(problem)
+
+
+def open_env(problem: Problem, physics: str = "model", **options: Any) -> ParallelEnv:
+    """An environment of a problem.
+
+    Args:
+        problem: The problem.
+        physics: What moves the robots, one of :data:`PHYSICS`.
+        **options: Further arguments of :class:`d4orm_env.navigation_v0.parallel_env`.
+
+    Raises:
+        ValueError: As :func:`check_physics`, or for a bad argument.
+        ImportError: If the physics needs a library that is not installed.
+    """
+    check_physics(problem, physics)
+    if physics == "mujoco":
+        from d4orm_env import mujoco
+
+        return mujoco.parallel_env(problem=problem, **options)
+    return navigation_v0.parallel_env(problem=problem, **options)
+
+
+def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0) -> Episode:
+    """Reset ``env``, reset ``policy``, and step until no agent is left.
+
+    Args:
+        env: A :mod:`d4orm_env.navigation_v0` parallel environment, wrapped or not.
+        policy: What acts: a policy, or anything else that :func:`~d4orm_planners.make_policy` takes.
+        seed: Seeds both.
+
+    Returns:
+        The executed trajectory and its metrics.
+
+    Raises:
+        ValueError: If the seed is negative, or there is no such policy.
+    """
+    whole_number(seed, "seed", 0)
+    actor = make_policy(policy)
+    observations, infos = env.reset(seed=seed)
+    problem = env.unwrapped.problem
+    actor.reset(env, seed=seed)
+    # What is recorded is the truth, whatever the policy sees.
+    joints, effects = [split_state(problem, env.unwrapped.true_state())], [env.unwrapped.effect().copy()]
+    all_observations, all_infos = [observations], [infos]
+    outcomes = [_outcome(env, {})]
+    while env.agents:
+        acting = {agent: observations[agent] for agent in env.agents}
+        observations, rewards, _, _, infos = env.step(actor.act(acting, env.state()))
+        joints.append(split_state(problem, env.unwrapped.true_state()))
+        effects.append(env.unwrapped.effect().copy())
+        all_observations.append(observations)
+        all_infos.append(infos)
+        outcomes.append(_outcome(env, rewards))
+    trajectory = _trajectory(problem, joints, outcomes)
+    jerk = mean_squared_jerk(trajectory.controls, trajectory.arrived, problem.dt)
+    metrics = {**env.unwrapped.metrics(), "mean_squared_jerk": jerk}
+    marks = None if all(part is None for part in effects[0]) else marks_of(effects, problem)
+    goals = np.stack([joint.goals for joint in joints])
+    return Episode(problem, trajectory, metrics, tuple(all_observations), tuple(all_infos), goals, marks)
+
+
+class _Outcome(NamedTuple):
+    """What a step did to every robot, each ``(K,)``."""
+
+    rewards: FloatArray
+    collided: BoolArray
+    margin_violated: BoolArray
+
+
+def _outcome(env: ParallelEnv, rewards: dict[str, float]) -> _Outcome:
+    """What the last step did to all robots, those that have left and may be run into included."""
+    step = env.unwrapped.last_step
+    outcome = _Outcome(step.rewards.copy(), step.collided, step.margin_violated)
+    for agent, reward in rewards.items():  # as wrappers have made them
+        outcome.rewards[int(agent.rsplit("_", 1)[1])] = reward
+    return outcome
+
+
+def _trajectory(problem: Problem, joints: list[JointState], outcomes: list[_Outcome]) -> Trajectory:
+    """What was seen at the reset and after every step, as one trajectory."""
+    states = np.stack([joint.states for joint in joints])
+    return Trajectory(
+        states=states,
+        positions=states[..., : problem.dimension],
+        controls=np.stack([joint.controls for joint in joints[1:]]),
+        rewards=np.stack([outcome.rewards for outcome in outcomes[1:]]),
+        arrived=np.stack([joint.arrived for joint in joints]),
+        collided=np.stack([outcome.collided for outcome in outcomes]),
+        margin_violated=np.stack([outcome.margin_violated for outcome in outcomes]),
+    )

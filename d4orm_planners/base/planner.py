@@ -1,0 +1,159 @@
+"""The planner protocol, ``init`` and ``iterate``, and the loop that every planner runs in: budget, callback, Ctrl-C."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeAlias
+
+from numpy.typing import ArrayLike
+
+from d4orm_env.core.arrays import FloatArray, duration, whole_number
+from d4orm_env.core.problem import Problem
+from d4orm_env.engine.types import StepWatcher
+from d4orm_planners.base.candidate import Candidate
+from d4orm_planners.base.plan import IterationRecord, Plan, Status
+from d4orm_planners.base.solve import Search
+from d4orm_planners.base.settings import CheckedSettings, Count, EngineName
+
+Callback = Callable[[IterationRecord], object]
+
+State: TypeAlias = Any
+"""What a planner keeps from one iteration to the next: a type of its own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannerConfig(CheckedSettings):
+    """Settings that every planner takes.
+
+    Attributes:
+        engine: ``"auto"``, ``"cpu"`` or ``"jax"``.
+        max_iterations: Iterations after which :meth:`Planner.solve` gives up, unless the call says otherwise.
+        improve: Go on improving after the first solution, until the time or iteration budget is used up. By default the
+            first solution ends the search.
+    """
+
+    engine: EngineName = "auto"
+    max_iterations: Count = 50
+    improve: bool = False
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """What a planner's iteration hands to the loop.
+
+    Attributes:
+        controls: ``(H, K, m)`` the new candidate.
+        denoising_steps: Sample-score-update steps spent.
+        excluded: Samples left out because their reward was not finite.
+        note: What the method itself says of how the iteration ended, where it has a word for it.
+        judged: What :func:`~d4orm_planners.base.candidate.evaluate_controls` made of these controls, if the iteration asked;
+            else the loop does.
+    """
+
+    controls: FloatArray
+    denoising_steps: int = 0
+    excluded: int = 0
+    note: str = ""
+    judged: Candidate | None = None
+
+
+class Planner(ABC):
+    """A method that turns a problem into a plan. Instances hold settings only.
+
+    What a planner keeps from one iteration to the next is its *state*, of whatever type it likes: :meth:`init` makes
+    the first one and every :meth:`iterate` the next. A planner that keeps nothing has ``None``, and no ``init``.
+
+    Attributes:
+        name: What its plans say they are by; that of the class unless it gives another.
+        config: The settings.
+        preset: Which of its presets it was made with, if any.
+        drives_straight: Whether it begins with straight drives, whose kernels the command line then compiles ahead.
+        presets: By name, settings for :func:`~d4orm_planners.make_planner`, which leaves out those that do not apply.
+    """
+
+    name: ClassVar[str]
+    config_class: ClassVar[type[PlannerConfig]] = PlannerConfig
+    drives_straight: ClassVar[bool] = False
+    presets: ClassVar[Mapping[str, Mapping[str, object]]] = {}
+    preset: str | None = None
+
+    def __init_subclass__(cls) -> None:
+        cls.name = cls.__dict__.get("name", cls.__name__)
+
+    def __init__(self, config: PlannerConfig) -> None:
+        self.config = config
+
+    def init(self, search: Search) -> State:
+        """The state that the first iteration begins with."""
+        del search
+
+    @abstractmethod
+    def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
+        """One iteration from the search's current candidate to the next: the new state, and what came of it."""
+
+    def finish(self, search: Search, state: State) -> None:  # noqa: B027 - a hook that most planners need not fill
+        """Let go of what the state holds open; called once after :meth:`init`, however the solve ends."""
+
+    def solve(
+        self,
+        problem: Problem,
+        seed: int = 0,
+        time_limit: float | None = None,
+        max_iterations: int | None = None,
+        callback: Callback | None = None,
+        initial_controls: ArrayLike | None = None,
+        watcher: StepWatcher | None = None,
+    ) -> Plan:
+        """Plan until a solution is found (or on, with ``improve``), the budget is used up, or Ctrl-C is pressed.
+
+        Args:
+            problem: What to solve.
+            seed: Non-negative seed; the same seed gives the same plan.
+            time_limit: Seconds, compilation not counted; looked at before every iteration, and within one between its
+                denoising steps, repairs or IPOPT's iterations. An iteration that it cuts short ends with what it has
+                by then, a candidate like any other. A limit that is not reached changes nothing.
+            max_iterations: Iterations; the configured number by default.
+            callback: Called with an :class:`IterationRecord` after every iteration, with the candidate that came of it;
+                returning ``True`` stops.
+            initial_controls: ``(H, K, m)`` to start from, zeros by default.
+            watcher: Called with a :class:`~d4orm_env.engine.types.DenoisingStep` after every denoising step, by the CPU
+                engine only. It changes nothing, and its time is not counted.
+
+        Returns:
+            The best plan found: a solved one with the most reward, else the one with the fewest robots failing.
+
+        Raises:
+            ValueError: If an argument makes no sense, or there is a watcher and another engine; the message names it.
+        """
+        limit = None if time_limit is None else duration(time_limit, "time_limit")
+        most = (
+            self.config.max_iterations if max_iterations is None else whole_number(max_iterations, "max_iterations", 1)
+        )
+        search = Search(self, problem, seed, initial_controls)
+        search.time_limit = limit
+        search.watcher = watcher
+        try:
+            status = _run(search, most, callback)
+        except KeyboardInterrupt:
+            status = "interrupted"
+        finally:
+            search.close()
+        return search.plan(status)
+
+
+def _run(search: Search, most: int, callback: Callback | None) -> Status:
+    """Iterate until something ends the search, and say what."""
+    while not search.is_over:
+        if search.iteration >= most:
+            return "iteration_limit"
+        if search.time_left == 0:
+            return "time_limit"
+        record = search.advance()
+        if callback is not None:
+            with search.watch.paused():
+                stop = callback(record)
+            if stop is True:
+                return "stopped"
+    return "solved"

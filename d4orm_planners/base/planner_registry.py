@@ -1,0 +1,329 @@
+"""Planners and policies: by name, those that come with the package and those that users bring, or given themselves."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any, TypeAlias, TypeGuard, TypeVar
+
+from d4orm_env.core.arrays import duration, shown
+from d4orm_env.core.errors import UnknownKeywordError
+from d4orm_env.core.registry import load_reference
+from d4orm_planners.base.names import PLANNERS, POLICIES, is_planner_class
+from d4orm_planners.base.planner import Planner
+from d4orm_planners.base.policy import OpenLoop, Policy, RobotFunction, TeamFunction, plain_attributes
+from d4orm_planners.base.import_paths import source_digest, written
+from d4orm_planners.base.settings import NOTHING, CheckedSettings
+
+RECOMMENDED = "d4orm-d"
+"""The planner that solves most problems, and soonest."""
+
+Presets: TypeAlias = Mapping[str, Mapping[str, object]]
+"""By name, settings."""
+
+Config = TypeVar("Config", bound=CheckedSettings)
+
+PolicyLike: TypeAlias = str | Policy | Planner | type[object] | Callable[..., object]
+"""What :func:`make_policy` takes; other objects with ``reset`` and ``act`` as well."""
+
+
+def list_planners() -> tuple[str, ...]:
+    """Names that :func:`make_planner` accepts."""
+    return tuple(PLANNERS)
+
+
+def list_policies() -> tuple[str, ...]:
+    """Names that :func:`make_policy` accepts."""
+    return (*PLANNERS, *POLICIES)
+
+
+def describe_planner(name: str) -> str:
+    """The first line of a planner's documentation."""
+    return _summary(_planner_class(name))
+
+
+def describe_policy(name: str) -> str:
+    """The first line of a policy's documentation."""
+    return _summary(find_policy(name))
+
+
+def make_planner(name: str | type[Planner] = RECOMMENDED, *, preset: str | None = None, **config: object) -> Planner:
+    """A planner by name; without one, that which solves most, soonest.
+
+    Args:
+        name: One of :func:`list_planners`, ``"package.module:Name"`` (or ``"folder/file.py:Name"``) of a planner class,
+            or the class.
+        preset: ``"paper"`` for the paper's algorithm and parameters; ``"tuned"``, of D4orm and its rivals, for that
+            with parameters that were tuned; ``None`` for this project's defaults.
+        **config: Settings that differ from the preset; see the planner's configuration class.
+
+    Raises:
+        ValueError: For an unknown planner or preset, or a setting that makes no sense.
+        TypeError: For an unknown setting.
+    """
+    kind, owner = _planner_class(name), f"planner {_called(name)!r}"
+    planner = kind(_configured(kind.config_class, kind.presets, preset, config, owner))
+    planner.preset = preset
+    return planner
+
+
+def make_policy(name: PolicyLike, **config: Any) -> Policy:
+    """A policy: by name, a planner's for executing its plan open loop; or from what a user brings.
+
+    Args:
+        name: One of :func:`list_policies`; ``"package.module:Name"`` or ``"folder/file.py:Name"`` of any of the
+            following; a :class:`Policy` or another object with ``reset`` and ``act``; a planner, executed open loop; a
+            class of these; a function ``(observations, state) -> actions`` of the team, ``observation -> action`` of
+            every robot by itself, or without required positional parameters, which makes a policy.
+        **config: For a planner, its settings and ``preset``, and the budget of the solve (``time_limit``,
+            ``max_iterations``); for a policy class, its own settings, and ``preset`` if it has presets; for a function
+            that makes one, its keywords.
+
+    Raises:
+        ValueError: For an unknown name or preset, an import path that leads nowhere, something that does not act, or a
+            setting that makes no sense.
+        TypeError: For an unknown setting.
+    """
+    kind, owner = find_policy(name), f"policy {_called(name)!r}"
+    if is_planner_class(kind):
+        time_limit = _time_limit(config)
+        return OpenLoop(make_planner(name if isinstance(name, str) else kind, **config), time_limit=time_limit)
+    if not makes_policy(kind):
+        _refuse_settings(config, owner)
+        return _as_policy(kind, owner)
+    if (config_class := getattr(kind, "config_class", None)) is not None:
+        return _as_policy(kind(_policy_config(kind, config_class, config, owner)), owner)
+    _check_keywords(kind, config, owner)
+    return _as_policy(kind(**config), owner)
+
+
+def find_policy(policy: object) -> object:
+    """What stands behind a policy's name or import path; anything but text is returned as it is.
+
+    Raises:
+        ValueError: If there is no such policy.
+    """
+    if is_brought(policy):
+        return policy
+    if isinstance(policy, str):
+        if policy in PLANNERS and policy in POLICIES:
+            raise ValueError(f"{policy!r} names a planner and a policy of two packages; uninstall one of them")
+        for table in (PLANNERS, POLICIES):
+            if policy in table:
+                return table[policy]
+        if ":" in policy:
+            return load_reference(policy)
+    raise ValueError(
+        f"policy {shown(policy)} is unknown; choose one of {', '.join(list_policies())}, or give a Policy, a function, "
+        "or package.module:Name of one"
+    )
+
+
+def is_brought(policy: object) -> bool:
+    """Whether a policy is given itself, rather than by name or import path."""
+    return callable(policy) or isinstance(policy, Planner) or _acts(policy)
+
+
+def origin(policy: object) -> object:
+    """What :func:`make_policy` takes for a policy in any process, whatever was registered there."""
+    for table in (PLANNERS, POLICIES):
+        if isinstance(policy, str) and policy in table:
+            return table.origin(policy)
+    return policy
+
+
+def is_planned(policy: object) -> bool:
+    """Whether a policy is a planner, whose plan is executed open loop."""
+    kind = find_policy(policy)
+    return is_planner_class(kind) or isinstance(kind, Planner)
+
+
+def makes_policy(kind: object) -> TypeGuard[Callable[..., object]]:
+    """Whether something that :func:`find_policy` found takes settings and makes a policy, rather than acts itself."""
+    return isinstance(kind, type) or (not _acts(kind) and callable(kind) and _required(kind) == 0)
+
+
+def setting_names(policy: object, given: Mapping[str, object] = NOTHING) -> tuple[str, ...]:
+    """Settings that :func:`make_policy` takes for a policy, where these are given."""
+    kind = find_policy(policy)
+    if is_planner_class(kind):
+        return (*kind.config_class.setting_names(given), "preset", "time_limit")
+    if not makes_policy(kind):
+        return ()
+    if (config_class := getattr(kind, "config_class", None)) is not None:
+        return (*config_class.setting_names(given), *(("preset",) if _presets(kind) else ()))
+    return tuple(inspect.signature(kind).parameters)
+
+
+def default_settings(policy: str) -> dict[str, object]:
+    """Settings of a planner or policy with their defaults; ``"required"`` where there is none.
+
+    Raises:
+        ValueError: If there is no such planner or policy.
+    """
+    kind = find_policy(policy)
+    if (config_class := getattr(kind, "config_class", None)) is not None:
+        return dict(config_class().keywords())
+    parameters = inspect.signature(kind).parameters if makes_policy(kind) else {}
+    return {name: "required" if own.default is own.empty else own.default for name, own in parameters.items()}
+
+
+def policy_settings(name: object, **config: Any) -> dict[str, object]:
+    """All that tells ``make_policy(name, **config)`` from other policies of that name.
+
+    These are its settings, defaults filled in where a configuration class has them; a preset has become its settings.
+    A policy that does not come with this package has the digest of its source as well.
+
+    Raises:
+        ValueError, TypeError: As :func:`make_policy`; also if there is no source to be read.
+    """
+    kind, owner = find_policy(name), f"policy {_called(name)!r}"
+    settings: dict[str, object]
+    if is_planner_class(kind):
+        time_limit = _time_limit(config)
+        planner = make_planner(name if isinstance(name, str) else kind, **config)
+        settings = {**planner.config.keywords(), "time_limit": time_limit}
+    elif not makes_policy(kind):
+        _refuse_settings(config, owner)
+        policy = _as_policy(kind, owner)
+        settings = policy.identity() if isinstance(kind, Policy | Planner) else plain_attributes(kind)
+    elif (config_class := getattr(kind, "config_class", None)) is not None:
+        checked = _policy_config(kind, config_class, config, owner)
+        if isinstance(kind, type) and issubclass(kind, Policy):
+            settings = kind.identity_with(checked)
+        else:
+            settings = checked.keywords()
+    else:
+        _check_keywords(kind, config, owner)
+        settings = dict(config)
+    code = written(kind.planner if isinstance(kind, OpenLoop) and kind.planner is not None else kind)
+    foreign = code.__module__.partition(".")[0] != __name__.partition(".")[0]
+    return {**settings, "source": source_digest(code)} if foreign else settings
+
+
+def _presets(kind: object) -> Presets:
+    """Of a planner's or policy's class; none where it has none."""
+    presets: Presets = getattr(kind, "presets", {})
+    return presets
+
+
+def _policy_config(kind: object, config_class: type[Config], given: Mapping[str, object], owner: str) -> Config:
+    """A policy's settings; one that has presets may be given one beside them."""
+    config, presets = dict(given), _presets(kind)
+    preset = config.pop("preset", None) if presets else None
+    return _configured(config_class, presets, preset, config, owner)
+
+
+def _configured(
+    config_class: type[Config], presets: Presets, preset: object, config: Mapping[str, object], owner: str
+) -> Config:
+    """Settings as given, on top of those of a preset.
+
+    Raises:
+        ValueError: For an unknown preset, or a setting that makes no sense.
+        TypeError: For an unknown setting.
+    """
+    if preset is not None and not (isinstance(preset, str) and preset in presets):
+        raise ValueError(f"preset {shown(preset)} of {owner} is unknown; choose one of {', '.join(presets)}")
+    settings = NOTHING if preset is None else presets[preset]
+    known = config_class.setting_names({**settings, **config})
+    applying = {name: value for name, value in settings.items() if name in known}
+    return config_class.from_keywords({**applying, **config}, owner)
+
+
+def _planner_class(name: object) -> type[Planner]:
+    kind = name
+    if isinstance(name, str) and (name in PLANNERS or ":" in name):
+        kind = PLANNERS[name] if name in PLANNERS else load_reference(name)
+    if not is_planner_class(kind):
+        if kind is not name:
+            raise ValueError(f"planner {name!r} is {shown(kind)}; it must be a subclass of d4orm_planners.Planner")
+        if isinstance(name, str) and name in POLICIES:
+            raise ValueError(
+                f"{name!r} is no planner but a policy, which acts step by step; use make_policy({name!r}), or "
+                f"d4orm run --policy {name}"
+            )
+        raise ValueError(f"planner {shown(name)} is unknown; choose one of {', '.join(PLANNERS)}")
+    if inspect.isabstract(kind):
+        raise ValueError(f"planner {_called(name)!r} lacks iterate; define it in the class")
+    return kind
+
+
+def _acts(thing: object) -> TypeGuard[Policy]:
+    return callable(getattr(thing, "reset", None)) and callable(getattr(thing, "act", None))
+
+
+def _as_policy(thing: Any, owner: str) -> Policy:
+    """What acts itself, as a policy.
+
+    Raises:
+        ValueError: If it does not.
+    """
+    if isinstance(thing, Planner):
+        return OpenLoop(thing)
+    if _acts(thing) and not isinstance(thing, type):
+        return thing
+    count = _required(thing) if callable(thing) and not isinstance(thing, type) else 0
+    if count not in (1, 2):
+        raise ValueError(
+            f"{owner} is {shown(thing)}, which does not act; it must have reset and act, or be a function of "
+            "(observations, state) or of one robot's observation, distinguished by their required positional parameters"
+        )
+    return TeamFunction(thing) if count == 2 else RobotFunction(thing)
+
+
+def _required(function: Callable[..., object]) -> int | None:
+    """How many positional parameters a function requires; ``None`` if that says nothing about it."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):
+        return None
+    count = sum(
+        parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
+        and parameter.default is parameter.empty
+        for parameter in parameters
+    )
+    return None if not count and any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters) else count
+
+
+def _check_keywords(kind: Callable[..., object], config: Mapping[str, object], owner: str) -> None:
+    """Refuse what a function or class that makes a policy does not take, and what it lacks."""
+    if inspect.isabstract(kind):
+        missing = ", ".join(sorted(vars(kind)["__abstractmethods__"]))
+        raise ValueError(f"{owner} lacks {missing}; define it in the class")
+    try:
+        signature = inspect.signature(kind)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"{owner} is {shown(kind)}, which does not say what it takes; give a Policy of yours"
+        ) from None
+    parameters = signature.parameters
+    if not parameters:
+        _refuse_settings(config, owner)
+    for name in config:
+        if name not in parameters and not any(known.kind is known.VAR_KEYWORD for known in parameters.values()):
+            raise UnknownKeywordError(f"{name!r} is no setting of {owner}; it takes {', '.join(parameters)}")
+    try:
+        signature.bind(**config)
+    except TypeError as error:
+        raise ValueError(f"{owner} cannot be made: {error}; give it as a setting") from None
+
+
+def _refuse_settings(config: Mapping[str, object], owner: str) -> None:
+    if config:
+        raise UnknownKeywordError(f"{owner} takes no settings, but was given {', '.join(map(shown, config))}")
+
+
+def _time_limit(config: dict[str, object]) -> float | None:
+    """Take the budget of the solve out of a planner's settings."""
+    limit = config.pop("time_limit", None)
+    return None if limit is None else duration(limit, "time_limit")
+
+
+def _called(thing: object) -> str:
+    """What to call a policy in messages."""
+    return thing if isinstance(thing, str) else getattr(thing, "__name__", type(thing).__name__)
+
+
+def _summary(kind: object) -> str:
+    return (kind.__doc__ or "").strip().partition("\n")[0]

@@ -1,0 +1,211 @@
+"""Policies: what acts in an ``env.step`` loop, from observations and ``env.state()`` alone."""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.seeds import Stream, generator
+from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_planners.base.plan import Plan
+from d4orm_planners.base.planner import Planner
+from d4orm_planners.base.settings import CheckedSettings
+from d4orm_planners.tracking.steering import drive_to_goal
+
+if TYPE_CHECKING:
+    from pettingzoo import ParallelEnv
+
+Observations = dict[str, FloatArray]
+Actions = dict[str, FloatArray]
+"""By agent."""
+
+
+class Policy(ABC):
+    """Something that chooses every robot's control at every step.
+
+    A subclass has :meth:`act`, and a :meth:`reset` if it draws, plans or remembers anything.
+
+    Attributes:
+        problem: Problem of the present episode, from the reset on.
+        config_class: :class:`~d4orm_planners.base.settings.CheckedSettings` of the policy, of which the constructor then
+            takes an instance. Without one, settings are keyword arguments of the constructor.
+        presets: By name, settings of ``config_class`` for :func:`~d4orm_planners.make_policy`.
+    """
+
+    config_class: ClassVar[type[CheckedSettings] | None] = None
+    presets: ClassVar[Mapping[str, Mapping[str, object]]] = {}
+    problem: Problem
+
+    def reset(self, env: ParallelEnv, seed: int = 0) -> None:
+        """Get ready for an episode that ``env.reset()`` has begun.
+
+        Args:
+            env: A :mod:`d4orm_env.navigation_v0` parallel environment, wrapped or not.
+            seed: Seeds whatever the policy draws.
+        """
+        self.problem = env.unwrapped.problem
+
+    @abstractmethod
+    def act(self, observations: Observations, state: FloatArray) -> Actions:
+        """Controls for the agents in ``observations``.
+
+        Args:
+            observations: The environment's observations; their keys are the agents that act.
+            state: ``env.state()``; :func:`d4orm_env.envs.joint_state.split_state` takes it apart.
+
+        Returns:
+            ``{agent: (m,) float32 control}``.
+
+        Raises:
+            RuntimeError: Before the first reset, if the policy needs one.
+        """
+
+    def identity(self) -> dict[str, object]:
+        """What a store of trials tells this instance from others of its class by, as JSON has it.
+
+        By default the settings in ``config``, if it has any, else its attributes that are numbers or text.
+        """
+        config = getattr(self, "config", None)
+        return self.identity_with(config) if isinstance(config, CheckedSettings) else plain_attributes(self)
+
+    @classmethod
+    def identity_with(cls, config: CheckedSettings) -> dict[str, object]:
+        """The same of an instance with these settings; more than they are where they name what may change."""
+        return config.keywords()
+
+
+def plain_attributes(thing: object) -> dict[str, object]:
+    """Attributes of an object that are numbers, truth values or text."""
+    if isinstance(thing, partial):
+        return {str(name): value for name, value in (*enumerate(thing.args), *thing.keywords.items()) if _plain(value)}
+    return {name: value for name, value in getattr(thing, "__dict__", {}).items() if _plain(value)}
+
+
+def _plain(value: object) -> bool:
+    return isinstance(value, bool | int | float | str)
+
+
+class StatePolicy(Policy):
+    """A policy that goes by the joint state: a subclass says what the whole team does, by :meth:`_controls`."""
+
+    def reset(self, env: ParallelEnv, seed: int = 0) -> None:
+        super().reset(env, seed)
+        self._begin(env, seed)
+
+    def act(self, observations: Observations, state: FloatArray) -> Actions:
+        require_reset(self)
+        controls = self._controls(split_state(self.problem, state))
+        return {agent: controls[robot] for agent, robot in zip(observations, robot_indices(observations))}
+
+    def _begin(self, env: ParallelEnv, seed: int) -> None:
+        """What the policy does at a reset beyond looking at the problem."""
+
+    @abstractmethod
+    def _controls(self, joint: JointState) -> FloatArray:
+        """``(K, m)`` controls of the whole team."""
+
+
+def require_reset(policy: Policy) -> None:
+    """Refuse to act before the first reset.
+
+    Raises:
+        RuntimeError: If there was none.
+    """
+    if not hasattr(policy, "problem"):
+        raise RuntimeError("the policy has seen no environment yet; call reset(env) before act()")
+
+
+def robot_indices(agents: Iterable[str]) -> list[int]:
+    """Which robots the agents ``"robot_0"``, ... are."""
+    return [int(agent.rsplit("_", 1)[1]) for agent in agents]
+
+
+class TeamFunction(Policy):
+    """A function ``(observations, state) -> actions`` as a policy."""
+
+    def __init__(self, function: Callable[[Observations, FloatArray], Actions]) -> None:
+        self.function = function
+
+    def act(self, observations: Observations, state: FloatArray) -> Actions:
+        return self.function(observations, state)
+
+
+class RobotFunction(Policy):
+    """A function ``observation -> action`` as a policy: every robot asks it by itself."""
+
+    def __init__(self, function: Callable[[FloatArray], FloatArray]) -> None:
+        self.function = function
+
+    def act(self, observations: Observations, state: FloatArray) -> Actions:
+        return {agent: self.function(observation) for agent, observation in observations.items()}
+
+
+class OpenLoop(StatePolicy):
+    """Plans once at the reset and executes the plan, whatever happens.
+
+    Attributes:
+        planner: What makes the plan.
+        plan: The plan of the present episode.
+    """
+
+    name = "open-loop"
+
+    def __init__(
+        self, planner: Planner | None = None, plan: Plan | None = None, time_limit: float | None = None
+    ) -> None:
+        if (planner is None) == (plan is None):
+            raise ValueError("an open-loop policy needs either a planner or a plan")
+        self.planner = planner
+        self.plan = plan
+        self.time_limit = time_limit
+
+    def _begin(self, env: ParallelEnv, seed: int) -> None:
+        if self.planner is not None:
+            self.plan = self.planner.solve(self.problem, seed=seed, time_limit=self.time_limit)
+        elif self.plan is not None and self.plan.problem != self.problem:
+            raise ValueError(
+                "the plan was made for another problem than the environment's; plan for this one, or keep one with "
+                "randomize_instance=False"
+            )
+
+    def identity(self) -> dict[str, object]:
+        if self.planner is not None:
+            config = self.planner.config.keywords()
+            return {"planner": self.planner.name, **config, "time_limit": self.time_limit}
+        assert self.plan is not None
+        return {"controls": hashlib.sha256(self.plan.controls.tobytes()).hexdigest()}
+
+    def _controls(self, joint: JointState) -> FloatArray:
+        assert self.plan is not None
+        if joint.steps >= len(self.plan.controls):
+            return np.zeros_like(self.plan.controls[0])
+        return self.plan.controls[joint.steps]
+
+
+class RandomControls(StatePolicy):
+    """Controls drawn uniformly from the box of each robot's limits."""
+
+    name = "random"
+
+    def _begin(self, env: ParallelEnv, seed: int) -> None:
+        self._generator = generator(seed, Stream.RANDOM_CONTROLS)
+
+    def _controls(self, joint: JointState) -> FloatArray:
+        limit = self.problem.team.control_limits
+        return self._generator.uniform(-limit, limit).astype(np.float32)
+
+
+class DriveToGoal(StatePolicy):
+    """Drives straight to the goal and brakes for it, as if nobody else were there."""
+
+    name = "goal"
+
+    def _controls(self, joint: JointState) -> FloatArray:
+        return drive_to_goal(self.problem, joint.states, joint.goals)

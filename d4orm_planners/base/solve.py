@@ -1,0 +1,198 @@
+"""One solve on its way: what a planner's iterations see of it, and how they follow each other."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from d4orm_env.core.arrays import FloatArray, whole_number
+from d4orm_env.core.metrics import trajectory_metrics
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.seeds import Stream, derived_seed
+from d4orm_env.engine.types import (
+    DenoisingStep,
+    Engine,
+    SamplingResult,
+    SamplingRules,
+    SamplingTask,
+    StepWatcher,
+    checked_controls,
+)
+from d4orm_env.engine.choice import get_engine
+from d4orm_planners.base.candidate import Candidate, evaluate_controls
+from d4orm_planners.base.plan import IterationRecord, Plan, Status
+from d4orm_planners.base.provenance import Provenance
+from d4orm_planners.base.stopwatch import Stopwatch
+
+if TYPE_CHECKING:
+    from d4orm_planners.base.planner import Planner, State
+
+
+class Search:
+    """One solve on its way.
+
+    Args:
+        planner: What iterates.
+        problem: The problem.
+        seed: Non-negative.
+        initial_controls: ``(H, K, m)`` to start from; zeros by default.
+        engine: What rolls out and samples, if not the planner's own.
+        judge: What makes a candidate of an iteration's controls, if not :func:`evaluate_controls`.
+        check_interval: Only at every so-manyth step is looked who fails (paper, section VI-A); a solution keeps the
+            margin at all steps.
+
+    Attributes:
+        problem: The problem.
+        engine: What rolls out and samples.
+        seed: The solve's seed.
+        watch: Time used.
+        current: The candidate that the next iteration starts from.
+        best: The best candidate so far.
+        iteration: Iterations done.
+        state: What the planner keeps between its own iterations, of a type of its own; ``None`` before the first one.
+        metrics: Numbers of the method's own that the plan's metrics will have.
+        time_limit: Seconds that the solve may take, or ``None``.
+        watcher: What is told of every denoising step, or ``None``.
+        cancelled: Once set, by whatever thread, the iteration under way is left as if its time were over.
+    """
+
+    def __init__(
+        self,
+        planner: Planner,
+        problem: Problem,
+        seed: int,
+        initial_controls: ArrayLike | None = None,
+        engine: Engine | None = None,
+        judge: Callable[[FloatArray], Candidate] | None = None,
+        check_interval: int = 1,
+    ) -> None:
+        self.planner = planner
+        self.problem = problem
+        self.engine = engine or get_engine(planner.config.engine)
+        self.seed = whole_number(seed, "seed", 0)
+        shape = (problem.horizon, problem.num_robots, problem.control_size)
+        if initial_controls is None:
+            controls = np.zeros(shape, np.float32)
+        else:
+            try:
+                controls = checked_controls(problem, initial_controls)
+            except ValueError as error:
+                raise ValueError(f"initial_controls: {error}") from None
+        self.watch = Stopwatch()
+        with self.watch.paused():
+            # The first rollout may compile.
+            self.engine.rollout(problem, controls)
+        # A plan of fewer steps is looked at where it ends.
+        self.check_interval = min(check_interval, problem.horizon)
+        evaluate = partial(evaluate_controls, self.engine, problem, check_interval=self.check_interval)
+        self.current = self.best = evaluate(controls)
+        self._judge = judge or evaluate
+        self.iteration = 0
+        self.denoising_steps = 0
+        self.history: list[IterationRecord] = []
+        self.state: State = None
+        self._began = False
+        self.metrics: dict[str, float] = {}
+        self.time_limit: float | None = None
+        self.watcher: StepWatcher | None = None
+        self.cancelled = threading.Event()
+
+    @property
+    def time_left(self) -> float | None:
+        """Seconds left, zero when they are used up; ``None`` without a limit."""
+        return None if self.time_limit is None else max(self.time_limit - self.watch.elapsed, 0.0)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether there is a solution, and nobody asks for a better one."""
+        return self.best.solved and not self.planner.config.improve
+
+    def should_stop(self) -> bool:
+        """Whether an iteration must come to its end as it is."""
+        return self.time_left == 0 or self.cancelled.is_set()
+
+    def denoise(
+        self,
+        task: SamplingTask,
+        rules: SamplingRules,
+        mean: FloatArray,
+        noise_scale: FloatArray,
+        num_samples: int,
+        seed: int,
+    ) -> SamplingResult:
+        """See :meth:`d4orm_env.engine.types.Engine.denoise`; compiling is not counted, and time may end it."""
+        with self.watch.paused():
+            self.engine.prepare(task, rules, noise_scale, num_samples)
+        # Engines of others need not know of watchers.
+        watched = {} if self.watcher is None else {"watcher": self._tell}
+        return self.engine.denoise(task, rules, mean, noise_scale, num_samples, seed, self.should_stop, **watched)
+
+    def _tell(self, step: DenoisingStep) -> None:
+        with self.watch.paused():
+            assert self.watcher is not None
+            self.watcher(step)
+
+    def iteration_seed(self, stream: Stream = Stream.SAMPLES, number: int = 0) -> int:
+        """A seed for the present iteration's use of a stream with this number."""
+        return derived_seed(self.seed, stream, self.iteration, number)
+
+    def advance(self) -> IterationRecord:
+        """Run one iteration, judge it and remember the best; the record that is kept has no arrays."""
+        if not self._began:
+            self.state, self._began = self.planner.init(self), True
+        self.state, iteration = self.planner.iterate(self, self.state)
+        self.current = iteration.judged or self._judge(iteration.controls)
+        self.iteration += 1
+        self.denoising_steps += iteration.denoising_steps
+        if self.current.rank > self.best.rank:
+            self.best = self.current
+        trajectory = self.current.trajectory
+        record = IterationRecord(
+            iteration=self.iteration,
+            wall_time=self.watch.elapsed,
+            denoising_steps=self.denoising_steps,
+            reward=self.current.reward,
+            solved=self.current.solved,
+            num_failed=int(self.current.failed.sum()),
+            num_margin_violated=int(trajectory.margin_violated[1:].any(axis=0).sum()),
+            num_not_arrived=int((~trajectory.arrived[-1]).sum()),
+            best_reward=self.best.reward,
+            best_solved=self.best.solved,
+            excluded=iteration.excluded,
+            note=iteration.note,
+        )
+        self.history.append(record)
+        return replace(record, controls=self.current.controls, trajectory=trajectory)
+
+    def close(self) -> None:
+        """Let the planner finish what it has begun."""
+        if self._began:
+            self._began = False
+            self.planner.finish(self, self.state)
+
+    def plan(self, status: Status) -> Plan:
+        """The best candidate as a plan."""
+        # Nodes may have reported a solution while they were closed.
+        if self.is_over and status in ("iteration_limit", "time_limit"):
+            status = "solved"
+        return Plan(
+            planner=self.planner.name,
+            problem=self.problem,
+            seed=self.seed,
+            controls=self.best.controls,
+            solved=self.best.solved,
+            status=status,
+            iterations=self.iteration,
+            denoising_steps=self.denoising_steps,
+            wall_time=self.watch.elapsed,
+            history=tuple(self.history),
+            trajectory=self.best.trajectory,
+            metrics=trajectory_metrics(self.problem, self.best.trajectory) | self.metrics,
+            provenance=Provenance.here(self.planner.preset, self.planner.config.keywords()),
+        )

@@ -1,0 +1,348 @@
+"""One robot's motion by alternating minimisation with polar collision constraints, compiled with numba.
+
+After V. K. Adajania, S. Zhou, A. K. Singh and A. P. Schoellig, *AMSwarm: An alternating minimization approach for safe
+motion planning of quadrotor swarms in cluttered environments* (ICRA 2023). A body at ``x_j`` is kept clear of by
+``p = x_j + d w``, a unit vector ``w`` (which the publication writes by its angles) and a distance ``d`` of at least the
+reach; velocity and acceleration are a direction and a length within the limits. With directions and lengths held, the
+coefficients follow from one linear system; with coefficients held, directions and lengths are closed forms.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from d4orm_env.core.arrays import BoolArray, Floats, Whole
+from d4orm_env.engine import compiling
+from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.compiling import OPTIONS, compiled
+
+MOST_PENALTY = 5e7
+"""What the weight of the constraints grows to at most, as in the authors' code: it would overflow in the end."""
+
+
+class Method(NamedTuple):
+    """Weights and limits of the alternation, with its basis.
+
+    Attributes:
+        place: ``(T, n+1)`` see :class:`~d4orm_planners.baselines.amswarm.bernstein.Basis`.
+        velocity: ``(T, n+1)``.
+        acceleration: ``(T, n+1)``.
+        squares: ``(4, n+1, n+1)`` of the constraints on places, velocities and accelerations the sums of squares over
+            all steps, and the objective's.
+        goal: ``(n+1,)`` what the objective wants of the coefficients, per metre of goal.
+        barrier: Share ``gamma`` of its distance to a body's reach that a robot may use up in a step.
+        lookout: Bodies are minded that come this near to the reach [m].
+        penalty: First weight ``rho`` of the constraints.
+        growth: Factor by which it grows from one alternation to the next.
+        alternations: At most.
+        tolerance: Largest violation, and change of a place, at which it ends, in SI units.
+    """
+
+    place: Floats
+    velocity: Floats
+    acceleration: Floats
+    squares: Floats
+    goal: Floats
+    barrier: float
+    lookout: float
+    penalty: float
+    growth: float
+    alternations: int
+    tolerance: float
+
+
+class Surroundings(NamedTuple):
+    """What a team keeps clear of.
+
+    Attributes:
+        paths: ``(K, T, d)`` where robots are predicted to be [m].
+        radius: ``(K,)`` of the robots [m].
+        margin: Between surfaces [m].
+        boxes: ``(B, 2 d + 1)`` obstacles, see :class:`~d4orm_env.geometry.shapes.Shapes`.
+        bounds: ``(2, d)`` of the world, infinite where open [m].
+    """
+
+    paths: Floats
+    radius: Floats
+    margin: float
+    boxes: Floats
+    bounds: Floats
+
+
+class Guess(NamedTuple):
+    """Samples of a motion at steps 1 to T, each ``(T, d)``: places [m], velocities [m/s], accelerations [m/s^2]."""
+
+    place: Floats
+    velocity: Floats
+    acceleration: Floats
+
+
+class Targets(NamedTuple):
+    """What directions and lengths make of a :class:`Guess`: the sums over all constraints, each ``(T, d)``."""
+
+    place: Floats
+    velocity: Floats
+    acceleration: Floats
+
+
+@cached_kernel(fingerprint((compiling,)), **OPTIONS)
+def alternate(
+    method: Method,
+    bodies: Surroundings,
+    robot: Whole,
+    limits: Floats,
+    goal: Floats,
+    fixed: int,
+    motion: Floats,
+    guess: Guess,
+) -> float:
+    """Alternate until no constraint is violated and no place moves, to the tolerance, or as often as may be.
+
+    Args:
+        method: :class:`Method`.
+        bodies: :class:`Surroundings`.
+        robot: Its number among them.
+        limits: ``(2,)`` of speed and acceleration [m/s, m/s^2], infinite where there is none.
+        goal: ``(d,)`` [m].
+        fixed: How many of the first coefficients are given.
+        motion: ``(n+1, d)`` coefficients; the given ones are read and the others written.
+        guess: :class:`Guess` to begin with, and the motion's samples in the end.
+
+    Returns:
+        The largest violation that is left, in SI units.
+    """
+    (steps, size), d = method.place.shape, len(goal)
+    targets = Targets(np.empty((steps, d)), np.empty((steps, d)), np.empty((steps, d)))
+    multiplier, right, matrix = np.zeros((size, d)), np.empty((size, d)), np.empty((size, size))
+    minded = np.zeros(len(bodies.radius) + len(bodies.boxes), np.bool_)
+    rows = _mind(method, bodies, robot, guess, minded) + 1  # the bounds are always minded
+    bends = 1.0 if limits[1] < math.inf else 0.0
+    squares = rows * method.squares[0] + method.squares[1] + bends * method.squares[2]
+    violation, penalty = _project(method, bodies, robot, limits, minded, motion[0], guess, targets), method.penalty
+    for _ in range(method.alternations):
+        _accumulate(method, targets, bends, right)
+        for i in range(size):
+            for j in range(size):
+                matrix[i, j] = method.squares[3, i, j] + penalty * squares[i, j]
+            for axis in range(d):
+                right[i, axis] = method.goal[i] * goal[axis] + multiplier[i, axis] + penalty * right[i, axis]
+        _solve(matrix, right, fixed, motion)
+        change = _sample(method, motion, guess)
+        violation = _project(method, bodies, robot, limits, minded, motion[0], guess, targets)
+        if max(violation, change) <= method.tolerance:
+            break
+        _accumulate(method, targets, bends, right)
+        _raise_multiplier(squares, motion, right, penalty, multiplier)
+        penalty = min(penalty * method.growth, MOST_PENALTY)
+    return violation
+
+
+@compiled
+def _raise_multiplier(squares: Floats, motion: Floats, right: Floats, penalty: float, multiplier: Floats) -> None:
+    """Add to the multiplier ``(n+1, d)`` what the constraints are violated by."""
+    size, d = motion.shape
+    for i in range(size):
+        for axis in range(d):
+            now = 0.0
+            for j in range(size):
+                now += squares[i, j] * motion[j, axis]
+            multiplier[i, axis] -= penalty * (now - right[i, axis])
+
+
+@compiled
+def _mind(method: Method, bodies: Surroundings, robot: Whole, guess: Guess, minded: BoolArray) -> int:
+    """Mark the bodies that come near the guess; how many there are."""
+    robots, d, count = len(bodies.radius), bodies.paths.shape[2], 0
+    for body in range(len(minded)):
+        if body == robot:
+            continue
+        for step in range(len(guess.place)):
+            square = 0.0
+            if body < robots:
+                reach = bodies.radius[robot] + bodies.radius[body] + bodies.margin
+                for axis in range(d):
+                    gap = guess.place[step, axis] - bodies.paths[body, step, axis]
+                    square += gap * gap
+            else:
+                box = bodies.boxes[body - robots]
+                reach = bodies.radius[robot] + box[2 * d] + bodies.margin
+                for axis in range(d):
+                    x = guess.place[step, axis]
+                    gap = max(box[axis] - x, x - box[d + axis], 0.0)
+                    square += gap * gap
+            if square < (reach + method.lookout) * (reach + method.lookout):
+                minded[body] = True
+                count += 1
+                break
+    return count
+
+
+@compiled
+def _project(
+    method: Method,
+    bodies: Surroundings,
+    robot: Whole,
+    limits: Floats,
+    minded: BoolArray,
+    here: Floats,
+    guess: Guess,
+    targets: Targets,
+) -> float:
+    """The nearest places, velocities and accelerations that the constraints allow, summed over constraints.
+
+    Args:
+        method: :class:`Method`.
+        bodies: :class:`Surroundings`.
+        robot: Its number among them.
+        limits: ``(2,)``.
+        minded: ``(K + B,)`` bool.
+        here: ``(d,)`` where the robot is now.
+        guess: :class:`Guess`.
+        targets: :class:`Targets`, output.
+
+    Returns:
+        The largest violation.
+    """
+    robots, (steps, d), radius = len(bodies.radius), guess.place.shape, bodies.radius[robot]
+    worst = _stay_within(bodies.bounds, radius, limits, guess, targets)
+    for body in range(len(minded)):
+        if not minded[body]:
+            continue
+        if body < robots:
+            reach = radius + bodies.radius[body] + bodies.margin
+            before = _gap(here, bodies.paths[body, 0], bodies.paths[body, 0])
+        else:
+            box = bodies.boxes[body - robots]
+            reach = radius + box[2 * d] + bodies.margin
+            before = _gap(here, box[:d], box[d : 2 * d])
+        for step in range(steps):
+            least = reach + (1.0 - method.barrier) * max(before - reach, 0.0)
+            if body < robots:
+                centre = bodies.paths[body, step]
+                before = _push(guess.place[step], centre, centre, least, targets.place[step])
+            else:
+                before = _push(guess.place[step], box[:d], box[d : 2 * d], least, targets.place[step])
+            worst = max(worst, reach - before)
+    return worst
+
+
+@compiled
+def _stay_within(bounds: Floats, radius: float, limits: Floats, guess: Guess, targets: Targets) -> float:
+    """Write the targets of the bounds and of the limits of speed and acceleration; return the largest violation."""
+    (steps, d), worst = guess.place.shape, 0.0
+    for step in range(steps):
+        for axis in range(d):
+            low, high = bounds[0, axis] + radius, bounds[1, axis] - radius
+            x = guess.place[step, axis]
+            targets.place[step, axis] = min(max(x, low), high)
+            worst = max(worst, low - x, x - high)
+        worst = max(worst, _shorten(guess.velocity[step], limits[0], targets.velocity[step]))
+        worst = max(worst, _shorten(guess.acceleration[step], limits[1], targets.acceleration[step]))
+    return worst
+
+
+@compiled
+def _gap(place: Floats, low: Floats, high: Floats) -> float:
+    """How far a place is from a box, zero within."""
+    square = 0.0
+    for axis in range(len(place)):
+        gap = max(low[axis] - place[axis], place[axis] - high[axis], 0.0)
+        square += gap * gap
+    return math.sqrt(square)
+
+
+@compiled
+def _push(place: Floats, low: Floats, high: Floats, least: float, target: Floats) -> float:
+    """Add to ``target`` the point nearest to ``place`` that is ``least`` from a box, which may be a point.
+
+    Returns:
+        How far ``place`` is from the box, negative within.
+    """
+    distance = _gap(place, low, high)
+    if distance > 0.0:
+        factor = max(least / distance, 1.0)
+        for axis in range(len(place)):
+            nearest = min(max(place[axis], low[axis]), high[axis])
+            target[axis] += nearest + factor * (place[axis] - nearest)
+        return distance
+    depth, out, side = math.inf, 0, 1.0
+    for axis in range(len(place)):
+        target[axis] += place[axis]
+        if place[axis] - low[axis] < depth:
+            depth, out, side = place[axis] - low[axis], axis, -1.0
+        if high[axis] - place[axis] < depth:
+            depth, out, side = high[axis] - place[axis], axis, 1.0
+    target[out] += side * (depth + least)
+    return -depth
+
+
+@compiled
+def _shorten(vector: Floats, most: float, target: Floats) -> float:
+    """Write to ``target`` the vector no longer than ``most`` nearest to it; return by how much it is too long."""
+    square = 0.0
+    for axis in range(len(vector)):
+        square += vector[axis] * vector[axis]
+    length = math.sqrt(square)
+    factor = most / length if length > most else 1.0
+    for axis in range(len(vector)):
+        target[axis] = factor * vector[axis]
+    return length - most
+
+
+@compiled
+def _accumulate(method: Method, targets: Targets, bends: float, right: Floats) -> None:
+    """What the targets ask of the coefficients: ``F^T`` of them, into ``right`` ``(n+1, d)``."""
+    (steps, size), d = method.place.shape, right.shape[1]
+    for i in range(size):
+        for axis in range(d):
+            total = 0.0
+            for step in range(steps):
+                total += method.place[step, i] * targets.place[step, axis]
+                total += method.velocity[step, i] * targets.velocity[step, axis]
+                total += bends * method.acceleration[step, i] * targets.acceleration[step, axis]
+            right[i, axis] = total
+
+
+@compiled
+def _solve(matrix: Floats, right: Floats, fixed: int, motion: Floats) -> None:
+    """The free coefficients of a positive definite system, by Cholesky's method; overwrites its arguments."""
+    size, d = motion.shape
+    for i in range(fixed, size):
+        for axis in range(d):
+            for j in range(fixed):
+                right[i, axis] -= matrix[i, j] * motion[j, axis]
+        for j in range(fixed, i + 1):
+            for k in range(fixed, j):
+                matrix[i, j] -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = math.sqrt(matrix[i, i]) if i == j else matrix[i, j] / matrix[j, j]
+    for axis in range(d):
+        for i in range(fixed, size):
+            for k in range(fixed, i):
+                right[i, axis] -= matrix[i, k] * right[k, axis]
+            right[i, axis] /= matrix[i, i]
+        for i in range(size - 1, fixed - 1, -1):
+            for k in range(i + 1, size):
+                right[i, axis] -= matrix[k, i] * right[k, axis]
+            right[i, axis] /= matrix[i, i]
+            motion[i, axis] = right[i, axis]
+
+
+@compiled
+def _sample(method: Method, motion: Floats, guess: Guess) -> float:
+    """Make the guess the samples of a motion; return how far a place moved at most along an axis [m]."""
+    (steps, size), d, change = method.place.shape, motion.shape[1], 0.0
+    for step in range(steps):
+        for axis in range(d):
+            place = velocity = acceleration = 0.0
+            for i in range(size):
+                place += method.place[step, i] * motion[i, axis]
+                velocity += method.velocity[step, i] * motion[i, axis]
+                acceleration += method.acceleration[step, i] * motion[i, axis]
+            change = max(change, abs(place - guess.place[step, axis]))
+            guess.place[step, axis] = place
+            guess.velocity[step, axis] = velocity
+            guess.acceleration[step, axis] = acceleration
+    return change

@@ -1,0 +1,354 @@
+"""The motion of a whole team as one nonlinear program, written for CasADi (paper, Eq. 1 and section IV-B).
+
+M. Kelly, "An Introduction to Trajectory Optimization", SIAM Review, 2017; A. Waechter and L. T. Biegler, "On the
+Implementation of an Interior-Point Filter Line-Search Algorithm for Large-Scale Nonlinear Programming", Mathematical
+Programming, 2006.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from itertools import chain
+from types import ModuleType
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.core.arrays import Floats, IntArray
+from d4orm_env.dynamics.collision import axis_gap
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_arrays import inverse_initial_distance
+from d4orm_env.dynamics.robot_model import SPEED, Ops
+from d4orm_env.dynamics.transition import TimeStep
+from d4orm_planners.baselines.abandoning import run_or_abandon
+
+OBJECTIVE_SCALE = 10.0
+"""Of the mean cost of a step, so that IPOPT's tolerance tells good motions from bad ones."""
+
+FEASIBILITY = 1e-5
+"""Largest violation of a constraint that IPOPT may leave, in SI units; the clearance makes up for it."""
+
+ABANDONED = "Abandoned_At_Time_Limit"
+"""How a run ended that was left before IPOPT could end it."""
+
+TINY = 1e-9
+"""Added to squared distances, since the square root has no derivative at zero [m^2]."""
+
+IPOPT = {"print_level": 0, "sb": "yes", "constr_viol_tol": FEASIBILITY}
+CASADI = {"print_time": False, "show_eval_warnings": False}
+"""Options of every solve."""
+
+Options = Mapping[str, object]
+Contacts = dict[tuple[int, int], NDArray[np.int64]]
+"""Steps at which robot ``k`` is kept clear of body ``b``: robot ``b``, or from ``K`` on obstacle ``b - K``."""
+
+Expression: TypeAlias = Any
+"""CasADi's matrices, symbolic or of numbers; the library carries no types."""
+
+Rows = tuple[Expression, float, float]
+"""A matrix of expressions with their lower and their upper bound."""
+
+
+class Motion(NamedTuple):
+    """What the program decides on.
+
+    Attributes:
+        states: ``(H+1, K, n)``, the start first.
+        controls: ``(H, K, m)``.
+    """
+
+    states: Floats
+    controls: Floats
+
+
+class TeamProgram:
+    """Direct collocation of a problem: the states and controls of all robots at all steps are variables.
+
+    A control is held over its step, and the defect of a step is that of the environment's own RK4, so that a solution
+    is what the engines roll out. Limits hold as they do there: on a norm, or on single components.
+
+    Args:
+        problem: The problem.
+        clearance: Added to every distance to keep [m].
+
+    Raises:
+        ImportError: If CasADi is not installed.
+    """
+
+    def __init__(self, problem: Problem, clearance: float) -> None:
+        self.casadi = ca = load_casadi()
+        self.problem, self.clearance = problem, clearance
+        self.ops = Ops(ca.cos, ca.sin, ca.sqrt, ca.fmin, ca.fmax, ca.atan2, ca.if_else)
+        self.models = problem.team.robot_models
+        self.limits, self.radius = problem.team.limits.astype(float), np.asarray(problem.team.radius, float)
+        self.obstacles = list(self._obstacles())
+        steps = problem.horizon
+        self.states = [ca.MX.sym("x", model.state_size, steps) for model in self.models]
+        self.controls = [ca.MX.sym("u", model.control_size, steps) for model in self.models]
+        # Each robot's states with the start ahead of them, so that columns are steps.
+        self.paths = [
+            ca.horzcat(ca.DM(problem.start[robot, : model.state_size].astype(float)), self.states[robot])
+            for robot, model in enumerate(self.models)
+        ]
+
+    def solve(
+        self, guess: Motion, contacts: Contacts, docks: IntArray, options: Options, should_stop: Callable[[], bool]
+    ) -> tuple[Motion, str]:
+        """Solve from a guess.
+
+        Args:
+            guess: Where IPOPT starts.
+            contacts: What is kept clear of what, and when.
+            docks: ``(K,)`` steps by which the robots are at their goals, and from which on they stand there.
+            options: IPOPT's.
+            should_stop: Asked every hundredth of a second whether to end; it ends within a tenth, even where writing
+                the program or one of IPOPT's iterations takes longer.
+
+        Returns:
+            The motion that IPOPT came to, feasible or not, and its word for how it ended.
+        """
+        reached = self._packed(guess)
+
+        def keep(values: Expression) -> None:
+            nonlocal reached
+            reached = values
+
+        ended = run_or_abandon(lambda ends: self._run_ipopt(guess, contacts, docks, options, keep, ends), should_stop)
+        # IPOPT gives up where a function has no value; the guess is then the best there is.
+        values = np.asarray(reached).ravel()
+        motion = self._unpacked(values) if np.isfinite(values).all() else guess
+        return motion, ABANDONED if ended is None else ended
+
+    def _run_ipopt(
+        self,
+        guess: Motion,
+        contacts: Contacts,
+        docks: IntArray,
+        options: Options,
+        keep: Callable[[Expression], None],
+        ends: Callable[[], bool],
+    ) -> str:
+        """Hand IPOPT's variables to ``keep`` after every iteration and at the end; return how it ended."""
+        ca = self.casadi
+        rows = [*self._motion_rows(), *self._goal_rows(docks), *self._contact_rows(contacts, docks)]
+        program = {
+            "x": ca.vertcat(*map(ca.vec, chain(self.states, self.controls))),
+            "f": self._cost(),
+            "g": ca.vertcat(*(ca.vec(row) for row, _, _ in rows)),
+        }
+        sizes = [row.numel() for row, _, _ in rows]
+        lower, upper = (np.repeat([row[bound] for row in rows], sizes) for bound in (1, 2))
+        lowest, highest = self._variable_bounds()
+        stopper = _stopper(ca, {name: part.numel() for name, part in program.items()}, keep, ends)
+        settings = {"ipopt": {**IPOPT, **options}, **CASADI, "iteration_callback": stopper}
+        solver = ca.nlpsol("team", "ipopt", program, settings)
+        solution = solver(x0=self._packed(guess), lbx=lowest, ubx=highest, lbg=lower, ubg=upper)
+        keep(solution["x"])
+        return str(solver.stats()["return_status"])
+
+    def contacts(self, motion: Motion, lookout: float | None) -> Contacts:
+        """What comes within ``lookout`` [m] of the distance to keep, and when; everything always, for ``None``."""
+        steps = np.arange(1, self.problem.horizon + 1)
+        if lookout is None:
+            return dict.fromkeys(self._encounters(), steps)
+        states = motion.states[1:, :, : self.problem.dimension].transpose(1, 2, 0)
+        points = [self.casadi.DM(own) for own in states]
+        found = {}
+        for robot, body in self._encounters():
+            near = steps[np.asarray(self._gap(robot, body, points)).ravel() < self._reach(robot, body) + lookout]
+            if len(near):
+                found[robot, body] = near
+        return found
+
+    def _encounters(self) -> Iterator[tuple[int, int]]:
+        bodies = self.problem.num_robots + len(self.obstacles)
+        return ((robot, body) for robot in range(self.problem.num_robots) for body in range(robot + 1, bodies))
+
+    def _gap(self, robot: int, body: int, places: Expression) -> Expression:
+        """Distance from a robot's centre to another's, or to an obstacle's surface [m], at every column of places."""
+        if body >= self.problem.num_robots:
+            return self.obstacles[body - self.problem.num_robots](places[robot])
+        return self._norm(places[robot] - places[body])
+
+    def _norm(self, vectors: Expression) -> Expression:
+        """Norm of every column; nowhere without a derivative."""
+        return self.casadi.sqrt(self.casadi.sum1(vectors**2) + TINY)
+
+    def _reach(self, robot: int, body: int | None = None) -> float:
+        """Distance to keep from a robot's centre to another's, or to an obstacle's surface or the bounds [m].
+
+        The margin holds at the steps only. Between them, on a chord of length ``L`` whose ends are at distance ``D``,
+        a robot comes as near as ``sqrt(D^2 - L^2 / 4)``, which must not be contact.
+        """
+        robots = [robot] if body is None or body >= self.problem.num_robots else [robot, body]
+        radius, chord = self.radius[robots].sum(), self.limits[robots, SPEED].sum() * self.problem.dt
+        return float(max(radius + self.problem.margin, np.hypot(radius, chord / 2)) + self.clearance)
+
+    def _obstacles(self) -> Iterator[Expression]:
+        """For each obstacle the distance to its surface, negative inside, as a function of columns of points."""
+        ca, world = self.casadi, self.problem.world
+        dimension = world.dimension
+        for centre, radius, axes in chain(
+            ((ball[:-1], ball[-1], dimension) for ball in world.balls.astype(float)),
+            ((cylinder[:2], cylinder[2], 2) for cylinder in world.cylinders.astype(float)),
+        ):
+            yield lambda p, c=centre, r=radius, n=axes: self._norm(p[:n, :] - ca.repmat(ca.DM(c), 1, p.shape[1])) - r
+        for box in world.boxes.astype(float):
+            yield lambda p, low=box[:dimension], high=box[dimension:]: self._box_gap(p, low, high)
+        for corners in world.shapes.triangles.astype(float).reshape(-1, 3, 2):
+            yield lambda p, corners=corners: self._triangle_gap(p, corners)
+
+    def _triangle_gap(self, points: Expression, corners: Floats) -> Expression:
+        ca = self.casadi
+        deepest, nearest = [], []
+        for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            along, offset = end - begin, points - ca.repmat(ca.DM(begin), 1, points.shape[1])
+            share = ca.fmin(ca.fmax((along[0] * offset[0, :] + along[1] * offset[1, :]) / (along @ along), 0.0), 1.0)
+            nearest.append(self._norm(offset - ca.DM(along) @ share))
+            deepest.append((along[1] * offset[0, :] - along[0] * offset[1, :]) / np.hypot(*along))
+        depth = ca.fmax(ca.fmax(*deepest[:2]), deepest[2])
+        return ca.if_else(depth < 0, depth, ca.fmin(ca.fmin(*nearest[:2]), nearest[2]))
+
+    def _box_gap(self, points: Expression, lower: Floats, upper: Floats) -> Expression:
+        ca = self.casadi
+        rows = [points[axis, :] for axis in range(len(lower))]
+        outside = [axis_gap(row, low, high, 0.0, self.ops) for row, low, high in zip(rows, lower, upper)]
+        inside = [ca.fmax(low - row, row - high) for row, low, high in zip(rows, lower, upper)]
+        depth = inside[0]
+        for axis in inside[1:]:
+            depth = ca.fmax(depth, axis)
+        return self._norm(ca.vertcat(*outside)) + ca.fmin(depth, 0.0)
+
+    def _cost(self) -> Expression:
+        """The mean of distance over initial distance, one minus the reward of a motion without violations.
+
+        Distances are smoothed within the goal radius, where a robot has docked anyway.
+        """
+        problem, ca = self.problem, self.casadi
+        weight = inverse_initial_distance(problem.start[:, : problem.dimension], problem.goal, problem.goal_radius)
+        distances = (
+            float(weight[robot]) * ca.sum2(ca.sqrt(self._squared_goal_distance(robot) + problem.goal_radius**2))
+            for robot in range(problem.num_robots)
+        )
+        return OBJECTIVE_SCALE * sum(distances) / (problem.num_robots * problem.horizon)
+
+    def _squared_goal_distance(self, robot: int) -> Expression:
+        goal = self.casadi.DM(self.problem.goal[robot].astype(float))
+        return self.casadi.sum1((self.states[robot][: self.problem.dimension, :] - goal) ** 2)
+
+    def _motion_rows(self) -> Iterator[Rows]:
+        """The dynamics, and the limits on norms."""
+        ca = self.casadi
+        step = TimeStep(*(self.problem.dt / part for part in (1, 2, 3, 6)))
+        for robot, model in enumerate(self.models):
+            x, u = ca.SX.sym("x", model.state_size), ca.SX.sym("u", model.control_size)
+            limits = self.limits[robot].tolist()
+            after = model.functions.integrate(ca.vertsplit(x), ca.vertsplit(u), limits, step, self.ops)
+            advance = ca.Function("advance", [x, u], [ca.vertcat(*after)]).map(self.problem.horizon)
+            yield self.states[robot] - advance(self.paths[robot][:, :-1], self.controls[robot]), 0.0, 0.0
+            for values, components, limit in self._limited(robot):
+                if len(components) > 1:
+                    yield ca.sum1(values[components, :] ** 2), -np.inf, limit**2
+
+    def _limited(self, robot: int) -> Iterator[tuple[Expression, list[int], float]]:
+        """Variables, the components of theirs that share a limit, and that limit on their norm."""
+        model, limits = self.models[robot], self.limits[robot]
+        if model.speed_indices:
+            yield self.states[robot], list(model.speed_indices), float(limits[SPEED])
+        for index, column in model.state_limits:
+            yield self.states[robot], [index], float(limits[column])
+        for column in dict.fromkeys(model.control_limits):
+            components = [index for index, own in enumerate(model.control_limits) if own == column]
+            yield self.controls[robot], components, float(limits[column])
+
+    def _goal_rows(self, docks: IntArray) -> Iterator[Rows]:
+        """At the step at which a robot docks it is within the goal radius, and no faster than docking allows."""
+        problem = self.problem
+        radius = problem.goal_radius - min(self.clearance, problem.goal_radius / 2)
+        for robot, dock in enumerate(docks):
+            yield self._squared_goal_distance(robot)[dock - 1], -np.inf, radius**2
+            if problem.goal_speed is not None:
+                variables = self.states[robot][:, dock - 1], self.controls[robot][:, dock - 1]
+                x, u = map(self.casadi.vertsplit, variables)
+                limits = self.limits[robot].tolist()
+                velocity = self.models[robot].functions.velocity(x, u, limits, self.ops)
+                yield sum(part**2 for part in velocity), -np.inf, problem.goal_speed**2
+
+    def _contact_rows(self, contacts: Contacts, docks: IntArray) -> Iterator[Rows]:
+        for (robot, body), steps in contacts.items():
+            pair = [robot] if body >= self.problem.num_robots else [robot, body]
+            # Once all have docked nothing changes any more.
+            moving = steps[steps <= docks[pair].max()]
+            if len(moving):
+                places = {
+                    one: self.paths[one][: self.problem.dimension, np.minimum(moving, docks[one]).tolist()]
+                    for one in pair
+                }
+                yield self._gap(robot, body, places), self._reach(robot, body), np.inf
+
+    def _variable_bounds(self) -> tuple[Floats, Floats]:
+        """Bounds of the world on positions, and limits of every single component."""
+        problem = self.problem
+        states = np.full((problem.horizon + 1, problem.num_robots, problem.state_size), np.inf)
+        controls = np.full((problem.horizon, problem.num_robots, problem.control_size), np.inf)
+        for robot in range(problem.num_robots):
+            for values, components, limit in self._limited(robot):
+                (states if values is self.states[robot] else controls)[:, robot, components] = limit
+        low, high = Motion(-states, -controls), Motion(states, controls)
+        reach = np.array([[self._reach(robot)] for robot in range(problem.num_robots)])
+        low.states[:, :, : problem.dimension] = problem.world.bounds[0] + reach
+        high.states[:, :, : problem.dimension] = problem.world.bounds[1] - reach
+        return self._packed(low), self._packed(high)
+
+    def _packed(self, motion: Motion) -> Floats:
+        """The values of the variables, in the order of the program."""
+        states = [motion.states[1:, robot, : model.state_size] for robot, model in enumerate(self.models)]
+        controls = [motion.controls[:, robot, : model.control_size] for robot, model in enumerate(self.models)]
+        return np.concatenate([part.ravel() for part in (*states, *controls)])
+
+    def _unpacked(self, values: Floats) -> Motion:
+        problem = self.problem
+        states = np.zeros((problem.horizon + 1, problem.num_robots, problem.state_size))
+        states[0] = problem.start
+        controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size))
+        sizes = [variable.numel() for variable in chain(self.states, self.controls)]
+        parts = np.split(values, np.cumsum(sizes)[:-1])
+        for robot, model in enumerate(self.models):
+            states[1:, robot, : model.state_size] = parts[robot].reshape(problem.horizon, -1)
+            own = parts[problem.num_robots + robot].reshape(problem.horizon, -1)
+            controls[:, robot, : model.control_size] = own
+        return Motion(states, controls)
+
+
+def _stopper(
+    casadi: Any, sizes: dict[str, int], keep: Callable[[Expression], None], ends: Callable[[], bool]
+) -> Expression:
+    """What IPOPT calls after every iteration of a program of these sizes, and what ends it once ``ends()`` is true."""
+
+    class Stopper(casadi.Callback):
+        def __init__(self) -> None:
+            casadi.Callback.__init__(self)
+            self.construct("stopper", {})
+
+        def get_n_in(self) -> int:
+            return casadi.nlpsol_n_out()
+
+        def get_sparsity_in(self, index: int) -> Expression:
+            size = sizes.get(casadi.nlpsol_out(index).removeprefix("lam_"), 0)
+            return casadi.Sparsity.dense(size, min(size, 1))
+
+        def eval(self, arguments: Expression) -> list[int]:
+            keep(arguments[0])
+            return [int(ends())]
+
+    return Stopper()
+
+
+def load_casadi() -> ModuleType:
+    """The library, or an ``ImportError`` that says how to install it."""
+    try:
+        import casadi
+    except ImportError as error:
+        raise ImportError("planner 'ipopt' needs casadi; install it with pip install \"d4orm-env[ipopt]\"") from error
+    return casadi

@@ -1,0 +1,165 @@
+"""Numerical optimisation with IPOPT: the rival of the paper's section IV-B."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from d4orm_env.core.seeds import Stream
+from d4orm_planners.base.candidate import Candidate, evaluate_controls
+from d4orm_planners.baselines.collocation import Contacts, Motion, TeamProgram, load_casadi
+from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
+from d4orm_planners.base.solve import Search
+from d4orm_planners.base.settings import Count, NotNegative, Positive
+from d4orm_planners.tracking.steering import prepare_drives, straight_drives
+
+FOUND = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+"""IPOPT's words for a solution of the program."""
+
+OUT_OF_TIME = "No_Time_After_Warm_Start"
+"""Our own word for an iteration that ends with the warm start."""
+
+NEARLY_SOLVED = 1e-2
+"""IPOPT's first barrier parameter in a round that begins where the last one ended."""
+
+
+SolverIterations = Annotated[Count, Field(le=2**31 - 1)]  # IPOPT's own counter
+
+
+@dataclass(frozen=True, kw_only=True)
+class IpoptConfig(PlannerConfig):
+    """Settings of :class:`Ipopt`.
+
+    Attributes:
+        max_iterations: Perturbed restarts after which :meth:`Planner.solve` gives up.
+        perturbation: Standard deviation of the noise on the warm start's states and controls, in SI units.
+        lookout: Robots are kept clear of what came nearer than this in the last solution, the margin not counted [m];
+            ``None`` keeps them clear of everything at every step, as in the paper.
+        rounds: Solves per restart. As long as the rollout does not keep the margin, the next one begins where the last
+            one ended; what came near is minded too, and robots stand where they docked. The paper solves once.
+        clearance: Added to every distance to keep, for what rounding and tolerances take away [m].
+        tolerance: IPOPT's, on the scaled optimality error.
+        barrier: IPOPT's first barrier parameter.
+        solver_iterations: IPOPT's own iterations in each solve.
+
+    Raises:
+        ValueError: If a value makes no sense; the message names it.
+    """
+
+    max_iterations: Count = 20
+    perturbation: NotNegative = 0.1
+    lookout: NotNegative | None = 0.5
+    rounds: Count = 8
+    clearance: NotNegative = 2e-3
+    tolerance: Positive = 1e-3
+    barrier: Positive = 1.0
+    solver_iterations: SolverIterations = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class WarmStart:
+    """The state of a solve, which stays as it is.
+
+    Attributes:
+        program: The problem as IPOPT is given it.
+        motion: What every iteration perturbs.
+    """
+
+    program: TeamProgram
+    motion: Motion
+
+
+class Ipopt(Planner):
+    """Direct collocation of the whole team, solved by IPOPT: without collisions first, then, perturbed, with them.
+
+    Maximises the other planners' reward (paper, section III-D) under Eq. 1. Every iteration is another perturbation of
+    the same warm start, or of the initial controls where there are any.
+
+    Raises:
+        ImportError: If CasADi is not installed.
+    """
+
+    name: ClassVar[str] = "ipopt"
+    config_class = IpoptConfig
+    drives_straight: ClassVar[bool] = True
+    presets: ClassVar = {"paper": {"lookout": None, "rounds": 1}}
+    config: IpoptConfig
+
+    def __init__(self, config: IpoptConfig) -> None:
+        super().__init__(config)
+        load_casadi()
+
+    def init(self, search: Search) -> WarmStart:
+        """See :meth:`Planner.init`."""
+        program = TeamProgram(search.problem, self.config.clearance)
+        return WarmStart(program, self._warm_start(search, program))
+
+    def iterate(self, search: Search, state: WarmStart) -> tuple[WarmStart, Iteration]:
+        """See :meth:`Planner.iterate`: one perturbed restart."""
+        if search.should_stop():
+            return state, Iteration(state.motion.controls.astype(np.float32), note=OUT_OF_TIME)
+        return state, self._restart(search, state)
+
+    def _restart(self, search: Search, state: WarmStart) -> Iteration:
+        config, problem, program = self.config, search.problem, state.program
+        motion = self._perturbed(search, state.motion)
+        contacts = program.contacts(motion, config.lookout)
+        docks = np.full(problem.num_robots, problem.horizon)
+        best, note, options = None, "", self._options()
+        for _ in range(config.rounds):
+            if best is not None and search.should_stop():
+                break
+            motion, note = program.solve(motion, contacts, docks, options, search.should_stop)
+            candidate = evaluate_controls(search.engine, problem, motion.controls.astype(np.float32))
+            if best is None or candidate.rank > best.rank:
+                best = candidate
+            # More constraints do not mend what is infeasible as it is; another start may.
+            if best.solved or note not in FOUND:
+                break
+            former, contacts = contacts, _union(contacts, program.contacts(motion, config.lookout))
+            standing, docks = docks, _docks(candidate)
+            if _size(contacts) == _size(former) and (docks == standing).all():
+                break
+            options["mu_init"] = min(NEARLY_SOLVED, config.barrier)
+        assert best is not None
+        return Iteration(best.controls, note=note)
+
+    def _options(self) -> dict[str, object]:
+        config = self.config
+        return {"tol": config.tolerance, "max_iter": config.solver_iterations, "mu_init": config.barrier}
+
+    def _warm_start(self, search: Search, program: TeamProgram) -> Motion:
+        """The controls that the search was given, or else the solution of the program without collisions."""
+        if search.current.controls.any():
+            return _motion(search.current)
+        problem = search.problem
+        with search.watch.paused():
+            prepare_drives(problem)
+        straight = evaluate_controls(search.engine, problem, straight_drives(problem).controls[:, :, 0])
+        docks = np.full(problem.num_robots, problem.horizon)
+        return program.solve(_motion(straight), {}, docks, self._options(), search.should_stop)[0]
+
+    def _perturbed(self, search: Search, warm_start: Motion) -> Motion:
+        random = np.random.default_rng(search.iteration_seed(Stream.PERTURBATION))
+        return Motion(*(part + self.config.perturbation * random.standard_normal(part.shape) for part in warm_start))
+
+
+def _motion(candidate: Candidate) -> Motion:
+    return Motion(candidate.trajectory.states.astype(float), candidate.controls.astype(float))
+
+
+def _docks(candidate: Candidate) -> np.ndarray:
+    """``(K,)`` steps at which the robots docked; the horizon for those that did not."""
+    arrived = candidate.trajectory.arrived
+    return np.where(arrived[-1], arrived.argmax(axis=0), len(arrived) - 1)
+
+
+def _union(contacts: Contacts, more: Contacts) -> Contacts:
+    return {key: np.union1d(contacts.get(key, []), more.get(key, [])).astype(int) for key in contacts.keys() | more}
+
+
+def _size(contacts: Contacts) -> int:
+    return sum(map(len, contacts.values()))

@@ -1,0 +1,220 @@
+"""The search over constraints: who plans again because of whom, and what it must keep clear of (CBS, ECBS, xECBS)."""
+
+from __future__ import annotations
+
+from bisect import insort
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.core.problem import Problem
+from d4orm_env.paths.wavefront import Space
+from d4orm_planners.baselines.mmd.conflicts import count_conflicts, first_conflict
+from d4orm_planners.baselines.mmd.reverse_process import Batch, Denoiser
+from d4orm_planners.baselines.mmd.guiding import Surroundings
+from d4orm_planners.baselines.mmd.way_frame import WayFrame
+
+if TYPE_CHECKING:
+    from d4orm_planners.baselines.mmd.planner import MMDConfig
+
+SPARE = 2e-3
+"""Added to distances when conflicts are sought, for rounding [m]."""
+PADDING = 2
+"""Of the 64 points of a motion, how many a constraint lasts before and after its conflict, as in the publication."""
+
+
+class Constraint(NamedTuple):
+    """A sphere that one robot's centre has to be out of for some steps.
+
+    Attributes:
+        sphere: Centre and radius [m].
+        span: First and last step.
+    """
+
+    sphere: tuple[float, float, float, float]
+    span: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What one robot does in a node of the tree.
+
+    Attributes:
+        motions: ``(B, SIZE)`` all that were denoised with it, which the next ones begin with.
+        controls: ``(H, m)``.
+        places: ``(H+1, 3)`` [m].
+        cost: Steps until it arrives.
+        fails: Whether it comes too near to an obstacle or does not arrive.
+    """
+
+    motions: FloatArray
+    controls: FloatArray
+    places: Floats
+    cost: int
+    fails: bool
+
+
+@dataclass(frozen=True, order=True)
+class Node:
+    """A node of the tree; the one to be expanded next is the least.
+
+    Attributes:
+        conflicts: Pairs in conflict, and robots that fail by themselves.
+        cost: Sum of the robots' steps until arrival.
+        number: Of the node, counted as they are made.
+        motions: Of the robots.
+        constraints: Of each robot.
+        pair: Two robots in conflict, or -1.
+        step: Of their conflict.
+    """
+
+    conflicts: int
+    cost: int
+    number: int
+    motions: tuple[Motion, ...] = field(compare=False)
+    constraints: tuple[tuple[Constraint, ...], ...] = field(compare=False)
+    pair: tuple[int, int] = field(compare=False)
+    step: int = field(compare=False)
+
+    @property
+    def controls(self) -> FloatArray:
+        """``(H, K, m)``."""
+        return np.stack([motion.controls for motion in self.motions], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Tree:
+    """The state of the search.
+
+    Attributes:
+        frames: Of the robots.
+        space: The world.
+        nodes: That are not expanded yet, best first.
+        made: How many nodes there have been.
+    """
+
+    frames: tuple[WayFrame, ...]
+    space: Space
+    nodes: tuple[Node, ...]
+    made: int
+
+    def with_nodes(self, added: list[Node]) -> Tree:
+        """The tree with its best node expanded to these."""
+        nodes = list(self.nodes[1:])
+        for node in added:
+            insort(nodes, node)
+        return replace(self, nodes=tuple(nodes), made=self.made + len(added))
+
+
+class Planning:
+    """How robots of one problem plan around each other; all that changes is in nodes.
+
+    Args:
+        problem: The team.
+        config: The method's settings.
+        denoiser: What denoises motions.
+        frames: Of the robots.
+        space: The world.
+
+    Attributes:
+        steps: Denoising steps so far.
+    """
+
+    def __init__(
+        self, problem: Problem, config: MMDConfig, denoiser: Denoiser, frames: tuple[WayFrame, ...], space: Space
+    ) -> None:
+        self._problem, self._config, self._denoiser = problem, config, denoiser
+        self._frames, self._space = frames, space
+        radius = np.asarray(problem.team.radius, np.float64)
+        self._distances: Floats = radius[:, None] + radius + problem.margin + SPARE
+        self.steps = 0
+
+    def root(self, seeds: list[int]) -> Node:
+        """Everybody's motion, one robot after another around those that have planned (soft constraints only)."""
+        motions: list[Motion] = []
+        for robot, seed in enumerate(seeds):
+            motions.append(self._plan(robot, motions, list(range(robot)), (), seed, None))
+        return self.node(0, tuple(motions), ((),) * len(seeds))
+
+    def node(self, number: int, motions: tuple[Motion, ...], constraints: tuple[tuple[Constraint, ...], ...]) -> Node:
+        """A node with its conflicts counted and the first one found."""
+        places = np.stack([motion.places for motion in motions])
+        pairs, step, one, another = first_conflict(places, self._distances)
+        failing = sum(motion.fails for motion in motions)
+        cost = sum(motion.cost for motion in motions)
+        return Node(int(pairs) + failing, cost, number, motions, constraints, (int(one), int(another)), int(step))
+
+    def children(self, node: Node, number: int, seeds: list[int], unlucky: int) -> list[Node]:
+        """What follows from a node: for each of two robots in conflict, one in which it keeps clear of where they met.
+
+        In a node without a pair in conflict a robot that fails plans anew, or if none does, ``unlucky``.
+        """
+        one, another = node.pair
+        if one < 0:
+            failing = [robot for robot, motion in enumerate(node.motions) if motion.fails]
+            robot = failing[0] if failing else unlucky
+            return [self._child(node, number, robot, node.constraints[robot], seeds[0], anew=True)]
+        added = []
+        for count, (robot, other) in enumerate(((one, another), (another, one))):
+            own = (*node.constraints[robot], self._constraint(node, robot, other))
+            added.append(self._child(node, number + count, robot, own, seeds[count], anew=False))
+        return added
+
+    def _child(
+        self, node: Node, number: int, robot: int, own: tuple[Constraint, ...], seed: int, *, anew: bool
+    ) -> Node:
+        others = [other for other in range(len(node.motions)) if other != robot]
+        before = None if anew or self._config.reuse_steps is None else node.motions[robot].motions
+        motion = self._plan(robot, list(node.motions), others, own, seed, before)
+        motions = tuple(motion if k == robot else kept for k, kept in enumerate(node.motions))
+        constraints = tuple(own if k == robot else kept for k, kept in enumerate(node.constraints))
+        return self.node(number, motions, constraints)
+
+    def _constraint(self, node: Node, robot: int, other: int) -> Constraint:
+        """To keep out of a sphere about the middle between two robots for a while."""
+        middle = (node.motions[robot].places[node.step] + node.motions[other].places[node.step]) / 2
+        radius = self._config.constraint_radius * self._distances[robot, other]
+        motion = self._frames[robot].quickest * self._config.quickest / self._problem.dt
+        padding = max(1, round(PADDING * motion / 64))
+        x, y, z = map(float, middle)
+        return Constraint((x, y, z, float(radius)), (node.step - padding, node.step + padding))
+
+    def _plan(
+        self,
+        robot: int,
+        motions: list[Motion],
+        others: list[int],
+        constraints: tuple[Constraint, ...],
+        seed: int,
+        before: FloatArray | None,
+    ) -> Motion:
+        """The motion of a robot that conflicts least with these others, of those that were denoised together."""
+        config, frame = self._config, self._frames[robot]
+        ways = np.stack([motions[other].places for other in others]) if others else np.empty((0, 1, 3))
+        distances = self._distances[robot, others]
+        surroundings = Surroundings(
+            space=self._space,
+            clearance=frame.reach + config.clearance,
+            dt=self._problem.dt,
+            spheres=np.array([constraint.sphere for constraint in constraints]).reshape(-1, 4),
+            spans=np.array([constraint.span for constraint in constraints], np.int64).reshape(-1, 2),
+            others=ways,
+            radii=distances * config.constraint_radius,
+            pull=config.soft_pull,
+        )
+        batch = self._denoiser.denoise(robot, frame, surroundings, seed, before)
+        self.steps += batch.steps
+        return self._choose(batch, ways, distances, frame.reach)
+
+    def _choose(self, batch: Batch, ways: Floats, distances: Floats, reach: float) -> Motion:
+        driven = batch.driven
+        counts: NDArray[np.int64] = np.zeros((len(batch.motions), 2), np.int64)
+        if len(ways):
+            count_conflicts(driven.places, ways, distances, counts)
+        fails = (driven.arrivals > self._problem.horizon) | (driven.clearances < reach + SPARE)
+        best = int(np.lexsort((driven.arrivals, counts[:, 1], counts[:, 0], fails))[0])
+        controls, places = driven.controls[best].copy(), driven.places[best].copy()
+        return Motion(batch.motions, controls, places, int(driven.arrivals[best]), bool(fails[best]))

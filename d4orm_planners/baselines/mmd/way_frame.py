@@ -1,0 +1,286 @@
+"""The frame in which a robot's motion is described: its shortest way, and how much room there is beside it.
+
+The model never sees a map. It learns how motions differ from the shortest way driven at an even pace, in lengths of
+that way: how far ahead or behind they are on it, and how far beside it. So one model serves all maps, sizes and
+directions, and a robot that waits or hurries stays on its way.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.core.portable import sin
+from d4orm_env.core.problem import Problem
+from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
+from d4orm_env.engine import compiling
+from d4orm_env.paths import wavefront
+from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
+from d4orm_env.paths.wavefront import Space, clearance_at, make_space
+
+SOURCES = fingerprint((compiling, wavefront))
+
+POINTS = 64
+"""Stretches of equal time that a motion is cut into, as in the publication."""
+MODES = 16
+"""Sines that a difference from the way is made of."""
+LOOKS = 16
+"""Places along the way at which the model is told of the way and of the room beside it."""
+FEATURES = 5 * LOOKS + 2
+"""Numbers that the model is told."""
+_ROUNDING = 2
+"""Points before and after one over which a way's direction is averaged."""
+_ANY = 1e6
+"""Acceleration of robots that take any velocity at once [m/s^2]."""
+_FAR = 4.0
+"""Of room the model is told up to so many times the robot's reach."""
+
+
+class WayFrame(NamedTuple):
+    """A robot's way and the axes in which its motion is described; all float64.
+
+    Attributes:
+        reference: ``(POINTS + 1, 3)`` places on the shortest way at equal distances, from start to goal [m].
+        tangents: ``(POINTS + 1, 3)`` its direction at each, corners rounded; of at most unit length.
+        axes: ``(P, 3)`` unit vectors about which directions turn to the side: up and down in the plane, and any four
+            across the line from start to goal in space.
+        length: Of the way, at least the goal's radius [m].
+        reach: The distance that the robot's centre keeps from obstacles [m].
+        speed: Limit of the robot [m/s].
+        acceleration: Limit of the robot; for one without inertia, a very large one [m/s^2].
+        quickest: Time that the way takes at full speed from rest [s].
+        features: ``(P, FEATURES)`` what the model is told, per axis.
+    """
+
+    reference: Floats
+    tangents: Floats
+    axes: Floats
+    length: float
+    reach: float
+    speed: float
+    acceleration: float
+    quickest: float
+    features: FloatArray
+
+
+def sine_table() -> Floats:
+    """``(POINTS + 1, MODES)`` the modes' sines at every point; zero at both ends."""
+    angle = np.pi / POINTS * np.arange(POINTS + 1)[:, None] * np.arange(1, MODES + 1)
+    table = sin(angle)
+    table[[0, -1]] = 0.0
+    return table
+
+
+def world_space(problem: Problem) -> Space:
+    """The world as :func:`~d4orm_env.paths.wavefront.clearance_at` reads it, with obstacles or without."""
+    if problem.world.num_obstacles:
+        return make_space(problem)
+    bounds = np.tile([[-np.inf], [np.inf]], 3)
+    bounds[:, : problem.dimension] = problem.world.bounds
+    empty = np.zeros(3)
+    return Space(
+        low=empty,
+        cell=1.0,
+        scale=1.0,
+        size=np.ones(3, np.int64),
+        rounding=0.0,
+        clearance=np.full(1, np.inf, np.float32),
+        first=np.zeros(2, np.int32),
+        items=np.zeros(0, np.int32),
+        boxes=np.zeros((0, 7)),
+        triangles=np.zeros((0, 6)),
+        bounds=bounds,
+        extent=np.tile([[-np.inf], [np.inf]], 3),
+        pad=np.inf,
+    )
+
+
+def make_frame(problem: Problem, robot: int, space: Space, turn: Floats) -> WayFrame | None:
+    """The frame of a robot, or ``None`` if it has no way to its goal.
+
+    Args:
+        problem: The team and its world.
+        robot: The robot's number.
+        space: The world, of :func:`world_space`.
+        turn: ``(3,)`` any vector, by which the axes are chosen in space.
+    """
+    corners = problem.ways.path(robot)
+    if not len(corners):
+        return None
+    way = np.zeros((len(corners), 3))
+    way[:, : problem.dimension] = corners
+    reference = np.empty((POINTS + 1, 3))
+    length = max(resample(way, reference), problem.goal_radius)
+    limits, reach = problem.team.limits[robot].astype(np.float64), float(problem.team.radius[robot]) + problem.margin
+    speed = float(limits[SPEED])
+    acceleration = float(limits[ACCELERATION]) if problem.team.robot_models[robot].speed_indices else _ANY
+    tangents = np.empty_like(reference)
+    round_tangents(reference, tangents)
+    along = _unit(reference[-1] - reference[0], np.array([1.0, 0.0, 0.0]))
+    axes = _axes(along, turn, problem.dimension)
+    features = np.empty((len(axes), FEATURES), np.float32)
+    for own, axis in zip(features, axes, strict=True):
+        describe(space, reference, along, _cross(axis, along), length, reach, own)
+        own[-2:] = min(reach / length, _FAR), min(speed * speed / (acceleration * length), _FAR)
+    quickest = length / speed + speed / acceleration / 2
+    return WayFrame(reference, tangents, axes, length, reach, speed, acceleration, quickest, features)
+
+
+def _axes(along: Floats, turn: Floats, dimension: int) -> Floats:
+    """``(P, 3)`` unit vectors across ``along``, each with its opposite."""
+    if dimension == 2:
+        return np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    least = np.eye(3)[np.argmin(np.abs(along))]
+    first = _unit(turn - along * _dot(turn, along), _unit(_cross(along, least), least))
+    second = _cross(along, first)
+    return np.stack([first, -first, second, -second])
+
+
+# NumPy's inner products and norms choose versions by processor; three terms are as well written out.
+
+
+def _dot(a: Floats, b: Floats) -> float:
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def _unit(vector: Floats, otherwise: Floats) -> Floats:
+    length = np.sqrt(_dot(vector, vector))
+    return vector / length if length > 1e-6 else otherwise
+
+
+@cached_kernel(SOURCES, variant="resample", **OPTIONS)
+def resample(way: Floats, reference: Floats) -> float:
+    """Fill ``reference`` ``(N + 1, 3)`` with places equally far apart on the way ``(w, 3)``; its length."""
+    last = reference.shape[0] - 1
+    total = 0.0
+    for corner in range(1, way.shape[0]):
+        total += _gap(way, corner)
+    corner, passed, own = 0, 0.0, 0.0
+    for i in range(last + 1):
+        arc = total * i / last
+        while corner < way.shape[0] - 1 and (corner == 0 or passed + own < arc):
+            passed += own
+            corner += 1
+            own = _gap(way, corner)
+        share = min((arc - passed) / own, 1.0) if own > 0.0 else 1.0
+        for axis in range(3):
+            before = way[max(corner - 1, 0), axis]
+            reference[i, axis] = before + share * (way[corner, axis] - before)
+    return total
+
+
+@cached_kernel(SOURCES, variant="tangents", **OPTIONS)
+def round_tangents(reference: Floats, tangents: Floats) -> None:
+    """Fill ``tangents`` ``(N + 1, 3)`` with the mean direction of the way about each point."""
+    last = reference.shape[0] - 1
+    for i in range(last + 1):
+        before, after = max(i - _ROUNDING, 0), min(i + _ROUNDING, last)
+        # Its length is of the chord: shorter in corners, zero where the way turns back on itself.
+        arc = 0.0
+        for k in range(before, after):
+            arc += _gap(reference, k + 1)
+        for axis in range(3):
+            tangents[i, axis] = (reference[after, axis] - reference[before, axis]) / arc if arc > 0.0 else 0.0
+
+
+@compiled
+def locate(
+    frame: WayFrame, axis: Floats, sines: Floats, deviation: Floats, motion: FloatArray, i: int, spot: Floats
+) -> None:
+    """Fill ``spot`` ``(4, 3)``: a motion's point [m], directions ahead and aside there, its place on the way [m].
+
+    Args:
+        frame: The robot's way.
+        axis: ``(3,)`` one of the frame's.
+        sines: ``(MODES,)`` of the point.
+        deviation: ``(2 MODES,)`` of the modes.
+        motion: ``(2 MODES,)`` whitened modes.
+        i: Number of the point.
+        spot: Output.
+    """
+    modes, last, ahead, aside = sines.shape[0], frame.reference.shape[0] - 1, 0.0, 0.0
+    for mode in range(modes):
+        ahead += motion[mode] * deviation[mode] * sines[mode]
+        aside += motion[modes + mode] * deviation[modes + mode] * sines[mode]
+    arc = min(max(i + last * ahead, 0.0), np.float64(last))
+    k = min(np.int64(arc), last - 1)
+    share = arc - k
+    for x in range(3):
+        spot[3, x] = frame.reference[k, x] + share * (frame.reference[k + 1, x] - frame.reference[k, x])
+        spot[1, x] = frame.tangents[k, x] + share * (frame.tangents[k + 1, x] - frame.tangents[k, x])
+    spot[2, 0] = axis[1] * spot[1, 2] - axis[2] * spot[1, 1]
+    spot[2, 1] = axis[2] * spot[1, 0] - axis[0] * spot[1, 2]
+    spot[2, 2] = axis[0] * spot[1, 1] - axis[1] * spot[1, 0]
+    for x in range(3):
+        spot[0, x] = spot[3, x] + frame.length * aside * spot[2, x]
+
+
+@inlined
+def trace(
+    frame: WayFrame, axis: Floats, sines: Floats, deviation: Floats, motion: FloatArray, spot: Floats, points: Floats
+) -> None:
+    """Fill ``points`` ``(N + 1, 3)`` with those of a motion [m]; all else as of :func:`locate`, ``spot`` as scratch."""
+    for i in range(points.shape[0]):
+        locate(frame, axis, sines[i], deviation, motion, i, spot)
+        for x in range(3):
+            points[i, x] = spot[0, x]
+
+
+@compiled
+def _gap(way: Floats, corner: int) -> float:
+    dx, dy, dz = (
+        way[corner, 0] - way[corner - 1, 0],
+        way[corner, 1] - way[corner - 1, 1],
+        way[corner, 2] - way[corner - 1, 2],
+    )
+    return np.sqrt(dx * dx + dy * dy + dz * dz)
+
+
+@cached_kernel(SOURCES, variant="describe", **OPTIONS)
+def describe(
+    space: Space, reference: Floats, along: Floats, across: Floats, length: float, reach: float, features: FloatArray
+) -> None:
+    """Fill in where the way leads and how much room is on it and on either side of it.
+
+    Args:
+        space: The world.
+        reference: ``(N + 1, 3)`` the way [m].
+        along: ``(3,)`` first axis.
+        across: ``(3,)`` second axis.
+        length: Of the way [m].
+        reach: Of the robot [m].
+        features: ``(FEATURES,)``, output: five numbers at every look; in the last two nothing is written.
+    """
+    last = reference.shape[0] - 1
+    looks = (features.shape[0] - 2) // 5
+    for look in range(looks):
+        i = last * (look + 1) // (looks + 1)
+        x, y = 0.0, 0.0
+        ahead, aside = 0.0, 0.0
+        for axis in range(3):
+            offset = reference[i, axis] - reference[0, axis]
+            x += offset * along[axis]
+            y += offset * across[axis]
+            step = reference[min(i + 1, last), axis] - reference[max(i - 1, 0), axis]
+            ahead += step * along[axis]
+            aside += step * across[axis]
+        norm = np.sqrt(ahead * ahead + aside * aside)
+        ahead, aside = (ahead / norm, aside / norm) if norm > 0.0 else (1.0, 0.0)
+        features[5 * look], features[5 * look + 1] = x / length, y / length
+        for side in range(-1, 2):
+            far = 2.0 * reach * side
+            dx, dy = -far * aside, far * ahead
+            room = clearance_at(
+                space,
+                reference[i, 0] + dx * along[0] + dy * across[0],
+                reference[i, 1] + dx * along[1] + dy * across[1],
+                reference[i, 2] + dx * along[2] + dy * across[2],
+            )
+            features[5 * look + 3 + side] = max(min(room / reach, _FAR), -_FAR)

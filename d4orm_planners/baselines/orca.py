@@ -1,0 +1,161 @@
+"""Optimal reciprocal collision avoidance, through the ``pyrvo`` bindings of the authors' RVO2 library.
+
+J. van den Berg, S. J. Guy, M. Lin and D. Manocha, "Reciprocal n-Body Collision Avoidance", Robotics Research, 2011.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.seeds import Stream, generator
+from d4orm_env.envs.joint_state import JointState
+from d4orm_planners.base.policy import StatePolicy
+from d4orm_planners.base.settings import CheckedSettings, NotNegative, Positive, Whole
+from d4orm_planners.tracking.steering import goals_along_ways, preferred_velocities, present_velocities, track_velocities
+
+if TYPE_CHECKING:
+    from pettingzoo import ParallelEnv
+
+CORNERS = 16
+"""Of the polygons that stand for round obstacles and docked robots."""
+
+
+Neighbors = Annotated[Whole, Field(ge=0, le=10**6)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class OrcaConfig(CheckedSettings):
+    """Settings of :class:`Orca`.
+
+    Attributes:
+        time_horizon: For this long the new velocities keep the robots apart [s].
+        obstacle_time_horizon: The same for obstacles, bounds and docked robots, which do not give way [s].
+        neighbor_distance: Robots farther away than this are not looked at [m].
+        max_neighbors: So many of the nearest robots are looked at.
+        clearance: Added to every robot's radius [m]; by default the problem's margin. Two robots so keep twice that
+            distance, which leaves robots with inertia some room: they cannot take a new velocity at once.
+        ways: Whether robots prefer to follow their shortest free ways among obstacles, or else the straight line.
+        deviation: Standard deviation of the angle by which each robot's preferred velocity is turned, drawn once per
+            episode [rad]. Without it robots in a symmetric formation block each other, as the authors note.
+
+    Raises:
+        ValueError: If a value makes no sense; the message names it.
+    """
+
+    time_horizon: Positive = 1.0
+    obstacle_time_horizon: Positive = 1.0
+    neighbor_distance: Positive = 10.0
+    max_neighbors: Neighbors = 10
+    clearance: NotNegative | None = None
+    ways: bool = True
+    deviation: NotNegative = 0.1
+
+
+class Orca(StatePolicy):
+    """ORCA: every robot drives to its goal at the velocity nearest to the one it prefers that avoids all others.
+
+    All robots give way to each other by halves; docked robots, obstacles and bounds do not give way. ORCA speaks of
+    robots that take a new velocity at once. Those of a model with inertia or a heading follow it as well as their
+    limits allow, so that they may come closer than ORCA promises. It works in the plane only.
+    """
+
+    name = "orca"
+    config_class: ClassVar[type[CheckedSettings] | None] = OrcaConfig
+
+    def __init__(self, config: OrcaConfig | None = None) -> None:
+        self.config = config or OrcaConfig()
+        self._rvo = _load_pyrvo()
+
+    def _begin(self, env: ParallelEnv, seed: int) -> None:
+        problem = self.problem
+        if problem.dimension != 2:
+            raise ValueError(
+                f"policy 'orca' works in the plane, and this problem has {problem.dimension} dimensions; choose "
+                "another policy or a planar model"
+            )
+        angle = generator(seed, Stream.PREFERRED_DIRECTION).normal(0, self.config.deviation, problem.num_robots)
+        self._turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]], np.float32)
+        self._walls = list(_walls(problem))
+
+    def _controls(self, joint: JointState) -> FloatArray:
+        problem, goals = self.problem, joint.goals
+        if self.config.ways:
+            goals = goals_along_ways(problem, joint.states[:, : problem.dimension], goals)
+        preferred = preferred_velocities(problem, joint.states, goals)
+        preferred = np.einsum("ijk,kj->ki", self._turn, preferred)
+        return track_velocities(problem, joint.states, self._avoid(joint, preferred))
+
+    def _avoid(self, joint: JointState, preferred: FloatArray) -> FloatArray:
+        """``(K, 2)`` velocities nearest to the preferred ones that avoid everything; zero for docked robots."""
+        problem, config = self.problem, self.config
+        # Made anew at every step, so that an action depends on the present state alone.
+        simulator = self._rvo.RVOSimulator()
+        simulator.set_time_step(problem.dt)
+        clearance = problem.margin if config.clearance is None else config.clearance
+        radius, max_speed = np.asarray(problem.team.radius), np.asarray(problem.team.max_speed)
+        stands = joint.arrived & problem.docks
+        moving = np.flatnonzero(~stands)
+        velocities = present_velocities(problem, joint.states, joint.controls)
+        for robot in moving:
+            simulator.add_agent(
+                joint.states[robot, :2].tolist(),
+                config.neighbor_distance,
+                config.max_neighbors,
+                config.time_horizon,
+                config.obstacle_time_horizon,
+                float(radius[robot]) + clearance,
+                float(max_speed[robot]),
+                velocities[robot].tolist(),
+            )
+        docked = [_disc(joint.states[k, 0], joint.states[k, 1], radius[k]) for k in np.flatnonzero(stands)]
+        for corners in [*self._walls, *docked]:
+            simulator.add_obstacle(corners.tolist())
+        simulator.process_obstacles()
+        for agent, robot in enumerate(moving):
+            simulator.set_agent_pref_velocity(agent, preferred[robot].tolist())
+        simulator.do_step()
+        avoiding = np.zeros_like(preferred)
+        for agent, robot in enumerate(moving):
+            avoiding[robot] = simulator.get_agent_velocity(agent).to_tuple()
+        return avoiding
+
+
+def _load_pyrvo() -> ModuleType:
+    try:
+        import pyrvo
+    except ImportError as error:
+        raise ImportError("policy 'orca' needs pyrvo; install it with pip install \"d4orm-env[orca]\"") from error
+    return pyrvo
+
+
+def _walls(problem: Problem) -> Iterator[FloatArray]:
+    """Obstacles and bounds as polygons: counter-clockwise around what is solid, clockwise around free space."""
+    for circle in problem.world.circles:
+        yield _disc(*circle)
+    for box in problem.world.boxes:
+        yield _rectangle(*box)
+    for corners, triangles in zip(problem.world.polygons, problem.world.triangles, strict=True):
+        # The triangles are counter-clockwise, and one that has an edge of the outline shows which way round it goes.
+        forward = any((b - a) % len(corners) == 1 for t in triangles for a, b in zip(t, (*t[1:], t[0]), strict=True))
+        yield corners if forward else corners[::-1]
+    if problem.world.lower is not None:
+        yield _rectangle(*problem.world.bounds.ravel())[::-1]
+
+
+def _rectangle(left: float, bottom: float, right: float, top: float) -> FloatArray:
+    return np.array([[left, bottom], [right, bottom], [right, top], [left, top]], np.float32)
+
+
+def _disc(x: float, y: float, radius: float) -> FloatArray:
+    """``(CORNERS, 2)`` polygon around a disc."""
+    angle = np.arange(CORNERS) * (2 * np.pi / CORNERS)
+    outer = radius / np.cos(np.pi / CORNERS)
+    return np.array([x, y] + outer * np.column_stack([np.cos(angle), np.sin(angle)]), np.float32)

@@ -1,0 +1,167 @@
+"""Benchmark results as JSON and as Markdown tables."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from datetime import UTC, datetime
+from operator import itemgetter
+from pathlib import Path
+
+from d4orm_env.core.files import replaced_when_done
+from d4orm_planners.base.machine import commit, describe_machine, versions
+from d4orm_planners.benchmark.settings import BenchmarkSettings
+from d4orm_planners.benchmark.timing import Row, Spread
+from d4orm_planners.evaluation.tables import table
+
+FORMAT = "d4orm-bench-1"
+LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "gymnasium", "pettingzoo")
+
+
+def circumstances(command: str) -> Row:
+    """Under which a benchmark runs that begins now: date, command, commit, machine with its load, and libraries."""
+    load = list(os.getloadavg()) if hasattr(os, "getloadavg") else None
+    machine = {**describe_machine(), "load_average": load, "libraries": versions(LIBRARIES)}
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    return {"date": date, "command": command, "commit": commit(), "machine": machine}
+
+
+def write_report(
+    folder: Path, settings: BenchmarkSettings, begun: Row, results: dict[str, list[Row]]
+) -> tuple[Path, Path]:
+    """Write ``bench.json`` and ``bench.md``.
+
+    Args:
+        folder: Where to.
+        settings: Of the benchmark.
+        begun: What :func:`circumstances` said at its beginning.
+        results: By section, see :func:`~d4orm_planners.benchmark.benchmark.run_parts`.
+
+    Returns:
+        The two paths.
+
+    Raises:
+        OSError: If the folder does not exist or cannot be written to.
+    """
+    document = {"format": FORMAT, **begun, "settings": asdict(settings), **results}
+    with replaced_when_done(folder / "bench.json") as path:
+        path.write_text(json.dumps(document, indent=1, default=asdict, allow_nan=False) + "\n", encoding="utf-8")
+    with replaced_when_done(folder / "bench.md") as path:
+        path.write_text(markdown(settings, begun, results), encoding="utf-8")
+    return folder / "bench.json", folder / "bench.md"
+
+
+def markdown(settings: BenchmarkSettings, begun: Row, results: dict[str, list[Row]]) -> str:
+    """The results as Markdown tables. Times are medians, with quartiles in brackets."""
+    machine = begun["machine"]
+    libraries = ", ".join(f"{name} {version}" for name, version in machine["libraries"].items())
+    blocks = [
+        f"- date: {begun['date']}\n"
+        f"- command: `{begun['command']}`\n"
+        f"- commit: {begun['commit'] or 'none'}\n"
+        f"- processor: {machine['processor']}, {machine['cores_used']} of {machine['cores']} cores\n"
+        f"- Python {machine['python']}, {libraries}",
+        f"M = {settings.num_samples} samples, H = {settings.horizon} steps, {settings.num_steps} denoising steps in an "
+        "iteration. Medians, quartiles in brackets.",
+    ]
+    blocks += [draw(results[section]) for section, draw in _SECTIONS.items() if results.get(section)]
+    return "\n\n".join(blocks) + "\n"
+
+
+def milliseconds(spread: Spread | None) -> str:
+    """Median and quartiles in ms; a dash where nothing was measured."""
+    if spread is None:
+        return "-"
+    digits = 1 if spread.median >= 0.01 else 2
+    low, high = spread.lower_quartile, spread.upper_quartile
+    return f"{spread.median * 1e3:.{digits}f} ({low * 1e3:.{digits}f}-{high * 1e3:.{digits}f})"
+
+
+def seconds(spread: Spread) -> str:
+    """Median and quartiles in s."""
+    return f"{spread.median:.2f} ({spread.lower_quartile:.2f}-{spread.upper_quartile:.2f})"
+
+
+def _denoising(rows: list[Row]) -> str:
+    plain = {(row["model"], row["num_robots"]): row["step"].median for row in rows if row["engine"] == "plain"}
+    lines = []
+    for row in rows:
+        reference = plain.get((row["model"], row["num_robots"]))
+        pair = row["ns_per_pair"]
+        lines.append((
+            row["model"],
+            str(row["num_robots"]),
+            row["engine"],
+            row["rules"],
+            milliseconds(row["step"]),
+            milliseconds(row["iteration"]),
+            f"{row['ns_per_robot_step']:.2f}",
+            "-" if pair is None else f"{pair:.2f}",
+            "-" if reference is None else f"{reference / row['step'].median:.1f}",
+        ))  # fmt: skip
+    header = ("model", "robots", "engine", "rules", "first step, ms", "iteration, ms", "ns per robot-step",
+              "ns added per pair check", "times plain JAX")  # fmt: skip
+    return table("Denoising", header, lines)
+
+
+def _tabulated(title: str, columns: Mapping[str, Callable[[Row], object]]) -> Callable[[list[Row]], str]:
+    """Draws a table of measurements, with what to write in a column by its name."""
+
+    def draw(rows: list[Row]) -> str:
+        return table(title, tuple(columns), [[str(text(row)) for text in columns.values()] for row in rows])
+
+    return draw
+
+
+_SECTIONS: dict[str, Callable[[list[Row]], str]] = {
+    "denoising": _denoising,
+    "threads": _tabulated("Threads", {
+        "robots": itemgetter("num_robots"),
+        "threads": itemgetter("threads"),
+        "iteration, ms": lambda row: milliseconds(row["iteration"]),
+        "on one thread, ms": lambda row: milliseconds(row["one_thread"]),
+        "times as fast": lambda row: f"{row['speedup'].median:.2f}",
+    }),
+    "environments": _tabulated("Environment steps", {
+        "environment": itemgetter("environment"),
+        "worlds": itemgetter("num_worlds"),
+        "robots": itemgetter("num_robots"),
+        "boxes": itemgetter("obstacles"),
+        "disturbances": itemgetter("disturbances"),
+        "env-steps per second": lambda row: f"{row['steps_per_second']:,.0f}",
+    }),
+    "obstacles": _tabulated("Obstacles, 8 robots, preset paper", {
+        "boxes": lambda row: f"{row['obstacles']} {row['where']}",
+        "iteration, ms": lambda row: milliseconds(row["iteration"]),
+        "times that in the open": lambda row: f"{row['ratio'].median:.2f}",
+        "verify(), ms": lambda row: milliseconds(row["verify"]),
+    }),
+    "index": _tabulated("Index of a map's obstacles", {
+        "cells": lambda row: f"{row['cells']} x {row['cells']}",
+        "boxes": itemgetter("obstacles"),
+        "s": lambda row: f"{row['seconds']:.2f}",
+        "MiB": lambda row: f"{row['bytes'] / 2**20:.1f}",
+    }),
+    "startup": _tabulated("From the start of a process to its first plan", {
+        "robots": itemgetter("num_robots"),
+        "compiling, s": lambda row: f"{row['compiling']:.1f}",
+        "process with an empty cache, s": lambda row: f"{row['cold']:.1f}",
+        "process with a full cache, s": lambda row: seconds(row["warm"]),
+    }),
+    "memory": _tabulated("Memory", {
+        "robots": itemgetter("num_robots"),
+        "after importing, MiB": lambda row: f"{row['imported'] / 2**20:.0f}",
+        "peak while planning, MiB": lambda row: f"{row['peak'] / 2**20:.0f}",
+    }),
+    "plans": _tabulated("First feasible verified plan, circle of 5 m", {
+        "robots": itemgetter("num_robots"),
+        "preset": itemgetter("rules"),
+        "solved": lambda row: f"{row['solved']} of {row['seeds']}",
+        "planning, s": lambda row: seconds(row["seconds"]),
+        "slowest, s": lambda row: f"{row['seconds'].largest:.2f}",
+        "iterations": lambda row: f"{row['iterations'].median:.1f}",
+        "travel time, s": lambda row: f"{row['travel_time'].median:.2f}",
+    }),
+}  # fmt: skip

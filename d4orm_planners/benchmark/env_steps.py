@@ -1,0 +1,142 @@
+"""Steps of environments: one, worlds in a batch, pure functions of JAX, and rigid bodies, under random controls."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from d4orm_env.disturbances import Delay, Dropout, StateNoise
+from d4orm_env.disturbances.disturbance import AnyDisturbance
+from d4orm_env.scenarios import make_problem
+from d4orm_planners.benchmark.settings import BenchmarkSettings
+from d4orm_planners.benchmark.timing import Row, Spread, measure
+from d4orm_planners.benchmark.walls import boxed_problem
+from d4orm_planners.base.episode import open_env
+
+if TYPE_CHECKING:
+    from pettingzoo import ParallelEnv
+
+DISTURBANCES: tuple[AnyDisturbance, ...] = (Delay(2), Dropout(0.3), StateNoise(0.02, 0.05))
+"""With what environments are stepped beside those that nothing disturbs."""
+
+RIGID = ("holonomic2d", "differential_drive")
+"""Models that are stepped as rigid bodies, where MuJoCo is installed."""
+
+
+def measure_env(settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[AnyDisturbance] = ()) -> Row:
+    """One PettingZoo environment of 8 robots under random controls, resets included."""
+    from d4orm_env import navigation_v0
+
+    env = navigation_v0.parallel_env(problem=boxed_problem(num_boxes, "near"), disturbances=disturbances)
+    return _rate("parallel_env", 1, num_boxes, disturbances, _measure_steps(settings, env, settings.env_steps))
+
+
+def measure_rigid(settings: BenchmarkSettings, model: str) -> Row:
+    """The same of rigid bodies in MuJoCo."""
+    env = open_env(make_problem("circle", num_robots=8, model=model, horizon=settings.horizon), "mujoco")
+    seconds = _measure_steps(settings, env, max(1, settings.env_steps // 10))
+    return _rate(f"mujoco, {model}", 1, 0, (), seconds)
+
+
+def _measure_steps(settings: BenchmarkSettings, env: ParallelEnv, count: int) -> Spread:
+    """Seconds per step of an environment, ``count`` of them with each repetition."""
+    env.reset(seed=0)
+    space = env.action_space(env.possible_agents[0])
+    random = np.random.default_rng(0)
+    table = [
+        {agent: random.uniform(space.low, space.high).astype(np.float32) for agent in env.possible_agents}
+        for _ in range(64)
+    ]
+
+    def steps() -> None:
+        for index in range(count):
+            if not env.agents:
+                env.reset()
+            env.step(table[index % len(table)])
+
+    spread = measure(steps, settings.repetitions, settings.time_limit)
+    env.close()
+    return spread.times(1 / count)
+
+
+def measure_worlds(settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[AnyDisturbance] = ()) -> Row:
+    """The batched environment of 8 robots per world under random controls, auto-reset included."""
+    size, problem = settings.num_worlds, boxed_problem(num_boxes, "near")
+    seconds = _measure_batch(settings, size, problem=problem, disturbances=disturbances)
+    return _rate("make_vec", size, num_boxes, disturbances, seconds)
+
+
+def measure_rooms(settings: BenchmarkSettings) -> Row:
+    """The same in eight rooms that worlds draw from, where robots see their ways and are paid along them."""
+    size = max(1, settings.num_worlds // 8)
+    along = {"observed_way": True, "progress": "way", "reward": "training"}
+    seconds = _measure_batch(settings, size, scenario="rooms", num_robots=8, num_instances=8, **along)
+    num_boxes = make_problem("rooms", num_robots=8).world.num_obstacles
+    return _rate("make_vec, rooms along ways", size, num_boxes, (), seconds)
+
+
+def _measure_batch(settings: BenchmarkSettings, size: int, **options: Any) -> Spread:
+    """Seconds per step of a world of the batched environment, of ``size`` worlds."""
+    import gymnasium
+
+    env = gymnasium.make_vec("d4orm/Navigation-v0", num_envs=size, vectorization_mode="vector_entry_point", **options)
+    env.reset(seed=0)
+    space = env.single_action_space
+    assert isinstance(space, gymnasium.spaces.Box)
+    low, high = space.low, space.high
+    random = np.random.default_rng(0)
+    table = [random.uniform(low, high, (size, *low.shape)).astype(np.float32) for _ in range(16)]
+    calls = max(1, settings.env_steps // 10)
+
+    def steps() -> None:
+        for index in range(calls):
+            env.step(table[index % len(table)])
+
+    spread = measure(steps, settings.repetitions, settings.time_limit)
+    env.close()
+    return spread.times(1 / (calls * size))
+
+
+def measure_functional(settings: BenchmarkSettings) -> Row:
+    """Worlds of 8 robots as pure functions of JAX, all in one program: random controls, observations, auto-reset."""
+    import jax
+
+    from d4orm_env.jax.functional_env import EnvState, FunctionalEnv
+
+    size, calls = settings.num_worlds, max(1, settings.env_steps // 10)
+    env = FunctionalEnv(problem=boxed_problem(0, "near"))
+    limits, begin = env.action_limits, jax.jit(jax.vmap(env.reset))
+
+    def move(carry: tuple[EnvState, Any], key: jax.Array) -> tuple[tuple[EnvState, Any], None]:
+        (state, total), keys = carry, jax.random.split(key, 1 + size)
+        controls = jax.random.uniform(keys[0], (size, *limits.shape), minval=-limits, maxval=limits)
+        state, transition = jax.vmap(env.step)(keys[1:], state, controls)
+        # What nobody reads would not be computed.
+        return (state, total + transition.rewards.sum() + transition.observations.sum()), None
+
+    @jax.jit
+    def steps(state: EnvState, key: jax.Array) -> tuple[EnvState, float]:
+        return jax.lax.scan(move, (state, 0.0), jax.random.split(key, calls))[0]
+
+    state, _ = begin(jax.random.split(jax.random.key(0), size))
+    spread = measure(
+        lambda: jax.block_until_ready(steps(state, jax.random.key(1))), settings.repetitions, settings.time_limit
+    )
+    return _rate("FunctionalEnv", size, 0, (), spread.times(1 / (calls * size)))
+
+
+def _rate(
+    environment: str, num_worlds: int, num_boxes: int, disturbances: Sequence[AnyDisturbance], seconds: Spread
+) -> Row:
+    """Seconds per environment step, and steps per second at the median."""
+    return {
+        "environment": environment,
+        "num_worlds": num_worlds,
+        "num_robots": 8,
+        "obstacles": num_boxes,
+        "disturbances": len(disturbances),
+        "seconds_per_step": seconds,
+        "steps_per_second": 1 / seconds.median,
+    }

@@ -1,0 +1,144 @@
+"""The command ``d4orm``.
+
+Exit status 0: done; 1: no solution found in the budget; 2: bad input, with one line on stderr that says what to change.
+Heavy imports happen inside the commands, so that ``--help`` is quick.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import sys
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import typer
+
+from d4orm_planners.cli.bench import bench
+from d4orm_planners.cli.dataset_command import dataset
+from d4orm_planners.cli.demo import demo
+from d4orm_planners.cli.evaluate_command import evaluate
+from d4orm_planners.cli.leaderboard_command import leaderboard
+from d4orm_planners.cli.node_command import node
+from d4orm_planners.cli.common_options import Quiet
+from d4orm_planners.cli.outputs import print_table
+from d4orm_planners.cli.plan_command import plan
+from d4orm_planners.cli.play import play
+from d4orm_planners.cli.reproduce import reproduce
+from d4orm_planners.cli.robustness_command import robustness
+from d4orm_planners.cli.run import run
+from d4orm_planners.cli.train import train
+
+# Typer carries its own copy of click, whose base class it does not export.
+ClickException: Any = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
+
+app = typer.Typer(
+    name="d4orm",
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+for command in (demo, plan, run, play, evaluate, robustness, reproduce, leaderboard, dataset, train, bench, node):
+    app.command()(command)
+
+
+def _tell_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"d4orm {importlib.metadata.version('d4orm-env')}")
+        raise typer.Exit
+
+
+@app.callback(invoke_without_command=True)
+def options(
+    context: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Plan and run teams of robots that cross each other's way without touching."""
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+@app.command()
+def warmup(quiet: Quiet = False) -> None:
+    """Compile ahead what planning and the environments need, so that the next start is quick."""
+    from d4orm_planners.cli.warmup import warm_up
+
+    report = warm_up()
+    if not quiet:
+        typer.echo(
+            f"{len(report.compiled)} kernels compiled, {len(report.loaded)} found in the cache, {report.seconds:.1f} s"
+        )
+        for folder in report.folders:
+            typer.echo(f"cache {folder}")
+    if not report.folders:
+        raise ValueError("no cache folder can be written to; set NUMBA_CACHE_DIR to one that can")
+
+
+@app.command()
+def scenarios() -> None:
+    """List the scenarios."""
+    from d4orm_env.scenarios import describe_scenario, list_scenarios
+
+    def described(name: str) -> str:
+        try:
+            return describe_scenario(name)
+        except ValueError as error:  # an installed package offers it and cannot be imported
+            return str(error)
+
+    print_table("Scenarios", [(name, described(name)) for name in list_scenarios()])
+
+
+@app.command()
+def planners(
+    name: Annotated[str | None, typer.Argument(help="List the settings of this one, with their defaults.")] = None,
+) -> None:
+    """List the planners and policies, or what --set can set of one."""
+    from d4orm_planners.base.names import PLANNERS, POLICIES
+    from d4orm_planners.base.planner_registry import default_settings, describe_planner, describe_policy
+
+    if name is not None:
+        settings = default_settings(name).items()
+        print_table(name, [(setting, str(value)) for setting, value in settings] or [("no settings", "")])
+        return
+    for title, table, describe in (("Planners", PLANNERS, describe_planner), ("Policies", POLICIES, describe_policy)):
+        print_table(title, [(name, _or_error(describe, name)) for name in table])
+
+
+def _or_error(describe: Callable[[str], str], name: str) -> str:
+    """A description, or why there is none: what another package brings may be broken."""
+    try:
+        return describe(name)
+    except ValueError as error:
+        return f"unusable: {error}"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line and exit."""
+    try:
+        status = app(arguments, standalone_mode=False)
+    except ClickException as error:
+        status = _complain(error.format_message())
+    except (ValueError, OSError, ImportError) as error:  # ImportError: an extra that is not installed
+        status = _complain(_message(error))
+    except (KeyboardInterrupt, typer.Abort):
+        status = 130
+    sys.exit(status if isinstance(status, int) else 0)
+
+
+def _message(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename or 'file'}: {error.strerror}"
+    return str(error)
+
+
+def _complain(message: str) -> int:
+    line = " ".join(message.split())
+    sys.stderr.write(f"d4orm: {line}{os.linesep}")
+    return 2
+
+
+if __name__ == "__main__":
+    main()

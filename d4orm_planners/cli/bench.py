@@ -1,0 +1,50 @@
+"""``d4orm bench``: how fast everything is on this machine."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from d4orm_planners.cli.arguments import MOST_SEEDS, make_folder, names, numbers
+from d4orm_planners.cli.common_options import Quiet
+
+
+def bench(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write bench.json and bench.md to.")] = Path(
+        "bench"
+    ),
+    quick: Annotated[bool, typer.Option("--quick", help="Small sizes and few repetitions, about a minute.")] = False,
+    num_robots: Annotated[
+        str | None, typer.Option("--num-robots", "--robots", "-k", help="Team sizes, as 4,8,16.")
+    ] = None,
+    models: Annotated[str | None, typer.Option("--models", help="Robot models, separated by commas.")] = None,
+    engines: Annotated[str | None, typer.Option("--engines", help="Of cpu, jax and plain, with commas.")] = None,
+    seeds: Annotated[
+        int | None, typer.Option("--seeds", max=MOST_SEEDS, help="Seeds for the first feasible plan.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Measure the engines, the environments and the planner on this machine."""
+    from d4orm_planners.benchmark.benchmark import parts, run_parts
+    from d4orm_planners.benchmark.bench_report import circumstances, write_report
+    from d4orm_planners.benchmark.settings import QUICK, BenchmarkSettings
+    from d4orm_planners.cli.progress import parts_progress
+
+    given = {
+        "num_robots": numbers("--num-robots", num_robots),
+        "models": names(models),
+        "engines": names(engines),
+        "seeds": seeds,
+    }
+    chosen = {name: value for name, value in given.items() if value is not None}
+    settings = BenchmarkSettings.from_keywords({**(QUICK if quick else {}), **chosen}, "the benchmark")
+    make_folder(out)
+    begun = circumstances(" ".join(["d4orm", *sys.argv[1:]]))
+    with parts_progress(enabled=not quiet) as progress:
+        results = run_parts(list(parts(settings)), progress)
+    for path in write_report(out, settings, begun, results):
+        if not quiet:
+            typer.echo(f"wrote {path}")

@@ -1,0 +1,62 @@
+"""What commands print and draw."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import typer
+
+if TYPE_CHECKING:
+    from d4orm_planners.base.episode import Episode
+    from d4orm_planners.base.plan import Plan
+
+
+def episode_rows(episode: Episode) -> list[tuple[str, str]]:
+    """What happened in an episode."""
+    metrics = episode.metrics
+    return [
+        ("success", "yes" if metrics["success"] else "no"),
+        ("arrived", f"{metrics['arrived']:.0f}"),
+        ("robots in contact", f"{metrics['collided']:.0f}"),
+        ("travel time", f"{metrics['travel_time']:.2f} s"),
+        ("makespan", f"{metrics['makespan']:.2f} s"),
+        ("stretch", f"{episode.stretch:.2f}"),
+    ]
+
+
+def print_plan(plan: Plan) -> None:
+    """How a plan was found and how good it is."""
+    metrics = plan.metrics
+    rows = [
+        ("solved", "yes" if plan.solved else f"no ({plan.status})"),
+        ("planning time", f"{plan.wall_time:.2f} s"),
+        ("iterations", f"{plan.iterations}"),
+        ("travel time", f"{metrics['travel_time']:.2f} s"),
+        ("makespan", f"{metrics['makespan']:.2f} s"),
+        ("stretch", f"{plan.stretch:.2f}"),
+        ("reward", f"{metrics['reward']:.3f}"),
+    ]
+    if not plan.solved:
+        rows.append(("not arrived", f"{plan.problem.num_robots - metrics['arrived']:.0f}"))
+        rows.append(("too close", f"{metrics['margin_violated']:.0f}"))
+    print_table(f"Plan by {plan.planner}, {plan.problem.num_robots} robots", rows)
+
+
+def print_table(title: str, rows: list[tuple[str, str]]) -> None:
+    """Rows without a header."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", show_header=False)
+    for row in rows:
+        table.add_row(*row)
+    Console().print(table)
+
+
+def require_solved(plan: Plan) -> None:
+    """Say why, and end with status 1, if a plan is no solution."""
+    if not plan.solved:
+        typer.echo(f"no solution found ({plan.status.replace('_', ' ')} after {plan.iterations} iterations)", err=True)
+        for robot, reason in plan.failures.items():
+            typer.echo(f"  {robot} {reason}", err=True)
+        raise typer.Exit(1)

@@ -1,0 +1,54 @@
+"""``d4orm play``: a team live in a browser."""
+
+from __future__ import annotations
+
+import os
+import sys
+import webbrowser
+from dataclasses import dataclass
+from typing import Annotated
+
+import typer
+
+from d4orm_planners.cli.dataclass_options import takes
+from d4orm_planners.cli.arguments import names
+from d4orm_planners.cli.common_options import ProblemOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlayOptions(ProblemOptions):
+    """What to begin with, and where to be found."""
+
+    policy: Annotated[
+        str, typer.Option("--policy", "-p", help="What drives (see `d4orm planners`); several, separated by commas.")
+    ] = "d4orm-c2f"
+    host: Annotated[
+        str, typer.Option("--host", help="Where to be found; elsewhere than here the address has a token.")
+    ] = "127.0.0.1"
+    port: Annotated[int, typer.Option("--port", help="Port; any free one by default.")] = 0
+    open_browser: Annotated[bool, typer.Option("--open/--no-open", help="Open a browser if there is one.")] = True
+
+
+@takes(PlayOptions)
+def play(options: PlayOptions) -> None:
+    """Look at a team live in a browser, and meddle with it; needs the extra viz."""
+    try:
+        from d4orm_planners.play.playground import Playground
+    except ImportError as error:
+        raise ImportError('d4orm play needs viser; install it with pip install "d4orm-env[viz]"') from error
+
+    typer.echo("getting ready; the first time this compiles for a while ...")
+    policies = names(options.policy) or ()
+    playground = Playground(options.problem(), *policies, seed=options.seed, host=options.host, port=options.port)
+    try:
+        typer.echo(f"open {playground.address}\nCtrl-C ends it")
+        if options.open_browser and has_display():
+            webbrowser.open(playground.address)
+        playground.run()
+    finally:
+        playground.close()
+
+
+def has_display() -> bool:
+    """Whether a browser would have something to draw on."""
+    return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -1,0 +1,228 @@
+"""Compile ahead whatever planning, rolling out and the environments need, into the cache on disk.
+
+The two kernels that a plan needs, that which samples and that which rolls out, take equally long. numba compiles one
+at a time in a process, so that two processes do it in half the time.
+"""
+
+from __future__ import annotations
+
+import pkgutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.dynamics.models import COMMON
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
+from d4orm_env.engine.types import SamplingRules, SamplingTask
+from d4orm_env.engine.caching import Kernel, has_to_be_compiled
+from d4orm_env.engine.choice import get_engine
+from d4orm_env.envs.joint_state import JointState
+from d4orm_env.scenarios import make_problem
+from d4orm_planners.base.planner_registry import make_planner
+from d4orm_planners.sampling.weights import SoftmaxWeights
+from d4orm_planners.base.solve import Search
+
+if TYPE_CHECKING:
+    from numba.core.dispatcher import Dispatcher
+
+
+@dataclass(frozen=True)
+class WarmupReport:
+    """What a warm-up did.
+
+    Attributes:
+        seconds: How long it took.
+        compiled: Kernels that had to be compiled.
+        loaded: Kernels that were in the cache already.
+        folders: Where the cache is; empty if no folder can be written to, so that nothing is kept.
+    """
+
+    seconds: float
+    compiled: tuple[str, ...]
+    loaded: tuple[str, ...]
+    folders: tuple[Path, ...]
+
+
+TEAMS = (*((model, model) for model in COMMON), ("holonomic2d", "differential_drive"))
+"""The smallest teams of common models that have kernels of their own."""
+
+_RULES = SamplingRules(weights=SoftmaxWeights(1.0))
+
+
+def compile_for_planning(
+    models: tuple[str, ...], announce: Callable[[], None] = lambda: None, *, drives: bool = False
+) -> None:
+    """Compile what planning on the CPU needs, in this process and another, unless it is on disk already.
+
+    Args:
+        models: The team's.
+        announce: Called before it begins, if there is anything to do.
+        drives: Whether straight drives are needed too.
+    """
+    from d4orm_planners.engine.score import score_kernel
+    from d4orm_env.engine.worlds import world_kernels
+
+    if has_to_be_compiled(score_kernel(models)) and has_to_be_compiled(world_kernels(models).roll_out):
+        announce()
+        # Should it fail, the kernel is compiled when it is needed, like any other.
+        other = _in_another_process(f"roll_out_once({models!r}, drives={drives})")
+        sample_once((models,))
+        other.wait()
+
+
+def _in_another_process(call: str) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [sys.executable, "-c", f"from {__name__} import find_ways, roll_out_once, sample_once; {call}"]
+    )
+
+
+def roll_out_once(models: tuple[str, ...], *, drives: bool = True) -> None:
+    """Roll out a plan of the smallest problem of a team of these models on the CPU, and drive straight.
+
+    Samples are weighed and averaged here too, and first: the process that scores them, which takes longer, needs that
+    last.
+    """
+    from d4orm_env.engine.cpu import Sampling
+    from d4orm_env.engine.threads import Threads
+
+    problem = _smallest_problem(models)
+    rewards = np.zeros((1, 2), np.float32)
+    run = Sampling(SamplingTask(problem, _no_controls(problem)), _RULES, rewards.size, 0, Threads(1))
+    run.moments(_RULES.weights(rewards, np), with_second=False)
+    get_engine("cpu").rollout(problem, _no_controls(problem))
+    if drives:
+        # What it drives by itself, and how it looks for ways around others.
+        planner = make_planner("d4orm-d", engine="cpu")
+        planner.init(Search(planner, problem, seed=0))
+
+
+def sample_once(teams: tuple[tuple[str, ...], ...]) -> None:
+    """Sample once for teams of these models on the CPU."""
+    for models in teams:
+        problem = _smallest_problem(models)
+        task = SamplingTask(problem, _no_controls(problem))
+        get_engine("cpu").prepare(task, _RULES, np.ones(1, np.float32), 2)
+
+
+def find_ways() -> None:
+    """Find the shortest free ways among walls, and guide a team along them."""
+    problem = make_problem("doorway", num_robots=4)
+    problem.ways.distance(problem.goal)
+    make_planner("guided", engine="cpu").solve(problem, seed=0)
+
+
+def warm_up() -> WarmupReport:
+    """Run everything once on the smallest problems.
+
+    One compilation of a kernel serves every problem with the same models, so two robots stand for all teams.
+    """
+    begin = time.perf_counter()
+    # Before anything runs: what the other process compiles is in the cache when it is needed here.
+    missing = [kernel for kernel in _kernels() if has_to_be_compiled(kernel)]
+    # The last kernel, for three models, takes as long as two others.
+    other = _in_another_process(f"roll_out_once({TEAMS[0]}); sample_once({TEAMS[1:-1]}); find_ways()")
+    sample_once((TEAMS[0], TEAMS[-1]))
+    for models in TEAMS[1:]:
+        roll_out_once(models)
+    _step_environments()
+    other.wait()
+    sample_once(TEAMS)
+    roll_out_once(TEAMS[0])
+    find_ways()
+    _evade()
+    _plan()
+    seconds = time.perf_counter() - begin
+    kernels = [kernel for kernel in _kernels() if kernel.signatures]
+    compiled = [kernel for kernel in kernels if kernel.stats.cache_misses or kernel in missing]
+    loaded = [kernel for kernel in kernels if kernel not in compiled]
+    return WarmupReport(
+        seconds,
+        tuple(kernel.py_func.__name__ for kernel in compiled), tuple(kernel.py_func.__name__ for kernel in loaded),
+        tuple(sorted({Path(path) for kernel in kernels if (path := kernel.stats.cache_path)})),
+    )  # fmt: skip
+
+
+def _smallest_problem(models: tuple[str, ...]) -> Problem:
+    team = Team(models)
+    start = np.zeros((team.num_robots, team.state_size))
+    start[:, 0] = np.arange(team.num_robots)
+    return Problem(team, start=start, goal=start[:, : team.dimension] + 1, horizon=5)
+
+
+def _no_controls(problem: Problem) -> FloatArray:
+    return np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
+
+
+def _plan() -> None:
+    from d4orm_planners.base.names import PLANNERS
+    from d4orm_planners.sampling.loop import SamplingPlanner
+
+    problem = _smallest_problem(TEAMS[0])
+    # A planner that does not sample has nothing to compile that the others have not.
+    for name in (name for name in PLANNERS.own() if issubclass(PLANNERS[name], SamplingPlanner)):
+        make_planner(name, engine="cpu", num_samples=32, num_steps=1).solve(problem, max_iterations=1)
+
+
+def _evade() -> None:
+    """Keep two robots apart, as D4orm-C2F does in the last resort."""
+    from d4orm_planners.d4orm_c2f.barrier import safe_velocities
+
+    problem = _smallest_problem(TEAMS[0])
+    colliding, everybody = 10 * (problem.start[::-1] - problem.start)[:, :2], np.ones(problem.num_robots, np.bool_)
+    joint = JointState(problem.start, problem.goal, _no_controls(problem)[0], ~everybody, 0)
+    safe_velocities(problem, joint, colliding, everybody, problem.margin)
+
+
+def _step_environments() -> None:
+    from d4orm_env import navigation_v0
+    from d4orm_env.disturbances import Dropout, Intruder, StateNoise
+
+    disturbances = [Dropout(0.5), StateNoise(0.1), Intruder()]
+    for arguments in ({}, {"lifelong": True}, {"disturbances": disturbances}):
+        env = navigation_v0.parallel_env(problem=_smallest_problem(TEAMS[0]), **arguments)
+        env.reset(seed=0)
+        zero = np.zeros(env.action_space(env.possible_agents[0]).shape, np.float32)
+        env.step(dict.fromkeys(env.agents, zero))
+        env.close()
+
+    from gymnasium import make_vec
+
+    vector_env = make_vec("d4orm/Navigation-v0", num_envs=2, vectorization_mode="vector_entry_point", num_robots=2)
+    vector_env.reset(seed=0)
+    vector_env.step(np.zeros(vector_env.action_space.shape, np.float32))
+    vector_env.close()
+
+
+def _kernels() -> list[Dispatcher[Callable[..., object]]]:
+    """The kernels of engines, guided plans and D4orm-C2F that are kept on disk."""
+    from numba.core.dispatcher import Dispatcher
+
+    from d4orm_env import engine
+    from d4orm_planners.mapf.beam_search import search_kernel
+    from d4orm_planners.tracking.straight_drives import drive_kernel
+    from d4orm_planners.engine.score import score_kernel
+    from d4orm_env.engine.worlds import world_kernels
+    from d4orm_planners import d4orm_c2f
+    from d4orm_planners import mapf as guidance
+
+    modules = [import_module(f"{package.__name__}.{module.name}") for package in (engine, guidance, d4orm_c2f)
+               for module in pkgutil.iter_modules(package.__path__) if module.name != "jax"]  # fmt: skip
+    found = {name: value for module in modules for name, value in vars(module).items() if isinstance(value, Dispatcher)}
+    worlds = {kernel for models in TEAMS for kernel in world_kernels(models)}
+    kernels: list[Kernel[..., object]] = [
+        *found.values(),
+        *worlds,
+        *map(score_kernel, TEAMS),
+        *map(drive_kernel, COMMON),
+    ]
+    kernels += map(search_kernel, COMMON)
+    return [kernel for kernel in kernels if isinstance(kernel, Dispatcher) and kernel.stats.cache_path is not None]

@@ -1,0 +1,329 @@
+"""The coarse plan that a team follows, where on it the team is, and when it is planned anew or made better."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.seeds import Stream, derived_seed
+from d4orm_env.engine.types import Engine
+from d4orm_env.envs.joint_state import JointState
+from d4orm_planners.base.candidate import Candidate
+from d4orm_planners.d4orm_c2f.background import Background
+from d4orm_planners.d4orm_c2f.coarse_plan import (
+    Guidance,
+    Waypoints,
+    coarse_problem,
+    interpolate,
+    nearest_indices,
+    rest_of,
+    subgoal_indices,
+)
+from d4orm_planners.d4orm_c2f.warm_start import episode_of
+from d4orm_planners.d4orm_c2f.following import BARRED_AFTER, STUCK_AFTER, WAITING_WITHIN, Patience, keep_time
+from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
+from d4orm_planners.d4orm_c2f.lookahead import within_sight
+from d4orm_planners.d4orm_d.planner import D4ormD
+from d4orm_planners.d4orm_d.settings import D4ormDConfig
+from d4orm_planners.mapf.planner import Guide as Ways
+from d4orm_planners.mapf.relay import relay_ways
+from d4orm_planners.base.solve import Search
+from d4orm_planners.tracking.steering import straight_drives
+
+NEARER = 0.05
+"""What counts as coming nearer to the goals, all robots together [m]."""
+
+
+class Guide:
+    """Leads a team through an episode.
+
+    Args:
+        problem: The problem of the episode.
+        config: The settings.
+        seed: Of the episode.
+        refiner: What refinements roll out and sample with.
+        background: Where they are made, if not between control loops.
+        lifelong: Whether robots that arrive get new goals.
+        last_step: Time steps after which the episode ends.
+
+    Attributes:
+        problem: The problem, with the limits that the robots are believed to have now.
+        guidance: What is followed at present.
+        index: Waypoint at which the team is.
+        anew: ``(K,)`` robots that are sent another way than before, until :meth:`fresh_start` has reported it.
+        stuck: ``(K,)`` robots that do not get on, or did not until a short while ago.
+    """
+
+    guidance: Waypoints
+    index: int
+    anew: BoolArray
+    stuck: BoolArray
+
+    def __init__(
+        self,
+        problem: Problem,
+        config: D4ormC2FConfig,
+        seed: int,
+        refiner: Engine,
+        background: Background[Guidance],
+        lifelong: bool,
+        last_step: int,
+    ) -> None:
+        self.problem, self._config, self._seed, self._lifelong = problem, config, seed, lifelong
+        self._last_step = last_step
+        self._refiner, self._background = refiner, background
+        # Ways that fit between others to the centimetre are no guidance: fine plans cannot keep to them. But where
+        # the team does not get on there may be no other ways.
+        self._planner, self._thorough = (_coarse_planner(config, reroute=reroute) for reroute in (False, True))
+
+    def begin(self, joint: JointState, docked: BoolArray) -> None:
+        """Plan for the episode, in which those ``docked`` ``(K,)`` stay where they are."""
+        everybody = np.ones(self.problem.num_robots, bool)
+        self._patience, self.stuck = Patience(joint), ~everybody
+        self.guidance, self.index = self.plan(joint, docked, self._guess(joint), self._config.coarse_iterations), 0
+        self._follow(joint, self._relayed(joint, everybody) or self.guidance, everybody)
+
+    def _guess(self, joint: JointState) -> FloatArray | None:
+        """``(H_c, K, m)`` what a policy does from where the team is, if the coarse plan is to begin with that."""
+        if self._config.first_guess is None:
+            return None
+        coarse = coarse_problem(self.problem.resumed_at(joint.states, joint.goals), self._config.coarse_factor)
+        return episode_of(self._config.first_guess, coarse, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps))
+
+    def _follow(self, joint: JointState, guidance: Waypoints, anew: BoolArray) -> None:
+        """Begin at the beginning of a guidance, which sends the robots ``anew`` ``(K,)`` another way than before."""
+        self.anew = anew
+        self.guidance = guidance
+        self.index, self._indices = 0, np.zeros(len(joint.goals), int)
+        self._goals, self._began = joint.goals, joint.steps
+        self._nearest, self._nearest_at = float("inf"), joint.steps
+
+    def plan(
+        self,
+        joint: JointState,
+        docked: BoolArray,
+        initial: FloatArray | None,
+        iterations: int,
+        thorough: bool = False,
+    ) -> Guidance:
+        """Plan for the whole team from where it is, until a plan passes the checks (Algorithm 4, lines 1 to 3)."""
+        # Whoever has docked at the rim of its goal could leave it within a coarse step.
+        goals = np.where(docked[:, None], joint.states[:, : self.problem.dimension], joint.goals)
+        coarse = coarse_problem(self.problem.resumed_at(joint.states, goals), self._config.coarse_factor)
+        chosen, guidance = self._planned(coarse, joint.steps, initial, iterations, thorough)
+        left = (self._last_step - joint.steps) // self._config.coarse_factor
+        if (
+            not self._lifelong
+            and 0 < left < coarse.horizon
+            and not chosen.failed.any()
+            and not chosen.trajectory.arrived[left].all()
+        ):
+            # It would come too late. Plans that come too late are none, if there are others.
+            in_time = coarse.resumed_at(coarse.start, coarse.goal, horizon=left)
+            hurried, other = self._planned(in_time, joint.steps, initial, iterations, thorough)
+            if not hurried.failed.any():
+                return other
+        return guidance
+
+    def _planned(
+        self, coarse: Problem, step: int, initial: FloatArray | None, iterations: int, thorough: bool
+    ) -> tuple[Candidate, Guidance]:
+        """The first plan that passes the checks, or the best one."""
+        planner = self._thorough if thorough else self._planner
+        seed, interval = derived_seed(self._seed, Stream.COARSE_PLAN, step), self._config.check_interval
+        start = None if initial is None else initial[: coarse.horizon]
+        search = Search(planner, coarse, seed, start, check_interval=interval)
+        chosen, ordered = search.current, False
+        for number in range(iterations):
+            if not chosen.failed.any():
+                break
+            search.advance()
+            if number == 0:
+                ordered = isinstance(search.state, Ways)
+            chosen = search.current if search.current.rank >= search.best.rank else search.best
+            if not search.current.failed.any():
+                chosen = search.current
+        plan = chosen.trajectory
+        path = interpolate(plan.positions, self._config.coarse_factor)
+        return chosen, Guidance(problem=coarse, controls=plan.controls, states=plan.states, path=path, ordered=ordered)
+
+    def subgoals(self, joint: JointState, docked: BoolArray) -> IntArray:
+        """``(K,)`` waypoints that the robots head for; finds out where on the path they are (Algorithm 4, line 6)."""
+        path, offset = self.guidance.path, self._config.subgoal_offset
+        positions = joint.states[:, : self.problem.dimension]
+        self._indices = nearest_indices(path, positions, self._indices, offset)
+        going = ~docked & ~self.stuck
+        if going.any():
+            self.index = round(float(self._indices[going].mean()))
+        lag = len(path) if self._config.max_lag is None else self._config.max_lag
+        targets = subgoal_indices(self._indices, self.index, offset, lag, len(path) - 1)
+        if not self._config.sight:
+            return targets
+        walls = self.guidance.ordered
+        return within_sight(self.problem, positions, path, self._indices, targets, docked, walls)
+
+    def followed(self, joint: JointState, engine: Engine, horizon: int) -> FloatArray:
+        """``(horizon, K, m)`` controls that take every robot along its path, from where on it it is."""
+        return keep_time(self.problem, engine, joint, self.guidance.path, self._indices, horizon)
+
+    def timed(self, joint: JointState, engine: Engine, horizon: int) -> FloatArray:
+        """``(horizon, K, m)`` controls that take every robot along its path in the team's time."""
+        return keep_time(self.problem, engine, joint, self.guidance.path, self._clock(), horizon)
+
+    def _clock(self) -> IntArray:
+        """``(K,)`` waypoints at which the robots should be now: the team's, or not far from where they are."""
+        clock = np.full_like(self._indices, self.index)
+        return clock if self._config.max_lag is None else np.minimum(clock, self._indices + self._config.max_lag)
+
+    def fresh_start(self, base: FloatArray) -> None:
+        """Have those that are sent another way begin ``base`` ``(H_predict, K, m)`` with the coarse plan's controls."""
+        if self.anew.any() and isinstance(self.guidance, Guidance):
+            # Each is held for as long as it stands for.
+            held = np.repeat(self.guidance.controls, self._config.coarse_factor, axis=0)[: len(base)]
+            base[:, self.anew] = 0
+            base[: len(held), self.anew] = held[:, self.anew]
+            self.anew = np.zeros_like(self.anew)
+
+    def replan_if_needed(self, joint: JointState, docked: BoolArray) -> bool:
+        """Plan anew for robots with new goals or stuck, for a team that lost the guidance or has come to its end."""
+        changed = (joint.goals != self._goals).any(axis=1)
+        moving = ~docked
+        held_up, lost = np.zeros_like(docked), False
+        if self._config.replan:
+            idle, self.stuck = self._patience.observe(joint.steps, self._indices, self._waiting(joint))
+            barred = self._barred(joint, docked, idle > BARRED_AFTER)
+            held_up = moving & (
+                np.minimum(idle, joint.steps - self._began) > np.where(barred, BARRED_AFTER, STUCK_AFTER)
+            )
+            lost = bool(moving.any()) and self._is_lost(joint, moving)
+        if not moving.any():
+            return False
+        if self._config.replan:
+            changed |= moving & (self._away(joint) > self._config.replan_distance)
+        if not (changed | held_up).any() and not lost:
+            return False
+        changed |= held_up
+        keep = moving & ~changed
+        relayed = self._relayed(joint, ~keep | lost) or self._relayed(joint, np.ones_like(keep))
+        if relayed is not None:
+            self._follow(joint, relayed, changed)
+            return True
+        thorough = lost or bool(held_up.any())
+        iterations = self._config.coarse_iterations if thorough else self._config.replan_iterations
+        initial = self._beginning(joint, keep & (not lost))
+        guidance = self.plan(joint, docked, initial, iterations, thorough)
+        self._follow(joint, guidance, ~keep | lost)
+        return True
+
+    def _relayed(self, joint: JointState, changed: BoolArray) -> Waypoints | None:
+        """New ways on the roadmap for those ``changed`` ``(K,)``, around all others on theirs, where goals are many."""
+        if not (self._lifelong and self.guidance.ordered):
+            return None
+        factor, seed = self._config.coarse_factor, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps)
+        present = coarse_problem(self.problem.resumed_at(joint.states, joint.goals), factor)
+        ways = relay_ways(present, self.guidance.path[self.index :: factor], changed, seed)
+        return None if ways is None else Waypoints(path=interpolate(ways, factor), ordered=True)
+
+    def _beginning(self, joint: JointState, keep: BoolArray) -> FloatArray | None:
+        """``(H_c, K, m)`` straight drives, but for those that ``keep`` ``(K,)`` back to and along their ways.
+
+        ``None`` among walls: there the whole team's ways are found anew on the roadmap.
+        """
+        if self.guidance.ordered or not isinstance(self.guidance, Guidance):
+            return None
+        factor = self._config.coarse_factor
+        present = coarse_problem(self.problem.resumed_at(joint.states, joint.goals), factor)
+        initial = straight_drives(present).controls[:, :, 0]
+        if keep.any():
+            ways = self.guidance.path[::factor]
+            along = keep_time(present, self._refiner, joint, ways, self._clock() // factor, present.horizon)
+            initial[:, keep] = along[:, keep]
+        return initial
+
+    def _barred(self, joint: JointState, docked: BoolArray, asked: BoolArray) -> BoolArray:
+        """``(K,)`` those ``asked`` whose next waypoints, up to the subgoal, lie within robots that stand for good."""
+        robots, barred = np.flatnonzero(asked & ~docked), np.zeros_like(docked)
+        path, ahead = self.guidance.path, np.arange(self._config.subgoal_offset + 1)
+        waypoints = path[np.minimum(self._indices[robots] + ahead[:, None], len(path) - 1), robots]
+        away = np.linalg.norm(waypoints[:, :, None] - joint.states[docked, : self.problem.dimension], axis=3)
+        radius = np.asarray(self.problem.team.radius)
+        barred[robots] = (away < radius[robots, None] + radius[docked]).any(axis=(0, 2))
+        return barred
+
+    def _waiting(self, joint: JointState) -> BoolArray:
+        """``(K,)`` who is where it should be by now, or ahead of the team, and so has to wait."""
+        due = self.guidance.path[min(self.index, len(self.guidance.path) - 1)]
+        away = np.linalg.norm(joint.states[:, : self.problem.dimension] - due, axis=1)
+        waiting: BoolArray = (away < WAITING_WITHIN) | (self._indices > self.index)
+        return waiting
+
+    def _is_lost(self, joint: JointState, moving: BoolArray) -> bool:
+        """Whether the robots under way are far from their waypoints, at the end of the path, or get no nearer."""
+        positions = joint.states[:, : self.problem.dimension]
+        distance = float(np.linalg.norm((joint.goals - positions)[moving], axis=1).sum())
+        if distance < self._nearest - NEARER:
+            self._nearest, self._nearest_at = distance, joint.steps
+        return bool(
+            self._away(joint)[moving].mean() > self._config.replan_distance
+            or self.index >= len(self.guidance.path) - 1
+            or joint.steps - self._nearest_at > self._config.patience
+        )
+
+    def _away(self, joint: JointState) -> FloatArray:
+        """``(K,)`` how far the robots are from their waypoints [m]."""
+        positions = joint.states[:, : self.problem.dimension]
+        away: FloatArray = np.linalg.norm(
+            positions - self.guidance.path[self._indices, np.arange(len(positions))], axis=1
+        )
+        return away
+
+    def refine(self, step: int, due: bool) -> bool:
+        """Take over what the refinement has done meanwhile, and give it more to do if that is ``due``."""
+        index = self.index + self._config.subgoal_offset
+        guidance, over = self.guidance, index >= len(self.guidance.path) - 1
+        if self._config.refine == "off" or over or not isinstance(guidance, Guidance):
+            return False
+        seed = derived_seed(self._seed, Stream.REFINEMENT, step)
+        if self._config.refine == "sync":
+            if due:
+                self.guidance = self._refined(guidance, index, seed)
+            return self.guidance is not guidance
+        done, refined = self._background.result()
+        # What was refined may have been replanned since.
+        if refined is not None and refined.problem is guidance.problem:
+            self.guidance = guidance = refined
+        if done and due:
+            self._background.start(lambda: self._refined(guidance, index, seed))
+        return self.guidance is refined
+
+    def _refined(self, guidance: Guidance, index: int, seed: int) -> Guidance:
+        """The guidance with what is left of it from a waypoint on made better, if that succeeds (line 4)."""
+        left, controls = rest_of(guidance, index, self._config.coarse_factor)
+        search = Search(self._planner, left, seed, controls, self._refiner)
+        search.advance()
+        done = guidance.problem.horizon - left.horizon
+        before, after = guidance.states[: done + 1], search.best.trajectory
+        states = np.concatenate([before, after.states[1:]])
+        positions = np.concatenate([before[..., : left.dimension], after.positions[1:]])
+        all_controls = np.concatenate([guidance.controls[:done], after.controls])
+        path = interpolate(positions, self._config.coarse_factor)
+        return replace(guidance, controls=all_controls, states=states, path=path)
+
+
+def _coarse_planner(config: D4ormC2FConfig, reroute: bool) -> D4ormD:
+    """D4orm-D as it plans coarsely, with or without looking for ways around all others."""
+    given: dict[str, Any] = {} if config.coarse_preset is None else {**D4ormD.presets[config.coarse_preset]}
+    given |= {
+        "engine": config.engine,
+        "num_samples": config.coarse_samples,
+        "num_steps": config.coarse_steps,
+        "repair_steps": config.coarse_repair_steps,
+        "improve": True,
+        "reroute": reroute,
+        "shorten": False,
+    }
+    return D4ormD(D4ormDConfig(**given))

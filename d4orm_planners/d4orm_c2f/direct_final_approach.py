@@ -1,0 +1,146 @@
+"""The last metres: robots that are nearly there drive straight home, or away and come again."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from d4orm_env.core import portable
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
+from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.engine.types import Engine
+from d4orm_planners.tracking.steering import NEAR_VIA, drives, standing, straight_drives
+
+ROUNDING = 1e-5
+"""Allowance for it [m]."""
+
+PASSING = 1e-6
+"""Goal radius of robots that drive through a place and do not dock there [m]."""
+
+NEARBY = 3.0
+"""Within how many radii of its turning circle of its goal a robot that cannot turn in place looks for a manoeuvre."""
+
+DIRECTIONS, BEYOND = 16, (0.25, 1.0, 2.0)
+"""In how many directions a manoeuvre may lead away at first, and how far, in radii of the turning circle."""
+
+LENGTH, RESERVE = 8.0, 2.0
+"""How long it may be, in radii of the turning circle, and how much longer it may take than at full speed [s]."""
+
+
+def docking_radius(problem: Problem, docks: bool) -> float:
+    """The goal radius for rollouts of an episode [m]; who does not dock drives on when it arrives, to its next goal."""
+    return problem.goal_radius if docks else PASSING
+
+
+def drive_home(
+    window: Problem, engine: Engine, controls: FloatArray, near: BoolArray, docked: BoolArray
+) -> tuple[FloatArray, BoolArray]:
+    """The controls, but straight drives for robots that dock by these no later, or manoeuvres (:func:`come_again`).
+
+    Samples head for a goal only roughly, and who misses it at full speed has to turn.
+
+    Args:
+        window: The robots from where they are to their goals, over the prediction horizon.
+        engine: What rolls out.
+        controls: ``(H_predict, K, m)``.
+        near: ``(K,)`` whose drives are tried.
+        docked: ``(K,)`` who stands for good.
+
+    Returns:
+        ``(H_predict, K, m)`` controls, and ``(K,)`` who drives home.
+    """
+    offsets = window.goal - window.start[:, : window.dimension]
+    away = np.linalg.norm(offsets, axis=1, keepdims=True)
+    speed, acceleration = (window.team.limits[:, limit, None] for limit in (SPEED, ACCELERATION))
+    circle = window.team.turning_radius
+    turning = (circle > 0) & np.isfinite(circle) & (window.dimension == 2)
+    beside = turning & ~docked & (away[:, 0] < NEARBY * circle)
+    near = near & (away <= speed * window.dt * window.horizon)[:, 0]
+    home = np.zeros_like(near)
+    if not (near | beside).any():
+        return controls, home
+    latest = np.minimum(_docking_times(engine.rollout(window, controls)), window.horizon)
+    # Past the goal at full speed where that meets it; else so that robots could stop there.
+    for beyond in (speed**2 / (2 * acceleration), np.zeros_like(speed)):
+        if not (near & ~home).any():
+            break
+        aimed = window.goal + beyond * offsets / np.maximum(away, window.goal_radius)
+        straight = straight_drives(window.resumed_at(window.start, aimed, goal_radius=PASSING)).controls[:, :, 0]
+        trajectory = engine.rollout(window, straight)
+        sooner = near & ~home & (_docking_times(trajectory) <= latest)
+        if (asked := np.flatnonzero(sooner & turning)).size:
+            sooner[asked] = _keeps_clear(window, trajectory.positions[:, asked, None], asked, docked)[:, 0]
+        controls = np.where(sooner[:, None], straight, controls)
+        home |= sooner
+    beside &= ~home & (latest == window.horizon)
+    controls, coming = come_again(window, controls, np.flatnonzero(beside), docked)
+    return controls, home | coming
+
+
+def come_again(
+    window: Problem, controls: FloatArray, robots: IntArray, docked: BoolArray
+) -> tuple[FloatArray, BoolArray]:
+    """The controls, but manoeuvres for robots ``(R,)`` that cannot turn in place and are beside their goals.
+
+    What lies within a robot's turning circles it reaches by driving away from it first, which samples that are paid for
+    being near do not do. Among drives by points all around, forwards or in reverse, that one is chosen which is home
+    first and keeps clear of all that stands.
+
+    Args:
+        window: The robots from where they are to their goals, over the prediction horizon.
+        controls: ``(H_predict, K, m)``.
+        robots: Who looks for one.
+        docked: ``(K,)`` who stands for good.
+
+    Returns:
+        ``(H_predict, K, m)`` controls, and ``(K,)`` who has found one.
+    """
+    coming = np.zeros_like(docked)
+    if not len(robots):
+        return controls, coming
+    circle, speed = window.team.turning_radius[robots], window.team.limits[robots, SPEED]
+    steps = round(float((LENGTH * circle / speed).max() + RESERVE) / window.dt)
+    alone = window.resumed_at(window.start, window.goal, horizon=steps).select(robots.tolist())
+    angle = 2 * np.pi / DIRECTIONS * np.arange(DIRECTIONS)
+    directions = np.stack([portable.cos(angle), portable.sin(angle)], axis=1)
+    # A robot turns to its goal as soon as it is so near to the point before.
+    away = np.sqrt(NEAR_VIA) + circle[:, None] * np.array(BEYOND)
+    vias = alone.start[:, None, None, :2] + away[:, :, None, None] * directions
+    vias = vias.reshape(len(robots), -1, 1, 2).astype(np.float32)
+    ways = drives(alone, *standing(alone), np.zeros(vias.shape[:2], int), vias)
+    clear = _keeps_clear(window, ways.positions, robots, docked)
+    moves = (ways.states[1:] != ways.states[:-1]).any(axis=3)
+    # The last step in which it moves.
+    length = len(moves) - moves[::-1].argmax(axis=0)
+    length = np.where(ways.arrived & clear, length, len(moves) + 1)
+    best, every = length.argmin(axis=1), np.arange(len(robots))
+    found = length[every, best] <= len(moves)
+    chosen = ways.controls[: len(controls), every, best]
+    controls = controls.copy()
+    controls[:, robots[found], : chosen.shape[2]] = chosen[:, found]
+    coming[robots[found]] = True
+    return controls, coming
+
+
+def _keeps_clear(window: Problem, positions: FloatArray, robots: IntArray, docked: BoolArray) -> BoolArray:
+    """``(R, V)`` whether ways ``(T, R, V, d)`` keep the margin to all that stands, or come no nearer than at first."""
+    radius = np.asarray(window.team.radius, np.float64)
+    room = window.world.clearance(positions) - radius[robots, None]
+    clear = _no_nearer(room, window.margin)
+    if docked.any():
+        away = np.linalg.norm(positions[:, :, :, None] - window.start[docked, : window.dimension], axis=4)
+        clear &= _no_nearer(away - radius[robots, None, None] - radius[docked], window.margin).all(axis=2)
+    return clear
+
+
+def _no_nearer(gaps: Floats, margin: float) -> BoolArray:
+    """``(...)`` whether no gap of ``(T, ...)`` is less than the margin, or than the first one if that is less [m]."""
+    keeps: BoolArray = (gaps >= np.minimum(gaps[0] - ROUNDING, margin)).all(axis=0)
+    return keeps
+
+
+def _docking_times(trajectory: Trajectory) -> IntArray:
+    """``(K,)`` time steps until everybody docks; one more than there are for who does not."""
+    steps: IntArray = (~trajectory.arrived).sum(axis=0)
+    return steps

@@ -1,0 +1,248 @@
+"""A fine plan over the prediction horizon, and who may follow it: the sampling of one control loop (Algorithm 4)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.engine.types import Engine, MovingObstacles, SamplingRules, SamplingTask
+from d4orm_env.envs.joint_state import JointState
+from d4orm_planners.d4orm_c2f.direct_final_approach import ROUNDING, docking_radius, drive_home
+from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
+from d4orm_planners.tracking.steering import track_velocities
+
+SHORTER = 3
+"""How many times fewer fresh steps a robot takes before it stops if it would violate the margin otherwise."""
+
+
+class Prediction(NamedTuple):
+    """What a control loop comes to.
+
+    Attributes:
+        controls: ``(H_predict + S, K, m)`` with the ``S`` steps that a stop may take.
+        positions: ``(1 + H_predict + S, K, d)`` where they lead, with the present place first [m].
+        gap: Least gap between the surfaces of any two robots that they keep [m]; infinite for one robot.
+    """
+
+    controls: FloatArray
+    positions: FloatArray
+    gap: float
+
+
+class Situation(NamedTuple):
+    """What a control loop begins with.
+
+    Attributes:
+        joint: Where the robots are.
+        docked: ``(K,)`` who stays there.
+        subgoals: ``(K, d)`` [m].
+        base: ``(H_predict, K, m)`` controls to deform.
+        left: ``(T, K, m)`` controls that the robots had in mind, with the stop after them.
+        careful: ``(H_predict, K, m)`` controls for robots that are stuck, if any are.
+        stuck: ``(K,)`` who is; they may come as near as half of the margin.
+        room: Added to the margin of the samples [m].
+    """
+
+    joint: JointState
+    docked: BoolArray
+    subgoals: FloatArray
+    base: FloatArray
+    left: FloatArray
+    careful: FloatArray | None
+    stuck: BoolArray
+    room: float
+
+
+class Window:
+    """Plans finely over the prediction horizon, from wherever the robots are.
+
+    Args:
+        problem: The problem of the episode.
+        config: The settings.
+        engine: What rolls out and samples.
+        docks: Whether robots dock at their goals, rather than drive through them to others.
+
+    Attributes:
+        problem: The problem, with the limits that the robots are believed to have now.
+    """
+
+    def __init__(self, problem: Problem, config: D4ormC2FConfig, engine: Engine, docks: bool) -> None:
+        self.problem, self._config, self._engine, self._docks = problem, config, engine, docks
+        self._rules = SamplingRules(config.weights)
+        self._noise_scale = config.noise_scale(config.num_steps)
+        limits = problem.team.limits
+        self._stop_steps = int(np.ceil(np.max(limits[:, 0] / (limits[:, 1] * problem.dt))))
+
+    def prepare(self, joint: JointState) -> None:
+        """Compile, so that the first control loop is as quick as the others."""
+        window = self.problem.resumed_at(joint.states, joint.goals, horizon=self._config.predict_horizon)
+        task = SamplingTask(window, self.no_controls(), arrived=joint.arrived)
+        self._engine.prepare(task, self._rules, self._noise_scale, self._config.num_samples)
+
+    def no_controls(self) -> FloatArray:
+        """``(H_predict, K, m)`` zeros."""
+        shape = (self._config.predict_horizon, self.problem.num_robots, self.problem.control_size)
+        return np.zeros(shape, np.float32)
+
+    def predict(self, now: Situation, seed: int) -> Prediction:
+        """Fine controls towards the subgoals."""
+        problem, config = self.problem, self._config
+        result = self._engine.denoise(
+            self._task(now), self._rules, np.zeros_like(now.base), self._noise_scale, config.num_samples, seed
+        )
+        limit = problem.team.control_limits
+        sampled = np.clip(now.base + result.mean, -limit, limit).astype(np.float32)
+        controls = sampled if now.careful is None else np.where(now.stuck[:, None], now.careful, sampled)
+        radius = docking_radius(problem, self._docks)
+        joint, horizon = now.joint, config.predict_horizon
+        truth = problem.resumed_at(joint.states, joint.goals, horizon=horizon, goal_radius=radius)
+        if not config.safe_mix:
+            positions = self._engine.rollout(truth, controls).positions
+            return Prediction(controls, positions, least_gap(truth, positions[1:]))
+        special = now.stuck
+        if config.drive_home and self._docks:
+            near = self._near_goals(now) & ~now.docked & ~now.stuck
+            controls, home = drive_home(truth, self._engine, controls, near, now.docked)
+            special = special | home
+        return self._safe_mix(truth, controls, special, sampled, now)
+
+    def _near_goals(self, now: Situation) -> BoolArray:
+        """``(K,)`` whose subgoal is as good as the goal."""
+        near: BoolArray = np.linalg.norm(now.subgoals - now.joint.goals, axis=1) <= self.problem.goal_radius
+        return near
+
+    def _task(self, now: Situation) -> SamplingTask:
+        """Deform the base so that everybody heads for its subgoal, or its goal where that is near."""
+        problem, config, goals = self.problem, self._config, now.joint.goals
+        near = self._near_goals(now)
+        window = problem.resumed_at(
+            now.joint.states,
+            np.where((near | now.docked)[:, None], goals, now.subgoals),
+            horizon=config.predict_horizon,
+            margin=problem.margin + config.extra_margin + now.room,
+            goal_radius=docking_radius(problem, self._docks and bool(near.any())),
+        )
+        reach = problem.dt * config.subgoal_offset * float(np.max(np.asarray(problem.team.max_speed)))
+        return SamplingTask(
+            window,
+            now.base,
+            credit=config.credit,
+            moving=self._bodies(now.joint, config.predict_horizon),
+            arrived=now.docked,
+            penalty=config.penalty,
+            reference_distance=None if config.relative_distance else reach,
+        )
+
+    def _bodies(self, joint: JointState, horizon: int) -> MovingObstacles | None:
+        """Where bodies that are no robots will be, going on as they do; ``None`` if none is seen."""
+        d, bodies = self.problem.dimension, joint.bodies
+        seen = bodies[bodies[:, -1] > 0] if len(bodies) else bodies
+        if not len(seen):
+            return None
+        times = self.problem.dt * np.arange(1, horizon + 1, dtype=np.float32)[:, None, None]
+        return MovingObstacles(seen[:, :d] + times * seen[:, d : 2 * d], seen[:, -1])
+
+    def _with_stop(self, window: Problem, controls: FloatArray, steps: int, docked: BoolArray) -> FloatArray:
+        """The first ``steps`` controls, and after them those that bring everyone to rest as soon as can be.
+
+        Returns:
+            ``(H_predict + S, K, m)`` with the ``S`` steps that a stop may take.
+        """
+        stopping = np.zeros((len(controls) + self._stop_steps, *controls.shape[1:]), np.float32)
+        stopping[:steps] = controls[:steps]
+        states = self._engine.rollout(window, stopping[: len(controls)]).states[steps]
+        still = np.zeros(window.goal.shape, np.float32)
+        for t in range(steps, steps + self._stop_steps):
+            stopping[t] = track_velocities(window, states, still)
+            states = self._engine.step(window.arrays, states, docked, stopping[t]).states
+        return stopping
+
+    def stop(self, joint: JointState, docked: BoolArray) -> FloatArray:
+        """``(H_predict + S, K, m)`` controls that bring everyone to rest now."""
+        nothing = self.no_controls()
+        present = self.problem.resumed_at(joint.states, joint.goals, horizon=len(nothing))
+        return self._with_stop(present, nothing, 0, docked)
+
+    def _safe_mix(
+        self, window: Problem, fresh: FloatArray, special: BoolArray, sampled: FloatArray, now: Situation
+    ) -> Prediction:
+        """Fresh controls where they keep everyone apart; where not, robots stop earlier, or do as they had in mind.
+
+        Those whose controls are ``special`` ``(K,)`` do as sampled before they stop.
+
+        What they had in mind was free of violations, and ends at rest. So without disturbances there always is a mix
+        that is free of them too: in the last resort everybody does as before.
+        """
+        horizon = len(fresh)
+        before = np.zeros((horizon + self._stop_steps, *fresh.shape[1:]), np.float32)
+        before[: len(now.left)] = now.left
+        controls = self._with_stop(window, fresh, horizon, now.docked)
+        window_to_rest = window.resumed_at(window.start, window.goal, horizon=len(controls))
+        # After how many fresh steps each robot stops.
+        steps = np.full(window.num_robots, horizon)
+        trajectory, violated = self._violations(window_to_rest, controls, now)
+        if (held := violated & special).any():
+            fresh = np.where(held[:, None], sampled, fresh)
+            controls[:, held] = self._with_stop(window, fresh, horizon, now.docked)[:, held]
+            trajectory, violated = self._violations(window_to_rest, controls, now)
+        while (violating := violated & (steps > 0)).any():
+            steps[violating] //= SHORTER
+            steps[steps < self._config.execute_horizon] = 0
+            for number in np.unique(steps[violating]):
+                fewer = self._with_stop(window, fresh, int(number), now.docked) if number else before
+                chosen = violating & (steps == number)
+                controls[:, chosen] = fewer[:, chosen]
+            trajectory, violated = self._violations(window_to_rest, controls, now)
+        return Prediction(controls, trajectory.positions, least_gap(window, trajectory.positions[1:]))
+
+    def _violations(self, window: Problem, controls: FloatArray, now: Situation) -> tuple[Trajectory, BoolArray]:
+        """The rollout, and ``(K,)`` who comes too near to anything in it.
+
+        That is within the margin; of half of it for those that are stuck; nearer than now for who is within it already.
+        """
+        trajectory, radius = self._engine.rollout(window, controls), np.asarray(window.team.radius)
+        violated: BoolArray = np.any(trajectory.margin_violated[1:], axis=0)
+        lenient = trajectory.margin_violated[0] | now.stuck
+        if lenient.any():
+            places = trajectory.positions[0]
+            gap = min(least_gap(window, places[None]), float((window.world.clearance(places) - radius).min()))
+            allowed = min(gap - ROUNDING, window.margin / 2 if now.stuck.any() else window.margin)
+            nearer = window.resumed_at(window.start, window.goal, margin=max(allowed, 0.0))
+            violated[lenient] = self._engine.rollout(nearer, controls).margin_violated[1:, lenient].any(axis=0)
+        return trajectory, violated | self._meets_bodies(now.joint, trajectory, window.margin)
+
+    def _meets_bodies(self, joint: JointState, trajectory: Trajectory, margin: float) -> BoolArray:
+        """``(K,)`` who comes within a margin of a body that is no robot."""
+        bodies = self._bodies(joint, len(trajectory.controls))
+        if bodies is None:
+            return np.zeros(self.problem.num_robots, bool)
+        away = np.linalg.norm(trajectory.positions[1:, :, None] - bodies.positions[:, None], axis=3)
+        reach = np.asarray(self.problem.team.radius)[:, None] + bodies.radius + margin
+        meets: BoolArray = (away <= reach).any(axis=(0, 2))
+        return meets
+
+    def touching(self, joint: JointState, docked: BoolArray, controls: FloatArray, gap: float) -> BoolArray:
+        """``(K,)`` who comes within a gap [m] of anything if all execute ``controls`` ``(T, K, m)``, and a stop."""
+        radius = docking_radius(self.problem, self._docks)
+        present = self.problem.resumed_at(
+            joint.states, joint.goals, horizon=len(controls), margin=gap, goal_radius=radius
+        )
+        trajectory = self._engine.rollout(present, controls)
+        touches: BoolArray = trajectory.margin_violated[1:].any(axis=0) & ~docked
+        return touches | self._meets_bodies(joint, trajectory, gap) & ~docked
+
+
+def least_gap(problem: Problem, positions: FloatArray) -> float:
+    """Least gap between the surfaces of any two robots on ``(T, K, d)`` [m]."""
+    radius = np.asarray(problem.team.radius)
+    first, second = np.triu_indices(problem.num_robots, 1)
+    if not len(first):
+        return float("inf")
+    gap2 = np.zeros((len(positions), len(first)), positions.dtype)
+    for axis in range(positions.shape[2]):
+        gap2 += (positions[:, first, axis] - positions[:, second, axis]) ** 2
+    return float((np.sqrt(gap2.min(axis=0)) - radius[first] - radius[second]).min())

@@ -1,0 +1,231 @@
+"""D4orm-C2F: receding-horizon control along a coarse plan (paper, section VI, Algorithm 4)."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.seeds import Stream, derived_seed, generator
+from d4orm_env.engine.choice import get_engine
+from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_planners.d4orm_c2f.background import Background
+from d4orm_planners.d4orm_c2f.barrier import safe_velocities
+from d4orm_planners.d4orm_c2f.coarse_plan import Guidance, Waypoints
+from d4orm_planners.d4orm_c2f.deviation import Deviation
+from d4orm_planners.d4orm_c2f.coarse_plan_tracker import Guide
+from d4orm_planners.d4orm_c2f.settings import PAPER_CONTROL, D4ormC2FConfig
+from d4orm_planners.d4orm_c2f.stall_estimator import PROBE
+from d4orm_planners.d4orm_c2f.fine_plan import Prediction, Situation, Window
+from d4orm_planners.base.policy import StatePolicy
+from d4orm_planners.base.settings import CheckedSettings
+from d4orm_planners.tracking.steering import drive_to_goal, present_velocities, track_velocities
+
+if TYPE_CHECKING:
+    from pettingzoo import ParallelEnv
+
+GAP = 0.4
+"""Share of the margin that is kept in the last resort."""
+
+REMEMBERED = 10_000
+"""Control loops; an episode with ever new goals has no end."""
+
+NEARLY = 1e-3
+"""Velocities that differ by no more are the same [m/s]."""
+
+
+@dataclass(frozen=True)
+class LoopRecord:
+    """What one control loop did.
+
+    Attributes:
+        step: The environment's step at which it began.
+        wall_time: Time used [s].
+        subgoal_index: Waypoint of the guidance that the team headed for.
+        predicted_margin: Least gap between the surfaces of any two robots over the prediction [m]; infinite for one
+            robot.
+        missed: Whether it took longer than the deadline, so that the last plan went on.
+        replanned: Whether the guidance was planned anew.
+        refined: Whether a refined guidance was taken over.
+    """
+
+    step: int
+    wall_time: float
+    subgoal_index: int
+    predicted_margin: float
+    missed: bool
+    replanned: bool
+    refined: bool
+
+
+class D4ormC2F(StatePolicy):
+    """Follows a coarse plan of the whole team by short fine plans from wherever the robots are, loop by loop.
+
+    Attributes:
+        config: The settings.
+        loops: A :class:`LoopRecord` per control loop of the present episode, of the last :data:`REMEMBERED`.
+        coarse_time: Time that the first coarse plan took [s].
+        subgoals: ``(K, d)`` where the last control loop headed for [m]; the start before the first.
+        predicted: ``(1 + T, K, d)`` where its plan led, robots that brake or evade in the last resort apart [m].
+    """
+
+    name = "d4orm-c2f"
+    config_class: ClassVar[type[CheckedSettings] | None] = D4ormC2FConfig
+    presets: ClassVar = {"paper": PAPER_CONTROL}
+
+    def __init__(self, config: D4ormC2FConfig | None = None) -> None:
+        self.config = config or D4ormC2FConfig()
+        self._engine = get_engine(self.config.engine)
+        # On one thread the refinement leaves the other cores, and their threads, to the control loop.
+        self._refiner = get_engine(self.config.engine, 1 if self.config.refine == "background" else None)
+        self._refinement: Background[Guidance] = Background(yielding=True)
+        self._control: Background[Prediction] = Background()
+
+    @property
+    def missed(self) -> int:
+        """Control loops that missed the deadline."""
+        return sum(loop.missed for loop in self.loops)
+
+    @property
+    def guidance(self) -> Waypoints:
+        """What is followed at present."""
+        return self._guide.guidance
+
+    def _begin(self, env: ParallelEnv, seed: int) -> None:
+        self._seed = seed
+        self._random = generator(seed, Stream.CONTROLLER_NOISE)
+        self._refinement.forget()
+        self._control.forget()
+        self.loops: deque[LoopRecord] = deque(maxlen=REMEMBERED)
+        self._begun = 0
+        joint = split_state(self.problem, env.state())
+        lifelong = env.unwrapped.lifelong
+        self._window = Window(self.problem, self.config, self._engine, docks=not lifelong)
+        self._window.prepare(joint)
+        self._plan, self._next = self._window.no_controls(), 0
+        self.subgoals: FloatArray = joint.states[:, : self.problem.dimension]
+        self.predicted: FloatArray = self.subgoals[None]
+        self._homes = np.full_like(joint.goals, np.nan)
+        self._see_docked(joint)
+        begin = time.perf_counter()
+        last_step = env.unwrapped.max_cycles
+        self._guide = Guide(self.problem, self.config, seed, self._refiner, self._refinement, lifelong, last_step)
+        self._guide.begin(joint, self._docked)
+        self._deviation = Deviation(self.problem, self._engine, self.config, docks=not lifelong)
+        self.coarse_time = time.perf_counter() - begin
+
+    def _controls(self, joint: JointState) -> FloatArray:
+        goals = joint.goals
+        joint = self._deviation.observe(joint)
+        self._see_docked(joint)
+        believed = self._window.problem = self._guide.problem = self._deviation.problem
+        if not self.loops or self._next >= self.config.execute_horizon:
+            self._loop(joint)
+        controls = self._plan[min(self._next, len(self._plan) - 1)]
+        if self.config.last_resort:
+            controls = self._evading(joint, controls)
+        self._next += 1
+        if (standing := self._deviation.standing) is not None and standing.robots.any():
+            probe = PROBE * drive_to_goal(believed, joint.states, goals)
+            controls = np.where(standing.robots[:, None], probe, controls)
+        if self.config.control_noise_std:
+            noise = self._random.normal(0, self.config.control_noise_std, controls.shape)
+            limit = self.problem.team.control_limits
+            controls = np.clip(controls + noise, -limit, limit).astype(np.float32)
+        self._deviation.expect(controls)
+        return controls
+
+    def _evading(self, joint: JointState, controls: FloatArray) -> FloatArray:
+        """The controls ``(K, m)``, but for robots that might come to touch something: these brake, or evade."""
+        problem, docked = self._deviation.problem, self._docked
+        gap, now = GAP * problem.margin, min(self._next, len(self._plan) - 1)
+        touching = self._window.touching(joint, docked, self._plan[now:], gap)
+        caution = self._deviation.caution
+        if not touching.any() and not caution:
+            return controls
+        if touching.any():
+            # A late loop may still be reading the plan.
+            self._plan = self._plan.copy()
+            self._plan[now:, touching] = self._window.stop(joint, docked)[: len(self._plan) - now, touching]
+        # Now they are told all that they may be able to do, whatever they are believed to be.
+        braking = track_velocities(self.problem, joint.states, np.zeros_like(joint.goals))
+        controls = np.where(touching[:, None], braking, controls)
+        run = 0 if (losses := self._deviation.losses) is None else losses.run
+        # Also in between, for there may be a corner to get around; and again, for one answer may be another's question.
+        for steps in 2 * (1 + run, 1 + run // 2, 1) if run else (1,):
+            controls = self._braking_in_time(joint, controls, gap, caution if steps == 1 else 0.0, steps)
+        return controls
+
+    def _braking_in_time(
+        self, joint: JointState, controls: FloatArray, gap: float, caution: float, steps: int
+    ) -> FloatArray:
+        """The controls ``(K, m)``, but for robots that could not brake in time any more after so many steps of them."""
+        problem, docked, states = self._deviation.problem, self._docked, joint.states
+        arrays = self._deviation.arrays(joint)
+        for _ in range(steps):
+            ahead = self._engine.step(arrays, states, docked, controls)
+            states = ahead.states
+        wanted = present_velocities(problem, states, ahead.controls)
+        # Other velocities are reached by the next step, by which everybody will be elsewhere.
+        safe = safe_velocities(problem, joint._replace(states=states), wanted, ~docked, gap, caution)
+        evading = np.abs(safe - wanted).max(axis=1) > NEARLY
+        if steps > 1:
+            velocities = present_velocities(problem, joint.states, joint.controls)
+            safe = velocities + (safe - velocities) / np.float32(steps)
+        return np.where(evading[:, None], track_velocities(self.problem, joint.states, safe), controls)
+
+    def _loop(self, joint: JointState) -> None:
+        """One control loop (Algorithm 4, lines 6 to 9)."""
+        begin = time.perf_counter()
+        guide, docked = self._guide, self._docked
+        replanned = guide.replan_if_needed(joint, docked)
+        refined = not replanned and guide.refine(joint.steps, due=self._begun % self.config.refine_every == 0)
+        self._begun += 1
+        targets = guide.subgoals(joint, docked)
+        self.subgoals = subgoals = guide.guidance.path[targets, np.arange(len(targets))]
+        left, base = self._plan[self._next :], self._base(joint)
+        seed = derived_seed(self._seed, Stream.CONTROL_LOOP, joint.steps)
+        stuck = guide.stuck & ~docked
+        careful = guide.followed(joint, self._engine, len(base)) if stuck.any() else None
+        room = self._deviation.room(self.config.reaction_time)
+        now = Situation(joint, docked, subgoals, base, left, careful, stuck, room)
+
+        def predict() -> Prediction:
+            return self._window.predict(now, seed)
+
+        result: Prediction | None
+        if self.config.deadline is None:
+            result = predict()
+        else:
+            result = self._control.run(predict, self.config.deadline - (time.perf_counter() - begin))
+        if result is not None:
+            self._plan, self._next, self.predicted = result.controls, 0, result.positions
+        margin = float("nan") if result is None else result.gap
+        used = time.perf_counter() - begin
+        missed = result is None
+        self.loops.append(LoopRecord(joint.steps, used, int(targets.max()), margin, missed, replanned, refined))
+
+    def _base(self, joint: JointState) -> FloatArray:
+        """``(H_predict, K, m)`` controls to deform: what is left of the last loop's.
+
+        Where who waits for whom decides, the coarse plan's own pace is kept instead.
+        """
+        horizon = self.config.predict_horizon
+        if self._guide.guidance.ordered:
+            return self._guide.timed(joint, self._engine, horizon)
+        base = self._window.no_controls()
+        ahead = self._plan[self._next : horizon]
+        base[: len(ahead)] = ahead
+        self._guide.fresh_start(base)
+        return base
+
+    def _see_docked(self, joint: JointState) -> None:
+        """Note who has arrived, and was where it has to be: noise on measurements sends nobody off again."""
+        gap = np.linalg.norm(joint.goals - joint.states[:, : self.problem.dimension], axis=1)
+        here = joint.arrived & (gap <= self.problem.goal_radius)
+        self._homes = np.where(here[:, None], joint.goals, self._homes)
+        self._docked: BoolArray = joint.arrived & (joint.goals == self._homes).all(axis=1)

@@ -1,0 +1,63 @@
+"""A team's controls in the course of an iteration, deformed for some robots after others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.seeds import Stream
+from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.engine.types import MovingObstacles, SamplingTask
+from d4orm_planners.sampling.d4orm import D4orm
+from d4orm_planners.base.planner import Iteration
+from d4orm_planners.mapf.working_plan import TeamPaths
+from d4orm_planners.base.solve import Search
+
+
+class DeformedTeam(TeamPaths):
+    """What the team does, some robots' controls deformed around all others.
+
+    Args:
+        planner: Whose rules deformations go by.
+        search: The search.
+        trajectory: What the team does at first.
+    """
+
+    def __init__(self, planner: D4orm, search: Search, trajectory: Trajectory) -> None:
+        super().__init__(search, trajectory)
+        self.planner = planner
+        self._denoising_steps = self._excluded = self._runs = 0
+
+    def deformed(
+        self, robots: Sequence[int], horizon: int, num_samples: int, noise_scale: FloatArray, **scoring: Any
+    ) -> tuple[Problem, FloatArray, Trajectory]:
+        """Deform these robots' first ``horizon`` controls around all others.
+
+        Returns:
+            The problem of these robots alone, their new controls as planned, and the rollout of those in it.
+        """
+        planner, search, problem = self.planner, self.search, self.problem
+        part = problem.select(robots)
+        others = np.setdiff1d(np.arange(problem.num_robots), robots)
+        moving = None
+        if len(others):
+            radius = np.asarray(problem.team.radius)[others]
+            moving = MovingObstacles(self.positions[1 : horizon + 1, others], radius)
+        base = np.ascontiguousarray(self.controls[:horizon, robots, : part.control_size])
+        task = SamplingTask(part.resumed_at(part.start, part.goal, horizon=horizon), base, moving=moving, **scoring)
+        self._runs += 1
+        start, seed = planner.start(search, base, self._runs), search.iteration_seed(Stream.REPAIR, self._runs)
+        result = search.denoise(task, planner.rules(), start, noise_scale, num_samples, seed)
+        self._denoising_steps += len(result.rewards)
+        self._excluded += result.excluded
+        controls = np.zeros((problem.horizon, len(robots), part.control_size), np.float32)
+        controls[:horizon] = base + result.mean
+        return part, controls, search.engine.rollout(part, controls)
+
+    def iteration(self) -> Iteration:
+        """What came of it."""
+        return Iteration(self.controls, self._denoising_steps, self._excluded)

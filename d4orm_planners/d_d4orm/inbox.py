@@ -1,0 +1,110 @@
+"""What a node has received: the newest candidate of every other node, judged anew, and a count of the rest."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from d4orm_planners.base.candidate import Candidate
+from d4orm_planners.d_d4orm.evaluator import Judge
+from d4orm_planners.d_d4orm.messages import KINDS, Message, MessageError, decode
+from d4orm_planners.d_d4orm.selection import merge
+from d4orm_planners.d_d4orm.transport import Transport
+
+logger = logging.getLogger(__name__)
+
+TOLERANCE = 1e-3
+"""Rewards that differ by more than this are not the same; engines round differently."""
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """A candidate of another node as it was found to be here.
+
+    Attributes:
+        node: Who sent it.
+        sequence: Which of its candidates it is.
+        candidate: Rolled out and judged by the receiver.
+    """
+
+    node: int
+    sequence: int
+    candidate: Candidate
+
+
+class Inbox:
+    """Takes messages from a transport; nothing that arrives makes it raise.
+
+    Args:
+        judge: What judges the candidates.
+        transport: Where messages arrive.
+        num_nodes: How many nodes there are.
+        own: The node that it belongs to, or ``None`` for an observer's.
+
+    Attributes:
+        newest: The newest report of every node heard from, by node.
+        dropped: How many messages were dropped, by :data:`~d4orm_planners.d_d4orm.messages.KINDS`.
+        false_claims: Candidates that were not what their sender claimed. They count for what they are.
+        namesake: The number of the last candidate that another node sent under this one's own number, or ``None``.
+    """
+
+    def __init__(self, judge: Judge, transport: Transport, num_nodes: int, own: int | None = None) -> None:
+        self._judge, self._transport = judge, transport
+        self._num_nodes, self._own = num_nodes, own
+        self._owner = "the observer" if own is None else f"node {own}"
+        self._logged: set[str] = set()
+        self.newest: dict[int, Report] = {}
+        # All kinds from the beginning: other threads look at it, which a growing dictionary does not bear.
+        self.dropped: Counter[str] = Counter(dict.fromkeys(KINDS, 0))
+        self.false_claims = 0
+        self.namesake: int | None = None
+
+    def receive(self, timeout: float = 0.0) -> list[Report]:
+        """The new reports among what has arrived, by node; waits up to ``timeout`` [s] if nothing has."""
+        messages = []
+        for data in self._transport.collect(timeout):
+            try:
+                messages.append(self._decoded(data))
+            except MessageError as error:
+                self._drop(error.kind, str(error))
+        newest: dict[int, Report | Message]
+        newest, stale = merge(dict(self.newest), messages)
+        for message in stale:
+            self._drop("stale", f"number {message.sequence} of node {message.node}, which has sent a newer one")
+        fresh = [newest[node] for node in sorted(newest)]
+        reports = [self._judged(item) for item in fresh if isinstance(item, Message)]
+        self.newest |= {report.node: report for report in reports}
+        return reports
+
+    def _decoded(self, data: bytes) -> Message:
+        message = decode(data, self._judge.problem, self._num_nodes)
+        if message.node == self._own:
+            self.namesake = message.sequence
+            raise MessageError("node", f"claims to be from node {message.node}, which has received it")
+        return message
+
+    def _judged(self, message: Message) -> Report:
+        # What is sent again, by the same node or another, need not be verified again, which takes its time.
+        known = (report.candidate for report in self.newest.values())
+        same = (candidate for candidate in known if np.array_equal(candidate.planned, message.controls))
+        candidate = next(same, None) or self._judge.received(message.controls)
+        reward = candidate.reward
+        if candidate.solved != message.feasible or abs(reward - message.reward) > TOLERANCE:
+            self.false_claims += 1
+            claimed, found = (f"reward {r:g}, feasible {f}" for r, f in
+                              ((message.reward, message.feasible), (reward, candidate.solved)))  # fmt: skip
+            self._log("false claim", f"node {message.node} claims {claimed}; found {found}")
+        return Report(message.node, message.sequence, candidate)
+
+    def _drop(self, kind: str, text: str) -> None:
+        self.dropped[kind] += 1
+        self._log(kind, text)
+
+    def _log(self, kind: str, text: str) -> None:
+        """Warn of the first of its kind; a flood of them would drown everything else."""
+        if kind not in self._logged:
+            self._logged.add(kind)
+            logger.warning("%s received a message with a fault (%s): %s", self._owner, kind, text)

@@ -1,0 +1,66 @@
+"""One node of this process among others on a network."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+from d4orm_planners.base.candidate import Candidate
+from d4orm_planners.d_d4orm.node_pool import SyncCrew
+from d4orm_planners.d_d4orm.evaluator import Judge
+from d4orm_planners.d_d4orm.node import Node
+from d4orm_planners.d_d4orm.transport import Transport
+
+logger = logging.getLogger(__name__)
+
+
+class NetworkCrew(SyncCrew):
+    """A single node here; a round is over when the others were heard from, or patience has ended.
+
+    Args:
+        node: The node.
+        transport: Its access to the others.
+        patience: See :class:`~d4orm_planners.d_d4orm.node_pool.Crew`.
+        judge: See :class:`~d4orm_planners.d_d4orm.node_pool.Crew`.
+        linger: Seconds that a solution is sent to the others in the end, see :meth:`Node.settle`.
+    """
+
+    def __init__(self, node: Node, transport: Transport, patience: float, judge: Judge, linger: float) -> None:
+        super().__init__([node], [transport], patience, judge)
+        self._node, self._linger = node, linger
+        self._seen: set[int] = set()
+
+    def close(self) -> Candidate:
+        """See :meth:`Crew.close`; before it, a solution is sent to the others."""
+        self._judge.stop.set()
+        try:
+            for job in self._jobs:
+                job.wait(self.patience)
+            self._node.settle(self._linger)
+            self._report_new_nodes()
+        except KeyboardInterrupt:
+            logger.info("interrupted while telling the others")
+        finally:
+            best = super().close()
+        # Waiting is part of a node's own round here.
+        self._waited = self._node.transport.waited
+        return best
+
+    def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
+        """See :meth:`Crew._round`."""
+        left = time_left()
+        patience = self.patience if left is None else min(self.patience, max(left, 0.0))
+        self._all(lambda node: node.step(self._judge.stop, patience, improve), time_left)
+        self._node.check_number()
+        if not self.alive:
+            # What others have sent is not lost with the planner here.
+            self._node.settle(0.0)
+            best = self._node.search.best
+            return [best] if best.solved and not improve else []
+        self._report_new_nodes()
+        return [self._node.candidate, *(report.candidate for report in self._node.inbox.newest.values())]
+
+    def _report_new_nodes(self) -> None:
+        for number in sorted(set(self._node.inbox.newest) - self._seen):
+            logger.info("heard from node %d", number)
+            self._seen.add(number)

@@ -1,0 +1,228 @@
+"""One node of D-D4orm: refine, broadcast, collect, choose (paper, Algorithm 5)."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.seeds import Stream, derived_seed
+from d4orm_planners.base.candidate import Candidate
+from d4orm_planners.d_d4orm.node_events import Event, Observer
+from d4orm_planners.d_d4orm.inbox import TOLERANCE, Inbox
+from d4orm_planners.d_d4orm.evaluator import Judge
+from d4orm_planners.d_d4orm.messages import Message, encode
+from d4orm_planners.d_d4orm.traffic import Meter
+from d4orm_planners.d_d4orm.selection import choose
+from d4orm_planners.d_d4orm.transport import Transport
+from d4orm_planners.base.planner import Planner
+from d4orm_planners.base.solve import Search
+
+RESEND = 0.2
+"""Seconds after which a candidate is sent again, as messages may get lost."""
+
+
+def node_seed(seed: int, node: int) -> int:
+    """The seed of a node; the first one's is the solve's own, so that a single node is the planner that it runs."""
+    return seed if node == 0 else derived_seed(seed, Stream.NODE, node)
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What the nodes of one solve have in common.
+
+    Attributes:
+        num_nodes: How many nodes there are.
+        seed: That of the whole solve.
+        controls: ``(H, K, m)`` to start from; ``None`` for zeros.
+        selection: How a node chooses what to go on from; see :func:`~d4orm_planners.d_d4orm.selection.choose`.
+        k: How many candidates it draws from.
+    """
+
+    num_nodes: int
+    seed: int
+    controls: FloatArray | None
+    selection: str
+    k: int
+
+
+class Node:
+    """A planner that exchanges candidates with others.
+
+    Args:
+        number: Its number, from 0.
+        task: What it has in common with the others.
+        planner: What it refines its candidate with.
+        transport: Its access to the others.
+        judge: What rolls out and judges, in common with other nodes of this process.
+        sequence: The number before that of its first message; more than any that it sent before, if it did, and on a
+            network the time at which it began, by which two nodes of one number know who was first.
+        observer: Called with every :class:`~d4orm_planners.d_d4orm.node_events.Event`, in the node's own thread.
+
+    Attributes:
+        number: From 0.
+        search: Its own search.
+        candidate: The candidate that it made last.
+        transport: What it sends and receives by, with a count.
+        inbox: What the others sent.
+        excluded: Samples left out so far because their reward was not finite.
+    """
+
+    def __init__(
+        self,
+        number: int,
+        task: Task,
+        planner: Planner,
+        transport: Transport,
+        judge: Judge,
+        sequence: int = 0,
+        observer: Observer | None = None,
+    ) -> None:
+        self.number = number
+        seed = node_seed(task.seed, number)
+        self.search = Search(planner, judge.problem, seed, task.controls, judge.engine, judge.own)
+        self.search.cancelled = judge.stop
+        self.candidate = self.search.current
+        self.transport = Meter(transport)
+        self.inbox = Inbox(judge, self.transport, task.num_nodes, number)
+        self.excluded = 0
+        self._task = task
+        self._sequence = self._began = sequence
+        self._observer = observer
+        self._others = set(range(task.num_nodes)) - {number}
+        self._awaited = self._others
+
+    def refine(self) -> None:
+        """One iteration of the planner; its candidate is broadcast."""
+        begin = time.perf_counter()
+        self.excluded += self.search.advance().excluded
+        self.candidate = self.search.current
+        self._note("computed", self.number, 0, self.candidate, begin)
+        self._publish(self.candidate)
+
+    def exchange(self) -> None:
+        """Take what has arrived and choose what to go on from."""
+        self._gather()
+        self._choose()
+
+    def run(self, stop: threading.Event, patience: float, improve: bool) -> None:
+        """Refine and exchange until asked to stop, or until there is a solution unless it is to be improved.
+
+        It waits for the others no longer than ``patience`` [s].
+        """
+        while self.step(stop, patience, improve):
+            pass
+
+    def step(self, stop: threading.Event, patience: float, improve: bool) -> bool:
+        """One round of :meth:`run`; whether there is to be another one."""
+        self.refine()
+        if stop.is_set() or self.search.time_left == 0 or (self.search.best.solved and not improve):
+            return False
+        self._await_others(stop, patience)
+        if self.search.best.solved and not improve:
+            return False
+        self._choose()
+        return True
+
+    def check_number(self) -> None:
+        """Raise ``ValueError`` if another node has this one's number, and had it first."""
+        namesake = self.inbox.namesake
+        if namesake is not None and namesake <= self._began:
+            last = len(self._others)
+            raise ValueError(
+                f"node is {self.number}, and another process on the network is node {self.number} already; give each "
+                f"a number of its own, from 0 to {last}"
+            )
+
+    def settle(self, seconds: float) -> bool:
+        """Send the best candidate again and again, until all others have one as good or the seconds are over.
+
+        Without a solution it only takes what has arrived.
+
+        Returns:
+            Whether all others have sent a solution as good as the best one here.
+        """
+        self._gather()
+        deadline = time.perf_counter() + seconds
+        sent, again = None, 0.0
+        while self.search.best.solved:
+            now = time.perf_counter()
+            if sent is not self.search.best or now >= again:
+                sent, again = self.search.best, now + RESEND
+                self._publish(sent)
+            if self._all_have(sent):
+                return True
+            if now >= deadline:
+                break
+            self._gather(min(again, deadline) - now)
+        return False
+
+    def _publish(self, candidate: Candidate) -> None:
+        self._sequence += 1
+        message = Message(self.number, self._sequence, candidate.planned, candidate.reward, bool(candidate.solved))
+        data = encode(message, self.search.problem)
+        self.transport.publish(data)
+        self._note("sent", self.number, self._sequence, candidate, size=len(data))
+
+    def _all_have(self, candidate: Candidate) -> bool:
+        """Whether each of the others has sent a solution as good as this one."""
+        reward = candidate.trajectory.rewards.mean() - TOLERANCE
+        reports = self.inbox.newest
+        return all(
+            node in reports
+            and reports[node].candidate.solved
+            and reports[node].candidate.trajectory.rewards.mean() >= reward
+            for node in self._others
+        )
+
+    def close(self) -> None:
+        """Let go of what the planner left open."""
+        self.search.close()
+
+    def _await_others(self, stop: threading.Event, patience: float) -> None:
+        """Gather until everybody heard from the last time is heard from again, or patience ends."""
+        deadline = time.perf_counter() + patience
+        heard = self._gather()
+        while not (stop.is_set() or heard >= self._awaited):
+            rest = deadline - time.perf_counter()
+            if rest <= 0:
+                break
+            heard |= self._gather(rest)
+        # Who is silent, maybe for ever, is awaited again only when heard from.
+        self._awaited = heard
+
+    def _gather(self, timeout: float = 0.0) -> set[int]:
+        """Who sent something new."""
+        reports = self.inbox.receive(timeout)
+        for report in reports:
+            self._note("received", report.node, report.sequence, report.candidate)
+            if report.candidate.rank > self.search.best.rank:
+                self.search.best = report.candidate
+        return {report.node for report in reports}
+
+    def _choose(self) -> None:
+        reports = self.inbox.newest
+        received = {node: (report.sequence, report.candidate) for node, report in reports.items()}
+        received[self.number] = (self._sequence, self.candidate)
+        nodes = sorted(received)
+        candidates = [received[node][1] for node in nodes]
+        chosen = choose(
+            self._task.selection,
+            [candidate.trajectory.rewards.mean() for candidate in candidates],
+            np.stack([candidate.controls for candidate in candidates]),
+            self._task.k,
+            np.random.default_rng(self.search.iteration_seed(Stream.CHOICE)),
+        )
+        self.search.current = candidates[chosen]
+        self._note("selected", nodes[chosen], *received[nodes[chosen]])
+
+    def _note(
+        self, kind: str, of: int, sequence: int, candidate: Candidate, begin: float | None = None, size: int = 0
+    ) -> None:
+        if self._observer is not None:
+            now = time.perf_counter()
+            start = now if begin is None else begin
+            self._observer(Event(self.number, kind, start, now, of, sequence, candidate, size))

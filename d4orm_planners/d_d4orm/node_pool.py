@@ -1,0 +1,323 @@
+"""Nodes in threads of one process: synchronous rounds, or every node at its own pace."""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Sequence
+
+from d4orm_planners.base.candidate import Candidate
+from d4orm_planners.d_d4orm.inbox import Inbox
+from d4orm_planners.d_d4orm.evaluator import Judge, Stopped
+from d4orm_planners.d_d4orm.node import Node
+from d4orm_planners.d_d4orm.transport import Transport
+from d4orm_planners.base.planner import Iteration
+from d4orm_planners.base.solve import Search
+
+logger = logging.getLogger(__name__)
+
+MODES = ("sync", "async")
+
+GLANCE = 0.05
+"""Seconds between looks at whether the nodes still live, while nothing arrives."""
+
+
+LAST_WAIT = 30.0
+"""Seconds that the end of the process waits for a thread that nobody else waited for: native code must not be cut."""
+
+
+class _Job:
+    """Work of a node, to be done in a thread of its own; an exception is kept instead of lost."""
+
+    def __init__(self, node: Node, work: Callable[[Node], object]) -> None:
+        self.node = node
+        self.error: Exception | None = None
+        self._work = work
+        self._begin: float | None = None
+        self._end: float | None = None
+        self._over = threading.Event()
+        # A node that hangs must not keep the process from ending for ever.
+        self._thread = threading.Thread(target=self._run, daemon=True, name=f"d-d4orm-{node.number}")
+
+    def start(self) -> None:
+        """Begin.
+
+        Ctrl-C may come while the thread starts, so whoever has to wait for it must know of this job before.
+        """
+        self._begin = time.perf_counter()
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self._work(self.node)
+        except Stopped:
+            pass
+        except Exception as error:  # whatever it is, it concerns this node only
+            self.error = error
+        finally:
+            self._end = time.perf_counter()
+            self._over.set()
+
+    @property
+    def running(self) -> bool:
+        """Whether it has begun and is not over."""
+        return self._begin is not None and not self._over.is_set()
+
+    @property
+    def seconds(self) -> float:
+        """How long it has taken."""
+        if self._begin is None:
+            return 0.0
+        return (self._end or time.perf_counter()) - self._begin
+
+    def wait(self, timeout: float | None) -> None:
+        """Wait while it runs, no longer than ``timeout`` [s]."""
+        # A thread whose start was interrupted cannot be joined before it has run.
+        if self._begin is not None and self._over.wait(timeout):
+            self._thread.join()
+
+    def leave(self) -> None:
+        """Wait for it no longer, except at the end of the process."""
+        if self.running:
+            atexit.register(self.wait, LAST_WAIT)
+
+
+class Crew(ABC):
+    """The nodes of one solve.
+
+    Args:
+        nodes: The nodes.
+        transports: All ends to close in the end.
+        patience: Seconds that are waited for stragglers: beyond the time limit, and when asynchronous in every round.
+        judge: The nodes' common judge.
+    """
+
+    def __init__(self, nodes: Sequence[Node], transports: Sequence[Transport], patience: float, judge: Judge) -> None:
+        self.alive = list(nodes)
+        self.patience = patience
+        self._judge = judge
+        self._nodes = tuple(nodes)
+        self._transports = tuple(transports)
+        self._jobs: list[_Job] = []
+        self._notes: list[str] = []
+        self._losses: list[str] = []
+        self._error: Exception | None = None
+        self._reported: Counter[str] = Counter()
+        self._spent = self._excluded = 0
+        self._read: Counter[Node] = Counter()
+        self._seconds = self._waited = 0.0
+
+    def iterate(self, search: Search) -> Iteration:
+        """The best new candidate, after a round of all nodes that live.
+
+        Raises:
+            RuntimeError: If every node has failed, from the error of the last one.
+        """
+        self._check_alive()
+        compiled_before = {node: node.search.watch.paused_seconds for node in self.alive}
+
+        def compiling() -> float:
+            paused = (node.search.watch.paused_seconds - before for node, before in compiled_before.items())
+            return min(paused, default=0.0)
+
+        def time_left() -> float | None:
+            if search.time_limit is None:
+                return None
+            return search.time_limit - search.watch.elapsed + compiling()
+
+        left = time_left()
+        for node in self.alive:
+            node.search.time_limit = None if left is None else node.search.watch.elapsed + left
+        candidates = self._round(time_left, search.planner.config.improve)
+        search.watch.leave_out(compiling())
+        if not candidates and not self.alive:
+            self._check_alive()
+        best = max(candidates, key=lambda candidate: candidate.rank, default=search.current)
+        return self._iteration(best)
+
+    def close(self) -> Candidate:
+        """Part the nodes, and give the best candidate that they have seen.
+
+        A thread leaves what it is at where it can, and nobody waits longer for it than patience.
+        """
+        self._judge.stop.set()
+        for node in self._nodes:
+            node.close()
+        for transport in self._transports:
+            transport.close()
+        deadline = time.perf_counter() + self.patience
+        for job in self._jobs:
+            if job.node in self.alive:
+                job.wait(max(deadline - time.perf_counter(), 0))
+            job.leave()
+        return max((node.search.best for node in self._nodes), key=lambda candidate: candidate.rank)
+
+    def metrics(self) -> dict[str, float]:
+        """What all nodes together sent, and the share of their time that they waited for each other.
+
+        To be asked for once closed.
+        """
+        meters = [node.transport for node in self._nodes]
+        return {
+            "messages": sum(meter.messages for meter in meters),
+            "message_bytes": sum(meter.message_bytes for meter in meters),
+            "waiting_share": self._waited / self._seconds if self._seconds else 0.0,
+        }
+
+    @abstractmethod
+    def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
+        """New candidates of the nodes.
+
+        Args:
+            time_left: Returns the seconds left, below zero when overdue.
+            improve: Whether nodes go on once there is a solution.
+        """
+
+    def _lose(self, job: _Job, reason: str) -> None:
+        self.alive.remove(job.node)
+        loss = f"node {job.node.number} {reason}"
+        logger.warning("%s", loss, exc_info=job.error)
+        self._notes.append(loss)
+        self._losses.append(loss)
+
+    def _lose_failed(self, job: _Job) -> None:
+        assert job.error is not None
+        self._error = job.error
+        self._lose(job, f"failed ({type(job.error).__name__}: {' '.join(str(job.error).split())})")
+
+    def _check_alive(self) -> None:
+        if not self.alive and self._error is not None:
+            raise RuntimeError(
+                f"all {len(self._nodes)} nodes of d-d4orm are lost: {'; '.join(self._losses)}"
+            ) from self._error
+
+    def _iteration(self, best: Candidate) -> Iteration:
+        steps = max(node.search.denoising_steps for node in self._nodes)
+        excluded = sum(node.excluded for node in self._nodes)
+        faults: Counter[str] = Counter()
+        for node in self._nodes:
+            faults += node.inbox.dropped
+            faults["false claim"] += node.inbox.false_claims
+        new = faults - self._reported
+        notes = self._notes + self._node_notes() + [f"received {count} x {kind}" for kind, count in sorted(new.items())]
+        iteration = Iteration(best.controls, steps - self._spent, excluded - self._excluded, "; ".join(notes), best)
+        self._spent, self._excluded, self._reported, self._notes = steps, excluded, faults, []
+        return iteration
+
+    def _node_notes(self) -> list[str]:
+        """What the nodes' planners noted since the last time."""
+        notes = []
+        for node in self._nodes:
+            records = node.search.history[self._read[node] :]
+            self._read[node] += len(records)
+            notes += [record.note for record in records if record.note]
+        return notes
+
+
+class SyncCrew(Crew):
+    """Rounds: all nodes refine, then all of them exchange. The same seed gives the same rounds."""
+
+    def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
+        """See :meth:`Crew._round`."""
+        self._all(Node.refine, time_left)
+        candidates = [node.candidate for node in self.alive]
+        # Judging what others claim to be solutions takes its time, and after the last round nobody goes on from it.
+        left = time_left()
+        in_time = left is None or left > 0
+        if in_time and (improve or not any(candidate.solved for candidate in candidates)):
+            self._all(Node.exchange, time_left)
+        return candidates
+
+    def _all(self, work: Callable[[Node], object], time_left: Callable[[], float | None]) -> None:
+        begin = time.perf_counter()
+        self._jobs = [_Job(node, work) for node in self.alive]
+        for job in self._jobs:
+            job.start()
+        for job in self._jobs:
+            while job.running:
+                left = time_left()
+                if left is not None and left + self.patience <= 0:
+                    break
+                job.wait(None if left is None else left + self.patience)
+            if job.running:
+                job.leave()
+                self._lose(job, "did not finish in time")
+            elif job.error is not None:
+                self._lose_failed(job)
+        seconds = time.perf_counter() - begin
+        self._seconds += seconds * len(self._jobs)
+        self._waited += sum(seconds - job.seconds for job in self._jobs)
+
+
+class AsyncCrew(Crew):
+    """Every node runs on by itself; a round is over when each was heard from, or patience ended after the first.
+
+    Args:
+        nodes: The nodes.
+        transports: All ends to close in the end.
+        patience: See :class:`Crew`.
+        judge: See :class:`Crew`.
+        observer: What the solve itself hears of the nodes.
+    """
+
+    def __init__(
+        self, nodes: Sequence[Node], transports: Sequence[Transport], patience: float, judge: Judge, observer: Inbox
+    ) -> None:
+        super().__init__(nodes, transports, patience, judge)
+        self._observer = observer
+
+    def close(self) -> Candidate:
+        """See :meth:`Crew.close`."""
+        best = super().close()
+        self._seconds += sum(job.seconds for job in self._jobs)
+        self._waited = sum(node.transport.waited for node in self._nodes)
+        return best
+
+    def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
+        """See :meth:`Crew._round`."""
+        self._run(improve)
+        heard: set[int] = set()
+        first = None
+        while True:
+            ended = not any(job.running for job in self._jobs)
+            heard |= {report.node for report in self._observer.receive(GLANCE)}
+            self._lose_dead()
+            now = time.perf_counter()
+            first = now if heard and first is None else first
+            left = time_left()
+            candidates = [self._observer.newest[number].candidate for number in sorted(heard)]
+            if (
+                heard >= {node.number for node in self.alive}
+                or (first is not None and now - first >= self.patience)
+                or (left is not None and left <= 0)
+                or ended
+                or (not improve and any(candidate.solved for candidate in candidates))
+            ):
+                return candidates
+
+    def _run(self, improve: bool) -> None:
+        """Start whoever does not run: at first all, later those who stopped at what proved to be no solution here."""
+        self._judge.solution_ends = not improve
+        running = [job for job in self._jobs if job.running]
+        failed = [job for job in self._jobs if job.error is not None]
+        self._seconds += sum(job.seconds for job in self._jobs if job not in running + failed)
+        idle = [node for node in self.alive if node not in {job.node for job in running + failed}]
+        if not running:
+            self._judge.stop.clear()
+
+        def run(node: Node) -> None:
+            node.run(self._judge.stop, self.patience, improve)
+
+        begun = [_Job(node, run) for node in idle]
+        self._jobs = [*running, *failed, *begun]
+        for job in begun:
+            job.start()
+
+    def _lose_dead(self) -> None:
+        for job in self._jobs:
+            if job.error is not None and job.node in self.alive:
+                self._lose_failed(job)

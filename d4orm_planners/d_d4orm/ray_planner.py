@@ -1,0 +1,199 @@
+"""The ``"ray"`` transport: every node's iterations run in an actor of Ray, a process on this machine or a cluster."""
+
+from __future__ import annotations
+
+import os
+import threading
+from dataclasses import replace
+from math import ceil
+from types import ModuleType
+from typing import Any, NamedTuple
+
+from d4orm_env.core.errors import first_line
+from d4orm_env.core.problem import Problem
+from d4orm_env.engine.choice import get_engine
+from d4orm_env.engine.threads import available_cores
+from d4orm_planners.base.candidate import evaluate_controls
+from d4orm_planners.d_d4orm.messages import Message, decode, encode
+from d4orm_planners.d_d4orm.ray_connection import RayConnection
+from d4orm_planners.base.planner import Iteration, Planner
+from d4orm_planners.base.solve import Search
+
+RESTARTS = 3
+"""How many times an actor that was lost is started again, before its node is done without."""
+
+START = 120.0
+"""Seconds that actors may take to start and to compile."""
+
+
+GLANCE = 0.1
+"""Seconds between looks at whether an iteration under way is still wanted."""
+
+
+class Outcome(NamedTuple):
+    """What an actor made of an iteration.
+
+    Attributes:
+        data: The candidate, a message.
+        denoising_steps: Spent on it.
+        excluded: See :class:`~d4orm_planners.base.planner.Iteration`.
+        compiling: Seconds of it that went into compiling.
+        process: Who did it.
+    """
+
+    data: bytes
+    denoising_steps: int
+    excluded: int
+    compiling: float
+    process: int
+
+
+class Worker:
+    """Runs a planner's iterations in a process of its own.
+
+    Args:
+        node: Number of the node that it works for.
+        num_nodes: How many there are.
+        planner: The planner.
+        problem: The problem.
+        seed: The node's seed.
+        sharing: Workers that share the cores of its machine.
+    """
+
+    def __init__(self, node: int, num_nodes: int, planner: Planner, problem: Problem, seed: int, sharing: int) -> None:
+        self._node, self._num_nodes = node, num_nodes
+        self._engine = get_engine(planner.config.engine, max(available_cores() // sharing, 1))
+        self._search = Search(planner, problem, seed, None, self._engine)
+
+    def ready(self) -> int:
+        """Compile what an iteration needs, by one of a single step; the number of this process."""
+        planner, config = self._search.planner, self._search.planner.config
+        short: dict[str, Any] = {name: 1 for name in ("num_steps", "repair_steps") if name in config.setting_names()}
+        Search(type(planner)(replace(config, **short)), self._search.problem, 0, None, self._engine).advance()
+        return os.getpid()
+
+    def advance(self, iteration: int, data: bytes, time_left: float | None) -> Outcome:
+        """One iteration.
+
+        Args:
+            iteration: Those done so far. It is all that a worker must know of the past, so that a new one can take the
+                place of one that was lost.
+            data: The candidate to go on from, a message.
+            time_left: Seconds that it may take, compilation not counted, or ``None``.
+        """
+        search = self._search
+        search.time_limit = None if time_left is None else search.watch.elapsed + time_left
+        controls = decode(data, search.problem, self._num_nodes).controls
+        search.iteration = iteration
+        search.current = evaluate_controls(self._engine, search.problem, controls)
+        steps, compiling = search.denoising_steps, search.watch.paused_seconds
+        record = search.advance()
+        return Outcome(
+            _message(self._node, search),
+            search.denoising_steps - steps,
+            record.excluded,
+            search.watch.paused_seconds - compiling,
+            os.getpid(),
+        )
+
+
+class RayPlanner(Planner):
+    """A planner whose iterations run in an actor.
+
+    Attributes:
+        process: Number of the actor's process.
+    """
+
+    def __init__(self, planner: Planner, node: int, num_nodes: int, ray: ModuleType, actor: Any) -> None:
+        super().__init__(planner.config)
+        self.process = 0
+        self._node, self._num_nodes = node, num_nodes
+        self._ray, self._actor = ray, actor
+        self._calling, self._closed = threading.Lock(), threading.Event()
+
+    def start(self) -> None:
+        """Wait until the actor is there.
+
+        Raises:
+            ConnectionError: If it does not start.
+        """
+        try:
+            self.process = self._ray.get(self._actor.ready.remote(), timeout=START)
+        except self._ray.exceptions.RayTaskError as error:
+            raise error.cause from error
+        except (self._ray.exceptions.RayError, TimeoutError) as error:
+            raise ConnectionError(
+                f"the actor of node {self._node} does not start ({first_line(error)}); "
+                "check that d4orm-env is installed on every machine of the cluster"
+            ) from error
+
+    def iterate(self, search: Search, state: None) -> tuple[None, Iteration]:
+        """See :meth:`Planner.iterate`."""
+        with self._calling:
+            outcome = self._outcome(search.iteration, _message(self._node, search), search.time_left)
+        search.watch.leave_out(outcome.compiling)
+        note = "" if outcome.process == self.process else f"the actor of node {self._node} was lost and restarted"
+        self.process = outcome.process
+        controls = decode(outcome.data, search.problem, self._num_nodes).controls
+        return None, Iteration(controls, outcome.denoising_steps, outcome.excluded, note)
+
+    def finish(self, search: Search, state: None) -> None:
+        """See :meth:`Planner.finish`: end the actor, whatever it is at."""
+        self._closed.set()
+        self._ray.kill(self._actor)
+        # Ray ends the process of whoever calls it once it is shut down.
+        with self._calling:
+            pass
+
+    def _outcome(self, iteration: int, data: bytes, time_left: float | None) -> Outcome:
+        if self._closed.is_set():
+            raise ChildProcessError("its actor has been ended")
+        try:
+            call = self._actor.advance.remote(iteration, data, time_left)
+            # An actor whose machine cannot be reached may not be seen to end for long.
+            while not self._ray.wait([call], timeout=GLANCE)[0]:
+                if self._closed.is_set():
+                    raise ChildProcessError("its actor has been ended")
+            outcome: Outcome = self._ray.get(call)
+        except self._ray.exceptions.RayTaskError as error:
+            raise error.cause from error
+        except self._ray.exceptions.RayError as error:
+            raise ChildProcessError(f"its actor was lost for good ({first_line(error)})") from error
+        return outcome
+
+
+def ray_planners(
+    connection: RayConnection, planners: list[Planner], problem: Problem, seeds: list[int]
+) -> list[RayPlanner]:
+    """Planners that do what these do, each in an actor, once all actors are there.
+
+    Args:
+        connection: To Ray.
+        planners: One per node.
+        problem: The problem.
+        seeds: The nodes' seeds.
+
+    Raises:
+        ConnectionError: If an actor does not start.
+    """
+    ray, number = connection.ray, len(planners)
+    machines = sum(bool(machine["Alive"]) for machine in ray.nodes())
+    # Without a claim on cores no actor waits for a place, however many there are; they share what a machine has.
+    kind = ray.remote(num_cpus=0, scheduling_strategy="SPREAD", max_restarts=RESTARTS, max_task_retries=RESTARTS)(
+        Worker
+    )
+    sharing = ceil(number / machines)
+    remote = [
+        RayPlanner(planner, node, number, ray, kind.remote(node, number, planner, problem, seed, sharing))
+        for node, (planner, seed) in enumerate(zip(planners, seeds, strict=True))
+    ]
+    for planner in remote:
+        planner.start()
+    return remote
+
+
+def _message(node: int, search: Search) -> bytes:
+    """The search's current candidate."""
+    candidate = search.current
+    message = Message(node, search.iteration, candidate.planned, candidate.reward, bool(candidate.solved))
+    return encode(message, search.problem)

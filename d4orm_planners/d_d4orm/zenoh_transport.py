@@ -1,0 +1,245 @@
+"""The ``"zenoh"`` transport: peers on a network, by Eclipse Zenoh, which ROS 2 can run on too."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import ipaddress
+import json
+import logging
+import re
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from types import ModuleType
+
+from d4orm_env.core.arrays import duration
+from d4orm_planners.d_d4orm.messages import MAX_BYTES
+from d4orm_planners.d_d4orm.transport import WAITING, Mailbox
+
+logger = logging.getLogger(__name__)
+
+LOOPBACK = ("tcp/127.0.0.1:0",)
+"""Where nodes listen unless configured otherwise: at a free port that only this machine reaches."""
+
+PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws")
+
+LAST_WAIT = 5.0
+"""Seconds to wait for the thread that receives, once there is nothing more to come."""
+
+RESERVED = {
+    "listen/endpoints": "listen",
+    "connect/endpoints": "connect",
+    "scouting/multicast/enabled": "multicast",
+    "namespace": "namespace",
+}
+"""What a zenoh configuration file leaves to the settings, and the setting."""
+
+DEFAULTS: Mapping[str, object] = {
+    "mode": "peer",
+    # The queues of a slow link hold a megabyte, so that a candidate that is cut into pieces is not lost halfway.
+    "transport/link/tx/queue/size/data": 16,
+    # Longer messages end here, before they cost memory; what is a little too long is left to the inbox to count.
+    "transport/link/rx/max_message_size": 2 * MAX_BYTES,
+    # A node that is killed leaves nothing behind in shared memory.
+    "transport/shared_memory/enabled": False,
+    "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
+}
+"""Zenoh's settings, unless its configuration file has something else."""
+
+_ENDPOINT = re.compile(rf"({'|'.join(PROTOCOLS)})/(?P<host>\[[0-9A-Fa-f:.%]+\]|[^\[\]:/?#]+):(?P<port>\d+)([?#].*)?")
+_NAMESPACE = re.compile(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ZenohSettings:
+    """Where a node finds the others. By default that is on this machine only, and no port is open beyond loopback.
+
+    Attributes:
+        namespace: What the nodes of one solve have in common and others on the network have not: their messages have
+            the key ``NAMESPACE/candidates``.
+        listen: Endpoints to listen at, as ``tcp/192.168.1.10:7447``; port 0 for any free one.
+        connect: Endpoints of other nodes or of a zenoh router; who is away is tried again and again. One is enough, as
+            connected nodes let each other know of the rest.
+        multicast: Whether to find others by UDP multicast: on the network, or on this machine where the node listens
+            on loopback only.
+        config_file: A zenoh configuration in JSON5, for TLS, access control and whatever else zenoh has; the settings
+            above are not to be in it.
+        linger: Seconds that a node with a solution goes on telling it, until all others have one as good.
+    """
+
+    namespace: str = "d4orm"
+    listen: tuple[str, ...] = LOOPBACK
+    connect: tuple[str, ...] = ()
+    multicast: bool = False
+    config_file: str | None = None
+    linger: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.namespace, str) or not _NAMESPACE.fullmatch(self.namespace):
+            raise ValueError(
+                f"namespace {self.namespace!r} is not of letters, digits, '_', '.' and '-', with '/' between, as team/1"
+            )
+        for name in ("listen", "connect"):
+            object.__setattr__(self, name, _endpoints(name, getattr(self, name)))
+        if not isinstance(self.multicast, bool):
+            raise ValueError(f"multicast must be true or false, not {self.multicast!r}")
+        if self.config_file is not None:
+            object.__setattr__(self, "config_file", str(self.config_file))
+        object.__setattr__(self, "linger", duration(self.linger, "linger", zero_allowed=True))
+
+    @classmethod
+    def of(cls, settings: object) -> ZenohSettings:
+        """Settings from a mapping; those that are such already stay.
+
+        Raises:
+            ValueError: If it is neither, or a setting is unknown or makes no sense.
+        """
+        if isinstance(settings, cls):
+            return settings
+        known = [field.name for field in fields(cls)]
+        if not isinstance(settings, Mapping):
+            raise ValueError(f"the settings of zenoh must be a mapping of {', '.join(known)}, not {settings!r}")
+        for name in settings:
+            if name not in known:
+                raise ValueError(f"{name!r} is no setting of zenoh; it takes {', '.join(known)}")
+        return cls(**settings)
+
+    @property
+    def on_loopback(self) -> bool:
+        """Whether nobody beyond this machine can connect."""
+        return all(_is_loopback(endpoint) for endpoint in self.listen)
+
+
+class ZenohTransport:
+    """One end of a network of zenoh peers. The environment variable ``RUST_LOG`` makes zenoh log what it does.
+
+    Args:
+        settings: Where the others are.
+
+    Raises:
+        ImportError: If zenoh is not installed.
+        ValueError: If zenoh refuses the settings or its configuration file, or cannot listen where it is asked to.
+    """
+
+    def __init__(self, settings: ZenohSettings) -> None:
+        zenoh = _import_zenoh()
+        zenoh.try_init_log_from_env()
+        config = _config(zenoh, settings)
+        key = f"{settings.namespace}/candidates"
+        self._mailbox = Mailbox()
+        self._error: type[Exception] = zenoh.ZError
+        try:
+            self._session = zenoh.open(config)
+            # Newer candidates replace older ones, so that it is better to lose one than to wait for a slow link.
+            self._publisher = self._session.declare_publisher(
+                key,
+                congestion_control=zenoh.CongestionControl.DROP,
+                express=True,
+                allowed_destination=zenoh.Locality.REMOTE,
+            )
+            self._subscriber = self._session.declare_subscriber(key, zenoh.handlers.RingChannel(WAITING))
+        except zenoh.ZError as error:
+            raise ValueError(
+                f"zenoh cannot listen at {', '.join(settings.listen) or 'nothing'} or connect to "
+                f"{', '.join(settings.connect) or 'nothing'}: {_reason(error)}"
+            ) from error
+        # Zenoh's own thread for a callback is none that the end of the process leaves alone.
+        self._receiver = threading.Thread(target=self._receive, daemon=True, name=f"zenoh-{key}")
+        self._receiver.start()
+        # A session that is left open might keep the process from ending, and a thread inside it would abort it.
+        atexit.register(self._leave)
+
+    def publish(self, data: bytes) -> None:
+        """See :meth:`~d4orm_planners.d_d4orm.transport.Transport.publish`."""
+        if self._mailbox.closed:
+            return
+        try:
+            self._publisher.put(data)
+        except self._error as error:
+            if not self._mailbox.closed:
+                logger.warning("a candidate was not sent: %s", _reason(error))
+
+    def collect(self, timeout: float = 0.0) -> list[bytes]:
+        """See :meth:`~d4orm_planners.d_d4orm.transport.Transport.collect`."""
+        return self._mailbox.take(timeout)
+
+    def close(self) -> None:
+        """See :meth:`~d4orm_planners.d_d4orm.transport.Transport.close`."""
+        self._mailbox.close()
+        atexit.unregister(self._leave)
+        self._leave()
+
+    def _leave(self) -> None:
+        self._session.close()
+        self._receiver.join(LAST_WAIT)
+
+    def _receive(self) -> None:
+        with contextlib.suppress(self._error):  # which says that the session is closed
+            while True:
+                self._mailbox.put(self._subscriber.recv().payload.to_bytes())
+
+    @property
+    def has_listeners(self) -> bool:
+        """Whether anybody would receive what is published now."""
+        return bool(self._publisher.matching_status.matching)
+
+
+def _import_zenoh() -> ModuleType:
+    try:
+        import zenoh
+    except ImportError as error:
+        raise ImportError("transport 'zenoh' needs zenoh; install it with pip install \"d4orm-env[zenoh]\"") from error
+    return zenoh
+
+
+def _config(zenoh: ModuleType, settings: ZenohSettings) -> object:
+    """Zenoh's own configuration."""
+    config = plain = zenoh.Config()
+    if settings.config_file is not None:
+        try:
+            config = zenoh.Config.from_file(settings.config_file)
+        except zenoh.ZError as error:
+            raise ValueError(f"config_file {settings.config_file}: {_reason(error)}") from error
+        for key, name in RESERVED.items():
+            if config.get_json(key) != plain.get_json(key):
+                raise ValueError(f"config_file {settings.config_file} has {key}; leave it to the setting {name}")
+    unset = {key: value for key, value in DEFAULTS.items() if config.get_json(key) == plain.get_json(key)}
+    given: dict[str, object] = {
+        "listen/endpoints": settings.listen,
+        "connect/endpoints": settings.connect,
+        "scouting/multicast/enabled": settings.multicast,
+    }
+    if settings.on_loopback and config.get_json("scouting/multicast/interface") == "null":
+        given["scouting/multicast/interface"] = "127.0.0.1"
+    for key, value in {**unset, **given}.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _endpoints(name: str, endpoints: object) -> tuple[str, ...]:
+    if isinstance(endpoints, str) or not isinstance(endpoints, (list, tuple)):
+        raise ValueError(f"{name} must be a list of endpoints, as [tcp/192.168.1.10:7447], not {endpoints!r}")
+    for endpoint in endpoints:
+        match = _ENDPOINT.fullmatch(endpoint) if isinstance(endpoint, str) else None
+        if match is None or not (name == "connect") <= int(match["port"]) <= 65535:
+            raise ValueError(
+                f"{name} has {endpoint!r}; an endpoint is of the form PROTOCOL/HOST:PORT, as tcp/192.168.1.10:7447, "
+                f"with one of {', '.join(PROTOCOLS)}"
+            )
+    return tuple(endpoints)
+
+
+def _is_loopback(endpoint: str) -> bool:
+    match = _ENDPOINT.fullmatch(endpoint)
+    assert match is not None
+    host = match["host"].strip("[]")
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _reason(error: Exception) -> str:
+    """What zenoh says, on one line and without the places in its sources."""
+    return " ".join(re.sub(r" at /\S+\.rs:\d+\.?", "", str(error)).split())

@@ -1,0 +1,252 @@
+"""Which contacts a tile has to check, so that the checks do not stay quadratic where nothing is near.
+
+A tile moves its robots a block of steps at a time and checks the block's places afterwards. Sixteen boxes hold a
+robot's places in the block, each those of four of the tile's samples, one box a lane of a vector: four comparisons tell
+that two robots keep apart in all of them. Every robot gets a list of those before it for which they do not tell. Then
+64 boxes, one a sample, tell which samples to look at. Moving bodies, obstacles and the bounds have boxes too.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.core.arrays import FloatArray, Ints, Whole
+from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.engine import simd as lanes
+from d4orm_env.engine.compiling import aligned_zeros, compiled, inlined
+from d4orm_env.engine.simd import (
+    BLOCK,
+    BOX,
+    CHUNK,
+    NOWHERE,
+    TILE,
+    chunk_within_2,
+    chunk_within_3,
+    lanes_meet_2,
+    lanes_meet_3,
+    lanes_overlap_2,
+    lanes_overlap_3,
+    use_wide_registers,
+    worlds_overlap_2,
+    worlds_overlap_3,
+)
+from d4orm_env.engine.obstacles import may_touch
+from d4orm_env.engine.tiles import near_round
+
+SLACK = np.float32(1e-4)
+"""Allowance for rounding [m]."""
+
+_INFINITY = np.float32(np.inf)
+_CHUNK_BITS = np.uint64((1 << CHUNK) - 1)
+_HALF = np.float32(0.5)
+
+
+class Scratch(NamedTuple):
+    """What a tile notes of ``K`` robots.
+
+    Attributes:
+        boxes: ``(K d BOX,)`` where the robots are within a block, see :func:`~d4orm_env.engine.simd.enclose`, widened
+            so that what is within the margin of each other touches.
+        num_robots: ``(K,)`` how many robots before it each may touch,
+        robots: ``(K, K)`` and which.
+        near: ``(K, BLOCK)`` who is near a robot or a body at which step of the block, a bit for every sample.
+        spare: ``(2 TILE,)`` two rows to overwrite.
+    """
+
+    boxes: FloatArray
+    num_robots: Ints
+    robots: Ints
+    near: NDArray[np.uint64]
+    spare: FloatArray
+
+
+class Bodies(NamedTuple):
+    """Bodies that move among the robots.
+
+    Attributes:
+        places: ``(H, O, d)`` after every step.
+        radius: ``(O,)``.
+        boxes: ``(B, O, d, 2)`` ends of the boxes round them in each of the blocks of a horizon, widened by half of the
+            margin.
+    """
+
+    places: FloatArray
+    radius: FloatArray
+    boxes: FloatArray
+
+
+def make_scratch(num_robots: int, dimension: int) -> Scratch:
+    """Scratch for one thread."""
+    return Scratch(
+        aligned_zeros(num_robots * dimension * BOX), np.empty(num_robots, np.int32),
+        np.empty((num_robots, num_robots), np.int32), np.empty((num_robots, BLOCK), np.uint64),
+        aligned_zeros(2 * TILE),
+    )  # fmt: skip
+
+
+def bound_boxes(arrays: ProblemArrays) -> FloatArray:
+    """``(S, d, 2)`` ends of the boxes round what lies beyond each of the bounds, widened by half of the margin."""
+    dimension = arrays.goal.shape[1]
+    low, high = np.full((2, 0, dimension), np.float32(0))
+    for side, axis in np.argwhere(np.isfinite(arrays.bounds)):
+        beyond = np.full((2, 1, dimension), _INFINITY)
+        beyond[0] = -_INFINITY
+        beyond[1 - side, 0, axis] = arrays.bounds[side, axis]
+        low, high = np.concatenate([low, beyond[0]]), np.concatenate([high, beyond[1]])
+    return _widened(low, high, arrays.margin)
+
+
+def make_bodies(places: FloatArray, radius: FloatArray, margin: np.float32) -> Bodies:
+    """Bodies of this radius ``(O,)`` at ``places`` ``(H, O, d)``, with their boxes."""
+    places, radius = np.ascontiguousarray(places, np.float32), np.ascontiguousarray(radius, np.float32)
+    num_steps, num_blocks = len(places), -(-len(places) // BLOCK)
+    # A last block that is short goes on with its last place.
+    blocks = places[np.minimum(np.arange(num_blocks * BLOCK), num_steps - 1)]
+    blocks = blocks.reshape(num_blocks, BLOCK, *places.shape[1:])
+    boxes = _widened(blocks.min(axis=1) - radius[:, None], blocks.max(axis=1) + radius[:, None], margin)
+    return Bodies(places, radius, boxes)
+
+
+def _widened(low: FloatArray, high: FloatArray, margin: np.float32) -> FloatArray:
+    widening = _HALF * margin + SLACK
+    return np.ascontiguousarray(np.stack([low - widening, high + widening], axis=-1), np.float32)
+
+
+@inlined
+def place_of(k: Whole, step: int, dimension: int) -> Whole:
+    """Where the rows of robot ``k``'s places after a step of the block begin: a row an axis."""
+    return (k * BLOCK + step) * dimension * TILE
+
+
+@inlined
+def box_of(thing: Whole, dimension: int) -> Whole:
+    """Where the rows of a thing's boxes begin."""
+    return thing * dimension * BOX
+
+
+@inlined
+def enclose(k: int, reach: np.float32, dimension: int, places: FloatArray, boxes: FloatArray) -> None:
+    """Make the boxes of robot ``k`` in this block, for its radius and half of the margin as reach."""
+    for axis in range(dimension):
+        first, begin = place_of(k, 0, dimension) + axis * TILE, box_of(k, dimension) + axis * BOX
+        lanes.enclose(places, first, dimension * TILE, reach + SLACK, boxes, begin)
+
+
+@inlined
+def _overlap(a: Whole, b: Whole, dimension: int, boxes: FloatArray) -> bool:
+    """Whether two things may touch in any lane."""
+    if dimension == 2:
+        return lanes_overlap_2(boxes, box_of(a, dimension), box_of(b, dimension)) != NOWHERE
+    return lanes_overlap_3(boxes, box_of(a, dimension), box_of(b, dimension)) != NOWHERE
+
+
+@inlined
+def _samples_overlap(a: Whole, b: Whole, dimension: int, boxes: FloatArray) -> np.uint64:
+    """The samples in which two robots may touch."""
+    if dimension == 2:
+        return worlds_overlap_2(boxes, box_of(a, dimension), box_of(b, dimension))
+    return worlds_overlap_3(boxes, box_of(a, dimension), box_of(b, dimension))
+
+
+@inlined
+def _near_pair(reach: np.float32, a: Whole, b: Whole, dimension: int, places: FloatArray) -> np.uint64:
+    """Where two centres are within reach, of the first ``CHUNK`` samples in the rows from ``a`` and from ``b`` on."""
+    if dimension == 2:
+        return chunk_within_2(places, a, b, reach * reach)
+    return chunk_within_3(places, a, b, reach * reach)
+
+
+@inlined
+def _meets(k: int, thing: int, dimension: int, boxes: FloatArray, limits: FloatArray) -> bool:
+    """Whether robot ``k`` may touch, in any lane, the thing of this number in ``limits`` ``(. d 2,)``."""
+    if dimension == 2:
+        return lanes_meet_2(boxes, box_of(k, dimension), limits, thing * 4)
+    return lanes_meet_3(boxes, box_of(k, dimension), limits, thing * 6)
+
+
+@compiled
+def _list_near(dimension: int, s: Scratch) -> None:
+    """List for every robot those before it that it may touch in this block."""
+    use_wide_registers()
+    for k in range(s.num_robots.shape[0]):
+        listed, count = s.robots[k], np.int32(0)
+        for other in range(k):
+            listed[count] = other
+            count += np.int32(_overlap(k, other, dimension, s.boxes))
+        s.num_robots[k] = count
+
+
+@compiled
+def _mark_listed(radius: FloatArray, margin: np.float32, dimension: int, places: FloatArray, s: Scratch) -> None:
+    """Flag robots within the margin of those on their lists."""
+    use_wide_registers()
+    for k in range(radius.shape[0]):
+        for i in range(s.num_robots[k]):
+            other = np.int64(np.uint32(s.robots[k, i]))
+            reach = radius[k] + radius[other] + margin
+            samples = _samples_overlap(k, other, dimension, s.boxes)
+            for chunk in range(0, TILE, CHUNK):
+                if (samples >> np.uint64(chunk)) & _CHUNK_BITS == NOWHERE:
+                    continue
+                for step in range(BLOCK):
+                    a, b = place_of(k, step, dimension) + chunk, place_of(other, step, dimension) + chunk
+                    touch = _near_pair(reach, a, b, dimension, places) << np.uint64(chunk)
+                    s.near[k, step] |= touch
+                    s.near[other, step] |= touch
+
+
+@compiled
+def _mark_bodies(
+    radius: FloatArray, margin: np.float32, bodies: Bodies, first: int, count: int, places: FloatArray, s: Scratch
+) -> None:
+    """Flag robots within the margin of moving bodies."""
+    _, num_bodies, dimension = bodies.places.shape
+    limits, before = bodies.boxes.reshape(-1), first // BLOCK * num_bodies
+    for k in range(radius.shape[0]):
+        for body in range(num_bodies):
+            if _meets(k, before + body, dimension, s.boxes, limits):
+                reach = radius[k] + bodies.radius[body] + margin
+                for step in range(count):
+                    rows = places[place_of(k, step, dimension) : place_of(k, step + 1, dimension)]
+                    s.near[k, step] |= near_round(reach, bodies.places[first + step, body], dimension, rows, s.spare)
+
+
+@inlined
+def mark_robots(
+    radius: FloatArray, margin: np.float32, bodies: Bodies, first: int, count: int, places: FloatArray, s: Scratch
+) -> None:
+    """Flag in ``s.near`` robots within the margin of each other or of a body in a block.
+
+    Args:
+        radius: ``(K,)``.
+        margin: The margin.
+        bodies: The :class:`Bodies`.
+        first: Time of the block's first step.
+        count: Steps in the block; of later ones the flags mean nothing.
+        places: Rows of places, see :func:`place_of`.
+        s: Scratch with the boxes of the robots in this block.
+    """
+    s.near[:] = NOWHERE
+    dimension = bodies.places.shape[2]
+    _list_near(dimension, s)
+    _mark_listed(radius, margin, dimension, places, s)
+    if bodies.places.shape[1] > 0:
+        _mark_bodies(radius, margin, bodies, first, count, places, s)
+
+
+@inlined
+def near_static(arrays: ProblemArrays, k: int, bounds: FloatArray, boxes: FloatArray, spare: FloatArray) -> bool:
+    """Whether in this block any sample of robot ``k`` may be within the margin of an obstacle, or of ``bounds``, see
+    :func:`bound_boxes`. ``spare`` is two rows to overwrite.
+    """
+    dimension, limits, touch = arrays.goal.shape[1], bounds.reshape(-1), False
+    if arrays.grid.clearance.shape[0] > 0:
+        # The boxes are wider than the places by the radius and half of the margin.
+        reach, half = arrays.radius[k] + arrays.margin, arrays.radius[k] + _HALF * arrays.margin + SLACK
+        touch = may_touch(arrays.grid, reach, half, boxes, box_of(k, dimension) + 2 * TILE, BOX, spare)
+    for bound in range(bounds.shape[0]):
+        touch |= _meets(k, bound, dimension, boxes, limits)
+    return touch

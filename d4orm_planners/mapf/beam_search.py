@@ -1,0 +1,359 @@
+"""Beam search of one robot's way among all others' known ways, in space and time, compiled with numba.
+
+A way is made of pieces of a block of steps each, in which the robot heads for its goal, faster or slower, stops, or
+turns off by some angle. After every block the most promising of the ways so far are kept.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numba.extending import register_jitable
+from numpy.typing import NDArray
+
+from d4orm_env.dynamics import collision
+from d4orm_env.dynamics import robot_model
+from d4orm_env.dynamics import transition
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Whole
+from d4orm_env.dynamics.models import MODELS
+from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.dynamics.robot_model import SPEED, TimeStep
+from d4orm_env.engine import obstacles, stepping
+from d4orm_planners.engine import path_index
+from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
+from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, compiled, inlined, to_fixed_tuple
+from d4orm_env.engine.elementary import OPS
+from d4orm_env.engine.obstacles import is_closed, touches_static
+from d4orm_planners.engine.path_index import PathTable, count_near, is_unsure, steps_of
+from d4orm_env.engine.tile_layout import Row
+from d4orm_env.engine.stepping import make_stepper, models_key
+
+SOURCES = fingerprint((robot_model, transition, collision, obstacles, *stepping.PARTS, stepping, path_index))
+
+_FAR = np.float32(10)
+"""How far ahead a robot that turns off looks, in seconds at full speed."""
+
+_AHEAD = np.float32(0.5)
+"""How far ahead of a robot the rest of its way is measured from [s]."""
+
+_TOUCH = 100.0
+"""Robots that are met rather than an obstacle touched for a step."""
+
+
+class Moves(NamedTuple):
+    """What a robot may do in a block, ``P`` things.
+
+    Attributes:
+        turns: ``(P, 3)`` directions, along that to the goal and two across.
+        homewards: ``(P,)`` whether it heads for the goal, or so many goal radii from there in the direction.
+        pace: ``(P,)`` share of the speed that it would have.
+    """
+
+    turns: FloatArray
+    homewards: BoolArray
+    pace: FloatArray
+
+
+class BeamRules(NamedTuple):
+    """What ways are kept.
+
+    Attributes:
+        width: How many.
+        contact: What being near another robot in a block costs [s].
+        apart: How far apart two are, or else twice as much in speed [m, m/s].
+    """
+
+    width: int
+    contact: float
+    apart: float
+
+
+class Seekers(NamedTuple):
+    """Robots that look for ways.
+
+    Attributes:
+        robots: ``(R,)`` their numbers in the team.
+        blocks: ``(R,)`` the block at whose beginning their new ways begin,
+        states: ``(R, n)`` and in which state.
+        limits: ``(R,)`` what their ways must cost less than [s]: the step at which one ends, and what contacts cost.
+        without: ``(R, N)`` numbers of robots that they do not mind, their own among them.
+        beside: ``(R, M, H+1, d)`` ways that they mind as well [m],
+        radius: ``(R, M)`` and the radii of who is on them [m].
+    """
+
+    robots: NDArray[np.int64]
+    blocks: NDArray[np.int64]
+    states: FloatArray
+    limits: NDArray[np.float64]
+    without: NDArray[np.int64]
+    beside: FloatArray
+    radius: NDArray[np.float64]
+
+
+class _Beam(NamedTuple):
+    """Up to ``N`` ways as far as they have come.
+
+    Attributes:
+        states: ``(N, n)``.
+        velocities: ``(N, d)``.
+        faults: ``(N,)`` robots met, block by block.
+        bounds: ``(N,)`` what they cost at least, as it seems [s].
+        before: ``(N,)`` number of the way that each goes on from: in the beam before, or ever.
+        moves: ``(N,)`` what was done in the last block.
+    """
+
+    states: FloatArray
+    velocities: FloatArray
+    faults: Floats
+    bounds: Floats
+    before: IntArray
+    moves: IntArray
+
+
+@register_jitable(nogil=True, **OPTIONS)
+def _make_beam(size: int, n: int, d: int) -> _Beam:
+    return _Beam(
+        np.empty((size, n), np.float32), np.empty((size, d), np.float32), np.empty(size), np.empty(size),
+        np.empty(size, np.int64), np.empty(size, np.int64),
+    )  # fmt: skip
+
+
+@compiled
+def _frame(place: FloatArray, goal: FloatArray) -> Row:
+    """Unit vectors from a place to its goal, across in the plane, and upright to both, one after the other."""
+    x, y, z = goal[0] - place[0], goal[1] - place[1], ZERO
+    if goal.shape[0] == 3:
+        z = goal[2] - place[2]
+    length = np.sqrt(x * x + y * y + z * z)
+    if length > ZERO:
+        x, y, z = x / length, y / length, z / length
+    else:
+        x = ONE
+    flat = np.sqrt(x * x + y * y)
+    i, j = ZERO, ONE
+    if flat > ZERO:
+        i, j = -y / flat, x / flat
+    return x, y, z, i, j, -z * j, z * i, x * j - y * i
+
+
+@compiled
+def _turned_2(place: Row, far: np.float32, turn: Row, frame: Row) -> Row:
+    x, y, _, i, j, _, _, _ = frame
+    return place[0] + far * (turn[0] * x + turn[1] * i), place[1] + far * (turn[0] * y + turn[1] * j)
+
+
+@compiled
+def _turned_3(place: Row, far: np.float32, turn: Row, frame: Row) -> Row:
+    x, y, z, i, j, u, v, w = frame
+    return (
+        place[0] + far * (turn[0] * x + turn[1] * i + turn[2] * u),
+        place[1] + far * (turn[0] * y + turn[1] * j + turn[2] * v),
+        place[2] + far * (turn[0] * z + turn[2] * w),
+    )
+
+
+@compiled
+def _slowed_2(v: Row, pace: np.float32) -> Row:
+    return v[0] * pace, v[1] * pace
+
+
+@compiled
+def _slowed_3(v: Row, pace: np.float32) -> Row:
+    return v[0] * pace, v[1] * pace, v[2] * pace
+
+
+_TURNED, _SLOWED = {2: _turned_2, 3: _turned_3}, {2: _slowed_2, 3: _slowed_3}
+
+
+@compiled
+def _is_like_another(ways: _Beam, way: Whole, kept: _Beam, size: int, apart2: float) -> bool:
+    """Whether a way is about where one of those kept is, about as fast."""
+    for other in range(size):
+        gap2, change2 = 0.0, 0.0
+        for axis in range(ways.velocities.shape[1]):
+            gap = ways.states[way, axis] - kept.states[other, axis]
+            change = ways.velocities[way, axis] - kept.velocities[other, axis]
+            gap2 += gap * gap
+            change2 += change * change
+        if gap2 < apart2 and change2 < 4 * apart2:
+            return True
+    return False
+
+
+@compiled
+def _keep(ways: _Beam, way: Whole, kept: _Beam, number: Whole) -> None:
+    for i in range(ways.states.shape[1]):
+        kept.states[number, i] = ways.states[way, i]
+    for axis in range(ways.velocities.shape[1]):
+        kept.velocities[number, axis] = ways.velocities[way, axis]
+    kept.faults[number] = ways.faults[way]
+    kept.before[number], kept.moves[number] = ways.before[way], ways.moves[way]
+
+
+@compiled
+def _count_beside(
+    table: PathTable, robot: Whole, seekers: Seekers, r: int, path: FloatArray, first: Whole, last: Whole
+) -> int:
+    """How many of the further ways a path meets from one step to another; at its end it stands still."""
+    count, end = 0, path.shape[0] - 1
+    for other in range(seekers.beside.shape[1]):
+        reach = table.radius[robot] + seekers.radius[r, other] + table.margin
+        for t in range(first, last):
+            gap2 = 0.0
+            for axis in range(path.shape[1]):
+                place = np.float64(path[min(t - first, end), axis])
+                gap = place - np.float64(seekers.beside[r, other, t, axis])
+                gap2 += gap * gap
+            if gap2 <= reach * reach:
+                count += 1
+                break
+    return count
+
+
+Search: TypeAlias = Kernel[
+    [ProblemArrays, PathTable, Moves, BeamRules, Seekers, IntArray, FloatArray, FloatArray, BoolArray], None
+]
+"""A kernel of :func:`search_kernel`."""
+
+
+@cache
+def search_kernel(name: str) -> Search:
+    """The compiled search for robots of the model with this name.
+
+    For a range of the seekers it fills controls ``u`` ``(R, H, m)`` and states ``x`` ``(R, H+1, n)`` from where their
+    ways begin, and says in ``found`` ``(R,)`` whether a way arrives; if none does, the rest is left alone.
+    """
+    model = MODELS[name]
+    move, dock = make_stepper(model)
+    approach, track = inlined(model.functions.approach), inlined(model.functions.track)
+    velocity_of, limit_control = inlined(model.functions.velocity), inlined(model.functions.limit_control)
+    turned, slowed = _TURNED[model.dimension], _SLOWED[model.dimension]
+    n, m, d, num_limits = model.state_size, model.control_size, model.dimension, len(model.limit_names)
+    no_control = (ZERO,) * m
+
+    @inlined
+    def aim_of(
+        place: FloatArray, at: Row, limits: Row, goal: FloatArray, goal_radius: np.float32, moves: Moves, number: Whole
+    ) -> Row:
+        """Where to head: ``place`` is an array, ``at`` a tuple of the same numbers."""
+        turn = to_fixed_tuple(moves.turns[number], 3)
+        if moves.homewards[number]:
+            return turned(to_fixed_tuple(goal, d), goal_radius, turn, _frame(place, goal))
+        return turned(at, _FAR * limits[SPEED], turn, _frame(place, goal))
+
+    @inlined
+    def control_of(state: Row, aim: Row, pace: np.float32, limits: Row, h: TimeStep) -> Row:
+        velocity = slowed(approach(state, aim, limits, h, OPS), pace)
+        return limit_control(track(state, velocity, limits, h, OPS), limits, OPS)
+
+    @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
+    def search(
+        arrays: ProblemArrays, table: PathTable, moves: Moves, rules: BeamRules, seekers: Seekers, part: IntArray,
+        u: FloatArray, x: FloatArray, found: BoolArray,
+    ) -> None:  # fmt: skip
+        dt, closed = arrays.time_step, is_closed(arrays)
+        h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])
+        docking = (arrays.squared_goal_radius, arrays.squared_goal_speed, arrays.docks)
+        goal_radius = np.sqrt(arrays.squared_goal_radius)
+        num_blocks, num_moves, width = table.first.shape[0], moves.pace.shape[0], rules.width
+        last_busy = min(num_blocks - 1, table.moving[0] + 1)
+        beam, ways = _make_beam(width, n, d), _make_beam(width * num_moves, n, d)
+        # Of all ways ever kept: what each goes on from, and by what.
+        before, made_by = np.empty(width * num_blocks, np.int64), np.empty(width * num_blocks, np.int64)
+        numbers, did = np.empty(width, np.int64), np.empty(num_blocks, np.int64)
+        path = np.empty((table.block, d), np.float32)
+        for r in range(part[0], part[1]):
+            robot, begin = seekers.robots[r], seekers.blocks[r]
+            goal, limits = arrays.goal[robot], to_fixed_tuple(arrays.limits[robot], num_limits)
+            at, reach = to_fixed_tuple(goal, d), arrays.radius[robot] + arrays.margin
+            for i in range(n):
+                beam.states[0, i] = seekers.states[r, i]
+            beam.faults[0], numbers[0], size, num_kept = 0.0, -1, 1, 0
+            best, best_number, best_move = seekers.limits[r], -1, -1
+            without = seekers.without[r]
+            for block in range(begin, num_blocks):
+                first, last = steps_of(table, block)
+                count = 0
+                for way in range(size):
+                    for number in range(num_moves):
+                        state, control, at_goal = to_fixed_tuple(beam.states[way], n), no_control, False
+                        aim = aim_of(beam.states[way], state, limits, goal, goal_radius, moves, number)
+                        faults, end = beam.faults[way], first
+                        for t in range(first, last):
+                            if not transition.stands(at_goal, arrays.docks):
+                                control = control_of(state, aim, moves.pace[number], limits, h)
+                                state = move(False, state, control, limits, h)
+                                state, _, at_goal = dock(False, state, control, limits, at, docking)
+                                end = t
+                            for axis in range(d):
+                                path[t - first, axis] = state[axis]
+                            if end == t and is_unsure(arrays, path[t - first], goal):
+                                faults += 1.0
+                            if closed and touches_static(arrays, reach, path[t - first]):
+                                faults += _TOUCH
+                        velocity, cost = velocity_of(state, control, limits, OPS), end * dt[0]
+                        if not at_goal:
+                            rest2 = 0.0
+                            for axis in range(d):
+                                gap = goal[axis] - (state[axis] + _AHEAD * velocity[axis])
+                                rest2 += gap * gap
+                            cost = end * dt[0] + max(np.sqrt(rest2) - goal_radius, ZERO) / limits[SPEED]
+                        if rules.contact * faults + cost >= best:
+                            continue
+                        faults += count_near(table, robot, without, path, first, block)
+                        faults += _count_beside(table, robot, seekers, r, path, first, last)
+                        if at_goal:
+                            # It stays there: whoever comes by later counts too.
+                            for axis in range(d):
+                                path[:, axis] = state[axis]
+                            for later in range(block + 1, last_busy + 1):
+                                faults += count_near(table, robot, without, path, steps_of(table, later)[0], later)
+                            faults += _count_beside(table, robot, seekers, r, path, last, table.places.shape[0])
+                            if rules.contact * faults + cost < best:
+                                best, best_number, best_move = rules.contact * faults + cost, numbers[way], number
+                            continue
+                        for axis in range(d):
+                            ways.velocities[count, axis] = velocity[axis]
+                        for i in range(n):
+                            ways.states[count, i] = state[i]
+                        ways.bounds[count] = rules.contact * faults + cost
+                        ways.faults[count], ways.before[count], ways.moves[count] = faults, numbers[way], number
+                        count += 1
+                size = 0
+                for way in np.argsort(ways.bounds[:count], kind="mergesort"):
+                    if size == width or ways.bounds[way] >= best:
+                        break
+                    if not _is_like_another(ways, way, beam, size, rules.apart * rules.apart):
+                        _keep(ways, way, beam, size)
+                        before[num_kept], made_by[num_kept], numbers[size] = ways.before[way], ways.moves[way], num_kept
+                        size, num_kept = size + 1, num_kept + 1
+                if size == 0:
+                    break
+            found[r] = best_move >= 0
+            if not found[r]:
+                continue
+            # What it did, from the last block to the first.
+            did[0], length = best_move, 1
+            while best_number >= 0:
+                did[length], best_number, length = made_by[best_number], before[best_number], length + 1
+            for i in range(n):
+                x[r, steps_of(table, begin)[0] - 1, i] = seekers.states[r, i]
+            state, at_goal = to_fixed_tuple(seekers.states[r], n), False
+            for block in range(begin, num_blocks):
+                first, last = steps_of(table, block)
+                number = did[length - 1 - block + begin] if block - begin < length else 0
+                aim = aim_of(x[r, first - 1], state, limits, goal, goal_radius, moves, number)
+                for t in range(first, last):
+                    standing = transition.stands(at_goal, arrays.docks)
+                    control = control_of(state, aim, moves.pace[number], limits, h)
+                    if not standing:
+                        state = move(False, state, control, limits, h)
+                        state, _, at_goal = dock(False, state, control, limits, at, docking)
+                    for i in range(m):
+                        u[r, t - 1, i] = ZERO if standing else control[i]
+                    for i in range(n):
+                        x[r, t, i] = state[i]
+
+    return search

@@ -1,0 +1,146 @@
+"""Ways of some robots around all others in space and time, by beam search on all cores."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from d4orm_env.core import portable
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.dynamics.robot_model import Model
+from d4orm_planners.mapf.beam_search import BeamRules, Moves, Seekers, search_kernel
+from d4orm_planners.engine.path_index import BLOCK
+from d4orm_env.engine.threads import Threads, available_cores
+from d4orm_planners.mapf.working_plan import TeamPaths
+from d4orm_planners.tracking.steering import Drives, by_model
+
+
+@dataclass(frozen=True)
+class Manner:
+    """What robots that look for a way may do.
+
+    Attributes:
+        angles: By which a robot turns off from the way to its goal [degrees]; in space up and down as well.
+        paces: Shares of its speed with which it heads for its goal: waiting has no direction.
+        beside: Goal radii beside its goal to which it may head too: who docks there keeps clear of a neighbour.
+        on_the_spot: The share with which one that has a heading turns, to its goal or to one side, as if it stood.
+    """
+
+    angles: tuple[float, ...]
+    paces: tuple[float, ...]
+    beside: float = 0.8
+    on_the_spot: float = 0.001
+
+    def moves(self, dimension: int, *, has_heading: bool) -> Moves:
+        """The same for the search."""
+        angle = np.radians(np.array(self.angles))
+        # To the left and to the right; in space upwards and downwards too.
+        across = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])[: 2 * (dimension - 1)]
+        sides = portable.sin(angle)[:, None, None] * across
+        ahead = np.broadcast_to(portable.cos(angle)[:, None, None], (*sides.shape[:2], 1))
+        turned = np.concatenate([ahead, sides], axis=2).reshape(-1, 3)
+        home = np.zeros((1, 3))
+        beside = np.column_stack([np.zeros(len(across)), self.beside * across])
+        parts = [(home, True, pace) for pace in self.paces] + [(beside, True, 1.0), (turned, False, 1.0)]
+        if has_heading:
+            parts += [(home, True, self.on_the_spot), (turned, False, self.on_the_spot)]
+        sizes = [len(turns) for turns, _, _ in parts]
+        return Moves(
+            np.concatenate([turns for turns, _, _ in parts]).astype(np.float32),
+            np.repeat([homewards for _, homewards, _ in parts], sizes),
+            np.repeat([pace for _, _, pace in parts], sizes).astype(np.float32),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Company:
+    """Whom robots that look for a way mind other than they drive at present.
+
+    Attributes:
+        without: ``(R, N)`` numbers of robots that each does not mind.
+        beside: ``(R, M, H+1, d)`` ways that it minds as well [m].
+        radius: ``(R, M)`` radii of who is on them [m].
+    """
+
+    without: NDArray[np.int64]
+    beside: FloatArray
+    radius: NDArray[np.float64]
+
+    @classmethod
+    def nobody(cls, robots: IntArray, horizon: int, dimension: int) -> Company:
+        """No others but the team."""
+        beside = np.zeros((len(robots), 0, horizon + 1, dimension), np.float32)
+        return cls(robots[:, None], beside, np.zeros((len(robots), 0)))
+
+
+def find_ways(
+    team: TeamPaths,
+    robots: IntArray,
+    blocks: ArrayLike,
+    manner: Manner,
+    rules: BeamRules,
+    limits: ArrayLike = np.inf,
+    company: Company | None = None,
+) -> Drives:
+    """The best ways that robots ``(R,)`` find; who finds none does what it does, and does not arrive.
+
+    So do those left over when the search should stop.
+
+    Args:
+        team: What all do.
+        robots: Their numbers.
+        blocks: ``(R,)`` the block of steps at whose beginning their new ways begin.
+        manner: What they may do.
+        rules: What ways are kept on the search.
+        limits: ``(R,)`` what a way must cost less than [s]: its time, and what it costs to meet others.
+        company: Whom else they mind or do not mind.
+
+    Returns:
+        A single way of each.
+    """
+    problem, horizon = team.problem, team.problem.horizon
+    blocks, limits = np.broadcast_to(blocks, len(robots)), np.broadcast_to(np.asarray(limits, float), len(robots))
+    company = company or Company.nobody(robots, horizon, problem.dimension)
+    u, x = (np.ascontiguousarray(rows[:, robots].swapaxes(0, 1)) for rows in (team.controls, team.states))
+    arrived = np.zeros(len(robots), bool)
+    for model, members in by_model(problem):
+        mine = np.flatnonzero(np.isin(robots, members))
+        if len(mine):
+            seekers = Seekers(
+                robots[mine], blocks[mine], x[mine, blocks[mine] * BLOCK], limits[mine], company.without[mine],
+                company.beside[mine], company.radius[mine],
+            )  # fmt: skip
+            moves = manner.moves(problem.dimension, has_heading=model.heading_index is not None)
+            u[mine], x[mine], arrived[mine] = _search(team, model, moves, rules, seekers, u[mine], x[mine])
+    u, x = (rows.swapaxes(0, 1)[:, :, None] for rows in (u, x))
+    return Drives(u, x, arrived[:, None], problem.dimension)
+
+
+def _search(
+    team: TeamPaths, model: Model, moves: Moves, rules: BeamRules, seekers: Seekers, u: FloatArray, x: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Controls ``(R, H, m)``, states ``(R, H+1, n)`` and who arrives, of robots of one model that did as given."""
+    found, search = np.zeros(len(u), bool), search_kernel(model.name)
+    arrays, table = team.problem.arrays, team.index.table
+
+    def look(part: IntArray) -> None:
+        for first in range(part[0], part[1]):
+            if team.search.should_stop():
+                break
+            search(arrays, table, moves, rules, seekers, np.array((first, first + 1)), u, x, found)
+
+    Threads(available_cores()).over(len(u), look)
+    return u, x, found
+
+
+def prepare_beams(team: TeamPaths) -> None:
+    """Compile what the search of this team's ways needs, if it is not yet."""
+    firsts: dict[str, int] = {model.name: robots[0] for model, robots in by_model(team.problem)}
+    if not all(search_kernel(name).signatures for name in firsts):
+        robots: Sequence[int] = list(firsts.values())
+        team.faults(robots)
+        find_ways(team, np.array(robots), 0, Manner((90.0,), (1.0,)), BeamRules(2, 1.0, 1.0))
+        team.index.move(robots, team.positions[:, robots])

@@ -1,0 +1,50 @@
+"""An iteration that makes the best plan so far better."""
+
+from __future__ import annotations
+
+from d4orm_env.core.seeds import Stream
+from d4orm_env.core.trajectory import Trajectory
+from d4orm_planners.base.candidate import evaluate_controls
+from d4orm_planners.base.planner import Iteration
+from d4orm_planners.mapf.roundabout import drive_roundabout
+from d4orm_planners.mapf.working_plan import TeamPaths
+from d4orm_planners.base.solve import Search
+
+ROUNDS = 96
+"""Rounds of the search in an iteration: one annealing."""
+FIRST_ROUNDS = 4
+"""Rounds for a plan that has just been found."""
+GUIDED_ROUNDS = 8
+"""The same for one that was found on a roadmap, with all its corners and stops."""
+
+
+def refined_iteration(search: Search) -> Iteration:
+    """The best plan so far, or a roundabout if that is better, whose robots have looked for faster ways."""
+    # Here, because importing numba takes long.
+    from d4orm_planners.mapf.beams import prepare_beams
+    from d4orm_planners.mapf.lns import shorten_ways
+
+    team = TeamPaths(search, _better_roundabout(search) or search.best.trajectory)
+    with search.watch.paused():
+        prepare_beams(team)
+    return Iteration(shorten_ways(team, search.iteration_seed(Stream.NEIGHBOURHOODS), ROUNDS))
+
+
+def _better_roundabout(search: Search) -> Trajectory | None:
+    """A roundabout in which nobody fails, with more reward than the best plan so far."""
+    best = search.best
+    for side in (1, -1):
+        controls = drive_roundabout(search.problem, search.engine, side)
+        if controls is None:
+            continue
+        candidate = evaluate_controls(search.engine, search.problem, controls)
+        if candidate.rank > best.rank:
+            best = candidate
+    return None if best is search.best else best.trajectory
+
+
+def shorten_first_ways(team: TeamPaths, rounds: int = FIRST_ROUNDS) -> None:
+    """Take what faster ways there are at once for a team in which nobody fails, in so many rounds."""
+    from d4orm_planners.mapf.lns import shorten_ways
+
+    shorten_ways(team, team.search.iteration_seed(Stream.NEIGHBOURHOODS), rounds, temperature=0.0)

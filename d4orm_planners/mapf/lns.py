@@ -1,0 +1,167 @@
+"""Large-neighbourhood search: a few robots at a time find faster ways around all others, under their own dynamics.
+
+After MAPF-LNS (J. Li, Z. Chen, D. Harabor, P. J. Stuckey and S. Koenig, IJCAI 2021); what is worse is accepted as in
+simulated annealing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray
+from d4orm_env.core.metrics import arrival_steps
+from d4orm_env.core.portable import log
+from d4orm_planners.mapf.beam_search import BeamRules
+from d4orm_planners.engine.path_index import BLOCK
+from d4orm_planners.mapf.beams import Company, Manner, find_ways
+from d4orm_planners.mapf.working_plan import TeamPaths
+from d4orm_planners.tracking.steering import straight_drives
+
+
+@dataclass(frozen=True)
+class NeighbourhoodRules:
+    """The numbers of the search.
+
+    Attributes:
+        groups: Groups of robots that look for ways at the same time, not minding each other: so that all cores have
+            work. What one finds is taken over only if it fits what those before it have found.
+        size: Robots in a group, at most.
+        give: How much later than before a robot of a group may arrive for the sake of those after it [s].
+        temperature: How much worse the ways of a group may be and still be taken over, on average and at first [s].
+        least_delay: Who arrives as soon as if it were alone is chosen as often as who arrives so much later [s].
+        nearness: How much farther away a robot may be and still be chosen for a group, at random [m].
+        angles: By which robots turn off [degrees], all times the same number, ...
+        scales: ... which is between these and drawn for every round.
+        paces: Shares of their speed with which they head for their goals.
+        width: Ways that a search keeps after each block of steps.
+        apart: How far apart the ways that are kept must be [m], or else twice as much in speed [m/s].
+        contact: What meeting anybody costs [s]: too much.
+    """
+
+    groups: int = 8
+    size: int = 2
+    give: float = 0.5
+    temperature: float = 0.05
+    least_delay: float = 0.02
+    nearness: float = 1.0
+    angles: tuple[float, ...] = (10.0, 20.0, 35.0, 60.0, 100.0)
+    scales: tuple[float, float] = (0.4, 1.6)
+    paces: tuple[float, ...] = (1.0, 0.7, 0.35, 0.0)
+    width: int = 32
+    apart: float = 0.1
+    contact: float = 1e6
+
+
+RULES = NeighbourhoodRules()
+
+
+def shorten_ways(team: TeamPaths, seed: int, rounds: int, temperature: float = RULES.temperature) -> FloatArray:
+    """Let groups of robots look for faster ways, so many rounds, as long as there is time.
+
+    What counts is the sum of all arrival times and of all distances left over time, each as a share of the robot's
+    first: the first is what travel takes, the second what the reward is made of.
+
+    Args:
+        team: A team in which nobody fails; changed.
+        seed: Of what is tried.
+        rounds: How often :attr:`NeighbourhoodRules.groups` groups try.
+        temperature: See :attr:`NeighbourhoodRules.temperature`; it falls to zero with the rounds.
+
+    Returns:
+        ``(H, K, m)`` controls of the best that there has been; at a temperature of zero that is what the team does.
+    """
+    search = _Neighbourhoods(team, np.random.default_rng(seed))
+    best, least = team.controls.copy(), search.cost
+    for number in range(rounds):
+        if team.search.should_stop():
+            break
+        search.run(temperature * (1 - number / rounds))
+        if search.cost < least:
+            best, least = team.controls.copy(), search.cost
+    return best
+
+
+class _Neighbourhoods:
+    """Groups of robots that look for faster ways."""
+
+    def __init__(self, team: TeamPaths, random: np.random.Generator) -> None:
+        self.team, self.problem, self.random = team, team.problem, random
+        self.num_robots, self.size = self.problem.num_robots, min(RULES.size, self.problem.num_robots)
+        start = self.problem.start[:, : self.problem.dimension]
+        self.distance = np.linalg.norm(self.problem.goal - start, axis=1)
+        everybody, straight = np.arange(self.num_robots), straight_drives(self.problem)
+        self.soonest, _ = self.costs(everybody, straight.positions[:, :, 0])
+        self.arrival, self.lag = self.costs(everybody, team.states[..., : self.problem.dimension])
+
+    @property
+    def cost(self) -> float:
+        """Of all together [s]."""
+        return float((self.arrival + self.lag).sum())
+
+    def costs(self, robots: IntArray, places: FloatArray) -> tuple[Floats, Floats]:
+        """``(R,)`` arrival times of robots at places ``(H+1, R, d)``, and their distances left over time [s]."""
+        still = (places[1:] == places[:-1]).all(axis=2)
+        gap = np.linalg.norm(places[1:] - self.problem.goal[robots], axis=2).sum(axis=0, dtype=np.float64)
+        lag: Floats = self.problem.dt * gap / np.maximum(self.distance[robots], self.problem.goal_radius)
+        # Who does not move from one step to the next has arrived by the first of the two.
+        return self.problem.dt * arrival_steps(np.concatenate([still, np.ones_like(still[:1])])).astype(float), lag
+
+    def run(self, temperature: float) -> None:
+        """One round."""
+        groups = np.stack([self.group() for _ in range(RULES.groups)])
+        # Exponential, by a logarithm that is the same everywhere.
+        slack = -temperature * log(1 - self.random.random(len(groups)))
+        blocks = self.random.integers(0, 2, len(groups)) * self.arrival[groups[:, 0]] / self.problem.dt // BLOCK
+        blocks = (blocks * self.random.random(len(groups))).astype(np.int64)
+        manner = Manner(tuple(np.array(RULES.angles) * self.random.uniform(*RULES.scales)), RULES.paces)
+        found = np.ones(len(groups), bool)
+        controls = np.zeros((self.problem.horizon, *groups.shape, self.problem.control_size), np.float32)
+        states = np.zeros((self.problem.horizon + 1, *groups.shape, self.problem.state_size), np.float32)
+        # Those of a group one after another, those of all groups at the same time.
+        budget = self.arrival[groups].sum(axis=1) + slack + self.problem.dt / 2
+        for member in range(groups.shape[1]):
+            robots, left = groups[found, member], groups[found, member + 1 :]
+            if not len(robots):
+                return
+            limits = budget[found] - self.soonest[left].sum(axis=1)
+            if left.shape[1]:
+                limits = np.minimum(limits, self.arrival[robots] + RULES.give)
+            before = groups[found, :member]
+            company = Company(
+                groups[found],
+                np.ascontiguousarray(np.moveaxis(states[:, found, :member, : self.problem.dimension], 0, 2)),
+                np.asarray(self.problem.team.radius, np.float64)[before],
+            )
+            rules = BeamRules(RULES.width, RULES.contact, RULES.apart)
+            ways = find_ways(self.team, robots, blocks[found], manner, rules, limits, company)
+            controls[:, found, member], states[:, found, member] = ways.controls[:, :, 0], ways.states[:, :, 0]
+            budget[found] -= self.costs(robots, ways.positions[:, :, 0])[0]
+            found[found] = ways.arrived[:, 0]
+        for number in np.flatnonzero(found):
+            self.take_over(groups[number], controls[:, number], states[:, number], slack[number])
+
+    def group(self) -> IntArray:
+        """``(size,)`` a robot that is late, and some that it comes near to, in random order."""
+        delay = np.maximum(self.arrival - self.soonest, RULES.least_delay)
+        robot = int(self.random.choice(self.num_robots, p=delay / delay.sum()))
+        places = self.team.positions
+        gap = np.sqrt(((places - places[:, [robot]]) ** 2).sum(axis=2).min(axis=0))
+        gap += RULES.nearness * self.random.random(self.num_robots)
+        gap[robot] = -1.0
+        return self.random.permutation(np.argsort(gap, kind="stable")[: self.size])
+
+    def take_over(self, robots: IntArray, controls: FloatArray, states: FloatArray, slack: float) -> None:
+        """Let robots ``(R,)`` do as they found, if it fits what the others do and costs no more than so much [s]."""
+        arrival, lag = self.costs(robots, states[..., : self.problem.dimension])
+        before = (self.arrival[robots] + self.lag[robots]).sum()
+        if (arrival + lag).sum() >= before + slack - 1e-4:
+            return
+        team = self.team
+        present = team.controls[:, robots], team.states[:, robots], team.arrived[robots]
+        team.move(robots, controls, states, np.ones(len(robots), bool))
+        if team.faults(robots)[0].any():
+            team.move(robots, *present)
+        else:
+            self.arrival[robots], self.lag[robots] = arrival, lag

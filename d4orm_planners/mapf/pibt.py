@@ -1,0 +1,349 @@
+"""One step of the whole team on a roadmap, compiled with numba: priority inheritance with backtracking (PIBT).
+
+After K. Okumura, M. Machida, X. Defago and Y. Tamura, *Priority inheritance with backtracking for iterative multi-agent
+path finding* (AIJ 2022). Here a step is a sequence of moves of single robots, each of which keeps clear of where all
+others stand at that moment: who is in a robot's way moves first. So no two ever exchange places or turn in a ring,
+robots may have any size and nodes lie anywhere, and the sequence says who goes first wherever ways cross.
+"""
+
+from __future__ import annotations
+
+import heapq
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Ints, Whole
+from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.compiling import OPTIONS, compiled
+from d4orm_planners.mapf import near_neighbours as nearness
+from d4orm_planners.mapf.near_neighbours import squared_gap
+from d4orm_planners.mapf.roadmap import Roadmap
+
+SOURCES = fingerprint((nearness,))
+
+FREE, MOVING, DONE = 0, 1, 2
+"""Robots that have not moved yet in a step; that are about to, once others have made way; that have, or stay."""
+STAY, NOTHING = -1, -2
+IDLE = 0.05
+"""Detour that a robot rather makes than stay where it is [m]."""
+
+
+class Footprints(NamedTuple):
+    """The robots.
+
+    Attributes:
+        radius: ``(K,)`` [m].
+        reach: ``(K,)`` radius and margin to obstacles [m].
+        margin: Between robots [m].
+        slack: Distance beyond it that they keep where they can [m].
+        docked: By how much a robot may stand off its goal [m].
+        docks: Whether who has arrived stands there for ever.
+        starts: ``(K,)`` int64 nodes.
+        goals: ``(K,)`` int64 nodes.
+        costs: ``(K, N)`` float32 length of the way from every node to each robot's goal [m].
+    """
+
+    radius: Floats
+    reach: Floats
+    margin: float
+    slack: float
+    docked: float
+    docks: bool
+    starts: IntArray
+    goals: IntArray
+    costs: FloatArray
+
+
+class Workspace(NamedTuple):
+    """What a step is worked out in.
+
+    Attributes:
+        state: ``(K,)`` int8.
+        may_dock: ``(K,)`` bool who may come to its goal.
+        who: ``(N,)`` int32 the robot at each node; -1 for nobody.
+        robots: ``(K,)`` int64 those that others make way for, the first one first.
+        edges: ``(K,)`` int64 by which each wants to go.
+        tried: ``(K,)`` int64 how many edges each has tried.
+        options: ``(K, D)`` int64 the edges that each tries in turn.
+        worth: ``(D,)`` float64 how good they are.
+        moves: ``(K, 2)`` int64 robot and edge of each move, in their order.
+    """
+
+    state: NDArray[np.int8]
+    may_dock: BoolArray
+    who: Ints
+    robots: IntArray
+    edges: IntArray
+    tried: IntArray
+    options: IntArray
+    worth: Floats
+    moves: IntArray
+
+
+@compiled
+def _gap(points: Floats, u: Whole, v: Whole) -> float:
+    return np.sqrt(squared_gap(points, u, points, v, points, v))
+
+
+@compiled
+def _too_near(
+    roadmap: Roadmap, bodies: Footprints, k: Whole, tail: Whole, head: Whole, i: Whole, u: Whole, gap: float
+) -> bool:
+    """Whether robot ``k`` passes robot ``i`` at node ``u`` too near, ``gap``, on its way from one node to another.
+
+    Starts and goals may be nearer to each other than robots keep: then it may leave its own, and come to its own, if it
+    comes no nearer on the way.
+    """
+    hard = bodies.radius[k] + bodies.radius[i] + bodies.margin
+    docked = bodies.docks and u == bodies.goals[i]
+    need = hard + (bodies.slack / 2 + bodies.docked if docked else bodies.slack)
+    if gap >= need:
+        return False
+    if tail == bodies.starts[k] or tail == bodies.goals[k]:
+        need = min(need, _gap(roadmap.nodes, u, tail))
+    if head == bodies.goals[k]:
+        need = min(need, max(_gap(roadmap.nodes, u, head), hard))
+    return gap < need - 1e-9
+
+
+@compiled
+def closed(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, tail: Whole, e: Whole) -> bool:
+    """Whether a robot can never take an edge, because it would dock in passing, or of somebody who has docked.
+
+    ``docked`` ``(N,)`` is the robot docked at each node, -1 for none.
+    """
+    head = np.int64(roadmap.heads[e])
+    if roadmap.room[e] < bodies.reach[k]:
+        return True
+    if not bodies.docks:
+        return False
+    for number in range(roadmap.near_first[e], roadmap.near_first[e + 1]):
+        u = np.int64(roadmap.near[number])
+        if u == bodies.goals[k]:
+            if u != head and u != tail and roadmap.gaps[number] < bodies.docked + bodies.slack / 2:
+                return True
+        elif docked[u] >= 0:
+            i = docked[u]
+            if i != k and _too_near(roadmap, bodies, k, tail, head, i, u, roadmap.gaps[number]):
+                return True
+    return False
+
+
+@cached_kernel(SOURCES, variant="costs", **OPTIONS)
+def fill_costs(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, end: Whole, costs: FloatArray) -> None:
+    """Length of a robot's shortest way from every node to one; ``costs`` ``(N,)`` is output."""
+    costs[:] = np.inf
+    heap = [(0.0, np.int64(end))]
+    costs[end] = 0.0
+    while len(heap) > 0:
+        cost, n = heapq.heappop(heap)
+        if cost > costs[n]:
+            continue
+        for e in range(roadmap.first[n], roadmap.first[n + 1]):
+            head = np.int64(roadmap.heads[e])
+            # Compared as they are kept, in single precision, or rounding would let nodes come up for ever.
+            through = np.float32(cost + roadmap.lengths[e])
+            if through < costs[head] and not closed(roadmap, bodies, docked, k, n, e):
+                costs[head] = through
+                heapq.heappush(heap, (np.float64(through), head))
+
+
+@cached_kernel(SOURCES, variant="open", **OPTIONS)
+def is_open(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, at: Whole, costs: FloatArray) -> bool:
+    """Whether nobody who has docked closes the way that a robot at a node would take by these costs."""
+    if not costs[at] < np.inf:
+        return False
+    while at != bodies.goals[k]:
+        best, edge = costs[at], -1
+        for e in range(roadmap.first[at], roadmap.first[at + 1]):
+            if costs[roadmap.heads[e]] < best and roadmap.room[e] >= bodies.reach[k]:
+                best, edge = costs[roadmap.heads[e]], e
+        if edge < 0 or closed(roadmap, bodies, docked, k, at, edge):
+            return False
+        at = np.int64(roadmap.heads[edge])
+    return True
+
+
+@compiled
+def _mixed(a: np.uint64, b: np.uint64) -> float:
+    """A number from 0 to 1 that looks random (after splitmix64)."""
+    z = np.uint64(a) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(b) * np.uint64(0xD1B54A32D192ED03)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return np.float64((z ^ (z >> np.uint64(31))) >> np.uint64(11)) * (1.0 / 9007199254740992.0)
+
+
+@compiled
+def _rank_options(
+    roadmap: Roadmap, bodies: Footprints, scratch: Workspace, depth: int, k: Whole, at: Whole, pushed: bool, seed: int
+) -> None:
+    """Sort the edges that a robot may take, the best first, with staying among them unless it is pushed."""
+    options, worth, count = scratch.options[depth], scratch.worth, 0
+    costs = bodies.costs[k]
+    for e in range(roadmap.first[at], roadmap.first[at + 1] + 1):
+        if e < roadmap.first[at + 1]:
+            head = np.int64(roadmap.heads[e])
+            if roadmap.room[e] < bodies.reach[k] or not costs[head] < np.inf:
+                continue
+            value, option = np.float64(costs[head]) + roadmap.lengths[e], np.int64(e)
+        elif pushed:
+            continue
+        else:
+            value, option = np.float64(costs[at]) + IDLE, np.int64(STAY)
+        # Ties are broken at random, lest two robots go on getting into each other's way.
+        value += 1e-3 * _mixed(np.uint64(seed) + np.uint64(k), np.uint64(e))
+        place = count
+        while place > 0 and worth[place - 1] > value:
+            worth[place], options[place] = worth[place - 1], options[place - 1]
+            place -= 1
+        worth[place], options[place] = value, option
+        count += 1
+    options[count] = NOTHING
+
+
+@compiled
+def _in_the_way(
+    roadmap: Roadmap, bodies: Footprints, scratch: Workspace, positions: IntArray, k: Whole, e: Whole, depth: int
+) -> Whole:
+    """The first robot that has to make way before ``k`` takes an edge; -1 for none, -2 where that cannot be."""
+    nodes, head, at = roadmap.nodes, np.int64(roadmap.heads[e]), positions[k]
+    found = -1
+    for number in range(roadmap.near_first[e], roadmap.near_first[e + 1]):
+        u = np.int64(roadmap.near[number])
+        if bodies.docks and u == bodies.goals[k] and u != at:
+            if head != u and roadmap.gaps[number] < bodies.docked + bodies.slack / 2:
+                return -2  # It would dock in passing.
+            if head == u and not scratch.may_dock[k]:
+                return -2
+        i = scratch.who[u]
+        if i < 0 or i == k:
+            continue
+        if _too_near(roadmap, bodies, k, at, head, i, u, roadmap.gaps[number]):
+            if scratch.state[i] != FREE:
+                return -2
+            if found < 0:
+                found = i
+    # Those who wait for this one must get past it afterwards.
+    for above in range(depth):
+        i, end = scratch.robots[above], np.int64(roadmap.heads[scratch.edges[above]])
+        gap = np.sqrt(squared_gap(nodes, head, nodes, positions[i], nodes, end))
+        if _too_near(roadmap, bodies, i, positions[i], end, k, head, gap):
+            return -2
+    return found
+
+
+@compiled
+def _move(
+    roadmap: Roadmap,
+    bodies: Footprints,
+    scratch: Workspace,
+    positions: IntArray,
+    root: Whole,
+    forced: Whole,
+    seed: int,
+    count: int,
+) -> int:
+    """Let a robot move, and before it those that are in its way; how many moves there are then.
+
+    Args:
+        roadmap: The roadmap.
+        bodies: The robots.
+        scratch: Working space.
+        positions: ``(K,)`` the robots' nodes, changed in place.
+        root: The robot.
+        forced: The node that it must go to; -1 for where it likes.
+        seed: Of ties.
+        count: Moves so far.
+    """
+    depth = 0
+    scratch.robots[0], scratch.edges[0], scratch.tried[0] = root, NOTHING, 0
+    scratch.state[root] = MOVING
+    _rank_options(roadmap, bodies, scratch, 0, root, positions[root], False, seed)
+    while depth >= 0:
+        k = scratch.robots[depth]
+        if scratch.edges[depth] == NOTHING:
+            e = scratch.options[depth, scratch.tried[depth]]
+            if e < 0:
+                leave_it = e == NOTHING or forced < 0 or forced == positions[k] or depth > 0
+                if not leave_it:
+                    scratch.tried[depth] += 1
+                    continue
+                scratch.state[k] = DONE
+                depth -= 1
+                if depth >= 0:
+                    scratch.edges[depth] = NOTHING  # Who does not make way blocks this edge.
+                continue
+            scratch.tried[depth] += 1
+            if depth == 0 and forced >= 0 and roadmap.heads[e] != forced:
+                continue
+            scratch.edges[depth] = e
+        e = scratch.edges[depth]
+        blocker = _in_the_way(roadmap, bodies, scratch, positions, k, e, depth)
+        if blocker == -2:
+            scratch.edges[depth] = NOTHING
+        elif blocker >= 0:
+            depth += 1
+            scratch.robots[depth], scratch.edges[depth], scratch.tried[depth] = blocker, NOTHING, 0
+            scratch.state[blocker] = MOVING
+            _rank_options(roadmap, bodies, scratch, depth, blocker, positions[blocker], True, seed)
+        else:
+            head = np.int64(roadmap.heads[e])
+            scratch.who[positions[k]], scratch.who[head] = -1, k
+            positions[k] = head
+            scratch.moves[count, 0], scratch.moves[count, 1] = k, e
+            count += 1
+            scratch.state[k] = DONE
+            depth -= 1
+    return count
+
+
+@cached_kernel(SOURCES, variant="step", **OPTIONS)
+def step_team(
+    roadmap: Roadmap,
+    bodies: Footprints,
+    scratch: Workspace,
+    order: IntArray,
+    robots: IntArray,
+    places: IntArray,
+    seed: int,
+    positions: IntArray,
+) -> int:
+    """Let the whole team move.
+
+    Args:
+        roadmap: The roadmap.
+        bodies: The robots.
+        scratch: Working space; its moves are output.
+        order: ``(K,)`` who goes first.
+        robots: ``(C,)`` robots that must go ...
+        places: ... to these nodes ``(C,)``, or stay there.
+        seed: Of ties.
+        positions: ``(K,)`` int64 the robots' nodes, changed in place.
+
+    Returns:
+        How many moves there are; -1 where somebody could not go where it must.
+    """
+    count = 0
+    scratch.state[:] = FREE
+    scratch.who[:] = -1
+    for k in range(positions.shape[0]):
+        scratch.who[positions[k]] = k
+        if bodies.docks and positions[k] == bodies.goals[k]:
+            scratch.state[k] = DONE
+    for number in range(robots.shape[0]):
+        k = robots[number]
+        if positions[k] == places[number]:
+            scratch.state[k] = DONE
+    for number in range(robots.shape[0]):
+        k = robots[number]
+        if scratch.state[k] == FREE:
+            count = _move(roadmap, bodies, scratch, positions, k, places[number], seed, count)
+        if positions[k] != places[number]:
+            return -1
+    for number in range(order.shape[0]):
+        k = order[number]
+        if scratch.state[k] == FREE:
+            count = _move(roadmap, bodies, scratch, positions, k, -1, seed, count)
+    return count

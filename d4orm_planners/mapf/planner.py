@@ -1,0 +1,189 @@
+"""Path finding on a roadmap, driven under the robots' dynamics and made better by and by: no sampling at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.seeds import Stream
+from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
+from d4orm_planners.base.solve import Search
+from d4orm_planners.base.settings import Count
+
+if TYPE_CHECKING:
+    from d4orm_planners.mapf.roadmap import Roadmap
+    from d4orm_planners.mapf.roadmap_team import Driven, Replanning
+
+FINENESS = (1.6, 1.25, 1.0, 2.2, 3.0)
+"""How fine the roadmaps are that are tried; see :func:`~d4orm_planners.mapf.roadmap.lay_roadmap`."""
+TURNS = 30
+"""Ways that are planned per robot before path finding for all at once is tried."""
+MAX_ROBOT_STEPS = 4_000_000
+"""Most steps of all robots together, whose drives are kept several times over."""
+ROUND = 1.25
+"""How many times as long as straight a way is that leads far round; on a lattice any may be 1.1 times as long."""
+STEPS = 3000
+"""Steps of path finding for all at once after which the next roadmap is tried."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GuidedConfig(PlannerConfig):
+    """Settings of path finding.
+
+    Attributes:
+        neighbours: Robots that are replanned together, at most.
+        replannings: Groups of robots that are replanned in an iteration.
+    """
+
+    max_iterations: Count = 1000
+    neighbours: Count = 8
+    replannings: Count = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Guide:
+    """The state of the search.
+
+    Attributes:
+        roadmap: What ways are found on.
+        replanning: What makes them better.
+        driven: How the team drives on them.
+    """
+
+    roadmap: Roadmap
+    replanning: Replanning
+    driven: Driven
+
+
+@dataclass(frozen=True)
+class NoWays:
+    """The state of the search when no ways were found.
+
+    Attributes:
+        why: For the record of the iterations.
+    """
+
+    why: str
+
+
+class Guided(Planner):
+    """Path finding on a roadmap, one robot after another or for all at once, driven under the robots' own dynamics."""
+
+    name: ClassVar[str] = "guided"
+    config_class = GuidedConfig
+    # The paper names path finding as what is missing, and so has no parameters for it.
+    presets: ClassVar = {"paper": {}}
+    config: GuidedConfig
+
+    def iterate(self, search: Search, state: Guide | NoWays | None) -> tuple[Guide | NoWays, Iteration]:
+        """See :meth:`Planner.iterate`: first ways for the whole team, then better ones for some robots at a time."""
+        if isinstance(state, Guide):
+            state = better_ways(search, state, self.config.neighbours, self.config.replannings)
+        elif state is None:
+            state = first_ways(search)
+        if isinstance(state, NoWays):
+            return state, Iteration(search.current.controls, note=state.why)
+        return state, guided_iteration(search, state)
+
+
+def guided_iteration(search: Search, guide: Guide) -> Iteration:
+    """What a team that drives so does within the horizon."""
+    return Iteration(guide.driven.until(search.problem.horizon))
+
+
+def going_on_from_best(search: Search, guide: Guide) -> Guide:
+    """The guide of a team that drives as in the best plan so far, whoever found it."""
+    # Here, because importing numba takes long.
+    from d4orm_planners.mapf.roadmap_team import Driven
+
+    return replace(guide, driven=Driven.of(search.best.trajectory))
+
+
+def better_ways(search: Search, guide: Guide, neighbours: int, replannings: int) -> Guide:
+    """Replan so many groups of at most so many robots; what is no better for all together is left."""
+    random, driven = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE)), guide.driven
+    for _ in range(replannings):
+        if search.should_stop():
+            break
+        robots = guide.replanning.neighbours(driven, random, neighbours)
+        driven = guide.replanning.better(driven, robots, random, search.should_stop) or driven
+    return replace(guide, driven=driven)
+
+
+def first_ways(search: Search) -> Guide | NoWays:
+    """Ways for the whole team, or as many robots as possible; why there are none if nothing is found in time."""
+    from d4orm_planners.mapf.lacam import find_moves
+    from d4orm_planners.mapf.roadmap import lay_roadmap
+    from d4orm_planners.mapf.roadmap_team import Replanning, drive_moves
+
+    problem, best = search.problem, None
+    if problem.num_robots * problem.horizon > MAX_ROBOT_STEPS:
+        return NoWays(f"more than {MAX_ROBOT_STEPS} steps of all robots together are too many to look for ways")
+    with search.watch.paused():
+        compile_guidance(problem)
+    random = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE))
+    for number, fineness in enumerate(FINENESS):
+        roadmap = lay_roadmap(problem, fineness)
+        replanning = Replanning(problem, roadmap)
+        if not np.isfinite(replanning.alone).all():
+            if number == 0:
+                try:
+                    problem.check_reachable()
+                except ValueError as error:
+                    return NoWays(str(error))
+            continue
+        driven = replanning.one_by_one(random, search.should_stop, TURNS * problem.num_robots)
+        if driven is not None:
+            return Guide(roadmap, replanning, driven)
+        if search.should_stop():
+            break
+        seed = search.iteration_seed(Stream.GUIDANCE, number + 1)
+        found = find_moves(problem, roadmap, seed, search.should_stop, STEPS)
+        if found is not None and (best is None or found.arrived.sum() > best[1].arrived.sum()):
+            best = Guide(roadmap, replanning, drive_moves(problem, roadmap, found.moves)), found
+        if search.should_stop() or (found is not None and found.arrived.all()):
+            break
+    return best[0] if best else NoWays("no ways found on the roadmaps in time")
+
+
+def compile_roadmap(problem: Problem) -> None:
+    """Compile what :func:`leads_round` needs, if it is not yet."""
+    if not problem.world.num_obstacles:
+        return
+    from d4orm_planners.mapf.pibt import fill_costs
+
+    if not fill_costs.signatures:
+        leads_round(problem.select([0]))
+
+
+def leads_round(problem: Problem) -> bool:
+    """Whether obstacles lead somebody's shortest way far round, so that straight ways are no place to begin."""
+    if not problem.world.num_obstacles:
+        return False
+    from d4orm_planners.mapf.lacam import Team
+    from d4orm_planners.mapf.roadmap import lay_roadmap
+
+    roadmap = lay_roadmap(problem)
+    straight = np.linalg.norm(problem.goal - problem.start[:, : problem.dimension], axis=1)
+    ways = Team(problem, roadmap).bodies.costs[np.arange(problem.num_robots), roadmap.starts]
+    return bool((ways > ROUND * straight + problem.goal_radius).any())
+
+
+def compile_guidance(problem: Problem) -> None:
+    """Compile what path finding for such a team in such a world needs, if it is not yet."""
+    from d4orm_planners.mapf.lacam import find_moves
+    from d4orm_planners.mapf.roadmap import lay_roadmap
+    from d4orm_planners.mapf.roadmap_team import Replanning, drive_moves, is_compiled
+
+    if is_compiled(problem):
+        return
+    for robot in {model: number for number, model in enumerate(problem.team.models)}.values():
+        alone = problem.select([robot])
+        roadmap = lay_roadmap(alone)
+        found = find_moves(alone, roadmap, 0, lambda: False, STEPS)
+        if found is not None:
+            driven = drive_moves(alone, roadmap, found.moves)
+            Replanning(alone, roadmap).better(driven, np.zeros(1, np.int64), np.random.default_rng(0), lambda: False)

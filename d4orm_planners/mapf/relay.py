@@ -1,0 +1,63 @@
+"""New ways for some robots of a team that never rests, among all others on the ways that they have."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_planners.mapf.roadmap import lay_roadmap
+from d4orm_planners.mapf.roadmap_team import FAR, Driven, Replanning
+
+FINENESS = 1.6
+"""How fine the roadmap is."""
+LINGER = 1.0
+"""For so long others keep off the goal of a robot that has arrived; by then it drives on to another [s]."""
+TURNS = 3
+"""Ways that are planned per robot before it gives up."""
+
+
+def relay_ways(problem: Problem, ways: FloatArray, changed: BoolArray, seed: int) -> FloatArray | None:
+    """Plan the ways of some robots around all others, who give way only where there is no other one.
+
+    Args:
+        problem: The team where it is now, and its goals.
+        ways: ``(T + 1, K, d)`` where the robots are going to be, from now on [m]; those of ``changed`` are not looked
+            at.
+        changed: ``(K,)`` whose way is planned.
+        seed: Of who may have to give way, and of how leisurely they drive.
+
+    Returns:
+        ``(H + 1, K, d)`` where everybody is going to be [m]; ``None`` if no ways were found.
+    """
+    from d4orm_planners.mapf.planner import compile_guidance
+
+    compile_guidance(problem)
+    num_robots, d = problem.num_robots, problem.dimension
+    linger = int(np.ceil(LINGER / problem.dt))
+    replanning = Replanning(problem, lay_roadmap(problem, FINENESS), linger)
+    if not np.isfinite(replanning.alone).all():
+        return None
+    result = ways[np.minimum(np.arange(problem.horizon + 1), len(ways) - 1)]
+    present = _driven(problem, result, linger)
+    present.places[:, changed] = FAR
+    before, random, robots = present.places.copy(), np.random.default_rng(seed), np.flatnonzero(changed)
+    order = robots[np.argsort(replanning.alone[robots] + random.random(len(robots)))]
+    driven = replanning.settle(present, order, random, lambda: False, TURNS * num_robots)
+    if driven is None:
+        return None
+    for robot in np.flatnonzero((driven.places != before).any(axis=(0, 2))):
+        end = int(driven.arrivals[robot]) + 1
+        result[:end, robot], result[end:, robot] = driven.places[:end, robot, :d], problem.goal[robot]
+    return result
+
+
+def _driven(problem: Problem, ways: FloatArray, linger: int) -> Driven:
+    """A team on its ways ``(H + 1, K, d)``, which leaves its goals again; nothing is known of its controls."""
+    steps, num_robots, d = problem.horizon, problem.num_robots, problem.dimension
+    there = np.linalg.norm(ways - problem.goal, axis=2) <= problem.goal_radius
+    arrivals = np.where(there.any(axis=0), there.argmax(axis=0), steps)
+    places = np.zeros((steps + 1, num_robots, 3))
+    places[:, :, :d] = ways
+    places[np.arange(steps + 1)[:, None] > arrivals + linger] = FAR
+    return Driven(np.zeros((steps, num_robots, problem.control_size), np.float32), places, arrivals)

@@ -1,0 +1,324 @@
+"""A way for one robot among all others as they drive, compiled with numba: in space and time, on the roadmap."""
+
+from __future__ import annotations
+
+import heapq
+from typing import NamedTuple
+
+import numpy as np
+from numba.extending import register_jitable
+
+from d4orm_env.core.arrays import Floats, IntArray, Ints, Whole
+from d4orm_env.paths import wavefront
+from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.compiling import OPTIONS, compiled
+from d4orm_env.paths.wavefront import Space, is_free_line
+from d4orm_planners.mapf import near_neighbours as nearness
+from d4orm_planners.mapf import pibt
+from d4orm_planners.mapf.near_neighbours import Cells, cells_about
+from d4orm_planners.mapf.pibt import Footprints
+from d4orm_planners.mapf.roadmap import Roadmap
+
+SOURCES = fingerprint((nearness, pibt, wavefront))
+
+
+BLOCK = 16
+"""Steps for which it is known at once whether somebody is about."""
+
+
+class Others(NamedTuple):
+    """Where everybody is at every step.
+
+    Attributes:
+        positions: ``(T + 1, K, 3)`` float64; afterwards they stay where they are [m].
+        need: ``(K,)`` how far the robot that is replanned keeps from each [m].
+    """
+
+    positions: Floats
+    need: Floats
+
+
+@compiled
+def _is_clear(others: Others, k: Whole, step: Whole, x: float, y: float, z: float) -> bool:
+    """Whether nobody is near a place at a step."""
+    row = min(step, others.positions.shape[0] - 1)
+    for i in range(others.positions.shape[1]):
+        dx, dy = others.positions[row, i, 0] - x, others.positions[row, i, 1] - y
+        dz = others.positions[row, i, 2] - z
+        if i != k and dx * dx + dy * dy + dz * dz < others.need[i] * others.need[i]:
+            return False
+    return True
+
+
+@compiled
+def _fill_boxes(others: Others, boxes: Floats) -> None:
+    """The lowest and highest places of everybody in every block of steps; ``boxes`` ``(B, K, 6)`` is output."""
+    positions, num_robots = others.positions, others.positions.shape[1]
+    for block in range(boxes.shape[0]):
+        for i in range(num_robots):
+            for axis in range(3):
+                low, high = np.inf, -np.inf
+                for step in range(block * BLOCK, (block + 1) * BLOCK):
+                    place = positions[min(step, positions.shape[0] - 1), i, axis]
+                    low, high = min(low, place), max(high, place)
+                boxes[block, i, axis], boxes[block, i, axis + 3] = low, high
+
+
+@compiled
+def _is_line_free(
+    others: Others, boxes: Floats, k: Whole, tail: Floats, head: Floats, depart: Whole, arrive: Whole
+) -> bool:
+    """:func:`_is_line_clear`, looking only at those who are about."""
+    for block in range((depart + 1) // BLOCK, arrive // BLOCK + 1):
+        first, last = max(depart + 1, block * BLOCK), min(arrive + 1, (block + 1) * BLOCK)
+        for i in range(boxes.shape[1]):
+            need = others.need[i]
+            if (
+                i == k
+                or boxes[block, i, 0] - need > max(tail[0], head[0])
+                or boxes[block, i, 3] + need < min(tail[0], head[0])
+                or boxes[block, i, 1] - need > max(tail[1], head[1])
+                or boxes[block, i, 4] + need < min(tail[1], head[1])
+                or boxes[block, i, 2] - need > max(tail[2], head[2])
+                or boxes[block, i, 5] + need < min(tail[2], head[2])
+            ):
+                continue
+            for step in range(first, last):
+                share, row = (step - depart) / (arrive - depart), min(step, others.positions.shape[0] - 1)
+                dx = tail[0] + share * (head[0] - tail[0]) - others.positions[row, i, 0]
+                dy = tail[1] + share * (head[1] - tail[1]) - others.positions[row, i, 1]
+                dz = tail[2] + share * (head[2] - tail[2]) - others.positions[row, i, 2]
+                if dx * dx + dy * dy + dz * dz < need * need:
+                    return False
+    return True
+
+
+@compiled
+def _is_line_clear(others: Others, k: Whole, tail: Floats, head: Floats, depart: Whole, arrive: Whole) -> bool:
+    """Whether nobody is near a robot that drives straight from one place to another between two steps."""
+    for step in range(depart + 1, arrive + 1):
+        share = (step - depart) / (arrive - depart)
+        x, y = tail[0] + share * (head[0] - tail[0]), tail[1] + share * (head[1] - tail[1])
+        if not _is_clear(others, k, step, x, y, tail[2] + share * (head[2] - tail[2])):
+            return False
+    return True
+
+
+@cached_kernel(SOURCES, variant="straighten", **OPTIONS)
+def straighten(
+    roadmap: Roadmap, bodies: Footprints, space: Space | None, others: Others, k: Whole, reach: float, way: IntArray
+) -> int:
+    """Leave out nodes of a way where the straight line is free of obstacles and of others.
+
+    Args:
+        roadmap: The roadmap.
+        bodies: The robots.
+        space: The world; ``None`` where there are no obstacles.
+        others: Where they are.
+        k: The robot.
+        reach: What it keeps from obstacles [m].
+        way: ``(n, 3)`` of :func:`find_way`, changed in place.
+
+    Returns:
+        How many are left.
+    """
+    nodes, goal, docked, count, i = roadmap.nodes, bodies.goals[k], bodies.docked + bodies.slack, 1, 0
+    while i + 1 < way.shape[0]:
+        j = i + 1
+        depart, tail = way[j, 1], nodes[way[i, 0]]
+        while j + 1 < way.shape[0]:
+            head = nodes[way[j + 1, 0]]
+            near = nearness.squared_gap(nodes, goal, nodes, way[i, 0], nodes, way[j + 1, 0])
+            if bodies.docks and way[j + 1, 0] != goal and near < docked * docked:
+                break
+            # Nested, because the compiler leaves out what is never reached.
+            if space is not None:  # noqa: SIM102
+                if not is_free_line(space, reach, tail, head):
+                    break
+            if not _is_line_clear(others, k, tail, head, depart, way[j + 1, 2]):
+                break
+            j += 1
+        way[count, 0], way[count, 1], way[count, 2] = way[j, 0], depart, way[j, 2]
+        count, i = count + 1, j
+    return count
+
+
+@cached_kernel(SOURCES, variant="touches", **OPTIONS)
+def touches(others: Others, k: Whole, places: Floats) -> bool:
+    """Whether a robot at places ``(T + 1, 3)`` comes nearer to any other than it may, after the start."""
+    for step in range(1, places.shape[0]):
+        if not _is_clear(others, k, step, places[step, 0], places[step, 1], places[step, 2]):
+            return True
+    return False
+
+
+@compiled
+def _close_nodes(cells: Cells, others: Others, k: Whole, begins: Ints) -> None:
+    """Mark with -1 in ``begins`` ``(N, T + 1)`` when somebody is near each node."""
+    nodes, steps, rows = cells.points, begins.shape[1], others.positions.shape[0]
+    for i in range(others.positions.shape[1]):
+        need, step = others.need[i], 0
+        while i != k and step < steps:
+            place = others.positions[min(step, rows - 1), i]
+            # Who stands still is looked at once.
+            end = step + 1
+            while end < steps:
+                after = others.positions[min(end, rows - 1), i]
+                if after[0] != place[0] or after[1] != place[1] or after[2] != place[2]:
+                    break
+                end += 1
+            (low_i, high_i), (low_j, high_j), (low_k, high_k) = cells_about(cells, place, place, need)
+            for ci in range(low_i, high_i):
+                for cj in range(low_j, high_j):
+                    for ck in range(low_k, high_k):
+                        cell = (ci * cells.size[1] + cj) * cells.size[2] + ck
+                        for number in range(cells.first[cell], cells.first[cell + 1]):
+                            n = cells.items[number]
+                            dx, dy, dz = nodes[n, 0] - place[0], nodes[n, 1] - place[1], nodes[n, 2] - place[2]
+                            if dx * dx + dy * dy + dz * dz < need * need:
+                                begins[n, step:end] = -1
+            step = end
+
+
+@compiled
+def _fill_begins(begins: Ints, ends: Ints) -> None:
+    """Say of every node and step when the free interval around it begins, and of every beginning when it ends.
+
+    Steps at which a node is not free know the next one at which it is, as its complement.
+    """
+    for n in range(begins.shape[0]):
+        begin, end = -1, begins.shape[1]
+        for step in range(begins.shape[1]):
+            if begins[n, step] < 0:
+                begin = -1
+            else:
+                begin = step if begin < 0 else begin
+                begins[n, step] = begin
+                ends[n, begin] = step + 1
+        for step in range(begins.shape[1] - 1, -1, -1):
+            if begins[n, step] < 0:
+                begins[n, step] = ~end
+            else:
+                end = step
+
+
+class Trip(NamedTuple):
+    """How a robot is taken to drive when its way is planned.
+
+    Attributes:
+        stride: How far it drives in a step [m].
+        launch: Steps that it loses whenever it sets out.
+        latest: Step by which it must have arrived.
+        linger: Steps for which it stays at its goal; negative for ever.
+    """
+
+    stride: float
+    launch: float
+    latest: int
+    linger: int
+
+
+@register_jitable(nogil=True, **OPTIONS)
+def _followed_back(path: IntArray, entry: Whole) -> IntArray:
+    """``(n, 3)`` the way that ends with an entry."""
+    count, walk = 0, entry
+    while walk >= 0:
+        count, walk = count + 1, path[walk, 3]
+    found, walk = np.empty((count, 3), np.int64), entry
+    while walk >= 0:
+        count -= 1
+        found[count, 0], found[count, 1], found[count, 2] = path[walk, 0], path[walk, 1], path[walk, 2]
+        walk = path[walk, 3]
+    return found
+
+
+@cached_kernel(SOURCES, variant="way", **OPTIONS)
+def find_way(roadmap: Roadmap, cells: Cells, bodies: Footprints, others: Others, k: Whole, trip: Trip) -> IntArray:
+    """The soonest way of a robot to its goal among all others: safe interval path planning.
+
+    After M. Phillips and M. Likhachev, *SIPP: safe interval path planning for dynamic environments* (ICRA 2011).
+
+    Args:
+        roadmap: The roadmap.
+        cells: Its nodes.
+        bodies: The robots.
+        others: Where they are.
+        k: The robot.
+        trip: How it drives.
+
+    Returns:
+        ``(n, 3)`` int64 nodes, the steps at which it sets out for each and comes to each; none where there is no way.
+    """
+    goal, start, nodes, costs = bodies.goals[k], np.int64(roadmap.starts[k]), roadmap.nodes, bodies.costs[k]
+    stride, latest = trip.stride, trip.latest
+    # Nobody may come near its goal once it stands there for good.
+    dock = others.positions.shape[0] - 1 if trip.linger < 0 else -1
+    while dock >= 0 and _is_clear(others, k, dock, nodes[goal, 0], nodes[goal, 1], nodes[goal, 2]):
+        dock -= 1
+    boxes = np.empty((latest // BLOCK + 2, others.positions.shape[1], 6))
+    _fill_boxes(others, boxes)
+    begins = np.zeros((nodes.shape[0], latest + 1), np.int32)
+    _close_nodes(cells, others, k, begins)
+    ends = np.empty((nodes.shape[0], latest + 1), np.int32)
+    _fill_begins(begins, ends)
+    # The entry of ``path`` that comes first to each interval, kept at its beginning.
+    came = np.full((nodes.shape[0], latest + 1), -1, np.int32)
+    aside = (bodies.docked + bodies.slack / 2) ** 2
+    path = np.empty((1024, 4), np.int64)
+    path[0, 0], path[0, 1], path[0, 2], path[0, 3] = start, 0, 0, -1
+    used = 1
+    # Where it starts others may be near as well.
+    if begins[start, 0] < 0:
+        begins[start, 0], ends[start, 0] = 0, 1
+    came[start, 0] = 0
+    heap = [(np.float64(costs[start]) / stride, np.int64(0))]
+    while len(heap) > 0:
+        _, entry = heapq.heappop(heap)
+        node, arrived = path[entry, 0], path[entry, 2]
+        begin = begins[node, arrived]
+        if came[node, begin] != entry:
+            continue
+        if node == goal and arrived > dock:
+            return _followed_back(path, entry)
+        if node == goal and bodies.docks:
+            continue
+        tail = nodes[node]
+        for e in range(roadmap.first[node], roadmap.first[node + 1]):
+            head = np.int64(roadmap.heads[e])
+            left = costs[head] / stride
+            if roadmap.room[e] < bodies.reach[k] or not costs[head] < np.inf:
+                continue
+            if bodies.docks and head != goal and nearness.squared_gap(nodes, goal, nodes, node, nodes, head) < aside:
+                continue
+            steps, depart, failures = np.int64(np.ceil(roadmap.lengths[e] / stride)), arrived, 0
+            while depart < ends[node, begin]:
+                lost = trip.launch if depart > arrived or path[entry, 3] < 0 else 0
+                until = depart + steps + lost
+                if until + left > latest:
+                    break
+                safe = begins[head, until]
+                if safe < 0:
+                    depart += ~safe - until
+                    continue
+                before = came[head, safe]
+                if before >= 0 and path[before, 2] <= until:
+                    depart += ends[head, safe] - until
+                    continue
+                depart += 1
+                if head == goal and bodies.docks and until <= dock:
+                    continue
+                if head == goal and ends[head, safe] < min(until + trip.linger, latest):
+                    depart += ends[head, safe] - until
+                    continue
+                if not _is_line_free(others, boxes, k, tail, nodes[head], depart - 1, until):
+                    # Whoever stands in the way often does so for long.
+                    failures += 1
+                    depart += failures // 4
+                    continue
+                if used == path.shape[0]:
+                    path = np.concatenate((path, np.empty((used, 4), np.int64)))
+                path[used, 0], path[used, 1], path[used, 2], path[used, 3] = head, until - steps - lost, until, entry
+                came[head, safe] = used
+                heapq.heappush(heap, (until + left, np.int64(used)))
+                used += 1
+    return np.empty((0, 3), np.int64)

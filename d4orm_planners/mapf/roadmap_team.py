@@ -1,0 +1,247 @@
+"""A team that drives on a roadmap: on ways planned one after another, and on better ones for some robots at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numba import types
+
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray
+from d4orm_env.core.metrics import arrival_steps
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.paths.wavefront import make_space
+from d4orm_planners.tracking.path_drives import drive_along
+from d4orm_planners.mapf.lacam import Team
+from d4orm_planners.mapf.near_neighbours import sort_into_cells
+from d4orm_planners.mapf.replanning import Others, Trip, find_way, straighten, touches
+from d4orm_planners.mapf.roadmap import WALL_SLACK, Roadmap
+from d4orm_planners.mapf.routes import Stops, join_routes, make_routes, stops_of
+from d4orm_planners.tracking.timed_path import drive_by_clock, timed_kernel
+
+FIRST_CUT = 0.03
+"""By how much corners are cut at most on first routes [m]."""
+MANNERS = ((1.0, 0.25), (0.9, 0.1), (0.75, 0.03), (0.6, 0.01))
+"""Shares of its speed that a robot is taken to drive at when its way is planned, and by how much it cuts corners [m];
+the next where it is late so, or comes too near to something."""
+LEISURE = 0.1
+"""Share of that by which it is slower, at most: drawn for every way, so that no two searches are the same."""
+LAUNCH = 0.4
+"""Share of the time to full speed that setting out costs."""
+OVERTIME = 3
+"""Horizons within which first routes must be driven; they become shorter afterwards."""
+SOON, PATIENCE = 1.5, 60
+"""How many times as long as alone, and how many steps more, a way may take that is looked for at first."""
+FAR = 1e9
+"""Where robots are that are not there yet [m]."""
+LATER = 30
+"""Steps by which a robot may come later for the sake of others."""
+KEEP, TOUCH = 0.06, 0.005
+"""Distances beyond radii and margin that a way is planned to keep, where starts and goals allow it, and keeps [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """How a team drives.
+
+    Attributes:
+        controls: ``(T, K, m)`` float32.
+        places: ``(T + 1, K, 3)`` float64 [m].
+        arrivals: ``(K,)`` int64 step of arrival; ``T + 1`` or more for who has not arrived.
+    """
+
+    controls: FloatArray
+    places: Floats
+    arrivals: IntArray
+
+    @classmethod
+    def of(cls, trajectory: Trajectory) -> Driven:
+        """How a team drives that docks."""
+        places = np.zeros((*trajectory.positions.shape[:2], 3))
+        places[..., : trajectory.positions.shape[2]] = trajectory.positions
+        return cls(trajectory.controls, places, arrival_steps(trajectory.arrived))
+
+    def cost(self, horizon: int) -> tuple[int, int]:
+        """Less is better: robots that come too late, and the sum of all arrival steps."""
+        return int((self.arrivals > horizon).sum()), int(self.arrivals.sum())
+
+    def until(self, horizon: int) -> FloatArray:
+        """Controls ``(H, K, m)``, at rest after the last arrival and cut off at the horizon."""
+        controls = np.zeros((horizon, *self.controls.shape[1:]), np.float32)
+        controls[: len(self.controls)] = self.controls[:horizon]
+        return controls
+
+
+def drive_moves(problem: Problem, roadmap: Roadmap, moves: IntArray) -> Driven:
+    """Drive a team along the moves of a search."""
+    stops = stops_of(roadmap, moves, problem.num_robots)
+    routes = join_routes(problem, make_routes(problem, stops, range(problem.num_robots), FIRST_CUT))
+    return Driven(*drive_along(problem, routes, OVERTIME * problem.horizon))
+
+
+class Replanning:
+    """Better ways for some robots of a team at a time, planned one after another around all others as they drive.
+
+    As in MAPF-LNS (J. Li, Z. Chen, D. Harabor, P. J. Stuckey and S. Koenig, IJCAI 2021).
+
+    Args:
+        problem: The team.
+        roadmap: The roadmap of its world.
+        linger: Steps after which a robot that has arrived is nobody's obstacle any more, for it goes on to another
+            goal; ``None`` if it stays.
+
+    Attributes:
+        alone: ``(K,)`` about how many steps each robot takes by itself.
+    """
+
+    def __init__(self, problem: Problem, roadmap: Roadmap, linger: int | None = None) -> None:
+        self.problem, self.roadmap, self.linger = problem, roadmap, linger
+        self.cells = sort_into_cells(roadmap.nodes, float(2 * np.asarray(problem.team.radius).max() + problem.margin))
+        self.space = make_space(problem) if problem.world.num_obstacles else None
+        self.bodies = Team(problem, roadmap).bodies
+        speed, acceleration = (np.asarray(problem.team.limits[:, column], np.float64) for column in (0, 1))
+        self.strides = problem.dt * speed
+        self.launch = np.round(LAUNCH * speed / acceleration / problem.dt).astype(np.int64)
+        places = [roadmap.nodes[ends] for ends in (roadmap.starts, roadmap.goals)]
+        gaps = [np.sqrt(((ends[:, None] - ends) ** 2).sum(axis=2)) for ends in places]
+        self.ends_apart = np.minimum(gaps[0], gaps[1] - self.bodies.docked) - 1e-6
+        # Who turns in place need not back up.
+        self.turns = [(False,) if model.turns_in_place else (False, True) for model in problem.team.robot_models]
+        d = problem.dimension
+        ends = np.stack([problem.world.clearance(place[:, :d]) for place in places])
+        self.own_room = ends.min(axis=0) - TOUCH
+        self.alone = self.bodies.costs[np.arange(problem.num_robots), roadmap.starts] / self.strides
+
+    def neighbours(self, driven: Driven, random: np.random.Generator, most: int) -> IntArray:
+        """Some robots to replan together, in random order: one that is much delayed, and those it drove nearest to."""
+        delay = np.maximum(driven.arrivals - self.alone, 1.0)
+        late = driven.arrivals > self.problem.horizon
+        if late.any() and random.random() < 0.5:
+            delay[~late] = 0.0
+        robot = int(random.choice(len(delay), p=delay / delay.sum()))
+        places = driven.places[: int(driven.arrivals[robot]) + 1]
+        gaps = np.sqrt(((places - places[:, robot, None]) ** 2).sum(axis=2)).min(axis=0) + random.random(len(delay)) / 2
+        gaps[robot] = -1.0
+        return random.permutation(np.argsort(gaps)[: random.integers(1, min(len(delay), most) + 1)])
+
+    def better(
+        self, driven: Driven, robots: IntArray, random: np.random.Generator, should_stop: Callable[[], bool]
+    ) -> Driven | None:
+        """The team with new ways for some robots, in their order, if that is better for all together, and in time."""
+        last = int(driven.arrivals.max())
+        changed = Driven(driven.controls[:last].copy(), driven.places[: last + 1].copy(), driven.arrivals.copy())
+        changed.places[:, robots] = FAR
+        latest = np.minimum(driven.arrivals + LATER, last)
+        for robot in robots.tolist():
+            if should_stop() or not self.replan_one(changed, robot, int(latest[robot]), random):
+                return None
+        return changed if changed.cost(self.problem.horizon) < driven.cost(self.problem.horizon) else None
+
+    def one_by_one(self, random: np.random.Generator, should_stop: Callable[[], bool], most: int) -> Driven | None:
+        """The team with ways planned one after another; who finds none displaces others, whose turn comes again.
+
+        Args:
+            random: Of the order, and of who may be displaced.
+            should_stop: Asked before every way.
+            most: Ways planned after which it gives up.
+
+        Returns:
+            Everybody's ways within the horizon; ``None`` if they were not found.
+        """
+        problem, steps, num_robots = self.problem, self.problem.horizon, self.problem.num_robots
+        places = np.full((steps + 1, num_robots, 3), FAR)
+        controls = np.zeros((steps, num_robots, problem.control_size), np.float32)
+        driven = Driven(controls, places, np.full(num_robots, steps + 1))
+        waiting = np.argsort(self.alone + random.random(num_robots))
+        return self.settle(driven, waiting, random, should_stop, most)
+
+    def settle(
+        self, driven: Driven, robots: IntArray, random: np.random.Generator, should_stop: Callable[[], bool], most: int
+    ) -> Driven | None:
+        """The same for those ``robots``, the last of them first, among all others in ``driven``, which is changed."""
+        steps, waiting, num_robots = len(driven.controls), robots.tolist(), self.problem.num_robots
+        settled = np.ones(num_robots, bool)
+        settled[robots] = False
+        while waiting and not should_stop():
+            most -= 1
+            if most < 0:
+                return None
+            robot = int(waiting.pop())
+            for hard in (1.0, 0.5, 0.0):
+                around = driven.places.copy()
+                around[:, settled & (random.random(num_robots) >= hard)] = FAR
+                here = Driven(driven.controls, around, driven.arrivals)
+                if self.replan_one(here, robot, steps, random):
+                    break
+            else:
+                return None
+            driven.places[:, robot] = around[:, robot]
+            apart = self.bodies.radius[robot] + self.bodies.radius + self.bodies.margin + TOUCH
+            there = driven.places[1 : self.leaves(int(driven.arrivals[robot]))]
+            gaps = np.sqrt(((there - there[:, robot, None]) ** 2).sum(axis=2))
+            displaced = settled & (gaps < np.minimum(apart, self.ends_apart[robot])).any(axis=0)
+            displaced[robot] = False
+            driven.places[:, displaced] = FAR
+            settled &= ~displaced
+            settled[robot] = True
+            waiting[:0] = random.permutation(np.flatnonzero(displaced)).tolist()
+        return None if waiting else driven
+
+    def leaves(self, arrival: int) -> int | None:
+        """The step from which on a robot that arrives at a step is nobody's obstacle any more, if any."""
+        return None if self.linger is None else arrival + self.linger + 1
+
+    def replan_one(self, driven: Driven, robot: int, latest: int, random: np.random.Generator) -> bool:
+        """Plan a robot's way around all others in ``driven``, which is changed; whether that succeeds."""
+        haste = 1 - random.random() * LEISURE
+        return any(self.find_and_drive(driven, robot, latest, cruise * haste, cut) for cruise, cut in MANNERS)
+
+    def find_and_drive(self, driven: Driven, robot: int, latest: int, cruise: float, cut: float) -> bool:
+        """The same in one of the :data:`MANNERS`."""
+        roadmap, bodies, steps = self.roadmap, self.bodies, len(driven.controls)
+        apart = bodies.radius[robot] + bodies.radius + bodies.margin
+        others = Others(driven.places, np.minimum(apart + KEEP, self.ends_apart[robot]))
+        linger = -1 if self.linger is None else self.linger
+        # Looked for among the sooner ones at first, because that is where it mostly is.
+        for bound in sorted({min(int(SOON * self.alone[robot]) + PATIENCE, latest), latest}):
+            trip = Trip(cruise * self.strides[robot], self.launch[robot], bound, linger)
+            way = find_way(roadmap, self.cells, bodies, others, robot, trip)
+            if len(way):
+                break
+        else:
+            return False
+        reach = bodies.reach[robot] * (1 + WALL_SLACK * 2 / 3)
+        left = straighten(roadmap, bodies, self.space, others, robot, reach, way)
+        nodes, departs, arrives = way[:left].T
+        stops = Stops(roadmap.nodes[nodes], np.array([0, left]), departs.astype(float), arrives.astype(float))
+        route = make_routes(self.problem, stops, [robot], cut)[0]
+        # As soon as it can, or else by the clock of its way.
+        for backs_up, hurrying in product(self.turns[robot], (True, False)):
+            drive = drive_by_clock(self.problem, robot, route, stops, steps, hurrying=hurrying, backs_up=backs_up)
+            if self.fits(Others(driven.places, np.minimum(apart + TOUCH, others.need)), robot, drive, latest):
+                driven.controls[:, robot], driven.places[:, robot], driven.arrivals[robot] = drive
+                if self.linger is not None:
+                    driven.places[self.leaves(drive[2]) :, robot] = FAR
+                return True
+        return False
+
+    def fits(self, others: Others, robot: int, drive: tuple[FloatArray, Floats, int], latest: int) -> bool:
+        """Whether a drive of a robot ends in time, and comes near to nobody and nothing."""
+        _, places, arrival = drive
+        if arrival > latest or touches(others, robot, places[: self.leaves(arrival)]):
+            return False
+        if self.space is None:
+            return True
+        room = self.problem.world.clearance(places[1 : arrival + 1, : self.problem.dimension])
+        return bool(room.min() > min(self.bodies.reach[robot] + TOUCH, self.own_room[robot]))
+
+
+def is_compiled(problem: Problem) -> bool:
+    """Whether all that a team like this in a world like this needs has been compiled in this process."""
+    open_world = not problem.world.num_obstacles
+    return all(timed_kernel(model).signatures for model in set(problem.team.models)) and any(
+        (signature[2] is types.none) == open_world for signature in straighten.signatures
+    )

@@ -1,0 +1,313 @@
+"""Who goes first: from moves on a roadmap to routes, and whom each robot has to let pass before it goes on.
+
+As in action dependency graphs (W. Hoenig, S. Kiesel, A. Tinka, J. W. Durham and N. Ayanian, 2019) only the order
+matters, not the time: wherever two routes come too near to each other, who moved there first goes first. Since the
+moves can be made one after another, in their order, nobody ever waits in a ring.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from d4orm_env.core.arrays import Floats, IntArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.compiling import OPTIONS
+from d4orm_planners.mapf import near_neighbours as nearness
+from d4orm_planners.mapf.near_neighbours import Cells, cells_about, sort_into_cells
+from d4orm_planners.mapf.roadmap import Roadmap
+
+SOURCES = fingerprint((nearness,))
+
+SPACING = 0.04
+"""Distance between the points of a route [m], at most."""
+CUTS = (1.0, 0.5, 0.25)
+"""Shares of the allowed cut that corners are rounded by; the first that leaves room at walls."""
+ARC_POINTS, ARC_CHECKS, ARC_SLACK = 9, 17, 0.01
+"""Points along an arc, those that are looked at for walls, and how far from those they keep beyond the margin [m]."""
+STRAIGHT, TURNING_BACK = 1e-4, 0.31
+"""Sine and cosine of half the angle by which ways turn at corners: less is no corner, and cannot be rounded."""
+WAIT_SLACK = 0.09
+"""Distance beyond radii and margin that robots under way keep [m]."""
+SHARPEST = 0.1
+"""Radius below which corners are not rounded [m]."""
+
+
+class Route(NamedTuple):
+    """One robot's way as a row of points.
+
+    Attributes:
+        points: ``(P, 3)`` float64 [m].
+        times: ``(P,)`` float64 when each is passed, of which only the order counts.
+        bends: ``(P,)`` float64 radius of the bend at each point [m]; infinite on straight stretches, zero at sharp
+            corners.
+    """
+
+    points: Floats
+    times: Floats
+    bends: Floats
+
+
+class Routes(NamedTuple):
+    """Every robot's way, and whom it waits for.
+
+    Attributes:
+        points: ``(T, 3)`` float64 points of all routes, one robot's after another's [m].
+        times: ``(T,)`` float64, see :class:`Route`.
+        bends: ``(T,)`` float64.
+        first: ``(K + 1,)`` int64 where each robot's begin.
+        arcs: ``(T,)`` float64 length of the route up to each point [m].
+        wait_first: ``(K + 1,)`` int64 where each robot's waits begin.
+        wait_at: int64 points, counted from the robot's first, that it may not come to ...
+        wait_for: ... before this robot ...
+        wait_until: ... has come to this point of its own.
+    """
+
+    points: Floats
+    times: Floats
+    bends: Floats
+    first: IntArray
+    arcs: Floats
+    wait_first: IntArray
+    wait_at: IntArray
+    wait_for: IntArray
+    wait_until: IntArray
+
+    def each(self) -> list[slice]:
+        """The rows of every robot."""
+        return [slice(low, high) for low, high in pairwise(self.first)]
+
+
+class Stops(NamedTuple):
+    """Corners of ways, one robot's after another's, each from its start on.
+
+    Attributes:
+        places: ``(C, 3)`` float64 [m].
+        begin: ``(K + 1,)`` int64 where each robot's begin.
+        departs: ``(C,)`` float64 when it sets out for each from the one before.
+        arrives: ``(C,)`` float64 when it gets there.
+    """
+
+    places: Floats
+    begin: IntArray
+    departs: Floats
+    arrives: Floats
+
+
+def stops_of(roadmap: Roadmap, moves: IntArray, num_robots: int) -> Stops:
+    """The corners that moves ``(M, 2)`` made one after another lead along."""
+    order = np.argsort(moves[:, 0], kind="stable")
+    begin = np.append(0, np.cumsum(np.bincount(moves[:, 0], minlength=num_robots) + 1)).astype(np.int64)
+    moving = np.ones(begin[-1], bool)
+    moving[begin[:-1]] = False
+    places, times = np.empty((begin[-1], 3)), np.full(begin[-1], -1.0)
+    places[~moving] = roadmap.nodes[roadmap.starts]
+    places[moving] = roadmap.nodes[roadmap.heads[moves[order, 1]]]
+    times[moving] = order
+    return Stops(places, begin, times, times)
+
+
+def make_routes(problem: Problem, stops: Stops, robots: Sequence[int], cut: float) -> list[Route]:
+    """The routes of robots along corners, which are rounded by ``cut`` at most [m], less where walls are near."""
+    owner = np.repeat(np.asarray(robots), np.diff(stops.begin))
+    points, first, times, bends = _rounded(stops, _corner_radii(problem, stops.places, owner, cut))
+    ends = [slice(low, high) for low, high in pairwise(first)]
+    return [Route(points[own], times[own], bends[own]) for own in ends]
+
+
+def join_routes(problem: Problem, routes: Sequence[Route]) -> Routes:
+    """Everybody's routes, and who waits for whom."""
+    points, times, bends = (np.concatenate(parts) for parts in zip(*routes))
+    first = np.append(0, np.cumsum([len(route.times) for route in routes])).astype(np.int64)
+    arcs = np.append(0.0, np.cumsum(_lengths(np.diff(points, axis=0))))
+    arcs -= np.repeat(arcs[first[:-1]], np.diff(first))
+    radius = np.asarray(problem.team.radius, np.float64)
+    cells = sort_into_cells(points, 2 * float(radius.max()) + problem.margin + WAIT_SLACK)
+    return Routes(points, times, bends, first, arcs, *_find_waits(cells, first, times, radius, problem.margin))
+
+
+class Bends(NamedTuple):
+    """Corners of ways, without the angles themselves, whose functions differ from one processor to the next.
+
+    Attributes:
+        corners: ``(C, 3)`` where they are [m].
+        before: ``(C, 3)`` unit vectors that lead to each.
+        after: ``(C, 3)`` unit vectors that lead on from each.
+        straight: ``(C,)`` half of the shorter of the ways to the corners next to each [m].
+        cosine: ``(C,)`` of half the angle by which the way turns.
+        sine: ``(C,)``.
+    """
+
+    corners: Floats
+    before: Floats
+    after: Floats
+    straight: Floats
+    cosine: Floats
+    sine: Floats
+
+
+def _bends_at(corners: Floats, inner: IntArray) -> Bends:
+    """The corners with these numbers, each with the one before it and the one after it."""
+    before, after = corners[inner] - corners[inner - 1], corners[inner + 1] - corners[inner]
+    one, other = _lengths(before), _lengths(after)
+    before, after = before / np.maximum(one, 1e-12)[:, None], after / np.maximum(other, 1e-12)[:, None]
+    cosine = np.clip(before[:, 0] * after[:, 0] + before[:, 1] * after[:, 1] + before[:, 2] * after[:, 2], -1.0, 1.0)
+    halves = np.sqrt((1 + cosine) / 2), np.sqrt((1 - cosine) / 2)
+    return Bends(corners[inner], before, after, np.minimum(one, other) / 2, *halves)
+
+
+def _arcs(bends: Bends, radius: Floats, num_points: int) -> Floats:
+    """``(C, P, 3)`` points along the arcs that round corners."""
+    reach = radius * bends.sine / bends.cosine
+    begin, end = bends.corners - bends.before * reach[:, None], bends.corners + bends.after * reach[:, None]
+    inward = bends.after - bends.before
+    inward /= np.maximum(_lengths(inward), 1e-12)[:, None]
+    centre = bends.corners + inward * (radius / bends.cosine)[:, None]
+    share = np.linspace(0, 1, num_points)[None, :, None]
+    spokes = (begin - centre)[:, None] * (1 - share) + (end - centre)[:, None] * share
+    arcs: Floats = centre[:, None] + spokes * (radius[:, None] / np.maximum(_lengths(spokes), 1e-12))[..., None]
+    return arcs
+
+
+def _corner_radii(problem: Problem, corners: Floats, owner: IntArray, cut: float) -> Floats:
+    """``(C,)`` radius of the arc that rounds each corner [m]; infinite where there is none, zero for a sharp one."""
+    radii = np.full(len(corners), np.inf)
+    inner = np.flatnonzero((owner[:-2] == owner[1:-1]) & (owner[1:-1] == owner[2:])) + 1
+    inner = inner[_bends_at(corners, inner).sine > STRAIGHT]
+    radii[inner] = 0.0
+    # Who turns back does so on the spot.
+    inner = inner[_bends_at(corners, inner).cosine > TURNING_BACK]
+    turning = problem.team.turning_radius.astype(np.float64)[owner]
+    for share in CUTS:
+        bends = _bends_at(corners, inner)
+        most = share * np.maximum(cut * bends.cosine / (1 - bends.cosine), turning[inner])
+        radius = np.minimum(most, bends.straight * bends.cosine / bends.sine)
+        fits = np.ones(len(inner), bool)
+        if problem.world.num_obstacles:
+            reach = np.asarray(problem.team.radius, np.float64)[owner[inner]] + problem.margin + ARC_SLACK
+            arcs = _arcs(bends, radius, ARC_CHECKS)[..., : problem.dimension]
+            room = problem.world.clearance(arcs.reshape(-1, problem.dimension)).reshape(len(inner), ARC_CHECKS)
+            fits = room.min(axis=1) > reach
+        rounded = fits & (radius > SHARPEST)
+        radii[inner[rounded]] = radius[rounded]
+        inner = inner[~fits]
+    return radii
+
+
+def _lengths(steps: Floats) -> Floats:
+    length: Floats = np.sqrt(steps[..., 0] ** 2 + steps[..., 1] ** 2 + steps[..., 2] ** 2)
+    return length
+
+
+def _rounded(stops: Stops, radii: Floats) -> tuple[Floats, IntArray, Floats, Floats]:
+    """``(points, first, times, bends)`` along ways with corners that are rounded by these radii."""
+    corners, rounded = stops.places, np.flatnonzero((radii > 0) & np.isfinite(radii))
+    arcs = _arcs(_bends_at(corners, rounded), radii[rounded], ARC_POINTS)
+    # Corners that are rounded become as many points, others stay one.
+    repeats = np.ones(len(corners), np.int64)
+    repeats[rounded] = ARC_POINTS
+    places, bends, arrive = (np.repeat(array, repeats, axis=0) for array in (corners, radii, stops.arrives))
+    depart = np.repeat(stops.departs, repeats)
+    at = np.append(0, np.cumsum(repeats))
+    index = at[rounded][:, None] + np.arange(ARC_POINTS)
+    places[index.ravel()] = arcs.reshape(-1, 3)
+    # The first half of an arc belongs to the stretch before the corner, the second to the one after it.
+    depart[index[:, 1:].ravel()] = np.repeat(stops.arrives[rounded], ARC_POINTS - 1)
+    late = index[:, ARC_POINTS // 2 + 1 :]
+    depart[late.ravel()] = arrive[late.ravel()] = np.repeat(stops.departs[rounded + 1], late.shape[1])
+    # Long stretches become several points each.
+    start = np.zeros(len(places), bool)
+    start[at[stops.begin[:-1]]] = True
+    steps = np.diff(places, axis=0, prepend=places[:1])
+    steps[start] = 0.0
+    parts = np.maximum(np.ceil(_lengths(steps) / SPACING).astype(np.int64), 1)
+    last = np.cumsum(parts)
+    part = np.arange(last[-1]) - np.repeat(last - parts, parts) + 1
+    share = part / np.repeat(parts, parts)
+    points = np.repeat(places - steps, parts, axis=0) + np.repeat(steps, parts, axis=0) * share[:, None]
+    times = np.repeat(depart, parts) + np.repeat(arrive - depart, parts) * share
+    inside = np.repeat(bends, parts)
+    inside[part < np.repeat(parts, parts)] = np.inf
+    first = np.append((last - parts)[at[stops.begin[:-1]]], last[-1]).astype(np.int64)
+    return points, first, times, inside
+
+
+def _find_waits(cells: Cells, first: IntArray, times: Floats, radius: Floats, margin: float) -> tuple[IntArray, ...]:
+    room, num_robots = 8 * len(times), len(first) - 1
+    owner = np.repeat(np.arange(num_robots), np.diff(first))
+    wait_first = np.empty(num_robots + 1, np.int64)
+    while True:
+        waits = np.empty((room, 3), np.int64)
+        count = find_waits(cells, first, owner, times, radius, margin + WAIT_SLACK, wait_first, waits)
+        if count <= room:
+            return wait_first, *np.ascontiguousarray(waits[:count].T)
+        room = count
+
+
+@cached_kernel(SOURCES, variant="waits", **OPTIONS)
+def find_waits(
+    cells: Cells,
+    first: IntArray,
+    owner: IntArray,
+    times: Floats,
+    radius: Floats,
+    margin: float,
+    wait_first: IntArray,
+    waits: IntArray,
+) -> int:
+    """Whom robots have to let pass; see :class:`Routes`.
+
+    ``owner`` ``(T,)`` is the robot of each point, and ``waits`` ``(room, 3)`` is at which point, for whom and until it
+    has come where.
+
+    Returns:
+        How many waits there are; as many as there is room for are written.
+    """
+    points, count, num_robots = cells.points, 0, first.shape[0] - 1
+    reach = 2.0 * radius.max() + margin
+    passed = np.zeros(num_robots, np.int64)
+    wanted = np.zeros(num_robots, np.int64)
+    touched = np.zeros(num_robots, np.int64)
+    for k in range(num_robots):
+        wait_first[k] = count
+        passed[:] = 0
+        for a in range(first[k], first[k + 1]):
+            num_touched = 0
+            (low_i, high_i), (low_j, high_j), (low_k, high_k) = cells_about(cells, points[a], points[a], reach)
+            for ci in range(low_i, high_i):
+                for cj in range(low_j, high_j):
+                    for ck in range(low_k, high_k):
+                        cell = (ci * cells.size[1] + cj) * cells.size[2] + ck
+                        for number in range(cells.first[cell], cells.first[cell + 1]):
+                            b = cells.items[number]
+                            j = owner[b]
+                            if j == k or times[b] >= times[a]:
+                                continue
+                            until = b - first[j] + 1
+                            if until <= passed[j] or until <= wanted[j]:
+                                continue
+                            near = radius[k] + radius[j] + margin
+                            dx, dy = points[a, 0] - points[b, 0], points[a, 1] - points[b, 1]
+                            dz = points[a, 2] - points[b, 2]
+                            if dx * dx + dy * dy + dz * dz < near * near:
+                                if wanted[j] == 0:
+                                    touched[num_touched] = j
+                                    num_touched += 1
+                                wanted[j] = until
+            for number in range(num_touched):
+                j = touched[number]
+                # Where it is at that time it is out of the way, however near that is.
+                last = max(np.searchsorted(times[first[j] : first[j + 1]], times[a]) - 1, 0)
+                until = min(wanted[j], last)
+                wanted[j] = 0
+                if until > passed[j]:
+                    passed[j] = until
+                    if count < waits.shape[0]:
+                        waits[count, 0], waits[count, 1], waits[count, 2] = a - first[k], j, until
+                    count += 1
+    wait_first[num_robots] = count
+    return count

@@ -1,0 +1,115 @@
+"""A team's controls in the course of an iteration, changed for some robots after others."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.core.trajectory import Trajectory
+from d4orm_planners.base.conflict_groups import Graph, graph_of
+from d4orm_planners.base.solve import Search
+from d4orm_planners.tracking.steering import Drives
+
+ROUNDING = 1e-5
+"""Kept beyond the margin: the engine, in float32, must not find near what this has found clear [m]."""
+
+MISSING = 5
+"""Robots that a robot may meet rather than never arrive, or touch an obstacle."""
+
+Costs = NDArray[np.float64]
+
+
+class TeamPaths:
+    """What the team does, to be changed for some robots around all others.
+
+    Args:
+        search: The search.
+        trajectory: What the team does at first.
+
+    Attributes:
+        controls: ``(H, K, m)``.
+        states: ``(H+1, K, n)``.
+        arrived: ``(K,)`` whether each ends at its goal.
+        index: Where everybody is.
+    """
+
+    def __init__(self, search: Search, trajectory: Trajectory) -> None:
+        # Here, because importing numba takes long.
+        from d4orm_planners.engine.path_index import PathIndex
+
+        self.search, self.problem = search, search.problem
+        self.controls, self.states = trajectory.controls.copy(), trajectory.states.copy()
+        self.arrived: BoolArray = trajectory.arrived[-1].copy()
+        margin = self.problem.margin + ROUNDING
+        self.index = PathIndex(trajectory.positions, self.problem.team.radius, margin)
+        self._interval = search.check_interval
+        # Who fails is looked for at some steps only, ways around others are at all of them.
+        self._checked = self.index
+        if self._interval > 1:
+            self._checked = PathIndex(trajectory.positions[:: self._interval], self.problem.team.radius, margin)
+
+    @property
+    def positions(self) -> FloatArray:
+        """``(H+1, K, d)`` [m]; not to be written to."""
+        return self.index.positions
+
+    def conflicts(self) -> Graph:
+        """Who comes within the margin of whom after the start, at the steps that are checked."""
+        return graph_of(self.problem.num_robots, self._checked.pairs())
+
+    def move(self, robots: ArrayLike, controls: FloatArray, states: FloatArray, arrived: ArrayLike) -> None:
+        """Let robots ``(R,)`` do otherwise: ``(H, R, m)``, ``(H+1, R, n)`` and ``(R,)``."""
+        index = np.asarray(robots)
+        self.controls[:, index] = 0
+        self.controls[:, index, : controls.shape[2]] = controls
+        self.states[:, index] = 0
+        self.states[:, index, : states.shape[2]] = states
+        self.arrived[index] = arrived
+        self.index.move(index, states[..., : self.problem.dimension])
+        if self._checked is not self.index:
+            self._checked.move(index, states[:: self._interval, :, : self.problem.dimension])
+
+    def faults(self, robots: ArrayLike) -> tuple[Costs, IntArray]:
+        """What robots ``(R,)`` do wrong at present, at the steps that are checked.
+
+        Returns:
+            ``(R,)`` counted in robots met: a missed goal and contact with an obstacle amount to several, docking where
+            rounding decides to one. And ``(R,)`` the step of the first fault, for those that have any.
+        """
+        index = np.asarray(robots)
+        costs, first = self._judged(index, self.states[:, index, None], self.arrived[index, None])
+        return np.floor(costs[:, 0]), first[:, 0]
+
+    def take_best(self, robots: ArrayLike, ways: Drives, *, or_longer: bool = False) -> None:
+        """Let one robot after the other take the best of its ways, if that is better than what it does.
+
+        Args:
+            robots: ``(R,)``.
+            ways: ``V`` of each. The best has the fewest faults, and of those with as many takes the least time.
+            or_longer: Take it even if it takes longer, as long as it has no more faults.
+        """
+        for i, robot in enumerate(np.asarray(robots).tolist()):
+            costs, _ = self._judged([robot], ways.states[:, [i]], ways.arrived[[i]])
+            present, _ = self._judged([robot], self.states[:, [robot], None], self.arrived[[robot], None])
+            best = int(costs[0].argmin())
+            before = np.floor(present[0, 0]) + 1 if or_longer else present[0, 0]
+            if costs[0, best] < before:
+                self.move([robot], ways.controls[:, [i], best], ways.states[:, [i], best], ways.arrived[[i], best])
+
+    def _judged(self, robots: ArrayLike, states: FloatArray, arrived: BoolArray) -> tuple[Costs, IntArray]:
+        """``(R, V)`` faults of ways, plus the share of the horizon that they take, which is less than one; and the step
+        of the first fault.
+        """
+        from d4orm_planners.engine.path_index import judge_alone
+
+        paths, horizon = np.ascontiguousarray(np.moveaxis(states, 0, 2)), self.problem.horizon
+        checked = paths[:, :, :: self._interval]
+        met, meeting = self._checked.count_meetings(robots, checked)
+        touching, moves, unsure = judge_alone(self.problem.arrays, robots, paths)
+        if self._interval > 1:
+            touching = judge_alone(self.problem.arrays, robots, checked)[0] * self._interval
+            # What there is none of comes after the last step.
+            meeting = np.minimum(meeting * self._interval, horizon + 1)
+        faults = met + (unsure <= horizon) + MISSING * (~arrived | (touching <= horizon))
+        return faults + moves / (horizon + 1), np.minimum(np.minimum(meeting, touching), unsure)

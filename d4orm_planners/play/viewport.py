@@ -1,0 +1,167 @@
+"""One of the policies that drive the same scene side by side: its team, in an episode that goes on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from d4orm_env import navigation_v0
+from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.portable import NUMPY_OPS
+from d4orm_env.core.problem import Problem
+from d4orm_env.disturbances.disturbance import AnyDisturbance
+from d4orm_env.disturbances.robot_faults import pushed
+from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_planners.play.edits import check_robot
+from d4orm_planners.play.scene_frame import Frame, Status, closest_approach, guidance, plan
+from d4orm_planners.play.episode_buffer import Recording
+from d4orm_planners.base.policy import Policy
+
+MOST_CYCLES = 10_000_000
+"""Steps of an episode that ends only when somebody changes it."""
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What holds for all that drive side by side.
+
+    Attributes:
+        seed: Of the policies, of what goes wrong, and of new goals.
+        lifelong: Whether robots go on to new goals.
+        disturbances: What goes wrong.
+    """
+
+    seed: int = 0
+    lifelong: bool = False
+    disturbances: Sequence[AnyDisturbance] = ()
+
+
+class Lane:
+    """A policy that drives a scene.
+
+    Args:
+        name: What the policy is called.
+        policy: What drives; others may have used it before.
+        scene: Team and world; where the robots are is where they start.
+        terms: What holds for all.
+        recording: What to go on recording; a fresh recording by default.
+
+    Attributes:
+        recording: What happened up to now.
+        finished: Whether all robots have arrived.
+    """
+
+    def __init__(
+        self, name: str, policy: Policy, scene: Problem, terms: Terms, recording: Recording | None = None
+    ) -> None:
+        self.name, self._policy, self._scene, self._seed = name, policy, scene, terms.seed
+        # A robot stalls within the scene's usual duration, after which this episode goes on all the same.
+        self._env = navigation_v0.parallel_env(
+            problem=scene, lifelong=terms.lifelong, disturbances=terms.disturbances, max_cycles=scene.horizon
+        )
+        self._observations, _ = self._env.reset(seed=terms.seed)
+        self._env.max_cycles = MOST_CYCLES
+        begin = time.perf_counter()
+        self.regain()
+        self._replanned, self._loop = time.perf_counter() - begin, 0.0
+        self._before = scene.start[:, : scene.dimension]
+        self.recording = Recording(scene) if recording is None else recording
+        self._remember()
+
+    def regain(self) -> None:
+        """Have the policy plan for this episode, which it has not seen or has forgotten for another."""
+        self._policy.reset(self._env, seed=self._seed)
+
+    @property
+    def finished(self) -> bool:
+        return not self._env.agents
+
+    @property
+    def docked(self) -> BoolArray:
+        """``(K,)`` bool: who stands at the goal for good."""
+        return self._joint.arrived & self._scene.docks
+
+    @property
+    def farthest(self) -> int:
+        """Of the robots, from its goal."""
+        joint = self._joint
+        return int(np.argmax(np.linalg.norm(joint.goals - joint.states[:, : self._scene.dimension], axis=1)))
+
+    @property
+    def scene(self) -> Problem:
+        """The scene as it is now: where the robots are is where they start, at rest or under way."""
+        joint = self._joint
+        return self._scene.resumed_at(joint.states, joint.goals)
+
+    def advance(self) -> None:
+        """One step of the policy and of the world."""
+        if self.finished:
+            return
+        before = self._joint.states[:, : self._scene.dimension]
+        acting = {agent: self._observations[agent] for agent in self._env.agents}
+        begin = time.perf_counter()
+        actions = self._policy.act(acting, self._env.state())
+        self._loop = time.perf_counter() - begin
+        self._observations, *_ = self._env.step(actions)
+        self._before = before
+        self._remember()
+
+    def push(self, robot: int, velocity: FloatArray) -> None:
+        """Give a robot a velocity ``(d,)`` [m/s] on top of its own, which nobody tells the policy of.
+
+        As with :class:`~d4orm_env.disturbances.Push`, none becomes faster than it may be.
+
+        Raises:
+            ValueError: If it stands at its goal.
+        """
+        joint, problem = self._joint, self._scene
+        check_robot(problem, robot)
+        if self.docked[robot]:
+            raise ValueError(f"robot_{robot} of {self.name} has docked; push one that is under way")
+        given = np.zeros((1, problem.num_robots, problem.dimension), np.float32)
+        given[0, robot] = velocity
+        states = pushed(problem, joint.states[None].copy(), given)[0]
+        own, limits = tuple(states[robot]), tuple(problem.team.limits[robot])
+        within = problem.team.robot_models[robot].functions.limit_state(own, limits, NUMPY_OPS)
+        states[robot, : len(within)] = within
+        self._observations, _ = self._env.set_state(states)
+
+    def frame(self, status: Status) -> Frame:
+        """What is shown of the present."""
+        joint = self._joint
+        return Frame(
+            status=status,
+            policy=self.name,
+            problem=self._scene,
+            states=joint.states,
+            before=self._before,
+            goals=joint.goals,
+            arrived=joint.arrived,
+            collided=np.array(self._env.last_step.collided),
+            finished=self.finished,
+            loop=self._loop,
+            replanned=self._replanned,
+            closest=closest_approach(self._scene, joint.states),
+            plan=plan(self._policy, joint.steps),
+            guidance=guidance(self._policy),
+            subgoals=getattr(self._policy, "subgoals", None),
+            bodies=self._bodies,
+        )
+
+    @property
+    def _joint(self) -> JointState:
+        """The truth, whatever the policy is told of it."""
+        return split_state(self._scene, self._env.true_state())
+
+    @property
+    def _bodies(self) -> FloatArray:
+        """``(N, 2 d + 1)`` what moves about and is no robot."""
+        bodies = self._env.effect().bodies
+        return np.zeros((0, 2 * self._scene.dimension + 1), np.float32) if bodies is None else np.array(bodies[0])
+
+    def _remember(self) -> None:
+        joint, last = self._joint, self._env.last_step
+        self.recording.add(joint.states, joint.goals, joint.arrived, last.collided, last.margin_violated, self._bodies)

@@ -1,0 +1,172 @@
+"""Recorded episodes as the files of a Minari dataset: shards that Minari writes, and a main file that links to them.
+
+Minari (https://minari.farama.org) keeps a dataset in one HDF5 file, with a group ``episode_i`` for each. Here this file
+holds external links into shards, each of which is a whole Minari storage of its own. Minari's reader follows them.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+
+from d4orm_env.core.arrays import BoolArray
+from d4orm_planners.rl.dataset.recorded_episode import RecordedEpisode
+
+if TYPE_CHECKING:
+    from minari.data_collector import EpisodeBuffer
+    from minari.dataset.minari_storage import MinariStorage
+
+MAIN, METADATA = "main_data.hdf5", "metadata.json"
+
+
+@dataclass(frozen=True)
+class DatasetFiles:
+    """The files of a dataset.
+
+    Attributes:
+        folder: What Minari opens, ``.../data``.
+        observation_space: Of the dataset.
+        action_space: Likewise.
+        env_spec: From which Minari makes the environment again, if it can.
+        agents: Whose an episode is, ``"team"`` or ``"robot"``.
+    """
+
+    folder: Path
+    observation_space: gymnasium.Space[object]
+    action_space: gymnasium.Space[object]
+    env_spec: EnvSpec | None
+    agents: str
+
+    @property
+    def shards(self) -> list[Path]:
+        """Whole shards, in order."""
+        return sorted(path for path in (self.folder / "shards").glob("*") if path.name.isdecimal())
+
+    def seeds(self) -> set[int]:
+        """Of the episodes that are in shards."""
+        return {int(seed) for shard in self.shards for seed in _metadata(shard)["recorded_seeds"]}
+
+    def add_shard(self, episodes: Sequence[RecordedEpisode]) -> None:
+        """Write the next shard; it is whole or not there."""
+        before = [_metadata(shard)["total_episodes"] for shard in self.shards]
+        final = self.folder / "shards" / f"{len(before):06d}"
+        partial = final.with_name(f".{final.name}.partial")
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        storage = self._storage(partial)
+        parts = [(episode, part) for episode in episodes for part in _PARTS[self.agents](episode)]
+        storage.update_episodes(_buffer(episode, part) for episode, part in parts)
+        storage.update_episode_metadata(
+            {**episode.metadata, **part.extra, "id": sum(before) + place} for place, (episode, part) in enumerate(parts)
+        )
+        storage.update_metadata({"recorded_seeds": [int(episode.metadata["seed"]) for episode in episodes]})
+        partial.rename(final)
+
+    def write_main(self, metadata: Mapping[str, object]) -> None:
+        """Write the main file and the metadata anew, for the shards that are there."""
+        import h5py
+
+        partial = self.folder / ".main"
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        storage = self._storage(partial)
+        steps, count = 0, 0
+        with h5py.File(partial / MAIN, "a", track_order=True) as main:
+            for shard in self.shards:
+                own = _metadata(shard)
+                for place in range(own["total_episodes"]):
+                    link = h5py.ExternalLink(f"shards/{shard.name}/{MAIN}", f"/episode_{place}")
+                    main[f"episode_{count + place}"] = link
+                steps, count = steps + own["total_steps"], count + own["total_episodes"]
+        size = sum(path.stat().st_size for shard in self.shards for path in shard.iterdir()) / 1e6
+        totals = {"total_steps": steps, "total_episodes": count, "dataset_size": round(size, 1)}
+        storage.update_metadata({**metadata, **totals})
+        # In this order: a main file with more episodes than the metadata counts is a dataset as well.
+        for name in (MAIN, METADATA):
+            (partial / name).replace(self.folder / name)
+        partial.rmdir()
+
+    def _storage(self, folder: Path) -> MinariStorage:
+        from minari.dataset.minari_storage import MinariStorage
+
+        return MinariStorage.new(folder, self.observation_space, self.action_space, self.env_spec, "hdf5")
+
+
+def _metadata(folder: Path) -> dict[str, Any]:
+    """Of a storage.
+
+    Raises:
+        ValueError: If it cannot be read.
+    """
+    path = folder / METADATA
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path} cannot be read ({error}); remove {folder} to record its episodes anew") from None
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What one episode of the dataset takes of a recorded one.
+
+    Attributes:
+        steps: Steps ``T'`` from the beginning.
+        pick: Takes what is of ``(T, K, ...)`` into the episode: all, or one robot.
+        extra: Further metadata.
+        together: Whether it is the team's.
+    """
+
+    steps: int
+    pick: Callable[[np.ndarray], np.ndarray]
+    extra: Mapping[str, object]
+    together: bool
+
+
+def _team(episode: RecordedEpisode) -> Iterator[_Part]:
+    yield _Part(len(episode.actions), lambda values: values, {}, True)
+
+
+def _robots(episode: RecordedEpisode) -> Iterator[_Part]:
+    for robot, steps in enumerate(episode.acting.sum(axis=0).tolist()):
+        yield _Part(steps, lambda values, robot=robot: values[:, robot], {"robot": robot}, False)  # type: ignore[misc]
+
+
+_PARTS: Mapping[str, Callable[[RecordedEpisode], Iterable[_Part]]] = {"team": _team, "robot": _robots}
+
+
+def _buffer(episode: RecordedEpisode, part: _Part) -> EpisodeBuffer:
+    """An episode as Minari takes it."""
+    from minari.data_collector import EpisodeBuffer
+
+    steps, pick = part.steps, part.pick
+    names = ("arrived", "collided", "margin_violated", "distance_to_goal")
+    infos = {name: pick(getattr(episode, name))[: steps + 1] for name in names}
+    ended: BoolArray = pick(episode.terminations)[:steps]
+    rewards = pick(episode.rewards)[:steps]
+    if part.together:
+        at_reset = np.zeros_like(rewards[:1])
+        infos |= {"robot_rewards": np.concatenate([at_reset, rewards]), "state": episode.state}
+        ended, rewards = np.all(np.maximum.accumulate(ended), axis=1), rewards.mean(axis=1)
+    last = np.arange(steps) == steps - 1
+    return EpisodeBuffer(
+        seed=int(episode.metadata["seed"]),
+        observations=_flat(pick(episode.observations)[: steps + 1]),
+        actions=_flat(pick(episode.actions)[:steps]),
+        rewards=rewards.astype(np.float64),
+        terminations=ended,
+        truncations=last & ~ended,
+        infos=infos,
+    )
+
+
+def _flat(values: np.ndarray) -> np.ndarray:
+    """``(T, .)``."""
+    return values.reshape(len(values), -1)

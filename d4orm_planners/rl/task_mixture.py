@@ -1,0 +1,323 @@
+"""Several scenarios and team sizes practised at once, so that none is forgotten over another."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
+
+from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.yaml_text import parse_yaml
+from d4orm_env.disturbances.disturbance_registry import disturbances_at
+from d4orm_env.scenarios import make_problem
+from d4orm_env.scenarios.problems import find_scenario, unknown_argument
+from d4orm_env.envs.team_step import Info
+from d4orm_planners.rl.robot_vec_env import RobotVecEnv
+
+_LOOSENED = "d4orm_planners.rl.perturbed_scenarios:loosened"
+_CLEARING = "d4orm_planners.rl.perturbed_scenarios:clearing"
+_DISTURB = "disturb."
+MIXTURES: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "crowds": (
+            "random 2",
+            "random 4",
+            "random 8",
+            "random 8 sight=4",
+            "random 16 size=7.07",
+            "random 16 size=7.07 sight=4",
+            "random 16",
+            "random 32 size=9",
+            f"{_LOOSENED} 4",
+            f"{_LOOSENED} 8",
+            f"{_LOOSENED} 8 shift=0.05",
+            f"{_LOOSENED} 12",
+            f"{_LOOSENED} 16 shrink=0.05 sight=4",
+            f"{_LOOSENED} 16 shrink=0",
+            "circle 8",
+            "circle 16",
+            f"{_LOOSENED} 8 base=four_obstacles",
+            f"{_LOOSENED} 8 base=four_obstacles shift=0.1 sight=4",
+            "four_obstacles 8",
+            f"{_LOOSENED} 12 base=swap",
+            f"{_CLEARING} 8",
+            f"{_CLEARING} 8 places=1 obstacles=10",
+        ),
+        "dense_crowds": (
+            "random 4 sight=4",
+            "random 8",
+            "random 8 sight=4",
+            "random 8 sight=4",
+            "random 16 size=7.07",
+            "random 16 size=7.07 sight=4",
+            "random 16 size=7.07 sight=4",
+            "random 16",
+            "random 32 size=9 sight=4",
+            f"{_LOOSENED} 8 sight=4",
+            f"{_LOOSENED} 16 shrink=0.05 sight=4",
+            "circle 8 sight=4",
+            "circle 16",
+            f"{_LOOSENED} 8 base=four_obstacles sight=4",
+            f"{_LOOSENED} 12 base=swap",
+            f"{_CLEARING} 8",
+            f"{_CLEARING} 8 places=1 obstacles=10",
+        ),
+        "walls": (
+            "rooms 4",
+            "rooms 8",
+            "rooms 8",
+            "rooms 8 disturb.control_noise=0.2",
+            "rooms 8 sight=4",
+            "rooms 8 sight=4",
+            "rooms 16",
+            "forest 8",
+            "warehouse 8 sight=4",
+            "maze 4",
+            "random 8",
+            "random 8 sight=4",
+            "random 8 sight=4 disturb.delay=2",
+            "random 16 size=7.07",
+            "random 16 size=7.07 sight=4",
+            "random 16",
+            "random 16 sight=4",
+            "random 32 size=10",
+            "circle 16 disturb.control_noise=0.2",
+            f"{_LOOSENED} 8 base=four_obstacles sight=4",
+            f"{_LOOSENED} 16 shrink=0.05 sight=4",
+        ),
+    }
+)
+"""Mixtures by name; ``walls`` is for robots that look along their ways."""
+
+
+@dataclass(frozen=True)
+class Exercise:
+    """One part of a mixture.
+
+    Attributes:
+        scenario: Name, file or import path.
+        num_robots: Size of its teams.
+        settings: Arguments of the scenario.
+        sight: How many of the observed robots are shown at most; ``None`` is all.
+        disturbances: Levels by name, see :func:`~d4orm_env.disturbances.disturbance_registry.disturbances_at`.
+    """
+
+    scenario: str
+    num_robots: int
+    settings: Mapping[str, object]
+    sight: int | None = None
+    disturbances: Mapping[str, object] = field(default_factory=dict)
+
+    @classmethod
+    def parse(cls, text: str) -> Exercise:
+        """From a scenario, a team size, and settings ``name=value``, separated by blanks.
+
+        ``sight=4`` and ``disturb.delay=2``, with any disturbance's name and level, are among the settings.
+
+        Raises:
+            ValueError: If it is something else.
+        """
+        scenario, *rest = text.split() or [""]
+        if not rest or not rest[0].isdecimal() or not 1 <= int(rest[0]) <= 1000:
+            raise ValueError(f"mixture has {text!r}; it must be a scenario and a team size, as 'random 8 size=4'")
+        settings: dict[str, object] = {}
+        for word in rest[1:]:
+            name, separator, value = word.partition("=")
+            if not separator or not name or not value or name in settings:
+                raise ValueError(f"mixture has {text!r}, in which {word!r} is no new setting of the form name=value")
+            settings[name] = parse_yaml(value)
+        sight = settings.pop("sight", None)
+        if sight is not None and (not isinstance(sight, int) or sight < 0):
+            raise ValueError(f"mixture has {text!r}, in which sight must be a whole number of zero or more")
+        for name in ("num_robots", "seed", "model"):
+            if name in settings:
+                raise ValueError(f"mixture has {text!r}, in which {name!r} has no place")
+        disturbances = {
+            name.removeprefix(_DISTURB): settings.pop(name) for name in list(settings) if name.startswith(_DISTURB)
+        }
+        try:
+            disturbances_at(disturbances)
+        except ValueError as error:
+            raise ValueError(f"mixture has {text!r}: {error}") from None
+        complaint = unknown_argument(scenario, settings)
+        if complaint:
+            raise ValueError(f"mixture has {text!r}: {complaint}")
+        return cls(scenario, int(rest[0]), settings, sight, disturbances)
+
+    def problem(self, seed: int, model: str | None = None) -> Problem:
+        """An instance with robots of that model; ``None`` is the scenario's own."""
+        return make_problem(self.scenario, self.num_robots, seed, model=model, **self.settings)
+
+    def draws(self, model: str | None = None) -> bool:
+        """Whether its instances differ."""
+        return find_scenario(self.scenario).draws or self.problem(0, model) != self.problem(1, model)
+
+    def worlds(
+        self, sights: Sequence[int | None], seed: int, instances: Instances, model: str | None = None, **options: Any
+    ) -> RobotVecEnv:
+        """Worlds to practise in.
+
+        Args:
+            sights: Of each, in place of :attr:`sight`.
+            seed: Of the first.
+            instances: To choose among at every reset.
+            model: Robot model; ``None`` is the scenario's own.
+            **options: Further arguments of the environment.
+        """
+        arguments: dict[str, Any] = {"scenario": self.scenario, "model": model, **self.settings}
+        if self.draws(model):
+            arguments = {"scenario": instances, "randomize_instance": True}
+        if self.disturbances:
+            options["disturbances"] = disturbances_at(self.disturbances)
+        return RobotVecEnv(len(sights), self.num_robots, seed=seed, sight=sights, **arguments, **options)
+
+    def validation(self, count: int, seed: int, model: str | None = None, **options: Any) -> RobotVecEnv:
+        """Worlds to judge by, a new instance for each; one is enough where nothing differs. Arguments as above."""
+        # Every validation asks for the same again.
+        instances = Instances(partial(self.problem, model=model), None, {})
+        count = count if self.disturbances or self.draws(model) else 1
+        return self.worlds([self.sight] * count, seed, instances, model, **options)
+
+
+class Instances:
+    """A scenario whose instances are kept when they have been drawn.
+
+    Args:
+        draw: ``seed -> Problem``.
+        seeds: Of the instances there are; ``None`` is all.
+        drawn: Instances by their seeds, to which others are added.
+    """
+
+    def __init__(self, draw: Callable[[int], Problem], seeds: Sequence[int] | None, drawn: dict[int, Problem]) -> None:
+        self._draw, self._seeds, self._drawn = draw, seeds, drawn
+
+    def __call__(self, seed: int, num_robots: int) -> Problem:
+        """The instance that this number stands for."""
+        own = seed if self._seeds is None else self._seeds[seed % len(self._seeds)]
+        if own not in self._drawn:
+            self._drawn[own] = self._draw(own)
+        return self._drawn[own]
+
+
+def parse_mixture(texts: Sequence[str]) -> tuple[Exercise, ...]:
+    """The parts of a mixture: texts as :meth:`Exercise.parse` takes them, and names of :data:`MIXTURES`.
+
+    Raises:
+        ValueError: If one is neither.
+    """
+    named = [part for text in texts for part in MIXTURES.get(text.strip(), (text,))]
+    return tuple(Exercise.parse(text) for text in named)
+
+
+def gather_parts(exercises: Sequence[Exercise], counts: Sequence[int]) -> list[tuple[Exercise, list[int | None]]]:
+    """Parts that differ in nothing but sight as one, since each takes its time to step, and the sight of its worlds.
+
+    Args:
+        exercises: Parts of a mixture.
+        counts: How many worlds each has.
+    """
+    gathered: list[tuple[Exercise, list[int | None]]] = []
+    for exercise, count in zip(exercises, counts, strict=True):
+        own = replace(exercise, sight=None)
+        if own not in [other for other, _ in gathered]:
+            gathered.append((own, []))
+        sights = next(sights for other, sights in gathered if other == own)
+        sights.extend([exercise.sight] * count)
+    return gathered
+
+
+class MixedVecEnv(VecEnv):
+    """The robots of several :class:`RobotVecEnv` as one, in order; all else as there.
+
+    Args:
+        parts: With the same features and robots of one model.
+
+    Attributes:
+        parts: Them.
+        acted: Which robots acted in the last step.
+        finished: ``(world, success, travel_time)`` of the worlds that ended in the last step, worlds counted through.
+        seconds: Time spent in the environments so far.
+
+    Raises:
+        ValueError: If the parts do not go together.
+    """
+
+    render_mode = None
+
+    def __init__(self, parts: Sequence[RobotVecEnv]) -> None:
+        first, self.parts = parts[0], tuple(parts)
+        models = sorted({part.problem.team.models[0] for part in parts})
+        if len(models) > 1 or any(part.features != first.features for part in parts):
+            raise ValueError(f"the mixture has robots of {', '.join(models)}; one policy is learned for one model")
+        self.features, self.problem, self.ways = first.features, first.problem, first.ways
+        self.num_worlds = sum(part.num_worlds for part in parts)
+        self._splits = np.cumsum([part.num_envs for part in parts])[:-1]
+        self._limits = np.concatenate([part.limits for part in parts])
+        self.seconds = 0.0
+        super().__init__(sum(part.num_envs for part in parts), first.observation_space, first.action_space)
+
+    @property
+    def acted(self) -> BoolArray:
+        return np.concatenate([part.acted for part in self.parts])
+
+    @property
+    def finished(self) -> list[tuple[int, bool, float]]:
+        offsets = np.cumsum([0, *(part.num_worlds for part in self.parts)]).tolist()
+        return [(offset + world, *how) for offset, part in zip(offsets, self.parts) for world, *how in part.finished]
+
+    def reset(self) -> FloatArray:
+        begin = time.perf_counter()
+        encoded = self._encoded([part.begin() for part in self.parts])
+        features = np.concatenate([part.show(*own)[0] for part, own in zip(self.parts, encoded, strict=True)])
+        self.seconds += time.perf_counter() - begin
+        return features
+
+    def step_async(self, actions: FloatArray) -> None:
+        self._actions = np.asarray(actions, np.float32)
+
+    def step_wait(self) -> tuple[FloatArray, FloatArray, BoolArray, list[Info]]:
+        begin = time.perf_counter()
+        frames = np.concatenate([part.frames for part in self.parts])
+        controls = np.split(self.features.decode(self._actions, frames, self._limits), self._splits)
+        encoded = self._encoded([part.drive(own) for part, own in zip(self.parts, controls, strict=True)])
+        outcomes = (part.conclude(*own) for part, own in zip(self.parts, encoded, strict=True))
+        features, rewards, dones, infos = zip(*outcomes)
+        flat = [info for listed in infos for info in listed]
+        self.seconds += time.perf_counter() - begin
+        return np.concatenate(features), np.concatenate(rewards), np.concatenate(dones), flat
+
+    def _encoded(self, seen: list[FloatArray]) -> list[tuple[FloatArray, FloatArray]]:
+        """Features and frames of what the robots of each part see: all at once, for each call takes its time."""
+        features, frames = self.parts[0].encoded(np.concatenate(seen))
+        ends = np.cumsum([len(own) for own in seen])[:-1]
+        return list(zip(np.split(features, ends), np.split(frames, ends), strict=True))
+
+    def close(self) -> None:
+        for part in self.parts:
+            part.close()
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seed the worlds of every part at the next reset, alike."""
+        return [seed for part in self.parts for seed in part.seed(seed)]
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[object]:
+        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: object, indices: VecEnvIndices = None) -> None:
+        self.parts[0].set_attr(attr_name, value, indices)
+
+    def env_method(
+        self, method_name: str, *args: object, indices: VecEnvIndices = None, **kwargs: object
+    ) -> list[object]:
+        return self.parts[0].env_method(method_name, *args, indices=indices, **kwargs)
+
+    def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
+        return [False] * len(list(self._get_indices(indices)))

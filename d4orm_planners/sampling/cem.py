@@ -1,0 +1,72 @@
+"""The cross-entropy method for the whole team (paper, appendix B)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import ModuleType
+from typing import ClassVar
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.engine.types import SamplingRules
+from d4orm_planners.sampling.loop import SamplingPlanner
+from d4orm_planners.sampling.schedule import constant
+from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, SamplingConfig
+from d4orm_planners.sampling.tuned import TUNED
+from d4orm_planners.sampling.weights import Array, EliteWeights
+from d4orm_planners.base.solve import Search
+from d4orm_planners.base.settings import Positive, Share
+
+
+@dataclass(frozen=True, kw_only=True)
+class CEMConfig(ContinuationSettings, SamplingConfig):
+    """Settings of the cross-entropy method.
+
+    Attributes:
+        elite_fraction: Share of samples that are averaged.
+        sigma: Standard deviation of the samples of an iteration's first step.
+        adapt_variance: Let the variance follow that of the elite, as the method is usually written.
+        sigma_floor: Smallest standard deviation that the adaptation may reach.
+    """
+
+    elite_fraction: Share = 0.05
+    sigma: Positive = 1.0
+    adapt_variance: bool = False
+    sigma_floor: Positive = 0.05
+
+
+@dataclass(frozen=True)
+class EliteDeviation:
+    """Noise factors from the spread of the elite, relative to ``sigma`` and not below ``floor``."""
+
+    sigma: float
+    floor: float
+
+    def __call__(self, mean_square_deviation: Array, xp: ModuleType) -> Array:
+        """``(H, K, m)`` factors on the schedule."""
+        return xp.maximum(xp.sqrt(xp.maximum(mean_square_deviation, 0)), self.floor) / self.sigma
+
+
+class CEM(SamplingPlanner):
+    """The cross-entropy method: the mean of the elite samples is the next mean (paper, appendix B)."""
+
+    name: ClassVar[str] = "cem"
+    config_class = CEMConfig
+    presets: ClassVar = {"paper": PAPER, "tuned": {**PAPER, **TUNED["cem"]}}
+    config: CEMConfig
+
+    def noise_scale(self) -> FloatArray:
+        """See :meth:`SamplingPlanner.noise_scale`."""
+        return constant(self.config.num_steps, self.config.sigma)
+
+    def rules(self) -> SamplingRules:
+        """See :meth:`SamplingPlanner.rules`."""
+        config = self.config
+        adapt = EliteDeviation(config.sigma, config.sigma_floor) if config.adapt_variance else None
+        return SamplingRules(weights=EliteWeights(config.elite_fraction), adapt=adapt)
+
+    def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
+        """See :meth:`SamplingPlanner.initial`."""
+        base = self.config.continued(search.current)
+        return base, np.zeros_like(base)

@@ -1,0 +1,109 @@
+"""The loop that MPPI, CEM, MBD, i-MBD and D4orm share: propose, sample and score, weight, update (paper, Algorithm 1).
+
+After every step the new mean is the weighted mean of the samples. For the denoising methods this is Algorithm 1
+exactly: substituting the score estimate of line 5 into line 6 gives ``U_{i-1} = sqrt(alpha_bar_{i-1}) * U_bar``, and
+line 3 of the next step samples around ``U_{i-1} / sqrt(alpha_bar_{i-1}) = U_bar``. A method is therefore a schedule of
+standard deviations, a rule for the weights, and where an iteration starts.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import numpy as np
+
+from d4orm_env.core import portable
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.seeds import Stream
+from d4orm_env.engine.types import SamplingRules, SamplingTask
+from d4orm_planners.base.conflict_groups import Groups, components, conflicts
+from d4orm_planners.base.planner import Iteration, Planner, State
+from d4orm_planners.sampling.schedule import alpha_bar
+from d4orm_planners.sampling.settings import DenoisingConfig, SamplingConfig
+from d4orm_planners.sampling.weights import GroupWeights
+from d4orm_planners.base.solve import Search
+
+
+class SamplingPlanner(Planner):
+    """A planner whose iteration is one run of the sampling loop over the whole team."""
+
+    config: SamplingConfig
+
+    @abstractmethod
+    def noise_scale(self) -> FloatArray:
+        """``(N,)`` standard deviation of the samples at every step of an iteration."""
+
+    @abstractmethod
+    def rules(self) -> SamplingRules:
+        """The method's weights, and how it adapts its noise."""
+
+    @abstractmethod
+    def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
+        """``(base, mean)``, each ``(H, K, m)``: samples are drawn around ``mean`` on top of ``base``."""
+
+    def task(self, search: Search, base: FloatArray) -> SamplingTask:
+        """What this iteration samples and scores."""
+        credit = self.config.credit
+        if credit == "alternate":
+            credit = "team" if search.iteration % 2 else "robot"
+        elif credit == "group":  # the rules sum the robots' rewards
+            credit = "robot"
+        return SamplingTask(search.problem, base, credit=credit, penalty=self.config.penalty)
+
+    def num_samples(self, search: Search) -> int:
+        """``M`` of this iteration."""
+        del search
+        return self.config.num_samples
+
+    def stages(self, search: Search) -> list[tuple[FloatArray, int]]:
+        """The steps of an iteration, in parts that each have their number of samples: ``(noise scale, M)``."""
+        return [(self.noise_scale(), self.num_samples(search))]
+
+    def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
+        """See :meth:`Planner.iterate`."""
+        return state, self.run(search)
+
+    def run(self, search: Search) -> Iteration:
+        """One run of the sampling loop over the whole team."""
+        base, mean = self.initial(search)
+        task, rules = self.task(search, base), self.rules()
+        if self.config.credit == "group":
+            rules = rules._replace(weights=GroupWeights(rules.weights, conflict_groups(search)))
+        num_steps = excluded = 0
+        for stage, (noise_scale, num_samples) in enumerate(self.stages(search)):
+            seed = search.iteration_seed(Stream.SAMPLES, stage)
+            result = search.denoise(task, rules, mean, noise_scale, num_samples, seed)
+            mean, num_steps, excluded = result.mean, num_steps + len(result.rewards), excluded + result.excluded
+        return Iteration(base + mean, num_steps, excluded)
+
+
+def conflict_groups(search: Search) -> Groups:
+    """The robots that are in conflict with each other in the present candidate, directly or by others."""
+    problem = search.problem
+    positions = search.current.trajectory.positions
+    return components(conflicts(positions, problem.team.radius, problem.margin))
+
+
+class DenoisingPlanner(SamplingPlanner):
+    """A planner whose noise follows the diffusion schedule, and whose weights are a softmax."""
+
+    config: DenoisingConfig
+
+    def noise_scale(self) -> FloatArray:
+        """See :meth:`SamplingPlanner.noise_scale`."""
+        return self.config.noise_scale(self.config.num_steps)
+
+    def rules(self) -> SamplingRules:
+        """See :meth:`SamplingPlanner.rules`."""
+        return SamplingRules(self.config.weights)
+
+    def first_mean(self, noise: FloatArray) -> FloatArray:
+        """``U_N / sqrt(alpha_bar_N)``, around which the first step draws its samples if it starts from ``noise``."""
+        final = alpha_bar(self.config.num_steps, self.config.beta_start, self.config.beta_end)[-1]
+        return noise / np.float32(np.sqrt(final))
+
+
+def standard_normal(search: Search, shape: tuple[int, ...], number: int = 0) -> FloatArray:
+    """Standard normal numbers in this shape for the start of a run of this iteration."""
+    generator = np.random.default_rng(search.iteration_seed(Stream.DEFORMATION_START, number))
+    return portable.standard_normal(generator, shape)

@@ -1,0 +1,247 @@
+"""Driving along routes under the robots' own dynamics, compiled with numba.
+
+Nobody enters a stretch before all whom it has to let pass have passed, and nobody is ever faster than it can stop
+before the next such stretch. Corners are rounded as far as the slack allows, and taken no faster than that.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from d4orm_env.dynamics import robot_model
+from d4orm_env.dynamics import transition
+from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, Floats, IntArray
+from d4orm_env.dynamics.models import MODELS
+from d4orm_env.core.problem import Problem
+from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE
+from d4orm_env.engine import stepping
+from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
+from d4orm_env.engine.compiling import OPTIONS, ZERO, to_fixed_tuple
+from d4orm_env.engine.stepping import make_stepper, models_key
+from d4orm_planners.tracking import pursuit
+from d4orm_planners.tracking.pursuit import lookaheads, point_ahead, point_reached, square_to, steering
+from d4orm_planners.mapf.routes import Routes
+
+SOURCES = fingerprint((robot_model, transition, *stepping.PARTS, stepping, pursuit))
+
+BRAKING = 0.5
+"""Share of its acceleration that a robot counts on before corners and in them."""
+RESERVE = 0.8
+"""Share of the way to where it must stop that a robot plans to stop in."""
+BEYOND = 2.0
+"""How far beyond its goal a robot plans to drive that is stopped by arriving [m]."""
+SLOWEST = 0.1
+"""Share of its speed at which a robot creeps round the sharpest corner."""
+
+
+class Progress(NamedTuple):
+    """How far robots are, and what they are to do next.
+
+    Attributes:
+        at: ``(K,)`` int64 the point of its route that each is at, counted from its first.
+        waits: ``(K,)`` int64 the wait of each that is not over, or where its waits end.
+        targets: ``(K, 3)`` float32 where each heads [m].
+        room: ``(K,)`` float32 how far it may drive on [m].
+        pace: ``(K,)`` float32 how fast [m/s].
+    """
+
+    at: IntArray
+    waits: IntArray
+    targets: FloatArray
+    room: FloatArray
+    pace: FloatArray
+
+    @classmethod
+    def of(cls, routes: Routes) -> Progress:
+        """Of robots that are about to set out."""
+        waits, size = routes.wait_first[:-1].copy(), len(routes.first) - 1
+        targets = np.zeros((size, 3), np.float32)
+        return cls(np.zeros(size, np.int64), waits, targets, np.zeros(size, np.float32), np.zeros(size, np.float32))
+
+
+class Part(NamedTuple):
+    """The robots of a team that have the same model.
+
+    Attributes:
+        time_step: ``(4,)`` see :class:`~d4orm_env.dynamics.robot_model.TimeStep`.
+        docking: ``(2,)`` squares of the goal radius and of the goal speed.
+        docks: Whether who has arrived stands there for ever.
+        robots: ``(B,)`` int64.
+        limits: ``(B, L)``.
+        goals: ``(B, d)`` [m].
+    """
+
+    time_step: FloatArray
+    docking: FloatArray
+    docks: np.bool_
+    robots: IntArray
+    limits: FloatArray
+    goals: FloatArray
+
+
+Drive: TypeAlias = Kernel[[Part, Progress, FloatArray, BoolArray, FloatArray], None]
+"""A kernel of :func:`drive_kernel`."""
+
+
+@cached_kernel(SOURCES, variant="direct", **OPTIONS)
+def direct(
+    routes: Routes,
+    paces: Floats,
+    sights: Floats,
+    dt: float,
+    beyond: float,
+    positions: Floats,
+    standing: BoolArray,
+    progress: Progress,
+) -> None:
+    """Say where everybody is to drive next.
+
+    Args:
+        routes: The routes.
+        paces: ``(T,)`` how fast each point may be passed [m/s].
+        sights: ``(K,)`` how far ahead robots look at least [m].
+        dt: Time step [s].
+        beyond: How far robots may plan to drive beyond their goals, which stop them [m].
+        positions: ``(K, 3)`` float64 where they are [m].
+        standing: ``(K,)`` bool who has docked, and so is at the end of its route.
+        progress: Changed in place.
+    """
+    points, arcs, num_robots = routes.points, routes.arcs, routes.first.shape[0] - 1
+    for k in range(num_robots):
+        first, last = routes.first[k], routes.first[k + 1] - 1
+        i = point_reached(points, arcs, first + progress.at[k], last, positions[k])
+        progress.at[k] = (last if standing[k] else i) - first
+    for k in range(num_robots):
+        first, last = routes.first[k], routes.first[k + 1] - 1
+        wait, end = progress.waits[k], routes.wait_first[k + 1]
+        while wait < end and progress.at[routes.wait_for[wait]] >= routes.wait_until[wait]:
+            wait += 1
+        progress.waits[k] = wait
+        i, here = first + progress.at[k], positions[k]
+        limit = last if wait == end else max(first + routes.wait_at[wait] - 1, i)
+        target = point_ahead(routes, paces, i, limit, np.inf, (sights[k], dt), here)
+        progress.targets[k, 0], progress.targets[k, 1] = points[target, 0], points[target, 1]
+        progress.targets[k, 2] = points[target, 2]
+        room = RESERVE * (arcs[limit] - arcs[i])
+        if limit - i <= 1:
+            room = np.sqrt(square_to(points, limit, here))
+        progress.room[k] = room + (beyond if limit == last else 0.0)
+        progress.pace[k] = paces[i]
+
+
+@cached_kernel(SOURCES, variant="paces", **OPTIONS)
+def fill_paces(arcs: Floats, dt: float, corner: Floats, speed: float, braking: float, paces: Floats) -> None:
+    """How fast every point of a route may be passed.
+
+    Args:
+        arcs: ``(P,)`` length of the route up to each [m].
+        dt: Time step, in which a robot should not drive past a corner [s].
+        corner: ``(P,)`` how fast each could be by itself [m/s].
+        speed: How fast the robot can be [m/s].
+        braking: How fast it brakes [m/s^2].
+        paces: ``(P,)`` output.
+    """
+    after = before = speed
+    for i in range(arcs.shape[0] - 1, -1, -1):
+        if i + 1 < arcs.shape[0]:
+            way = arcs[i + 1] - arcs[i]
+            after = min(np.sqrt(after * after + 2 * braking * way), before + way / (2 * dt))
+        after = before = min(min(after, corner[i]), speed)
+        paces[i] = max(after, SLOWEST * speed)
+
+
+@cache
+def drive_kernel(name: str) -> Drive:
+    """One compiled step of the robots of the model with this name that drive to where they are directed.
+
+    Args of the kernel: the :class:`Part`, the whole team's :class:`Progress`, ``states`` ``(K, n)`` and ``docked``
+    ``(K,)`` changed in place, and ``controls`` ``(K, m)`` output.
+    """
+    robot = MODELS[name]
+    (move, dock), steer = make_stepper(robot), steering(name)
+    n, m, d, num_limits = robot.state_size, robot.control_size, robot.dimension, len(robot.limit_names)
+
+    @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
+    def drive(part: Part, progress: Progress, states: FloatArray, docked: BoolArray, controls: FloatArray) -> None:
+        h = transition.TimeStep(part.time_step[0], part.time_step[1], part.time_step[2], part.time_step[3])
+        docks, rules = part.docks, (part.docking[0], part.docking[1], part.docks)
+        for b in range(part.robots.shape[0]):
+            k = part.robots[b]
+            own, goal = to_fixed_tuple(part.limits[b], num_limits), to_fixed_tuple(part.goals[b], d)
+            state, target = to_fixed_tuple(states[k], n), to_fixed_tuple(progress.targets[k], d)
+            standing = transition.stands(docked[k], docks)
+            control = steer(state, target, progress.room[k], progress.pace[k], True, own, h)
+            for i in range(m):
+                controls[k, i] = ZERO if standing else control[i]
+            control = to_fixed_tuple(controls[k], m)
+            state, _, docked[k] = dock(standing, move(standing, state, control, own, h), control, own, goal, rules)
+            for i in range(n):
+                states[k, i] = state[i]
+
+    return drive
+
+
+def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[FloatArray, Floats, IntArray]:
+    """Drive the team along its routes until everybody has arrived, or for ``most_steps``.
+
+    Args:
+        problem: The team.
+        routes: Its routes.
+        most_steps: ``T``, if it does not end sooner.
+
+    Returns:
+        Controls ``(T, K, m)``, places ``(T + 1, K, 3)`` float64 [m] and ``(K,)`` the step of each arrival; ``T + 1``
+        for who has not arrived.
+    """
+    d, num_robots = problem.dimension, problem.num_robots
+    paces = np.concatenate(
+        [paces_along(problem, robot, routes.arcs[own], routes.bends[own]) for robot, own in enumerate(routes.each())]
+    )
+    controls = np.zeros((most_steps, num_robots, problem.control_size), np.float32)
+    sights = lookaheads(problem)
+    states, docked = problem.start.copy(), np.zeros(num_robots, bool)
+    progress = Progress.of(routes)
+    places = np.zeros((most_steps + 1, num_robots, 3))
+    arrivals = np.full(num_robots, most_steps + 1, np.int64)
+    parts, beyond = _parts(problem), BEYOND if problem.docks and problem.goal_speed is None else 0.0
+    ends, steps = np.diff(routes.first) - 1, 0
+    while True:
+        places[steps, :, :d] = states[:, :d]
+        direct(routes, paces, sights, problem.dt, beyond, places[steps], docked & problem.docks, progress)
+        # Without docking a robot may come through its goal before it has made way for others.
+        there = docked & (problem.docks | (progress.at == ends))
+        arrivals[:] = np.where(there, np.minimum(arrivals, steps), most_steps + 1)
+        if steps == most_steps or there.all():
+            return controls[:steps], places[: steps + 1], arrivals
+        for drive, part in parts:
+            drive(part, progress, states, docked, controls[steps])
+        steps += 1
+
+
+def _parts(problem: Problem) -> list[tuple[Drive, Part]]:
+    """The robots by model, with what drives them."""
+    arrays, models, parts = problem.arrays, np.array(problem.team.models), []
+    docking = np.array([arrays.squared_goal_radius, arrays.squared_goal_speed])
+    for name in dict.fromkeys(problem.team.models):
+        robots = np.flatnonzero(models == name)
+        part = Part(arrays.time_step, docking, arrays.docks, robots, arrays.limits[robots], problem.goal[robots])
+        parts.append((drive_kernel(name), part))
+    return parts
+
+
+def paces_along(problem: Problem, robot: int, arcs: Floats, bends: Floats, share: float = BRAKING) -> Floats:
+    """``(P,)`` how fast a robot may pass each point of its route [m/s], from their places along it and their bends.
+
+    It counts on that share of its acceleration.
+    """
+    model, limits = problem.team.robot_models[robot], np.asarray(problem.team.limits[robot], np.float64)
+    corner = np.sqrt(share * limits[ACCELERATION] * bends)
+    if model.heading_index is not None:
+        corner = np.minimum(corner, share * limits[TURN_RATE] * bends)
+    braking = share * limits[ACCELERATION] if ACCELERATION in model.control_limits else LARGEST
+    paces = np.empty(len(arcs))
+    fill_paces(arcs, problem.dt, corner, limits[SPEED], braking, paces)
+    return paces

@@ -1,0 +1,197 @@
+"""Tracking a velocity, and driving straight to the goal as if nobody else were there: one law for every model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
+from d4orm_env.dynamics.models import MODELS
+from d4orm_env.core.portable import NUMPY_OPS
+from d4orm_env.core.problem import Problem
+from d4orm_env.dynamics.robot_model import Model
+from d4orm_env.dynamics.transition import TimeStep
+
+NEAR_VIA = np.float32(0.25)
+"""Square of how near to a point on its way a robot turns to its goal [m^2]."""
+
+
+def drive_to_goal(problem: Problem, states: FloatArray, goals: FloatArray) -> FloatArray:
+    """``(K, m)`` controls inside each robot's limits.
+
+    Args:
+        problem: Whose robots they are.
+        states: ``(K, n)``.
+        goals: ``(K, d)`` [m].
+    """
+    return track_velocities(problem, states, preferred_velocities(problem, states, goals))
+
+
+def preferred_velocities(problem: Problem, states: FloatArray, goals: FloatArray) -> FloatArray:
+    """``(K, d)`` velocities straight to the goals, from which every robot can still stop there [m/s].
+
+    Args:
+        problem: Whose robots they are.
+        states: ``(K, n)``.
+        goals: ``(K, d)`` [m].
+    """
+    velocities = np.zeros(goals.shape, np.float32)
+    h = TimeStep(*problem.arrays.time_step)
+    for model, robots in by_model(problem):
+        x, goal, limits = (tuple(rows[robots].T) for rows in (states, goals, problem.team.limits))
+        velocities[robots] = np.stack(model.functions.approach(x, goal, limits, h, NUMPY_OPS), axis=1)
+    return velocities
+
+
+def goals_along_ways(problem: Problem, places: FloatArray | Floats, goals: FloatArray) -> FloatArray:
+    """Where robots without a plan should head: along their shortest free ways, as far off as those are long.
+
+    It is their goals where the world is empty, for robots with new goals, and for those without a way.
+
+    Args:
+        problem: The world, and the first goals, to which the ways lead.
+        places: ``(K, d)`` where the robots are [m].
+        goals: ``(K, d)`` present goals [m].
+
+    Returns:
+        ``(K, d)`` [m].
+    """
+    if not problem.world.num_obstacles:
+        return goals
+    direction, length = problem.ways.ahead(places)
+    first = (goals == problem.goal).all(axis=1)
+    ahead, known = along_ways(direction, np.where(first, length, np.inf))
+    return np.where(known[:, None], places + ahead, goals).astype(np.float32)
+
+
+def along_ways(direction: ArrayLike, length: ArrayLike) -> tuple[Floats, BoolArray]:
+    """Vectors along ways ``(N, d)``, as long as they are, and ``(N,)`` who has one: is neither at its goal nor lost.
+
+    Args:
+        direction: ``(N, d)`` unit vectors, zero at a goal.
+        length: ``(N,)`` [m], infinite without a way.
+    """
+    direction, length = np.asarray(direction, np.float64), np.asarray(length, np.float64)
+    known = (direction != 0).any(axis=1) & np.isfinite(length)
+    return direction * np.where(known, length, 0.0)[:, None], known
+
+
+def track_velocities(problem: Problem, states: FloatArray, velocities: FloatArray) -> FloatArray:
+    """``(K, m)`` controls inside each robot's limits that bring the team to these velocities as soon as they allow.
+
+    Args:
+        problem: Whose robots they are.
+        states: ``(K, n)``.
+        velocities: ``(K, d)`` wanted [m/s].
+    """
+    controls = np.zeros((problem.num_robots, problem.control_size), np.float32)
+    h = TimeStep(*problem.arrays.time_step)
+    for model, robots in by_model(problem):
+        x, velocity, limits = (tuple(rows[robots].T) for rows in (states, velocities, problem.team.limits))
+        wanted = model.functions.track(x, velocity, limits, h, NUMPY_OPS)
+        allowed = model.functions.limit_control(wanted, limits, NUMPY_OPS)
+        controls[robots, : model.control_size] = np.stack(allowed, axis=1)
+    # The norm may come out above the limit by a rounding error.
+    limit = problem.team.control_limits
+    return np.clip(controls, -limit, limit)
+
+
+def present_velocities(problem: Problem, states: FloatArray, controls: FloatArray) -> FloatArray:
+    """``(K, d)`` velocities [m/s]; that of a first-order robot is its last command.
+
+    Args:
+        problem: Whose robots they are.
+        states: ``(K, n)``.
+        controls: ``(K, m)`` executed last.
+    """
+    velocities = np.zeros((problem.num_robots, problem.dimension), np.float32)
+    for model, robots in by_model(problem):
+        x, u, limits = (tuple(rows[robots].T) for rows in (states, controls, problem.team.limits))
+        velocities[robots] = np.stack(model.functions.velocity(x, u, limits, NUMPY_OPS), axis=1)
+    return velocities
+
+
+def by_model(problem: Problem) -> Iterator[tuple[Model, list[int]]]:
+    """The models of the team, each with its robots."""
+    models = problem.team.models
+    for name in dict.fromkeys(models):
+        yield MODELS[name], [robot for robot, model in enumerate(models) if model == name]
+
+
+@dataclass(frozen=True)
+class Drives:
+    """Ways that robots could take, each robot alone: ``R`` robots, ``V`` ways each.
+
+    Attributes:
+        controls: ``(H, R, V, m)``, zero after arrival.
+        states: ``(H+1, R, V, n)``.
+        arrived: ``(R, V)`` bool.
+        dimension: ``d``.
+    """
+
+    controls: FloatArray
+    states: FloatArray
+    arrived: BoolArray
+    dimension: int
+
+    @property
+    def positions(self) -> FloatArray:
+        """``(H+1, R, V, d)`` [m]."""
+        return self.states[..., : self.dimension]
+
+
+def drives(
+    problem: Problem, states: FloatArray, controls: FloatArray, switch_times: ArrayLike, vias: ArrayLike | None = None
+) -> Drives:
+    """Follow the controls up to a time, and from there drive straight from point to point and on to the goal.
+
+    Half a metre before a point a robot turns to the next one.
+
+    Args:
+        problem: The robots.
+        states: ``(H+1, R, n)`` their states under ``controls``.
+        controls: ``(H, R, m)`` as executed: clipped, zero for docked robots.
+        switch_times: ``(R, V)`` time steps.
+        vias: ``(R, V, P, d)`` the points [m]; none by default.
+    """
+    # Here, because importing numba takes long.
+    from d4orm_planners.tracking.straight_drives import DrivenWays, DriveRules, drive_kernel
+    from d4orm_env.engine.threads import Threads, available_cores
+
+    switch, arrays = np.asarray(switch_times, np.int64), problem.arrays
+    num_steps, dimension = problem.horizon, problem.dimension
+    points = np.empty((*switch.shape, 0, dimension), np.float32) if vias is None else np.asarray(vias, np.float32)
+    u = np.zeros((*switch.shape, num_steps, problem.control_size), np.float32)
+    x = np.zeros((*switch.shape, num_steps + 1, problem.state_size), np.float32)
+    arrived = np.zeros(switch.shape, bool)
+    docking = np.array([arrays.squared_goal_radius, arrays.squared_goal_speed])
+    rules = DriveRules(arrays.time_step, docking, arrays.docks, NEAR_VIA)
+    given_x, given_u = (np.ascontiguousarray(rows.swapaxes(0, 1), np.float32) for rows in (states, controls))
+    ways = DrivenWays(arrays.limits, problem.goal, given_x, given_u, switch, np.ascontiguousarray(points))
+    threads = Threads(available_cores())
+    for model, robots in by_model(problem):
+        kernel, index = drive_kernel(model.name), np.array(robots)
+        threads.over(len(index), lambda part: kernel(rules, ways, index[part[0] : part[1]], u, x, arrived))  # noqa: B023
+    return Drives(np.moveaxis(u, 2, 0), np.moveaxis(x, 2, 0), arrived, dimension)
+
+
+def prepare_drives(problem: Problem) -> None:
+    """Compile what drives of this team need, if it is not yet."""
+    from d4orm_planners.tracking.straight_drives import drive_kernel
+
+    if not all(drive_kernel(name).signatures for name in set(problem.team.models)):
+        straight_drives(problem)
+
+
+def straight_drives(problem: Problem) -> Drives:
+    """Drive from the start straight to the goal: a single way for every robot."""
+    return drives(problem, *standing(problem), np.zeros((problem.num_robots, 1), int))
+
+
+def standing(problem: Problem) -> tuple[FloatArray, FloatArray]:
+    """States ``(H+1, K, n)`` and controls ``(H, K, m)`` of robots that stay where they start."""
+    states = np.repeat(np.asarray(problem.start)[None], problem.horizon + 1, axis=0)
+    return states, np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)

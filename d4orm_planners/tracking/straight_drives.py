@@ -1,0 +1,144 @@
+"""Robots driving to points on their own, compiled with numba: whole ways, many at a time."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.dynamics import robot_model
+from d4orm_env.dynamics import transition
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.dynamics.models import MODELS
+from d4orm_env.core.problem import Problem
+from d4orm_env.engine import stepping
+from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
+from d4orm_env.engine.compiling import OPTIONS, inlined, to_fixed_tuple
+from d4orm_env.engine.elementary import OPS
+from d4orm_env.engine.tile_layout import SQUARED_GAP
+from d4orm_env.engine.stepping import make_stepper, models_key
+
+SOURCES = fingerprint((robot_model, transition, *stepping.PARTS, stepping))
+
+
+class DriveRules(NamedTuple):
+    """What holds for all ways.
+
+    Attributes:
+        time_step: ``(4,)`` see :class:`~d4orm_env.dynamics.robot_model.TimeStep`.
+        docking: ``(2,)`` squares of the goal radius and of the goal speed.
+        docks: Whether who has arrived stands there for ever.
+        near2: Square of how near to a point is near [m^2].
+    """
+
+    time_step: FloatArray
+    docking: FloatArray
+    docks: np.bool_
+    near2: np.float32
+
+
+class LoneRobot(NamedTuple):
+    """A robot that drives as if nobody else were there.
+
+    Attributes:
+        time_step: As of :class:`DriveRules`, like the next two.
+        docking: ``(2,)``.
+        docks: Whether it stands for ever where it has arrived.
+        limits: ``(L,)``.
+        goal: ``(d,)`` [m].
+        start: ``(n,)``.
+    """
+
+    time_step: FloatArray
+    docking: FloatArray
+    docks: np.bool_
+    limits: FloatArray
+    goal: FloatArray
+    start: FloatArray
+
+    @classmethod
+    def of(cls, problem: Problem, robot: int) -> LoneRobot:
+        """A robot of a team."""
+        arrays, goal, start = problem.arrays, problem.goal[robot], problem.start[robot]
+        docking = np.array([arrays.squared_goal_radius, arrays.squared_goal_speed])
+        return cls(arrays.time_step, docking, arrays.docks, arrays.limits[robot], goal, start)
+
+
+class DrivenWays(NamedTuple):
+    """``V`` ways of each of ``R`` robots: as given at first, then straight by points to the goal.
+
+    Attributes:
+        limits: ``(R, L)`` of the robots.
+        goals: ``(R, d)``.
+        states: ``(R, H+1, n)`` as given.
+        controls: ``(R, H, m)`` as given, inside the limits, zero for docked robots.
+        switch: ``(R, V)`` time step from which on a way is driven.
+        vias: ``(R, V, P, d)`` points to come near to one after the other, before the goal.
+    """
+
+    limits: FloatArray
+    goals: FloatArray
+    states: FloatArray
+    controls: FloatArray
+    switch: NDArray[np.int64]
+    vias: FloatArray
+
+
+@cache
+def drive_kernel(name: str) -> Kernel[[DriveRules, DrivenWays, IntArray, FloatArray, FloatArray, BoolArray], None]:
+    """The compiled drives of robots of the model with this name, each as if nobody else were there.
+
+    The kernel fills, for robots of these numbers, controls ``u`` ``(R, V, H, m)``, left alone once docked,
+    states ``x`` ``(R, V, H+1, n)`` and ``arrived`` ``(R, V)``.
+    """
+    robot = MODELS[name]
+    move, dock = make_stepper(robot)
+    approach, track = inlined(robot.functions.approach), inlined(robot.functions.track)
+    limit_control, squared_gap = inlined(robot.functions.limit_control), SQUARED_GAP[robot.dimension]
+    n, m, d, num_limits = robot.state_size, robot.control_size, robot.dimension, len(robot.limit_names)
+
+    @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
+    def drive(
+        rules: DriveRules, ways: DrivenWays, robots: IntArray, u: FloatArray, x: FloatArray, arrived: BoolArray
+    ) -> None:
+        dt, docking = rules.time_step, (rules.docking[0], rules.docking[1], rules.docks)
+        h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])
+        num_ways, horizon, num_vias = ways.switch.shape[1], ways.controls.shape[1], ways.vias.shape[2]
+        for r in robots:
+            own_limits, goal = to_fixed_tuple(ways.limits[r], num_limits), to_fixed_tuple(ways.goals[r], d)
+            for way in range(num_ways):
+                first, at_goal, passed = ways.switch[r, way], False, 0
+                for t in range(first + 1):
+                    for i in range(n):
+                        x[r, way, t, i] = ways.states[r, t, i]
+                for t in range(first):
+                    for i in range(m):
+                        u[r, way, t, i] = ways.controls[r, t, i]
+                state = to_fixed_tuple(ways.states[r, first], n)
+                if first > 0:
+                    control = to_fixed_tuple(ways.controls[r, first - 1], m)
+                    state, _, at_goal = dock(False, state, control, own_limits, goal, docking)
+                for t in range(first, horizon):
+                    if transition.stands(at_goal, rules.docks):
+                        for i in range(n):
+                            x[r, way, t + 1 :, i] = state[i]
+                        break
+                    aim = goal
+                    while passed < num_vias:
+                        aim = to_fixed_tuple(ways.vias[r, way, passed], d)
+                        if not squared_gap(state, aim) < rules.near2:
+                            break
+                        passed, aim = passed + 1, goal
+                    wanted = track(state, approach(state, aim, own_limits, h, OPS), own_limits, h, OPS)
+                    control = limit_control(wanted, own_limits, OPS)
+                    for i in range(m):
+                        u[r, way, t, i] = control[i]
+                    state = move(False, state, control, own_limits, h)
+                    state, _, at_goal = dock(False, state, control, own_limits, goal, docking)
+                    for i in range(n):
+                        x[r, way, t + 1, i] = state[i]
+                arrived[r, way] = at_goal
+
+    return drive

@@ -1,0 +1,283 @@
+"""The command line: what it does, and that bad input gets one clear line, exit status 2, and leaves no file behind."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from d4orm_env import make_problem
+from d4orm_planners.base.plan import Plan
+
+QUICK = ("--set", "num_samples=64", "--set", "num_steps=5", "--max-iterations", "1")
+
+
+def test_plan_writes_the_plan_and_its_pictures(d4orm, tmp_path: Path) -> None:
+    files = ("--out", "plan.npz", "--picture", "plan.png", "--animation", "plan.gif")
+    outcome = d4orm("plan", "--num-robots", "2", "--seed", "3", *files)
+    assert outcome.status == 0, outcome.err
+    plan = Plan.load(tmp_path / "plan.npz")
+    assert plan.solved
+    assert plan.seed == 3
+    assert plan.problem.num_robots == 2
+    assert "solved" in outcome.out
+    assert "yes" in outcome.out
+    assert {path.name for path in tmp_path.iterdir()} == {"plan.npz", "plan.png", "plan.gif"}
+
+
+def test_plan_writes_a_replay(d4orm, tmp_path: Path) -> None:
+    outcome = d4orm("plan", "--num-robots", "2", "--out", "plan.html")
+    assert outcome.status == 0, outcome.err
+    assert "wrote plan.html" in outcome.out
+    assert "circle, 2 robots by d4orm-d" in (tmp_path / "plan.html").read_text(encoding="utf-8")
+
+
+def test_run_compares_policies_side_by_side(d4orm, tmp_path: Path) -> None:
+    outcome = d4orm("run", "--num-robots", "2", "--compare", "goal, random", "--out", "compare.html")
+    assert outcome.status == 0, outcome.err
+    page = (tmp_path / "compare.html").read_text(encoding="utf-8")
+    assert page.index('"title": "goal"') < page.index('"title": "random"')
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (("--compare", "goal,random"), "--compare needs --out"),
+        (("--compare", "goal", "--policy", "d4orm", "--out", "a.html"), "--policy does not go with --compare goal"),
+        (("--compare", "goal,nobody", "--out", "a.html"), "nobody"),
+        (("--out", "a.htm"), "must end in .html"),
+    ],
+)
+def test_what_cannot_be_compared_is_said(d4orm, tmp_path: Path, options: Sequence[str], complaint: str) -> None:
+    outcome = d4orm("run", "--num-robots", "2", *options)
+    assert outcome.status == 2
+    assert complaint in outcome.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_run_executes_a_plan_file(d4orm) -> None:
+    assert d4orm("plan", "--num-robots", "2", "--out", "plan.npz", "--quiet").status == 0
+    outcome = d4orm("run", "plan.npz")
+    assert outcome.status == 0, outcome.err
+    assert "success" in outcome.out
+
+
+def test_run_of_a_policy_that_collides_exits_with_one(d4orm) -> None:
+    outcome = d4orm("run", "--policy", "goal", "--num-robots", "2")
+    assert outcome.status == 1
+    assert "robots in contact" in outcome.out
+
+
+@pytest.mark.parametrize(
+    "names", [("--num-robots", "--num-obstacles", "--control-noise-std"), ("--robots", "--obstacles", "--noise")]
+)
+def test_options_have_the_names_of_arguments_and_shorter_ones(d4orm, names: tuple[str, ...]) -> None:
+    outcome = d4orm("run", "--policy", "random", *(part for name in names for part in (name, "2")))
+    assert outcome.status == 1, outcome.err
+
+
+def test_no_solution_in_the_budget_exits_with_one_and_still_writes_the_best_plan(d4orm, tmp_path: Path) -> None:
+    outcome = d4orm("plan", "--num-robots", "8", *QUICK, "--out", "plan.npz")
+    assert outcome.status == 1
+    assert outcome.err.startswith("no solution found")
+    assert not Plan.load(tmp_path / "plan.npz").solved
+
+
+def test_demo_plans_executes_verifies_and_says_where(d4orm, tmp_path: Path) -> None:
+    outcome = d4orm("demo", "--num-robots", "3", "--out", "pictures")
+    assert outcome.status == 0, outcome.err
+    written = {path.name for path in (tmp_path / "pictures").iterdir()}
+    assert written == {"plan.npz", "plan.png", "execution.gif", "execution.html"}
+    assert "verified" in outcome.out
+    for name in written:
+        assert name in outcome.out
+
+
+def test_demo_shows_the_denoising(d4orm, tmp_path: Path) -> None:
+    outcome = d4orm("demo", "--denoising", "--num-robots", "3", "--out", "pictures")
+    assert outcome.status == 0, outcome.err
+    assert {path.name for path in (tmp_path / "pictures").iterdir()} == {"denoising.png", "denoising.html"}
+    assert "denoising step 100 of" in (tmp_path / "pictures" / "denoising.html").read_text(encoding="utf-8")
+
+
+def test_scenario_file(d4orm, tmp_path: Path) -> None:
+    robot = "{model: velocity2d, start: [0, 0], goal: [1, 0]}"
+    (tmp_path / "mine.yaml").write_text(f"version: 1\nname: mine\nrobots:\n  - {robot}\n")
+    assert d4orm("plan", "--scenario", "mine.yaml", "--quiet").status == 0
+
+
+def test_arguments_of_a_scenario(d4orm) -> None:
+    settings = ("--scenario-set", "diameter=2e0", "--scenario-set", "margin=0.1")
+    assert d4orm("plan", "--num-robots", "2", *settings, *QUICK, "--out", "plan.npz", "--quiet").status in (0, 1)
+    assert Plan.load(Path("plan.npz")).problem == make_problem("circle", 2, diameter=2.0, margin=0.1)
+
+
+@pytest.mark.parametrize("command", ["scenarios", "planners"])
+def test_lists(d4orm, command: str) -> None:
+    outcome = d4orm(command)
+    assert outcome.status == 0
+    assert {"scenarios": "amswarm_5", "planners": "d4orm"}[command] in outcome.out
+
+
+@pytest.mark.parametrize(
+    ("name", "listed", "missing"),
+    [
+        ("cem", {"sigma", "elite_fraction"}, "temperature"),
+        ("d-d4orm", {"planner", "nodes", "late_samples"}, "repair_steps"),
+        ("d4orm-c2f", {"weight_cutoff", "deadline"}, "nodes"),
+        ("goal", {"no settings"}, "sigma"),
+    ],
+)
+def test_the_settings_of_one_are_listed(d4orm, name: str, listed: set[str], missing: str) -> None:
+    outcome = d4orm("planners", name)
+    assert outcome.status == 0
+    assert all(setting in outcome.out for setting in listed)
+    assert missing not in outcome.out
+
+
+BAD = [
+    (("plan", "--num-robots", "0"), "num_robots is 0"),
+    (("plan", "--num-robots", "three"), "--num-robots"),
+    (("plan", "--planner", "nope"), "planner 'nope' is unknown; choose one of d4orm"),
+    (("plan", "--preset", "nope"), "preset 'nope'"),
+    (("plan", "--scenario", "nope"), "scenario 'nope' is unknown"),
+    (("plan", "--scenario", "map"), "scenario 'map' needs map=, the path of a .map file"),
+    (("plan", "--scenario", "map", "--scenario-set", "map=missing.map"), "missing.map: cannot be read"),
+    (("run", "--scenario", "map", "--scenario-set", "map=nan.yaml"), "nan.yaml: has no field 'image'"),
+    (("plan", "--scenario", "maze", "--scenario-set", "loops"), "--scenario-set 'loops' is not of the form name=value"),
+    (("plan", "--scenario", "maze", "--scenario-set", "loop=1"), "takes no argument 'loop'"),
+    (("plan", "--scenario-set", "num_robots=3"), "--scenario-set num_robots is said by --num-robots; use that"),
+    (("plan", "--scenario", "good.yaml", "--scenario-set", "dt=1"), "--scenario-set does not go with a scenario"),
+    (("plan", "--scenario", "missing.yaml"), "missing.yaml"),
+    (("plan", "--scenario", "nan.yaml"), "finite"),
+    (("plan", "--scenario", "overlap.yaml"), "overlap"),
+    (("plan", "--scenario", "good.yaml", "--num-robots", "4"), "--num-robots does not go with a scenario file"),
+    (("plan", "--model", "hovercraft"), "model 'hovercraft' is unknown"),
+    (("plan", "--engine", "gpu"), "engine 'gpu' is unknown"),
+    (("plan", "--set", "num_samples"), "name=value"),
+    (("plan", "--set", "num_samples=1"), "num_samples is 1"),
+    (("plan", "--set", "nonsense=1"), "nonsense"),
+    (("plan", "--set", "num_samples=64", "--set", "num_samples=65"), "--set gives 'num_samples' twice"),
+    (("plan", "--planner", "cem", "--set", "temperature=1"), "'temperature' is no setting of planner 'cem'; it takes"),
+    (("plan", "--planner", "d4orm-c2f"), "use make_policy('d4orm-c2f'), or d4orm run --policy d4orm-c2f"),
+    (("planners", "d4rom"), "policy 'd4rom' is unknown"),
+    (("plan", "--set", "temperature=[1"), "the value is not YAML"),
+    (("plan", "--set", "temperature=!!python/name:os.system"), "tags are not supported"),
+    (("plan", "--set", "temperature=1e400"), "temperature is inf"),
+    (("plan", "--set", "improve=yes"), "improve must be True or False, not 'yes'"),
+    (("plan", "--engine", "cpu", "--set", "engine=jax"), "--engine and --set engine say the same"),
+    (("plan", "--engine", "auto", "--set", "engine=cpu"), "--engine and --set engine say the same"),
+    (("plan", "--preset", "paper", "--set", "preset=paper"), "--preset and --set preset say the same"),
+    (("plan", "--max-iterations", "2", "--set", "max_iterations=3"), "--max-iterations and --set max_iterations"),
+    (("plan", "--planner", "d-d4orm", "--set", "nodes=100000000"), "nodes is 100000000; it must be at most 1024"),
+    (("plan", "--planner", "d-d4orm", "--set", "num_samples=1e21"), "num_samples must be a whole number, not 1e+21"),
+    (("plan", "--scenario", "endless.yaml"), "horizon is 100000000"),
+    (("plan", "--seed", "-1"), "seed is -1"),
+    (("plan", "--time-limit", "0"), "time_limit is 0"),
+    (("plan", "--max-iterations", "0"), "max_iterations is 0"),
+    (("plan", "--out", "plan.txt"), "must end in .npz"),
+    (("plan", "--out", "missing/plan.npz"), "'missing' does not exist"),
+    (("plan", "--picture", "plan.bmp"), "must end in .png"),
+    (("plan", "--no-such-option",), "--no-such-option"),
+    (("run", "truncated.npz"), "truncated.npz is not a readable plan"),
+    (("run", "absent.npz"), "absent.npz"),
+    *(
+        (("run", "whole.npz", option, value), f"{option} does not go with a plan file; whole.npz has a problem")
+        for option, value in (
+            ("--scenario", "circle"), ("--num-robots", "2"), ("--model", "velocity2d"), ("--num-obstacles", "0"),
+            ("--policy", "d4orm"), ("--scenario-set", "diameter=6"),
+        )
+    ),
+    (("reproduce", "--list", "circle"), "figure does not go with the list of figures"),
+    (("reproduce", "--quick"), "--quick does not go with the list of figures"),
+    (("reproduce", "--seeds", "99999999999"), "1000000"),
+    (("bench", "--seeds", "99999999999"), "1000000"),
+    (("bench", "--num-robots", "4,99999"), "num_robots is 99999; it must be at most 10000"),
+    (("run", "--control-noise-std", "-1"), "control_noise_std is -1"),
+    (("run", "--policy", "nope"), "policy 'nope' is unknown"),
+    (("run", "--policy", "d4orm-c2f", "--preset", "nope"), "preset 'nope' of policy 'd4orm-c2f' is unknown"),
+    (("run", "--policy", "orca", "--preset", "paper"), "'preset' is no setting of policy 'orca'"),
+    (("demo", "--out", "good.yaml"), "good.yaml"),
+    (("demo", "--num-robots", "0"), "num_robots"),
+    (("nonsense",), "nonsense"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
+def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: Sequence[str], message: str) -> None:
+    line = "version: 1\nname: x\nrobots:\n"
+    robot = "  - {model: velocity2d, start: [%s, 0], goal: [%s, 1]}\n"
+    (tmp_path / "good.yaml").write_text(line + robot % (0, 0))
+    (tmp_path / "nan.yaml").write_text(line + robot % (".nan", 0))
+    (tmp_path / "endless.yaml").write_text(line + robot % (0, 0) + "horizon: 100000000\n")
+    (tmp_path / "overlap.yaml").write_text(line + robot % (0, 0) + robot % (0.1, 5))
+    assert d4orm("plan", "--scenario", "good.yaml", "--quiet", *QUICK, "--out", "whole.npz").status in (0, 1)
+    (tmp_path / "truncated.npz").write_bytes((tmp_path / "whole.npz").read_bytes()[:500])
+    before = sorted(tmp_path.rglob("*"))
+    outcome = d4orm(*arguments)
+    assert outcome.status == 2
+    assert outcome.err.count("\n") == 1
+    assert outcome.err.startswith("d4orm: ")
+    assert message in outcome.err
+    # A folder made for the demo is no half-written file.
+    assert [path for path in sorted(tmp_path.rglob("*")) if path.name != "demo"] == before
+
+
+@pytest.mark.parametrize("setting", ["beta_start=1e-4", "beta_end=2E-2", "late_steps=7e-1", "late_samples=.5"])
+def test_numbers_may_have_an_exponent_without_a_point(d4orm, setting: str) -> None:
+    default = d4orm("plan", "--num-robots", "2", *QUICK, "--out", "default.npz", "--quiet")
+    given = d4orm("plan", "--num-robots", "2", *QUICK, "--set", setting, "--out", "given.npz", "--quiet")
+    assert given.status == default.status
+    np.testing.assert_array_equal(Plan.load(Path("given.npz")).controls, Plan.load(Path("default.npz")).controls)
+
+
+def test_settings_have_an_option_of_their_own_or_set(d4orm) -> None:
+    settings = ("--set", "engine=cpu", "--set", "preset=paper", "--set", "max_iterations=1")
+    assert d4orm("plan", "--num-robots", "2", *QUICK[:4], *settings, "--quiet").status in (0, 1)
+
+
+def test_version(d4orm) -> None:
+    outcome = d4orm("--version")
+    assert (outcome.status, outcome.out) == (0, f"d4orm {importlib.metadata.version('d4orm-env')}\n")
+
+
+def test_no_command_shows_the_help(d4orm) -> None:
+    assert d4orm().out == d4orm("--help").out
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs a folder that not even root can write to")
+@pytest.mark.parametrize("arguments", [("plan", "--out", "/proc/plan.npz"), ("demo", "--out", "/proc/demo")])
+def test_unwritable_folder(d4orm, arguments: Sequence[str]) -> None:
+    outcome = d4orm(*arguments)
+    assert outcome.status == 2
+    assert outcome.err.count("\n") == 1
+    assert "choose another" in outcome.err
+
+
+COMMANDS = ("demo", "plan", "run", "evaluate", "leaderboard", "robustness", "scenarios", "planners")
+
+
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
+def test_help(d4orm, command: list[str]) -> None:
+    outcome = d4orm(*command, "--help")
+    assert outcome.status == 0
+    assert "--help" in outcome.out
+
+
+def test_help_loads_nothing_heavy() -> None:
+    code = (
+        "import sys\nfrom d4orm_planners import cli\n"
+        "try:\n    cli.main(['--help'])\nexcept SystemExit:\n    pass\n"
+        "heavy = ('numba', 'jax', 'torch', 'matplotlib', 'pettingzoo', 'pyarrow', 'pyrvo', 'ray')\n"
+        "print([m for m in heavy if m in sys.modules])"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env={**os.environ, "COLUMNS": "100"}
+    )
+    assert result.stdout.splitlines()[-1] == "[]"

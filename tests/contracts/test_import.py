@@ -1,0 +1,124 @@
+"""What importing the package costs, in libraries: nothing that most users do not need."""
+
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = ("torch", "ray", "casadi", "matplotlib", "jax", "stable_baselines3", "supersuit", "zenoh", "pyrvo",
+         "pandas", "pyarrow", "scipy.stats")  # fmt: skip
+CONTRACT = (
+    "navigation_v0",
+    "make_problem",
+    "load_problem",
+    "save_problem",
+    "list_scenarios",
+    "load_map",
+    "Problem",
+    "Team",
+    "World",
+    "Trajectory",
+    "rollout",
+    "verify",
+)
+
+
+def run_python(code: str) -> str:
+    """Standard output of a fresh interpreter in which warnings are errors."""
+    result = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout.strip()
+
+
+def loaded_by(code: str) -> set[str]:
+    """Which of the heavy libraries are loaded after running ``code``."""
+    report = f"import sys; print(*(name for name in {HEAVY!r} if name in sys.modules))"
+    return set(run_python(f"{code}\n{report}").split())
+
+
+def test_the_package_loads_nothing_heavy() -> None:
+    assert loaded_by("import d4orm_env") == set()
+
+
+def test_making_and_judging_a_problem_loads_nothing_heavy() -> None:
+    code = (
+        "import numpy as np, d4orm_env\n"
+        "problem = d4orm_env.make_problem('circle', num_robots=2, horizon=5)\n"
+        "assert not d4orm_env.verify(problem, np.zeros((5, 2, 2))).ok"
+    )
+    assert loaded_by(code) == set()
+
+
+def test_the_cpu_engine_does_without_jax() -> None:
+    code = "from d4orm_env.engine.choice import get_engine\nassert get_engine('cpu').name == 'cpu'"
+    assert loaded_by(code) == set()
+
+
+def test_the_environment_does_without_jax_and_matplotlib() -> None:
+    assert loaded_by("from d4orm_env import navigation_v0\nnavigation_v0.parallel_env(num_robots=2)") == set()
+
+
+def test_comparing_policies_loads_nothing_heavy_before_there_is_something_to_report() -> None:
+    assert loaded_by("from d4orm_planners import evaluate") == set()
+
+
+@pytest.mark.parametrize("name", CONTRACT)
+def test_the_public_names_are_there(name: str) -> None:
+    import d4orm_env
+
+    assert getattr(d4orm_env, name) is not None
+    assert name in d4orm_env.__all__
+
+
+def test_the_contracts_import_statement_works_in_a_fresh_process() -> None:
+    names = ", ".join(CONTRACT)
+    assert run_python(f"from d4orm_env import {names}\nprint(callable(rollout), navigation_v0.__name__)") == (
+        "True d4orm_env.navigation_v0"
+    )
+
+
+def test_all_names_resolve() -> None:
+    assert run_python("from d4orm_env import *\nprint(functional.__name__)") == "d4orm_env.jax.functional"
+
+
+PUBLIC = (
+    "d4orm_env", "d4orm_env.jax.functional", "d4orm_env.envs.joint_state",
+    "d4orm_env.dynamics", "d4orm_env.navigation_v0", "d4orm_env.envs.options", "d4orm_env.render", "d4orm_env.envs.rewards",
+    "d4orm_env.scenarios", "d4orm_env.verify", "d4orm_env.envs.wrappers", "d4orm_planners", "d4orm_planners.base.adapters",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_public_modules_say_what_is_public(name: str) -> None:
+    module = importlib.import_module(name)
+    assert len(set(module.__all__)) == len(module.__all__)
+    for public in module.__all__:
+        assert getattr(module, public) is not None
+
+
+def test_unknown_names_are_attribute_errors() -> None:
+    import d4orm_env
+
+    with pytest.raises(AttributeError, match="module 'd4orm_env' has no attribute 'teleport'"):
+        _ = d4orm_env.teleport
+
+
+def test_the_planners_are_not_loaded_by_the_environment() -> None:
+    code = "import sys, d4orm_env\nprint(any(name.startswith('d4orm_planners') for name in sys.modules))"
+    assert run_python(code) == "False"
+
+
+@pytest.mark.parametrize(
+    ("library", "package"), [("jaxmarl", "jaxmarl"), ("torchrl", "'d4orm-env[rl]'"), ("benchmarl", "benchmarl")]
+)
+def test_an_integration_says_which_library_is_missing(library: str, package: str) -> None:
+    if library != "jaxmarl":
+        pytest.importorskip("torchrl")
+    code = f"import sys; sys.modules[{library!r}] = None\nimport d4orm_env.integrations.{library}"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert f"ImportError: this integration needs {library}; install it with: pip install {package}" in result.stderr

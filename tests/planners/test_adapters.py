@@ -1,0 +1,93 @@
+"""Models of reinforcement-learning libraries, asked as those libraries ask them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+from d4orm_env import make_problem, navigation_v0
+from d4orm_planners import run_episode
+from d4orm_planners.base.adapters import from_rllib, from_sb3, from_torchrl
+
+torch = pytest.importorskip("torch")
+PROBLEM = make_problem("circle", num_robots=3, horizon=10, model="differential_drive")
+
+
+def first_actions(policy: Any) -> tuple[np.ndarray, np.ndarray, Any]:
+    """What the robots observe first, what the policy has them do, and the space of that."""
+    env = navigation_v0.parallel_env(problem=PROBLEM)
+    episode = run_episode(env, policy)
+    assert len(episode.trajectory.controls) == PROBLEM.horizon
+    observed = np.stack(list(episode.observations[0].values()))
+    actions = policy.act(episode.observations[0], None)
+    assert list(actions) == env.possible_agents
+    assert policy.act({}, None) == {}
+    return observed, np.stack(list(actions.values())), env.action_space("robot_0")
+
+
+def test_stable_baselines3() -> None:
+    sb3 = pytest.importorskip("stable_baselines3")
+    env = navigation_v0.parallel_env(problem=PROBLEM)
+
+    class One(gymnasium.Env):
+        observation_space, action_space = env.observation_space("robot_0"), env.action_space("robot_0")
+
+    model, other = (sb3.PPO("MlpPolicy", One(), seed=seed, device="cpu") for seed in (0, 1))
+    observed, actions, _ = first_actions(from_sb3(model))
+    for observation, action in zip(observed, actions):
+        np.testing.assert_allclose(action, model.predict(observation, deterministic=True)[0], rtol=1e-5, atol=1e-6)
+    assert from_sb3(model).identity() == from_sb3(model).identity() != from_sb3(other).identity()
+
+
+def test_torchrl() -> None:
+    pytest.importorskip("torchrl")
+    from tensordict.nn import NormalParamExtractor, TensorDictModule
+    from torchrl.modules import ProbabilisticActor, TanhNormal
+
+    size = navigation_v0.parallel_env(problem=PROBLEM).observation_space("robot_0").shape[0]
+    layers = torch.nn.Sequential(torch.nn.Linear(size, 4), NormalParamExtractor())
+    parameters = TensorDictModule(layers, in_keys=["seen"], out_keys=["loc", "scale"])
+    actor = ProbabilisticActor(
+        parameters, in_keys=["loc", "scale"], out_keys=["done"], distribution_class=TanhNormal,
+        distribution_kwargs={"low": torch.tensor([-1.0, -0.5]), "high": torch.tensor([1.0, 0.5])},
+    )  # fmt: skip
+    observed, actions, _ = first_actions(from_torchrl(actor, "seen", "done"))
+    with torch.no_grad():
+        mean = layers(torch.as_tensor(observed))[0]
+    np.testing.assert_allclose(actions, torch.tanh(mean) * torch.tensor([1.0, 0.5]), rtol=1e-4, atol=1e-5)
+
+
+class Module(torch.nn.Linear):
+    """What an ``RLModule`` of RLlib has that is called here."""
+
+    def forward_inference(self, batch: dict[str, Any]) -> dict[str, Any]:
+        return {"action_dist_inputs": self(batch["obs"])}
+
+    def get_inference_action_dist_cls(self) -> Any:
+        class Distribution:
+            def __init__(self, logits: Any) -> None:
+                self.logits = logits
+
+            from_logits = classmethod(lambda cls, logits: cls(logits))
+
+            def to_deterministic(self) -> Any:
+                return Distribution(self.logits.chunk(2, dim=-1)[0])
+
+            def sample(self) -> Any:
+                return self.logits
+
+        return Distribution
+
+
+def test_rllib() -> None:
+    size = navigation_v0.parallel_env(problem=PROBLEM).observation_space("robot_0").shape[0]
+    module = Module(size, 4)
+    observed, actions, space = first_actions(from_rllib(module, normalized=False))
+    with torch.no_grad():
+        mean = module(torch.as_tensor(observed))[:, :2].numpy()
+    np.testing.assert_allclose(actions, mean, rtol=1e-4, atol=1e-5)
+    _, scaled, space = first_actions(from_rllib(module))
+    np.testing.assert_allclose(scaled, space.high * np.clip(mean, -1, 1), rtol=1e-4, atol=1e-5)

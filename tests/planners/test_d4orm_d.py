@@ -1,0 +1,255 @@
+"""D4orm-D solves big and dense teams, touches only robots that fail, and in its paper preset is Algorithm 3."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from planner_support import hop_problem, walled_in_problem
+
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
+from d4orm_env.engine.types import SamplingResult, SamplingTask
+from d4orm_env.engine.cpu import CpuEngine
+from d4orm_env.scenarios import make_problem
+from d4orm_env.verify import verify
+from d4orm_planners import make_planner
+from d4orm_planners.d4orm_d.planner import D4ormD
+from d4orm_planners.base.conflict_groups import conflicts, failure_groups, reconnected
+from d4orm_planners.base.solve import Search
+
+CASES = [
+    pytest.param({"scenario": "circle", "num_robots": 16}, id="circle-16"),
+    pytest.param({"scenario": "four_obstacles", "num_robots": 16}, id="four-obstacles-16"),
+    pytest.param({"scenario": "random", "num_robots": 24, "size": 6.0}, id="random-24"),
+    pytest.param({"scenario": "amswarm_5", "num_robots": 10}, id="amswarm-5"),
+    pytest.param({"scenario": "heterogeneous", "num_robots": 8}, id="heterogeneous-8"),
+    pytest.param({"scenario": "circle", "num_robots": 8, "model": "velocity2d"}, id="velocity2d-8"),
+    pytest.param({"scenario": "random", "num_robots": 16, "model": "differential_drive"}, id="differential-drive-16"),
+    pytest.param({"scenario": "swap", "num_robots": 8}, id="swap-8"),
+]
+BIG = [
+    pytest.param({"scenario": "random", "num_robots": 64, "size": 10.0}, id="random-64"),
+    pytest.param({"scenario": "circle", "num_robots": 64, "diameter": 12.0}, id="circle-64"),
+    pytest.param({"scenario": "sphere", "num_robots": 64}, id="sphere-64"),
+]
+
+
+def assert_solves(case: dict[str, Any], seed: int, **config: Any) -> None:
+    """Whatever is claimed to be solved is checked here anew."""
+    problem = make_problem(**case, seed=seed)
+    plan = make_planner("d4orm-d", engine="cpu", **config).solve(problem, seed=seed, max_iterations=100)
+    assert plan.solved, [(record.num_not_arrived, record.num_margin_violated) for record in plan.history]
+    report = verify(problem, plan.controls)
+    assert report.ok, report.violations
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("case", CASES)
+def test_default_settings_solve(case: dict[str, Any], seed: int) -> None:
+    assert_solves(case, seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", BIG)
+def test_default_settings_solve_64_robots(case: dict[str, Any]) -> None:
+    assert_solves(case, seed=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_groups_solve_a_circle(seed: int) -> None:
+    assert_solves({"scenario": "circle", "num_robots": 12}, seed, decoupling="groups")
+
+
+def search_of(problem: Problem, iterations: int = 0, **config: Any) -> Search:
+    """A search after some iterations."""
+    search = Search(make_planner("d4orm-d", engine="cpu", **config), problem, 0, None)
+    for _ in range(iterations):
+        search.advance()
+    return search
+
+
+CROSSING = make_problem("circle", num_robots=12)
+FEW = {"num_samples": 64, "num_steps": 10, "repair_samples": 64, "repair_steps": 10}
+
+
+@pytest.mark.parametrize("clip", [True, False])
+def test_the_paper_preset_replans_exactly_the_groups_that_fail(clip: bool) -> None:
+    search = search_of(CROSSING, iterations=1, preset="paper", clip_between_iterations=clip, **FEW)
+    assert search.current.failed.any()
+    previous = None
+    for _ in range(4):
+        before = search.current
+        graph = conflicts(before.trajectory.positions, CROSSING.team.radius, CROSSING.margin)
+        groups = failure_groups(before.failed, reconnected(graph, previous))
+        replanned = {robot for group in groups for robot in group}
+        search.advance()
+        # Clipping what is clipped already may change the last bit.
+        change = np.abs(search.current.controls - before.controls).max(axis=(0, 2))
+        assert set(np.flatnonzero(change > 1e-5)) == replanned
+        kept = [k for k in range(12) if k not in replanned]
+        went_on_from = before.controls if clip else before.planned
+        np.testing.assert_allclose(search.current.planned[:, kept], went_on_from[:, kept], atol=1e-6)
+        previous = graph
+
+
+def test_the_first_iteration_of_the_paper_preset_minds_no_collisions() -> None:
+    search = search_of(CROSSING, preset="paper", **FEW)
+    planner = search.planner
+    assert isinstance(planner, D4ormD)
+    assert not planner.task(search, search.current.controls).collisions
+    search.advance()
+    assert planner.task(search, search.current.controls).collisions
+
+
+def test_an_independent_repair_leaves_whoever_does_not_fail_alone() -> None:
+    search = search_of(make_problem("random", num_robots=16, size=6.0, seed=3), iterations=1, start="straight")
+    repairs = 0
+    while search.current.failed.any() and repairs < 8:
+        before = search.current
+        search.advance()
+        repairs += 1
+        if not search.current.failed.any():
+            break  # The last repair shortens everybody's way.
+        same = (search.current.controls == before.controls).all(axis=(0, 2))
+        assert same[~before.failed].all()
+    assert repairs >= 1
+    assert search.best.solved
+
+
+class Astray(CpuEngine):
+    """Sampling that goes wrong: it sends everybody to the right at full throttle."""
+
+    def denoise(self, task: Any, rules: Any, mean: Any, noise_scale: Any, *more: Any, **options: Any) -> Any:
+        away = np.zeros_like(task.base)
+        away[..., 0] = task.problem.team.control_limits[:, 0]
+        return SamplingResult(away - task.base, np.zeros(len(noise_scale), np.float32), 0)
+
+
+def test_a_repair_that_makes_things_worse_is_not_taken_over() -> None:
+    """Robot 0 cannot reach its goal, and on every way there it meets robot 1, which has docked in between."""
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    ring = np.column_stack([4 + 0.8 * np.cos(angle), 0.8 * np.sin(angle), np.full(12, 0.25)])
+    start = [[0, 0, 0, 0], [1.5, -0.5, 0, 0]]
+    problem = Problem(Team(("holonomic2d",) * 2), start, [[4, 0], [1.5, 0]], World(circles=ring), horizon=60)
+    controls = np.zeros((60, 2, 2), np.float32)
+    controls[:, 1, 1] = 0.5
+    search = Search(make_planner("d4orm-d", engine="cpu"), problem, 0, controls, Astray())
+    before = search.current
+    assert before.failed.tolist() == [True, False]
+    search.advance()
+    assert search.denoising_steps > 0, "a repair was tried"
+    np.testing.assert_array_equal(search.current.trajectory.states, before.trajectory.states)
+
+
+class Recorded(Astray):
+    """Keeps how it was asked to sample."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tasks: list[SamplingTask] = []
+        self.scales: list[float] = []
+
+    def prepare(self, *arguments: Any) -> None:
+        """Nothing has to be compiled for what it does."""
+
+    def denoise(self, task: Any, rules: Any, mean: Any, noise_scale: Any, *more: Any, **options: Any) -> Any:
+        self.tasks.append(task)
+        self.scales.append(float(np.max(noise_scale)))
+        return super().denoise(task, rules, mean, noise_scale, *more, **options)
+
+
+def test_robots_that_were_repaired_in_vain_are_repaired_jointly_and_every_other_noise_is_wider() -> None:
+    """Two robots meet in a lane where neither can pass the other, whatever they are told."""
+    start = [[0, 0, 0, 0], [2, 0, 0, 0]]
+    lane = World(lower=[-1, -0.25], upper=[3, 0.25])
+    problem = Problem(Team(("holonomic2d",) * 2), start, [[2, 0], [0, 0]], lane, horizon=60)
+    engine = Recorded()
+    towards = np.zeros((60, 2, 2), np.float32)
+    towards[:, :, 0] = [0.2, -0.2]
+    search = Search(make_planner("d4orm-d", engine="cpu"), problem, 0, towards, engine)
+    for _ in range(7):
+        search.advance()
+        assert search.current.failed.all()
+    # Six repairs, one robot at a time: before the fourth, one of them had failed only once.
+    assert [task.credit for task in engine.tasks] == ["robot"] * 6 + ["team"]
+    assert [task.problem.num_robots for task in engine.tasks] == [1] * 6 + [2]
+    assert search.state.failures.min() >= 3
+    np.testing.assert_allclose(np.divide(engine.scales, engine.scales[0]), [1, 2, 1, 2, 1, 2, 1], rtol=1e-6)
+
+
+def test_who_arrives_without_conflict_was_not_repaired_in_vain() -> None:
+    """Few samples end somewhere; from there everybody turns straight home."""
+    search = search_of(hop_problem(2), 1, start="team", **FEW)
+    assert not search.current.failed.any()
+    assert search.state.failures.tolist() == [0, 0]
+
+
+def test_teams_of_more_than_32_are_sampled_half_as_often() -> None:
+    for robots, samples in ((32, 256), (33, 128)):
+        search = search_of(make_problem("random", num_robots=robots, size=12.0), num_samples=256)
+        assert isinstance(search.planner, D4ormD)
+        assert search.planner.num_samples(search) == samples
+
+
+@pytest.mark.parametrize(("scenario", "straight"), [("circle", False), ("random", True)])
+def test_sparse_teams_start_straight(scenario: str, straight: bool) -> None:
+    search = search_of(make_problem(scenario, num_robots=16, seed=0), iterations=1)
+    assert (search.denoising_steps == 0) == straight
+    drives = search_of(make_problem(scenario, num_robots=16, seed=0), iterations=1, start="straight").current
+    assert drives.trajectory.arrived[-1].all()
+    assert np.array_equal(drives.controls, search.current.controls) == straight
+
+
+def test_given_controls_are_repaired_rather_than_thrown_away() -> None:
+    problem = make_problem("random", num_robots=16, seed=0)
+    drives = search_of(problem, iterations=1, start="straight").current
+    assert drives.failed.any()
+    assert not drives.failed.all()
+    planner = make_planner("d4orm-d", engine="cpu", start="team", shorten=False)
+    search = Search(planner, problem, 0, drives.controls)
+    search.advance()
+    assert (search.current.controls == drives.controls).all(axis=(0, 2))[~drives.failed].all()
+
+
+@pytest.mark.parametrize("preset", [None, "paper"])
+def test_a_goal_that_cannot_be_reached_ends_at_the_budget(preset: str | None) -> None:
+    plan = make_planner("d4orm-d", preset=preset, engine="cpu", **FEW).solve(walled_in_problem(), max_iterations=6)
+    assert not plan.solved
+    assert plan.status == "iteration_limit"
+    assert plan.iterations == 6
+    assert list(plan.failures) == ["robot_0"]
+    assert "m from its goal" in plan.failures["robot_0"] or "an obstacle" in plan.failures["robot_0"]
+
+
+def test_failures_name_robots_and_reasons() -> None:
+    problem = make_problem("circle", num_robots=4)
+    plan = make_planner("d4orm-d", start="straight", engine="cpu").solve(problem, max_iterations=1)
+    assert not plan.solved
+    assert plan.failures == {
+        f"robot_{k}": "comes within the margin of " + ", ".join(f"robot_{i}" for i in range(4) if i != k)
+        for k in range(4)
+    }
+    assert (plan.history[0].num_not_arrived, plan.history[0].num_margin_violated) == (0, 4)
+    still = make_planner("d4orm-d", engine="cpu").solve(problem, max_iterations=10)
+    assert still.solved
+    assert still.failures == {}
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "message"),
+    [
+        ("decoupling", "all", "decoupling 'all' is unknown; choose one of independent, groups"),
+        ("start", "zero", "start 'zero' is unknown; choose one of auto, team, straight"),
+        ("first_collisions", 1, "first_collisions must be True or False"),
+        ("repair_samples", 1, "repair_samples is 1.*at least 2"),
+        ("repair_steps", 0, "repair_steps is 0.*at least 1"),
+        ("penalty", 0, "penalty is 0.*positive"),
+    ],
+)
+def test_a_bad_setting_is_refused_by_name(setting: str, value: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_planner("d4orm-d", **{setting: value})

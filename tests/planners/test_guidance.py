@@ -1,0 +1,356 @@
+"""Path finding on a roadmap: moves that never meet, who goes first, drives that keep clear, and what users get."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from planner_support import walled_in_problem
+
+from d4orm_env import Problem, Team, World, make_problem, verify
+from d4orm_env.dynamics.models import MODELS
+from d4orm_env.engine.choice import get_engine
+from d4orm_planners import make_planner
+from d4orm_planners.mapf.lacam import Moves, find_moves
+from d4orm_planners.mapf.planner import leads_round
+from d4orm_planners.tracking.pursuit import gear_towards
+from d4orm_planners.mapf.replanning import Others, Trip, find_way
+from d4orm_planners.mapf.roadmap import Roadmap, lay_roadmap
+from d4orm_planners.mapf.routes import Stops, join_routes, make_routes, stops_of
+from d4orm_planners.mapf.roadmap_team import Driven, Replanning, drive_moves
+from d4orm_planners.tracking.timed_path import drive_by_clock
+
+
+def walled(
+    start: Any, goal: Any, boxes: Any = (), bounds: Any = ((-4, -4), (4, 4)), radius: float = 0.15, **arguments: Any
+) -> Problem:
+    """Holonomic robots that stand still at first, in a room with boxes."""
+    states = np.hstack([np.asarray(start, float), np.zeros((len(start), 2))])
+    world = World(dimension=2, boxes=boxes, lower=bounds[0], upper=bounds[1])
+    team = Team(("holonomic2d",) * len(start), radius=radius)
+    return Problem(team, states, goal, world, **{"horizon": 400, **arguments})
+
+
+def corridor_with_bay(right: float = 2.0) -> Problem:
+    """Two robots that exchange places in a corridor for one, with a bay in the middle."""
+    boxes = [[-4, 0.3, -0.3, 1.0], [0.3, 0.3, 4, 1.0], [-4, -1.0, 4, -0.3]]
+    bounds = ((-3, -1), (3, 1))
+    return walled([[-2, 0], [right, 0]], [[2, 0], [-2, 0]], boxes, bounds)
+
+
+def found(problem: Problem, fineness: float = 1.0, seed: int = 0) -> tuple[Roadmap, Moves]:
+    roadmap = lay_roadmap(problem, fineness)
+    moves = find_moves(problem, roadmap, seed, lambda: False, 3000)
+    assert moves is not None
+    return roadmap, moves
+
+
+def assert_moves_keep_clear(problem: Problem, roadmap: Roadmap, moves: Moves) -> None:
+    """One after another, each past all others where they stand at that moment."""
+    at, radius = roadmap.starts.copy(), np.asarray(problem.team.radius, float)
+    for robot, edge in moves.moves:
+        assert roadmap.first[at[robot]] <= edge < roadmap.first[at[robot] + 1], "moves go from where a robot is"
+        tail, head = roadmap.nodes[at[robot]], roadmap.nodes[roadmap.heads[edge]]
+        others = np.arange(problem.num_robots) != robot
+        step, places = head - tail, roadmap.nodes[at[others]]
+        share = np.clip((places - tail) @ step / (step @ step), 0, 1)
+        gaps = np.linalg.norm(places - tail - share[:, None] * step, axis=1)
+        assert (gaps > radius[others] + radius[robot] + problem.margin - 1e-6).all()
+        at[robot] = roadmap.heads[edge]
+    np.testing.assert_array_equal(at == roadmap.goals, moves.arrived)
+
+
+# The roadmap.
+
+
+def test_edges_of_the_roadmap_keep_clear_of_walls_on_all_their_length() -> None:
+    problem = make_problem("rooms", num_robots=6, seed=2)
+    roadmap = lay_roadmap(problem, 1.6)
+    tails = np.repeat(np.arange(len(roadmap.nodes)), np.diff(roadmap.first))
+    for share in np.linspace(0, 1, 21):
+        places = roadmap.nodes[tails] * (1 - share) + roadmap.nodes[roadmap.heads] * share
+        # Starts and goals may be nearer than other places.
+        own = np.minimum(
+            *(problem.world.clearance(roadmap.nodes[ends][:, :2]) for ends in (tails, roadmap.heads.astype(int)))
+        )
+        room = problem.world.clearance(places[:, :2])
+        assert (room > np.minimum(0.2, own) - 0.2 / 100).all()
+
+
+def test_starts_and_goals_are_nodes_of_their_own() -> None:
+    problem = make_problem("maze", num_robots=5, seed=0)
+    roadmap = lay_roadmap(problem)
+    np.testing.assert_array_equal(roadmap.nodes[roadmap.starts, :2], problem.start[:, :2].astype(float))
+    np.testing.assert_array_equal(roadmap.nodes[roadmap.goals, :2], problem.goal.astype(float))
+
+
+def test_what_is_near_an_edge_is_what_brute_force_finds() -> None:
+    roadmap = lay_roadmap(make_problem("forest", num_robots=4, seed=1))
+    tails = np.repeat(np.arange(len(roadmap.nodes)), np.diff(roadmap.first))
+    reach = 2 * 0.15 + 0.05 + 0.06 + 0.075
+    for edge in range(0, len(tails), 37):
+        tail, step = roadmap.nodes[tails[edge]], roadmap.nodes[roadmap.heads[edge]] - roadmap.nodes[tails[edge]]
+        share = np.clip((roadmap.nodes - tail) @ step / (step @ step), 0, 1)
+        gaps = np.linalg.norm(roadmap.nodes - tail - share[:, None] * step, axis=1)
+        own = slice(roadmap.near_first[edge], roadmap.near_first[edge + 1])
+        np.testing.assert_array_equal(roadmap.near[own], np.flatnonzero(gaps < reach))
+        np.testing.assert_allclose(roadmap.gaps[own], gaps[roadmap.near[own]], atol=1e-12)
+
+
+# Path finding.
+
+
+def test_two_robots_exchange_places_in_a_corridor_by_its_bay() -> None:
+    problem = corridor_with_bay()
+    roadmap, moves = found(problem)
+    assert moves.arrived.all()
+    assert_moves_keep_clear(problem, roadmap, moves)
+    at, aside = roadmap.starts.copy(), False
+    for robot, edge in moves.moves:
+        at[robot] = roadmap.heads[edge]
+        aside |= bool(roadmap.nodes[at[robot], 1] > 0.4)
+    assert aside, "one of them has been in the bay"
+
+
+def test_without_the_bay_they_cannot_and_the_search_ends() -> None:
+    boxes = [[-4, 0.3, 4, 1.0], [-4, -1.0, 4, -0.3]]
+    problem = walled([[-2, 0], [2, 0]], [[2, 0], [-2, 0]], boxes, ((-3, -1), (3, 1)))
+    _, moves = found(problem)
+    assert not moves.arrived.all()
+
+
+def test_a_ring_of_robots_moves_on() -> None:
+    corners = np.array([[-0.3, -0.3], [0.3, -0.3], [0.3, 0.3], [-0.3, 0.3]])
+    problem = walled(corners, np.roll(corners, -1, axis=0))
+    roadmap, moves = found(problem)
+    assert moves.arrived.all()
+    assert_moves_keep_clear(problem, roadmap, moves)
+
+
+@pytest.mark.parametrize("arrival", ["dock", "stay"])
+def test_a_goal_that_closes_a_corridor_is_taken_last(arrival: str) -> None:
+    """The goal of robot 0 lies in the middle of the only corridor, through which robot 1 has to go."""
+    boxes = [[-1, 0.3, 1, 4], [-1, -4, 1, -0.3]]
+    problem = walled([[-1.6, 0], [-3, 1]], [[0, 0], [3, 1]], boxes, arrival=arrival)
+    roadmap, moves = found(problem)
+    assert moves.arrived.all()
+    assert_moves_keep_clear(problem, roadmap, moves)
+    if arrival == "dock":
+        last = [int(np.flatnonzero(moves.moves[:, 0] == robot)[-1]) for robot in range(2)]
+        through = roadmap.nodes[roadmap.heads[moves.moves[:, 1]], 0]
+        passed = np.flatnonzero((moves.moves[:, 0] == 1) & (through > 0.5))[0]
+        assert passed < last[0]
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.integers(0, 10**6), st.integers(2, 12), st.sampled_from(["rooms", "maze", "forest", "random"]))
+def test_moves_keep_clear_of_everybody(seed: int, num_robots: int, scenario: str) -> None:
+    problem = make_problem(scenario, num_robots=num_robots, seed=seed)
+    roadmap = lay_roadmap(problem, 1.6)
+    moves = find_moves(problem, roadmap, seed, lambda: False, 200)
+    if moves is not None:
+        assert_moves_keep_clear(problem, roadmap, moves)
+
+
+def test_robots_of_any_size_keep_clear() -> None:
+    problem = make_problem("rooms", num_robots=5, seed=0, radius=[0.1, 0.2, 0.15, 0.1, 0.2], room_size=3.0)
+    roadmap, moves = found(problem, 1.6)
+    assert moves.arrived.all()
+    assert_moves_keep_clear(problem, roadmap, moves)
+
+
+# Who goes first.
+
+
+def test_who_goes_first_is_never_decided_in_a_ring() -> None:
+    """Driven as they may be, point by point and in any order, all come to the end of their routes."""
+    problem = make_problem("rooms", num_robots=12, seed=1)
+    roadmap, moves = found(problem, 1.25)
+    stops = stops_of(roadmap, moves.moves, problem.num_robots)
+    routes = join_routes(problem, make_routes(problem, stops, range(problem.num_robots), 0.03))
+    at, ends, moved = np.zeros(problem.num_robots, int), np.diff(routes.first) - 1, True
+    while moved:
+        moved = False
+        for robot in range(problem.num_robots):
+            waits = slice(routes.wait_first[robot], routes.wait_first[robot + 1])
+            over = at[routes.wait_for[waits]] >= routes.wait_until[waits]
+            closed = routes.wait_at[waits][~over]
+            limit = min(closed.min() - 1, ends[robot]) if len(closed) else ends[robot]
+            moved |= bool(limit > at[robot])
+            at[robot] = max(at[robot], limit)
+    np.testing.assert_array_equal(at, ends)
+
+
+# Driving.
+
+
+@pytest.mark.parametrize("model", [name for name in MODELS if name in ("holonomic2d", "velocity2d", "unicycle")])
+def test_a_drive_along_found_moves_is_what_the_engine_makes_of_its_controls(model: str) -> None:
+    problem = make_problem("maze", num_robots=6, seed=1, model=model, horizon=900)
+    roadmap, moves = found(problem, 1.25)
+    driven = drive_moves(problem, roadmap, moves.moves)
+    trajectory = get_engine("cpu").rollout(problem, driven.until(problem.horizon))
+    steps = len(driven.controls)
+    # A control inside the limits is clipped once more, which may round it.
+    np.testing.assert_allclose(trajectory.positions[: steps + 1], driven.places[:, :, :2], atol=1e-4)
+    np.testing.assert_array_equal(trajectory.arrived.argmax(axis=0), driven.arrivals)
+    assert verify(problem, driven.until(problem.horizon)).ok
+
+
+@numba.njit
+def gear(along: float, across: float, speed: float, backs_up: bool) -> float:
+    return float(gear_towards(np.float32(along), np.float32(across), np.float32(speed), backs_up))
+
+
+@pytest.mark.parametrize(
+    ("degrees", "speed", "swings_round", "backs_up"),
+    [
+        (0, 0, 1, 1), (180, 0, -1, -1), (10, -1, 1, 1), (-170, 1, -1, -1),
+        # Aside, a robot that drives goes on in its gear, and one that backs up does so until the point is ahead.
+        (80, 0, 1, -1), (-80, 0, 1, -1), (100, 0, -1, 1), (40, 1, 1, 1), (30, -1, 1, -1),
+        (115, 1, 1, 1), (65, -1, -1, -1), (125, 1, -1, 1), (55, -1, 1, -1),
+    ],
+)  # fmt: skip
+def test_a_robot_that_turns_as_it_drives_chooses_its_gear(
+    degrees: float, speed: float, swings_round: int, backs_up: int
+) -> None:
+    along, across = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    assert gear(along, across, speed, False) == swings_round
+    assert gear(along, across, speed, True) == backs_up
+
+
+@pytest.mark.parametrize("heading", np.arange(-180, 180, 45))
+@pytest.mark.parametrize("way", [[(0, 0), (3, 0)], [(0, 0), (2, 0), (2, 2)], [(0, 0), (1.5, 0), (1.5, 1), (0, 1)]])
+def test_a_car_follows_a_route_from_every_heading(way: Any, heading: float) -> None:
+    start = [[0, 0, np.radians(heading), 0, 0]]
+    problem = Problem(Team(("car",)), start, [way[-1]], World(dimension=2), horizon=400)
+    corners = np.hstack([np.array(way, float), np.zeros((len(way), 1))])
+    times = np.arange(len(way)) * 40.0
+    stops = Stops(corners, np.array([0, len(way)]), np.append(-1.0, times[:-1]), times)
+    (route,) = make_routes(problem, stops, [0], 0.1)
+    turning = problem.team.turning_radius[0]
+    assert (route.bends > turning - 1e-6).all()
+    for backs_up in (False, True):
+        controls, places, arrival = drive_by_clock(problem, 0, route, stops, 400, hurrying=True, backs_up=backs_up)
+        assert arrival <= 400
+        assert verify(problem, controls[:, None]).ok
+        gaps = np.linalg.norm(places[: arrival + 1, None] - route.points, axis=2).min(axis=1)
+        # It leaves the route no farther than turning round takes, and is on it in the end.
+        assert gaps.max() < 4 * turning
+        assert gaps[arrival - 5 :].max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("scenario", "seed"), [("corridor", 3), ("corridor", 4), ("doorway", 4), ("maze", 5), ("rooms", 4)]
+)
+def test_a_car_alone_finds_its_way_among_walls(scenario: str, seed: int) -> None:
+    problem = make_problem(scenario, num_robots=1, seed=seed, model="car")
+    plan = make_planner("guided").solve(problem, seed=0, max_iterations=4)
+    assert plan.solved
+    assert verify(problem, plan.controls).ok
+
+
+@pytest.mark.parametrize("fault", ["nobody", "across", "ahead"])
+def test_a_way_in_space_and_time_lets_others_pass(fault: str) -> None:
+    """Another robot crosses, or drives the same way ahead and stops for a while where both have to go."""
+    boxes = [[-0.3, 0.35, 0.3, 4], [-0.3, -4, 0.3, -0.35]]
+    problem = walled([[-2, 0], [3, 3]], [[2, 0], [3, 2]], boxes)
+    roadmap = lay_roadmap(problem, 1.25)
+    replanning = Replanning(problem, roadmap)
+    places = np.full((401, 2, 3), 1e9)
+    if fault != "nobody":
+        # It stands in the door until step 100, and then is gone.
+        places[:100, 1] = [0.0, 0.0, 0.0]
+    if fault == "ahead":
+        places[100:200, 1] = np.linspace([0, 0, 0], [3, 3, 0], 100)
+        places[200:, 1] = [3, 3, 0]
+    others = Others(places, np.full(2, 0.41))
+    bodies = replanning.bodies
+    way = find_way(roadmap, replanning.cells, bodies, others, 0, Trip(0.09, 4, 400, -1))
+    assert way[0].tolist() == [roadmap.starts[0], 0, 0]
+    assert way[-1, 0] == roadmap.goals[0]
+    assert (way[1:, 1] >= way[:-1, 2]).all()
+    assert (way[-1, 2] > 100) == (fault != "nobody")
+    for (tail, _, _), (head, depart, arrive) in pairwise(way):
+        for step in range(depart, arrive + 1):
+            share = (step - depart) / (arrive - depart)
+            place = roadmap.nodes[tail] * (1 - share) + roadmap.nodes[head] * share
+            assert np.linalg.norm(place - places[step, 1]) >= 0.41 - 1e-9
+
+
+def test_what_is_replanned_is_better_for_all_together_or_left() -> None:
+    problem = make_problem("rooms", num_robots=8, seed=0)
+    roadmap, moves = found(problem, 1.25)
+    driven, random = drive_moves(problem, roadmap, moves.moves), np.random.default_rng(0)
+    replanning, kept = Replanning(problem, roadmap), 0
+    for _ in range(20):
+        better = replanning.better(driven, replanning.neighbours(driven, random, 4), random, lambda: False)
+        if better is not None:
+            assert better.cost(problem.horizon) < driven.cost(problem.horizon)
+            driven, kept = better, kept + 1
+    assert kept > 0
+    assert verify(problem, driven.until(problem.horizon)).ok
+
+
+def test_ways_one_by_one_displace_those_in_the_way() -> None:
+    problem = corridor_with_bay(right=1.0)
+    replanning = Replanning(problem, lay_roadmap(problem))
+    driven = replanning.one_by_one(np.random.default_rng(0), lambda: False, 200)
+    assert isinstance(driven, Driven)
+    assert driven.cost(problem.horizon)[0] == 0
+    assert verify(problem, driven.until(problem.horizon)).ok
+
+
+# What users get.
+
+
+@pytest.mark.parametrize(
+    ("scenario", "num_robots", "arguments"),
+    [
+        ("rooms", 12, {}), ("maze", 8, {}), ("warehouse", 12, {}), ("corridor", 8, {}), ("doorway", 8, {}),
+        ("rooms", 8, {"model": "unicycle"}), ("rooms", 8, {"model": "velocity2d"}),
+        ("forest", 10, {"model": "differential_drive"}), ("forest", 10, {"model": "holonomic3d"}),
+        ("rooms", 4, {"model": "car"}), ("warehouse", 6, {"model": "car"}),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("name", ["guided", "d4orm-d", "d4orm"])
+def test_teams_among_walls_are_guided(name: str, scenario: str, num_robots: int, arguments: dict[str, Any]) -> None:
+    problem = make_problem(scenario, num_robots=num_robots, seed=3, **arguments)
+    settings = {} if name == "guided" else {"start": "guided"}
+    plan = make_planner(name, **settings).solve(problem, seed=1, max_iterations=30)
+    assert plan.solved
+    assert verify(problem, plan.controls).ok
+
+
+def test_improving_never_makes_it_worse_and_mostly_better() -> None:
+    problem = make_problem("rooms", num_robots=12, seed=0)
+    plan = make_planner("guided", improve=True).solve(problem, max_iterations=6)
+    rewards = [record.best_reward for record in plan.history]
+    assert rewards == sorted(rewards)
+    assert rewards[-1] > rewards[0]
+
+
+def test_a_goal_without_a_way_is_named_at_once() -> None:
+    plan = make_planner("guided").solve(walled_in_problem(), max_iterations=2)
+    assert not plan.solved
+    assert plan.history[0].note.startswith("robot_0 has no way from start to goal")
+
+
+@pytest.mark.parametrize(("scenario", "guided"), [("circle", False), ("four_obstacles", False), ("maze", True)])
+def test_teams_are_guided_where_obstacles_lead_far_round(scenario: str, guided: bool) -> None:
+    assert leads_round(make_problem(scenario, num_robots=8, seed=0)) == guided
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_who_is_alone_drives_about_as_fast_as_it_can(seed: int) -> None:
+    """Along its shortest way at full speed, and as long again as it takes to get to that."""
+    problem = make_problem("rooms", num_robots=4, seed=seed).select([0])
+    plan = make_planner("guided").solve(problem, seed=0)
+    speed, acceleration = problem.team.limits[0, :2]
+    assert plan.solved
+    assert plan.metrics["travel_time"] < 1.3 * (problem.ways.length[0] / speed + 0.5 * speed / acceleration)

@@ -1,0 +1,117 @@
+"""Plans become shorter and never worse: groups of robots find faster ways around all others."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from engine_support import MODEL_NAMES
+
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
+from d4orm_planners.engine import path_index
+from d4orm_planners.mapf.beam_search import BeamRules
+from d4orm_env.engine.threads import Threads
+from d4orm_env.scenarios import make_problem
+from d4orm_env.verify import verify
+from d4orm_planners import make_planner
+from d4orm_planners.mapf import beams
+from d4orm_planners.mapf.beams import Company, Manner, find_ways
+from d4orm_planners.mapf.lns import shorten_ways
+from d4orm_planners.mapf.working_plan import TeamPaths
+from d4orm_planners.base.solve import Search
+from d4orm_planners.tracking.steering import straight_drives
+
+STRAIGHT, STRICT = Manner((45.0, 90.0), (1.0, 0.5, 0.0)), BeamRules(32, 1e6, 0.1)
+
+
+def solved_team(problem: Problem, seed: int = 0) -> TeamPaths:
+    """A first solution, as it was found."""
+    search = Search(make_planner("d4orm-d", engine="cpu", shorten=False), problem, seed)
+    while not search.best.solved:
+        search.advance()
+    return TeamPaths(search, search.best.trajectory)
+
+
+def travel_time(team: TeamPaths) -> float:
+    arrived = team.search.engine.rollout(team.problem, team.controls).arrived
+    assert arrived[-1].all()
+    return float((~arrived).sum(axis=0).mean() * team.problem.dt)
+
+
+@pytest.mark.parametrize("model", MODEL_NAMES)
+def test_ways_become_shorter_and_stay_free(model: str) -> None:
+    team = solved_team(make_problem("random", num_robots=10, model=model, seed=1))
+    before = travel_time(team)
+    shorten_ways(team, seed=0, rounds=6, temperature=0.0)
+    assert travel_time(team) <= before
+    assert verify(team.problem, team.controls).ok
+
+
+def test_ways_among_obstacles_become_shorter() -> None:
+    team = solved_team(make_problem("four_obstacles", num_robots=12))
+    before = travel_time(team)
+    shorten_ways(team, seed=0, rounds=6, temperature=0.0)
+    assert travel_time(team) < before - 0.1
+    assert verify(team.problem, team.controls).ok
+
+
+def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, found = make_problem("heterogeneous", num_robots=6), []
+    for threads in (1, 3):
+        for module in (path_index, beams):
+            monkeypatch.setattr(module, "Threads", lambda _, threads=threads: Threads(threads))
+        team = solved_team(problem)
+        found.append(shorten_ways(team, seed=0, rounds=4))
+    np.testing.assert_array_equal(*found)
+
+
+@pytest.mark.parametrize("planner", ["d4orm", "d4orm-d"])
+def test_a_plan_is_never_worse_than_what_it_began_with(planner: str) -> None:
+    problem = make_problem("circle", num_robots=8)
+    first = make_planner(planner, engine="cpu").solve(problem, seed=0)
+    better = make_planner(planner, engine="cpu", improve=True).solve(
+        problem, seed=0, max_iterations=first.iterations + 1
+    )
+    assert first.solved
+    assert verify(problem, better.controls).ok
+    assert better.metrics["reward"] >= first.metrics["reward"]
+    assert better.metrics["travel_time"] <= first.metrics["travel_time"]
+
+
+def crossing() -> TeamPaths:
+    """Robot 0 drives to the right, and robot 1 stands in its way."""
+    start = [[0, 0, 0, 0], [1.5, 0, 0, 0]]
+    problem = Problem(Team(("holonomic2d",) * 2), start, [[3, 0], [1.5, 2.0]], horizon=80)
+    search = Search(make_planner("d4orm-d", engine="cpu"), problem, 0)
+    return TeamPaths(search, search.current.trajectory)
+
+
+def arrival(ways: Any) -> int:
+    """Steps that the only robot's only way takes, or -1 for none."""
+    moves = (np.diff(ways.positions[:, 0, 0], axis=0) != 0).any(axis=1)
+    return int(np.flatnonzero(moves).max()) + 1 if ways.arrived[0, 0] else -1
+
+
+def test_a_robot_minds_whom_it_is_told_to() -> None:
+    team, me = crossing(), np.array([0])
+    straight = straight_drives(team.problem.select([0]))
+    nobody = np.zeros((1, 0, 81, 2), np.float32)
+    alone = find_ways(team, me, 0, STRAIGHT, STRICT, company=Company(np.array([[0, 1]]), nobody, np.zeros((1, 0))))
+    around = find_ways(team, me, 0, STRAIGHT, STRICT)
+    assert arrival(alone) == arrival(straight)
+    assert arrival(around) > arrival(alone)
+    # Somebody who is not in the team stands where robot 1 does.
+    there = np.broadcast_to(np.float32([1.5, 0]), (1, 1, 81, 2)).copy()
+    company = Company(np.array([[0, 1]]), there, np.array([[0.15]]))
+    np.testing.assert_array_equal(find_ways(team, me, 0, STRAIGHT, STRICT, company=company).states, around.states)
+
+
+def test_a_way_that_costs_too_much_is_not_found() -> None:
+    team, me = crossing(), np.array([0])
+    time = arrival(find_ways(team, me, 0, STRAIGHT, STRICT)) * team.problem.dt
+    assert find_ways(team, me, 0, STRAIGHT, STRICT, time + 0.1).arrived.all()
+    ways = find_ways(team, me, 0, STRAIGHT, STRICT, time - 0.15)
+    assert not ways.arrived.any()
+    np.testing.assert_array_equal(ways.states[:, :, 0], team.states[:, me])

@@ -1,0 +1,94 @@
+"""Robots that fail find ways around all others: waiting, turning off, in space and among obstacles."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from engine_support import MODEL_NAMES
+
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
+from d4orm_env.engine import cpu
+from d4orm_planners.engine import path_index
+from d4orm_env.engine.threads import Threads
+from d4orm_env.scenarios import make_problem
+from d4orm_env.verify import verify
+from d4orm_planners import make_planner
+from d4orm_planners.d4orm_d.rerouting import reroute
+from d4orm_planners.mapf import beams
+from d4orm_planners.mapf.working_plan import TeamPaths
+from d4orm_planners.base.solve import Search
+from d4orm_planners.tracking.steering import straight_drives
+
+
+def rerouted(problem: Problem, seed: int = 0) -> TeamPaths:
+    """A team that sets off straight, after one call."""
+    planner: Any = make_planner("d4orm-d", engine="cpu")
+    search = Search(planner, problem, seed, straight_drives(problem).controls[:, :, 0])
+    team = TeamPaths(search, search.current.trajectory)
+    reroute(team)
+    return team
+
+
+def assert_executed(team: TeamPaths) -> None:
+    """What the team says of itself is what the engine makes of its controls."""
+    rollout = cpu.CpuEngine().rollout(team.problem, team.controls)
+    np.testing.assert_allclose(rollout.states, team.states, atol=1e-4)
+    np.testing.assert_array_equal(rollout.arrived[-1], team.arrived)
+    faults, _ = team.faults(np.arange(team.problem.num_robots))
+    failing = rollout.margin_violated[1:].any(axis=0) | ~rollout.arrived[-1]
+    assert not failing[faults == 0].any()
+
+
+@pytest.mark.parametrize("model", MODEL_NAMES)
+def test_a_crossing_is_resolved(model: str) -> None:
+    problem = make_problem("random", num_robots=10, model=model, seed=1)
+    assert TeamPaths.faults(rerouted(problem), np.arange(10))[0].tolist() == [0] * 10
+    assert_executed(rerouted(problem))
+
+
+def test_a_mixed_team_is_rerouted_model_by_model() -> None:
+    team = rerouted(make_problem("heterogeneous", num_robots=6))
+    assert_executed(team)
+    assert team.arrived.all()
+
+
+def test_who_cannot_pass_waits() -> None:
+    """In a lane too narrow to pass in, one robot docks on the way of another, and so must come after it."""
+    start = [[0, 0, 0, 0], [2.0, -2.0, 0, 0]]
+    walls = [[-1, 0.3, 4, 0.6], [-1, -0.6, 1.5, -0.3], [2.5, -0.6, 4, -0.3]]
+    world = World(boxes=walls)
+    problem = Problem(Team(("holonomic2d",) * 2), start, [[3.5, 0], [2.0, 0.0]], world, horizon=200)
+    team = rerouted(problem)
+    assert_executed(team)
+    assert team.faults([0, 1])[0].tolist() == [0, 0]
+
+
+def test_two_that_face_each_other_make_way_together() -> None:
+    """Robots 0 and 1 start 4 mm apart: nothing that one of them does helps while the other comes on at once."""
+    problem = make_problem("random", num_robots=16, model="differential_drive", seed=4)
+    plan = make_planner("d4orm-d", engine="cpu").solve(problem, seed=4, max_iterations=10)
+    assert plan.solved
+
+
+def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = make_problem("random", num_robots=40, size=7.0, seed=0)
+    teams = []
+    for threads in (1, 3):
+        for module in (path_index, beams):
+            monkeypatch.setattr(module, "Threads", lambda _, threads=threads: Threads(threads))
+        teams.append(rerouted(problem))
+    np.testing.assert_array_equal(teams[0].controls, teams[1].controls)
+    np.testing.assert_array_equal(teams[0].states, teams[1].states)
+
+
+@pytest.mark.parametrize("num_robots", [100, pytest.param(500, marks=pytest.mark.slow)])
+def test_a_big_team_is_solved_without_sampling(num_robots: int) -> None:
+    problem = make_problem("random", num_robots=num_robots, seed=0)
+    plan = make_planner("d4orm-d").solve(problem, seed=0, max_iterations=4)
+    assert plan.solved
+    assert verify(problem, plan.controls).ok
+    assert plan.denoising_steps <= 100

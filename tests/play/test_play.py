@@ -1,0 +1,553 @@
+"""The playground: what may be done to a scene, a session that goes on by itself, the door before a page."""
+
+from __future__ import annotations
+
+import gc
+import http.client
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+
+import numpy as np
+import pytest
+
+from d4orm_env import World, make_problem
+from d4orm_env.core.problem import Problem
+from d4orm_env.disturbances.disturbance_registry import DISTURBANCES
+from d4orm_env.scenarios.problem_files import scenario_text
+from d4orm_planners.play import edits
+from d4orm_planners.play.scene_frame import closest_approach
+from d4orm_planners.play.proxy import Gate
+from d4orm_planners.play.session import Session
+from d4orm_planners.base.policy import DriveToGoal
+
+PATIENCE = 60.0
+
+
+def until(condition: Callable[[], object]) -> None:
+    """Wait for something that another thread does."""
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+@pytest.fixture
+def scene() -> Problem:
+    return make_problem("circle", num_robots=4, seed=0)
+
+
+@pytest.fixture
+def random() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+@pytest.fixture
+def session(scene: Problem) -> Iterator[Session]:
+    session = Session(scene, "goal")
+    session.start()
+    yield session
+    session.close()
+    assert session.failure is None
+
+
+def test_a_goal_goes_where_it_is_dragged(scene: Problem) -> None:
+    moved = edits.move_goal(scene, 1, [0.5, 0.25])
+    assert moved.goal[1].tolist() == [0.5, 0.25]
+    np.testing.assert_array_equal(moved.goal[[0, 2, 3]], scene.goal[[0, 2, 3]])
+    np.testing.assert_array_equal(moved.start, scene.start)
+
+
+def test_a_robot_stands_where_it_is_put(scene: Problem) -> None:
+    start = np.array(scene.start)
+    start[2, 2:] = 0.3
+    moved = edits.move_robot(scene.resumed_at(start, scene.goal), 2, [0.1, 0.2])
+    np.testing.assert_allclose(moved.start[2], [0.1, 0.2, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("edit", "complaint"),
+    [
+        (lambda p: edits.move_goal(p, 0, p.goal[1]), "the goal of robot_0 would touch that of robot_1"),
+        (lambda p: edits.move_robot(p, 0, p.start[1, :2]), "the robot of robot_0 would touch that of robot_1"),
+        (lambda p: edits.move_goal(p, 0, [np.nan, 0]), "is not at a place"),
+        (lambda p: edits.move_goal(p, 0, [1e5, 0]), "float32 resolves"),
+        (edits.remove_obstacle, "there is no obstacle to remove"),
+        (lambda p: edits.remove_robot(p.select([0])), "the last robot stays"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(scene: Problem, edit: edits.Edit, complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        edit(scene)
+
+
+def test_walls_stop_goals_and_robots(scene: Problem) -> None:
+    walled = scene.resumed_at(scene.start, scene.goal, world=World(boxes=[[-0.2, -0.2, 0.2, 0.2]]))
+    with pytest.raises(ValueError, match="would touch an obstacle"):
+        edits.move_goal(walled, 0, [0, 0])
+    with pytest.raises(ValueError, match="the obstacle would touch the robot_"):
+        edits.move_obstacle(walled, "boxes", 0, walled.start[0, :2])
+
+
+@pytest.mark.parametrize("scenario", ["circle", "sphere", "heterogeneous"])
+def test_robots_come_and_go(scenario: str, random: np.random.Generator) -> None:
+    scene = make_problem(scenario, num_robots=4)
+    more = edits.add_robot(scene, random)
+    assert more.num_robots == 5
+    assert more.team.models[4] == scene.team.models[0]
+    assert closest_approach(more, more.start) > 0
+    again = edits.remove_robot(more)
+    np.testing.assert_array_equal(again.goal, scene.goal)
+    assert again.team.models == scene.team.models
+
+
+@pytest.mark.parametrize("scenario", ["circle", "sphere"])
+@pytest.mark.parametrize("kind", ["disc", "box"])
+def test_obstacles_come_and_go(scenario: str, kind: str, random: np.random.Generator) -> None:
+    scene = make_problem(scenario, num_robots=3)
+    more = edits.add_obstacle(scene, kind, random)
+    assert more.world.num_obstacles == 1
+    assert closest_approach(more, more.start) > 0
+    assert edits.remove_obstacle(more).world.num_obstacles == 0
+
+
+@pytest.mark.parametrize(
+    "world",
+    [
+        World(circles=[[0, 0, 0.2]]),
+        World(boxes=[[-0.1, -0.1, 0.1, 0.1]]),
+        World(polygons=[[[0, 0], [0.2, 0], [0, 0.2]]]),
+    ],
+)
+def test_obstacles_move(scene: Problem, world: World) -> None:
+    kind = next(name for name in ("circles", "boxes", "polygons") if len(getattr(world, name)))
+    moved = edits.move_obstacle(scene.resumed_at(scene.start, scene.goal, world=world), kind, 0, [0.3, 0.1])
+    points = np.random.default_rng(1).uniform(-1, 1, (50, 2))
+    np.testing.assert_allclose(moved.world.clearance(points + np.array([0.3, 0.1])), world.clearance(points), atol=1e-5)
+
+
+def test_the_clock_runs_pauses_and_steps(session: Session) -> None:
+    until(lambda: session.frame.status.time > 0.2)
+    session.pause(True)
+    until(lambda: session.frame.status.state == "paused")
+    before = session.frame
+    time.sleep(0.3)
+    assert session.frame is before, "pause pauses"
+    session.step()
+    until(lambda: session.frame.status.number > before.status.number)
+    assert session.frame.status.time == pytest.approx(before.status.time + 0.1)
+    assert session.frame.status.state == "paused"
+
+
+def test_a_team_goes_on_from_where_it_is(session: Session) -> None:
+    until(lambda: session.frame.status.time > 0.4)
+    session.pause(True)
+    until(lambda: session.frame.status.state == "paused")
+    states, elapsed = session.frame.states, session.frame.status.time
+    session.edit(lambda scene: edits.move_goal(scene, 0, [0.7, 0.9]))
+    until(lambda: np.allclose(session.frame.goals[0], [0.7, 0.9]))
+    np.testing.assert_array_equal(session.frame.states, states)
+    assert session.frame.status.time == elapsed
+    assert session.frame.replanned >= 0
+
+
+def test_a_robot_is_pushed_in_all_that_drive_and_nobody_plans_anew(session: Session) -> None:
+    session.choose("goal", "random")
+    session.pause(True)
+    until(lambda: len(session.frames) == 2 and session.frame.status.state == "paused")
+    before, planned = session.frames, [frame.replanned for frame in session.frames]
+    session.push(1, [0.1, -0.2])
+    until(lambda: session.frame.status.number > before[0].status.number)
+    for old, new in zip(before, session.frames, strict=True):
+        np.testing.assert_allclose(new.states[1] - old.states[1], [0, 0, 0.1, -0.2], atol=1e-6)
+        np.testing.assert_array_equal(np.delete(new.states, 1, 0), np.delete(old.states, 1, 0))
+    assert [frame.replanned for frame in session.frames] == planned
+    session.push(1, [50.0, 0.0], lane=1)
+    until(lambda: session.frame.states[1, 2] > 0.5)
+    speeds = np.linalg.norm(session.frame.states[:, 2:], axis=1)
+    assert (speeds <= session.frame.problem.team.max_speed + 1e-5).all(), "none is faster than it may be"
+
+
+def test_what_is_let_go_after_somebody_took_it_away_is_refused(session: Session) -> None:
+    drops = (
+        lambda: session.push(9, [0.1, 0.0]),
+        lambda: session.edit(lambda scene: edits.move_robot(scene, 9, [0.1, 0.2])),
+        lambda: session.edit(lambda scene: edits.move_goal(scene, 9, [0.1, 0.2])),
+        lambda: session.edit(lambda scene: edits.move_obstacle(scene, "boxes", 3, [0.1, 0.2])),
+    )
+    for drop in drops:
+        drop()
+    until(lambda: session.frame.status.refused == len(drops))
+    assert session.failure is None
+
+
+def test_who_is_farthest_from_its_goal_is_pushed_and_who_has_docked_is_not(session: Session) -> None:
+    session.set_speed(50)
+    until(lambda: session.frame.status.state == "arrived")
+    session.push(0, [0.3, 0.0])
+    until(lambda: session.frame.status.message)
+    assert "robot_0 of goal has docked" in session.frame.status.message
+    session.edit(lambda scene: edits.move_goal(scene, 2, [0.7, 0.9]))
+    until(lambda: session.frame.status.state == "running")
+    session.pause(True)
+    until(lambda: session.frame.status.state == "paused")
+    before = session.frame
+    session.push(None, [0.0, 0.1])
+    until(lambda: session.frame.status.number > before.status.number)
+    assert np.flatnonzero((session.frame.states != before.states).any(axis=1)).tolist() == [2]
+
+
+def test_a_change_that_is_refused_leaves_the_scene_and_says_why(session: Session) -> None:
+    session.edit(lambda scene: edits.move_goal(scene, 0, scene.goal[1]))
+    until(lambda: session.frame.status.message)
+    assert "would touch" in session.frame.status.message
+    session.choose("nobody")
+    until(lambda: "nobody" in session.frame.status.message)
+    assert session.policies == ("goal",)
+    assert session.failure is None
+
+
+def test_a_step_that_fails_pauses_and_says_why(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(actions: object) -> None:
+        raise RuntimeError("no room for a goal")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(session._lanes[0]._env, "step", fail)
+        until(lambda: session.frame.status.message)
+    assert session.frame.status.message == "no room for a goal"
+    assert session.frame.status.state == "paused"
+    session.pause(False)
+    until(lambda: session.frame.status.state == "running" and not session.frame.status.message)
+
+
+def test_everybody_arrives_and_is_sent_on(session: Session) -> None:
+    session.set_speed(50)
+    until(lambda: session.frame.status.state == "arrived")
+    session.edit(lambda scene: edits.move_goal(scene, 0, [0.7, 0.9]))
+    until(lambda: session.frame.status.state == "running")
+    until(lambda: session.frame.status.state == "arrived")
+    assert np.linalg.norm(session.frame.states[0, :2] - [0.7, 0.9]) < 0.1
+    session.set_lifelong(True)
+    until(lambda: session.frame.status.state == "running")
+
+
+def test_what_happened_becomes_a_replay(session: Session) -> None:
+    until(lambda: session.recorded_steps > 2)
+    assert "circle, 4 robots by goal" in session.replay().html
+    session.edit(edits.remove_robot)
+    until(lambda: session.frame.problem.num_robots == 3)
+    assert "circle, 3 robots by goal" in session.replay().html
+
+
+def test_a_replay_shows_intruders_while_they_were_there(session: Session) -> None:
+    until(lambda: session.recorded_steps > 2)
+    assert "bodies" not in session.replay().motions[0].content
+    session.disturb({"intruder": 2})
+    until(lambda: session.levels)
+    steps = session.recorded_steps
+    until(lambda: session.recorded_steps > steps + 2)
+    bodies = session.replay().motions[0].content["bodies"]
+    assert bodies["count"] == 2
+    assert bodies["low"][-1] == 0, "at first there were none"
+
+
+def test_reset_begins_the_scene_anew(session: Session, scene: Problem) -> None:
+    until(lambda: session.frame.status.time > 0.2)
+    session.pause(True)
+    session.reset()
+    until(lambda: session.frame.status.time == 0)
+    np.testing.assert_array_equal(session.frame.states, scene.start)
+
+
+def test_another_scene_is_loaded(session: Session) -> None:
+    session.load(lambda: make_problem("sphere", num_robots=2))
+    until(lambda: session.frame.problem.dimension == 3)
+    assert session.frame.problem.num_robots == 2
+
+
+def test_a_scene_that_the_policy_cannot_drive_in_is_left(session: Session) -> None:
+    pytest.importorskip("pyrvo")
+    session.choose("orca")
+    until(lambda: session.policies == ("orca",))
+    session.load(lambda: make_problem("sphere", num_robots=2))
+    until(lambda: session.frame.status.message)
+    assert "orca" in session.frame.status.message
+    status = session.frame.status.time
+    until(lambda: session.frame.status.time > status + 0.3)
+    assert session.frame.problem.dimension == 2
+
+
+def test_policies_drive_side_by_side_with_the_same_seed(session: Session, scene: Problem) -> None:
+    until(lambda: session.frame.status.time > 0.3)
+    session.choose("goal", "random")
+    session.reset()
+    until(lambda: len(session.frames) == 2 and session.recorded_steps > 3)
+    session.pause(True)
+    until(lambda: session.frame.status.state == "paused")
+    first, second = session.frames
+    assert [frame.policy for frame in session.frames] == ["goal", "random"]
+    assert not np.array_equal(first.states, second.states)
+    assert first.status is second.status
+    motions = session.replay().motions
+    assert [motion.content["title"].partition(",")[0] for motion in motions] == ["goal", "random"]
+    session.choose("random")
+    until(lambda: len(session.frames) == 1)
+    np.testing.assert_array_equal(session.frame.states, second.states, "and goes on alone")
+    session.choose("random", "goal")
+    session.reset()
+    until(lambda: len(session.frames) == 2 and np.array_equal(session.frame.states, scene.start))
+    np.testing.assert_array_equal(session.frames[1].states, scene.start, "both from the same start")
+
+
+def test_what_is_changed_for_one_is_changed_for_all(session: Session) -> None:
+    session.choose("goal", "random")
+    session.set_speed(5)
+    until(lambda: len(session.frames) == 2 and session.recorded_steps > 25)
+    session.pause(True)
+    until(lambda: session.frame.status.state == "paused")
+    before = session.frames
+    session.edit(lambda scene: edits.move_goal(scene, 0, [0.7, 0.9]), lane=1)
+    until(lambda: np.allclose(session.frame.goals[0], [0.7, 0.9]))
+    for old, new in zip(before, session.frames, strict=True):
+        np.testing.assert_array_equal(new.states, old.states)
+        assert np.allclose(new.goals[0], [0.7, 0.9])
+    session.edit(lambda scene: edits.add_robot(scene, np.random.default_rng(0)))
+    until(lambda: session.frame.problem.num_robots == 5)
+    assert session.frames[1].problem.team == session.frame.problem.team
+    session.edit(lambda scene: edits.add_obstacle(scene, "box", np.random.default_rng(1)))
+    until(lambda: session.frame.problem.world.num_obstacles == 1)
+    assert session.frames[1].problem.world == session.frame.problem.world
+    occupied = session.frames[1].states[2, :2]
+    session.edit(lambda scene: edits.move_robot(scene, 0, occupied))
+    until(lambda: session.frame.status.message)
+    assert session.frame.status.message.startswith("random: the robot of robot_0 would touch")
+
+
+@pytest.mark.parametrize("policies", [(), ("goal", "goal"), ("goal", "nobody")])
+def test_a_choice_that_cannot_be_leaves_who_drives(session: Session, policies: tuple[str, ...]) -> None:
+    session.choose(*policies)
+    until(lambda: session.frame.status.message)
+    assert session.policies == ("goal",)
+    status = session.frame.status.time
+    session.pause(False)
+    until(lambda: session.frame.status.time > status)
+
+
+@pytest.mark.parametrize("name", sorted(DISTURBANCES))
+def test_whatever_goes_wrong_goes_wrong_from_the_next_step_on(session: Session, name: str) -> None:
+    level = {"delay": 2, "state_delay": 2, "intruder": 2, "limit_mismatch": 0.5, "occlusion": 1.0}.get(name, 0.3)
+    session.set_speed(20)
+    session.disturb({name: level})
+    until(lambda: session.levels == {name: level})
+    assert session._lanes[0]._env.unwrapped._simulation.disturbances
+    assert len(session.frame.bodies) == (2 if name == "intruder" else 0)
+    status = session.frame.status
+    assert not status.message
+    until(lambda: session.frame.status.time > status.time or session.frame.finished)
+    session.disturb({})
+    until(lambda: not session.levels)
+    assert not session._lanes[0]._env.unwrapped._simulation.disturbances
+
+
+def test_the_page_shows_the_truth_and_not_what_the_policy_sees(session: Session) -> None:
+    session.pause(True)
+    until(lambda: session.frame.status.state == "paused")
+    states = session.frame.states
+    session.disturb({"state_noise": 0.2})
+    until(lambda: session.levels)
+    np.testing.assert_array_equal(session.frame.states, states)
+    np.testing.assert_array_equal(session.scene.start, states)
+
+
+def test_a_level_that_makes_no_sense_is_left(session: Session) -> None:
+    session.disturb({"dropout": 0.5})
+    session.disturb({"dropout": 7.0})
+    until(lambda: session.frame.status.message)
+    assert session.levels == {"dropout": 0.5}
+
+
+def test_a_slow_planner_holds_nobody_up(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on = threading.Event()
+    monkeypatch.setattr(DriveToGoal, "_begin", lambda *_: go_on.wait(PATIENCE))
+    session.reset()
+    until(lambda: session.frame.status.state == "planning")
+    begin = time.monotonic()
+    session.set_speed(2)
+    session.disturb({})
+    assert session.replay().html
+    assert session.scene.num_robots == 4
+    assert time.monotonic() - begin < PATIENCE, "nobody waits for the planner"
+    assert session.frame.status.state == "planning"
+    go_on.set()
+    until(lambda: session.frame.status.state == "running")
+
+
+def test_a_policy_that_predicts_looks_as_far_as_it_is_told(scene: Problem) -> None:
+    session = Session(scene, "d4orm-c2f")
+    session.start()
+    session.set_horizon(7)
+    until(lambda: session.frame.status.number > 2)
+    session.choose("goal")
+    until(lambda: session.policies == ("goal",) and session.frame.guidance is None)
+    session.set_horizon(0)
+    session.choose("d4orm-c2f")
+    until(lambda: session.frame.status.message)
+    assert "predict_horizon" in session.frame.status.message
+    session.close()
+    assert session.failure is None
+
+
+def test_scenes_go_through_files(scene: Problem, random: np.random.Generator) -> None:
+    panel = pytest.importorskip("d4orm_planners.play.panel")
+    changed = edits.add_obstacle(edits.add_robot(scene, random), "box", random)
+    start = np.array(changed.start)
+    start[:, 2] = 0.4
+    under_way = changed.resumed_at(start, changed.goal)
+    read = panel.read_scene(scenario_text(edits.at_rest(under_way)).encode())
+    assert read.replace(name="x") == changed.replace(name="x")
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (b"\xff\xfe", "not UTF-8"),
+        (b"x" * 3_000_000, "a scene has at most"),
+        (b"!!python/object/apply:os.system ['true']", "tags are not supported"),
+        (b"version: 1\nscenario: os:system\n", "scenario 'os:system' is unknown"),
+        (b"version: 1\nscenario: circle\nnum_robots: 300\n", "do not fit on a diameter"),
+    ],
+)
+def test_a_file_that_is_no_scene_is_refused(content: bytes, complaint: str) -> None:
+    panel = pytest.importorskip("d4orm_planners.play.panel")
+    with pytest.raises(ValueError, match=complaint):
+        panel.read_scene(content)
+
+
+def test_messages_are_shown_as_they_are() -> None:
+    panel = pytest.importorskip("d4orm_planners.play.panel")
+    assert panel.plain("<b>[x](y)</b> *") == "\\<b\\>\\[x\\]\\(y\\)\\</b\\> \\*"
+
+
+@pytest.fixture
+def gate() -> Iterator[Gate]:
+    """A gate before something that echoes the first line."""
+    with socket.create_server(("127.0.0.1", 0)) as behind:
+
+        def answer() -> None:
+            while True:
+                try:
+                    connection, _ = behind.accept()
+                except OSError:
+                    return
+                with connection:
+                    line = connection.recv(65536).split(b"\r\n")[0]
+                    connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n%s" % (len(line), line))
+
+        threading.Thread(target=answer, daemon=True).start()
+        gate = Gate("127.0.0.1", 0, behind.getsockname()[1])
+        yield gate
+        gate.close()
+
+
+def asked(gate: Gate, path: str, **headers: str) -> tuple[int, str, str]:
+    """Status, cookie and body of an answer."""
+    connection = http.client.HTTPConnection("127.0.0.1", gate.port, timeout=PATIENCE)
+    connection.request("GET", path, headers=headers)
+    answer = connection.getresponse()
+    body = answer.read().decode()
+    connection.close()
+    return answer.status, answer.getheader("Set-Cookie") or "", body
+
+
+def test_only_who_has_the_token_comes_in(gate: Gate) -> None:
+    assert asked(gate, "/")[0] == 403
+    assert asked(gate, "/?token=guess")[0] == 403
+    assert asked(gate, "/", Cookie=f"d4orm_play_{gate.port}=guess")[0] == 403
+    status, cookie, _ = asked(gate, f"/?token={gate.token}")
+    assert status == 303
+    assert "HttpOnly" in cookie
+    shown = cookie.partition(";")[0]
+    assert asked(gate, "/page", Cookie=shown) == (200, "", "GET /page HTTP/1.1")
+
+
+def test_pages_of_others_do_not_come_in_with_the_token(gate: Gate) -> None:
+    cookie = f"d4orm_play_{gate.port}={gate.token}"
+    assert asked(gate, "/", Cookie=cookie, Origin="http://elsewhere.example")[0] == 403
+    assert asked(gate, "/", Cookie=cookie, Origin=f"http://127.0.0.1:{gate.port}")[0] == 200
+
+
+def test_nonsense_is_hung_up_on(gate: Gate) -> None:
+    with socket.create_connection(("127.0.0.1", gate.port), timeout=PATIENCE) as connection:
+        connection.sendall(b"x" * 40_000)
+        with suppress(ConnectionError):
+            assert connection.recv(100) == b""
+    assert asked(gate, "/")[0] == 403, "and it goes on"
+
+
+def test_a_closed_gate_leaves_no_port(gate: Gate) -> None:
+    other = Gate("127.0.0.1", 0, gate.port)
+    other.close()
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", other.port), timeout=PATIENCE)
+
+
+def test_without_the_extra_one_line_names_it() -> None:
+    code = (
+        "import sys; sys.modules['viser'] = None; from d4orm_planners.cli.app import main;"
+        "main(['play', '--num-robots', '2', '--no-open'])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert result.returncode == 2
+    assert result.stderr == 'd4orm: d4orm play needs viser; install it with pip install "d4orm-env[viz]"\n'
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # viser leaves a loop open
+def test_a_page_cannot_ask_for_a_tunnel_to_elsewhere(scene: Problem) -> None:
+    playground = pytest.importorskip("d4orm_planners.play.playground").Playground(scene, "goal")
+    server = playground._server
+    assert server.get_host() == "127.0.0.1"
+    assert server.request_share_url() is None
+    assert server._share_tunnel is None
+    playground.close()
+    del playground, server
+    gc.collect()
+
+
+@pytest.mark.slow
+def test_ctrl_c_leaves_no_process_and_no_port() -> None:
+    pytest.importorskip("viser")
+    command = [sys.executable, "-c", "from d4orm_planners.cli.app import main; main()", "play", "-k", "2", "-p", "goal"]
+    environment = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**environment, "PYTHONUNBUFFERED": "1"}
+    ) as process:
+        assert process.stdout is not None
+        told = "".join(process.stdout.readline() for _ in range(2))
+        port = int(re.search(r"http://127\.0\.0\.1:(\d+)/", told)[1])  # type: ignore[index]
+        page = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)
+        page.request("GET", "/")
+        assert b"<html" in page.getresponse().read()
+        page.close()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE) == 130
+        assert process.stderr is not None
+        assert "Traceback" not in process.stderr.read()
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", port), timeout=PATIENCE)
+
+
+@pytest.mark.parametrize("options", [("--port", "70000"), ("--host", "203.0.113.1")])
+def test_a_place_where_one_cannot_listen_is_said(options: tuple[str, str]) -> None:
+    pytest.importorskip("viser")
+    code = f"from d4orm_planners.cli.app import main; main(['play', '-k', '2', '-p', 'goal', *{options!r}])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert result.returncode == 2
+    assert result.stderr.startswith("d4orm: cannot listen at")
+    assert result.stderr.count("\n") == 1

@@ -1,0 +1,710 @@
+"""The example programs run as a user runs them, and what they write is true."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from d4orm_env import make_problem
+from d4orm_env.envs.joint_state import JointState
+from d4orm_planners import Plan
+from d4orm_planners.evaluation.tables import read_parquet
+from d4orm_planners.sampling.tuned import TUNED
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = ROOT / "examples"
+PNG = b"\x89PNG"
+SOLVE_RATES = {"paper": 1, "big": 1, "canonical": 1, "walls": 1, "few": 3}
+"""Tables of ``solve_rates.py``, and how many planners are in each."""
+
+
+def run(name: str, out: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run ``examples/NAME.py --quick`` in a process of its own."""
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    return subprocess.run(
+        [sys.executable, str(EXAMPLES / f"{name}.py"), "--quick", "--out", str(out), *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": path},
+        cwd=out.parent,
+    )
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    """The rows of a CSV file, which must have a Markdown twin with as many."""
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(path.with_suffix(".md").read_text().splitlines()) == len(rows) + 2
+    return rows
+
+
+def completed(name: str, out: Path, *arguments: str) -> None:
+    result = run(name, out, *arguments)
+    assert result.returncode == 0, result.stderr
+    assert not [path for path in out.iterdir() if path.name.startswith(".")], "a temporary file was left behind"
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "extra"),
+    [
+        ("supersuit_ppo", "supersuit", "rl"),
+        ("train_and_compare", "stable_baselines3", "rl"),
+        ("training_seeds", "stable_baselines3", "rl"),
+        ("tune_learners", "stable_baselines3", "rl"),
+        ("train_and_compare", "pyrvo", "orca"),
+        ("jax_ppo", "optax", "jaxrl"),
+        ("cleanrl_ppo", "torch", "rl"),
+        ("torchrl_mappo", "torchrl", "rl"),
+        ("imitate_expert", "stable_baselines3", "rl"),
+        ("read_results", "pandas", "dev"),
+        ("read_results", "pyarrow", "evaluate"),
+        ("onboard_lifelong", "zenoh", "zenoh"),
+    ],
+)
+def test_an_example_says_which_extra_is_missing(name: str, module: str, extra: str, tmp_path: Path) -> None:
+    code = (
+        f"import runpy, sys; sys.modules[{module!r}] = None; sys.argv = ['x', '--quick']\n"
+        f"sys.path.insert(0, {str(EXAMPLES)!r})\n"
+        f"runpy.run_path({str(EXAMPLES / name)!r} + '.py', run_name='__main__')"
+    )
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    result = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True, text=True, check=False, cwd=tmp_path, env={**os.environ, "PYTHONPATH": path},
+    )  # fmt: skip
+    assert result.returncode == 2
+    assert result.stderr == f"this example needs {module}; install it with: pip install 'd4orm-env[{extra}]'\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_first_snippet_of_the_readme_succeeds(capsys: pytest.CaptureFixture[str]) -> None:
+    snippet = (ROOT / "README.md").read_text().split("```python\n")[1].partition("```")[0]
+    exec(compile(snippet, "README.md", "exec"), {})
+    plan, episode = capsys.readouterr().out.splitlines()
+    assert plan.startswith("True ")
+    assert plan.endswith(" True")
+    assert episode.startswith("1.0 ")
+
+
+def test_annealed_noise_beats_constant_noise_in_one_dimension(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("one_dimension", out)
+    rows = {row["method"]: row for row in table(out / "one_dimension.csv")}
+    short = {name: float(row["short of the best reward"]) for name, row in rows.items()}
+    assert 0 <= short["MBD"] < short["MPPI, large noise"] < short["MPPI, small noise"]
+    assert float(rows["MBD"]["movement in the last step"]) < float(
+        rows["MPPI, large noise"]["movement in the last step"]
+    )
+    assert (out / "one_dimension.png").read_bytes().startswith(PNG)
+
+
+@pytest.mark.slow
+def test_robot_credit_does_not_dilute_with_the_team(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("gradient_dilution", out)
+    rows = table(out / "gradient_dilution.csv")
+    assert [(row["robots"], row["weighted by"], row["samples"]) for row in rows] == [
+        ("1", "robot", "256"), ("16", "team", "256"), ("16", "groups of 4", "256"), ("16", "robot", "256"),
+        ("16", "team", "4096"),
+    ]  # fmt: skip
+    one, team, groups, robot, more = (float(row["reward in the end"]) for row in rows)
+    assert robot == pytest.approx(one, abs=0.02)
+    assert team < min(groups, more) < max(groups, more) < robot
+    # A standard deviation's share of what very many normal samples would have, over the root of the robots that share.
+    assert float(rows[0]["its theory"]) / 4 == pytest.approx(float(rows[1]["its theory"]), abs=0.01)
+    signal = [float(row["own reward [SD]"]) for row in rows]
+    assert signal[1] < signal[4] < signal[2] < signal[3]
+    assert signal[2] == pytest.approx(float(rows[2]["its theory"]), rel=0.4)
+    assert (out / "gradient_dilution.png").read_bytes().startswith(PNG)
+
+
+@pytest.mark.slow
+def test_step_loop_shows_that_the_plan_avoids_what_driving_straight_does_not(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("step_loop", out)
+    rows = {(float(row["noise [m/s^2]"]), row["policy"]): row for row in table(out / "step_loop.csv")}
+    assert rows[0.0, "d4orm"]["success"] == "1 of 1"
+    assert rows[0.0, "goal"]["success"] == "0 of 1"
+    assert rows[0.5, "d4orm"]["success"] == "0 of 1", "a plan executed blindly does not survive much noise"
+
+
+@pytest.mark.slow
+def test_mixed_team_example_solves_a_scenario_and_draws_it(tmp_path: Path) -> None:
+    scenario = tmp_path / "easy.yaml"
+    scenario.write_text(
+        "version: 1\nrobots:\n"
+        "  - {model: differential_drive, start: [-1.5, 0.0], goal: [1.5, 0.0]}\n"
+        "  - {model: velocity2d, start: [0.0, -1.5], goal: [0.0, 1.5]}\n"
+    )
+    out = tmp_path / "out"
+    result = run("mixed_team", out, "--scenario", str(scenario))
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "verified: True" in result.stdout
+    assert {path.name for path in out.iterdir()} == {"mixed_team.npz", "mixed_team.png", "mixed_team.gif"}
+    with Image.open(out / "mixed_team.gif") as animation:
+        assert animation.n_frames > 5
+
+
+@pytest.mark.slow
+def test_learners_are_tuned_and_a_second_call_trains_nothing(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3")
+    out = tmp_path / "out"
+    completed("tune_learners", out, "--learner", "ppo")
+    rows = table(out / "tune_learners.csv")
+    # Three settings at first, the learner's own among them; the best one goes on.
+    assert [bool(row["twice as long"]) for row in rows] == [True, False, False]
+    assert sum(row["settings"] == "as they are" for row in rows) == 1
+    trained = sorted((path, path.stat().st_mtime_ns) for path in out.glob("*/policy.safetensors"))
+    assert len(trained) == 4
+    completed("tune_learners", out, "--learner", "ppo")
+    assert sorted((path, path.stat().st_mtime_ns) for path in out.glob("*/policy.safetensors")) == trained
+    completed("tune_learners", tmp_path / "again", "--trials", str(out / "tune_learners.parquet"))
+    assert table(tmp_path / "again" / "tune_learners.csv") == rows
+
+
+@pytest.mark.slow
+def test_scenarios_are_drawn(tmp_path: Path) -> None:
+    completed("scenario_pictures", tmp_path / "out")
+    pictures = sorted((tmp_path / "out").iterdir())
+    assert [path.name for path in pictures] == ["scenario_paper_circle.png", "scenario_paper_sphere.png"]
+    assert all(path.read_bytes().startswith(PNG) for path in pictures)
+
+
+@pytest.mark.slow
+def test_rivals_are_tuned_and_a_second_call_runs_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("tune_rivals", out, "--method", "cem")
+    rows = table(out / "tuning.csv")
+    # Two settings at first, on four teams; the better one goes on to four seeds.
+    assert [(row["method"], row["trials"]) for row in rows] == [("cem", "16"), ("cem", "4")]
+    assert sum(row["settings"].startswith("sigma=1.0, elite_fraction=0.05, adapt_variance=False") for row in rows) == 1
+    # The preset's steps are more than the small version's budget, so that none of its settings is the preset.
+    assert table(out / "tuning_best.csv") == rows[:1]
+    trials = (out / "trials.sqlite").read_bytes()
+    completed("tune_rivals", out, "--method", "cem")
+    assert (out / "trials.sqlite").read_bytes() == trials
+    completed("tune_rivals", tmp_path / "again", "--trials", str(out / "tuning.parquet"))
+    assert table(tmp_path / "again" / "tuning.csv") == rows
+
+
+@pytest.mark.slow
+def test_credit_and_update_are_crossed(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("credit_by_update", out)
+    rows = table(out / "credit_by_update.csv")
+    assert len({(row["update"], row["credit"]) for row in rows}) == len(rows) == 25
+    assert all(row["p (steps)"] == "1" for row in rows if row["update"] == "d4orm")
+    assert (out / "credit_by_update.png").read_bytes().startswith(PNG)
+    for option in ("--trials", "--go-on-from"):
+        again = tmp_path / option
+        completed("credit_by_update", again, option, str(out / "credit_by_update.parquet"))
+        assert table(again / "credit_by_update.csv") == rows
+    # Nothing was run again.
+    files = [read_parquet(folder / "credit_by_update.parquet") for folder in (out, again)]
+    assert [trial.wall_time for trial in files[0]] == [trial.wall_time for trial in files[1]]
+
+
+def test_samples_are_counted_for_every_setting(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("fewer_samples", out)
+    rows = {row["steps x samples"]: row for row in table(out / "fewer_samples.csv")}
+    assert len(rows) == 10
+    # One iteration each: 100 steps of 1024; 70 of 256; and 30 of 256 with 70 of 128, or of 64.
+    counted = {label: row["1000 samples"] for label, row in rows.items() if row["solved"] == "1 of 1"}
+    expected = {"100 x 1024": "102", "70 x 256": "18", "100 x 256, the last 70% with 128 (default)": "17",
+                "100 x 256, the last 70% with 64": "12"}  # fmt: skip
+    assert {label: counted[label] for label in expected} == expected
+    completed("fewer_samples", tmp_path / "again", "--trials", str(out / "fewer_samples.parquet"))
+    assert table(tmp_path / "again" / "fewer_samples.csv") == list(rows.values())
+
+
+def test_contacts_are_charged_by_every_credit(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("contact_penalty", out)
+    rows = table(out / "contact_penalty.csv")
+    assert len({(row["team"], row["credit, penalty"]) for row in rows}) == len(rows) == 4 * 8
+    # In its first iteration everybody is a group of its own.
+    by_credit = {(row["team"], row["credit, penalty"].partition(" (")[0]): row["travel time [s]"] for row in rows}
+    assert all(by_credit[team, "robot, 2"] == by_credit[team, "group, 2"] for team, _ in by_credit)
+    assert any(by_credit[team, "group, 1"] != by_credit[team, "group, 2"] for team, _ in by_credit)
+    completed("contact_penalty", tmp_path / "again", "--trials", str(out / "contact_penalty.parquet"))
+    assert table(tmp_path / "again" / "contact_penalty.csv") == rows
+
+
+def test_robots_fit_between_the_cylinders_that_are_further_apart(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("amswarm_gaps", out)
+    rows = table(out / "amswarm_gaps.csv")
+    fits = {row["cylinders"]: float(row["gap [m]"]) > float(row["a robot needs [m]"]) for row in rows}
+    assert fits == {"as it is": False, "1.1 times as far apart": True, "1.2 times as far apart": True,
+                    "robots of 0.24 m": True, "without those on the left": False}  # fmt: skip
+    completed("amswarm_gaps", tmp_path / "again", "--trials", str(out / "amswarm_gaps.parquet"))
+    assert table(tmp_path / "again" / "amswarm_gaps.csv") == rows
+
+
+def test_defaults_and_the_paper_differ_by_one_setting_at_a_time(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("paper_differences", out)
+    rows = table(out / "paper_differences.csv")
+    assert len({(row["team"], row["settings"]) for row in rows}) == len(rows) == 2 * 12
+    trials = read_parquet(out / "paper_differences.parquet")
+    configs = {trial.label: json.loads(trial.config) for trial in trials}
+    assert configs["preset paper"]["num_samples"] == 1024
+    assert configs["defaults"]["credit"] == "group"
+    for reference, kind in (("preset paper", "preset"), ("defaults", "defaults")):
+        others = [label for label in configs if label.startswith(f"{kind}, ")]
+        changed = [{key for key, value in configs[one].items() if value != configs[reference][key]} for one in others]
+        assert sorted(map(sorted, changed)) == sorted(
+            [["clip_between_iterations"], ["credit", "penalty"], ["random_start"], ["weight_cutoff"],
+             ["num_samples"] if kind == "preset" else ["late_samples", "num_samples"]]
+        )  # fmt: skip
+    completed("paper_differences", tmp_path / "again", "--trials", str(out / "paper_differences.parquet"))
+    assert table(tmp_path / "again" / "paper_differences.csv") == rows
+
+
+def test_rivals_meet_the_same_seeds_tuned_and_as_the_paper_has_them(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("tuned_rivals", out)
+    rows = table(out / "tuned_rivals.csv")
+    methods = [row["method"] for row in rows]
+    assert set(methods) >= {"d4orm, defaults", "mbd, tuned", *(f"{name}, paper" for name in TUNED if name != "mbd")}
+    assert len(methods) == len(set(methods))
+    assert [row["p (steps)"] for row in rows if row["method"] == "d4orm, tuned"] == ["1"]
+    configs = {trial.label: json.loads(trial.config) for trial in read_parquet(out / "tuned_rivals.parquet")}
+    assert {config["num_steps"] * config["max_iterations"] for config in configs.values()} == {20}
+    for label, tuned in (("d4orm, tuned", TUNED["d4orm"]), ("cem, tuned", TUNED["cem"])):
+        assert {key: configs[label][key] for key in tuned if key != "num_steps"} == {
+            key: value for key, value in tuned.items() if key != "num_steps"
+        }
+    completed("tuned_rivals", tmp_path / "again", "--trials", str(out / "tuned_rivals.parquet"))
+    assert table(tmp_path / "again" / "tuned_rivals.csv") == rows
+
+
+@pytest.mark.slow
+def test_policies_meet_every_disturbance(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("disturbance_study", out)
+    rows = table(out / "disturbance_study.csv")
+    assert len({row["disturbance"] for row in rows}) == len(rows) == 13
+    assert {(row["scenario"], row["policy"], row["trials"], row["errors"]) for row in rows} == {
+        ("circle", "orca", "1", "0")
+    }
+    assert (out / "disturbance_study.png").read_bytes().startswith(PNG)
+    completed("disturbance_study", tmp_path / "again", "--trials", str(out / "disturbance_study.parquet"))
+    assert table(tmp_path / "again" / "disturbance_study.csv") == rows
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("program", "names"),
+    [
+        ("tune_rivals", "tuning tuning_best"),
+        ("disturbance_study", "disturbance_study disturbance_overview"),
+        ("policy_rates", "policy_rates policy_rates_walls"),
+        ("solve_rates", " ".join(["solve_rates", *(f"solve_rates_{name}" for name in SOLVE_RATES)])),
+        *((program, program) for program in ("ablation", "amswarm_gaps", "contact_penalty", "credit_by_update",
+                                             "fewer_samples", "gradient_dilution", "lifelong", "multimodality",
+                                             "multimodality_team", "paper_differences", "scaling", "tune_learners",
+                                             "tuned_rivals", "warm_start")),
+    ],
+)  # fmt: skip
+def test_the_tables_of_the_docs_are_those_of_the_data(tmp_path: Path, program: str, names: str) -> None:
+    data = "tuning" if program == "tune_rivals" else program
+    completed(program, tmp_path / "out", "--trials", str(ROOT / "data" / f"{data}.parquet"))
+    for name in names.split():
+        for kind in ("csv", "md"):
+            committed = ROOT / "docs" / "tables" / f"{name}.{kind}"
+            assert (tmp_path / "out" / f"{name}.{kind}").read_bytes() == committed.read_bytes()
+
+
+def test_the_table_of_the_readme_is_that_of_the_data() -> None:
+    assert (ROOT / "docs" / "tables" / "solve_rates.md").read_text() in (ROOT / "README.md").read_text()
+
+
+@pytest.mark.slow
+def test_solve_rates_make_a_table_per_set(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("solve_rates", out)
+    for name, planners in SOLVE_RATES.items():
+        assert [row["solved"] for row in table(out / f"solve_rates_{name}.csv")] == ["1 of 1"] * planners
+    assert len(table(out / "solve_rates.csv")) == 2
+
+
+@pytest.mark.slow
+def test_measures_against_disturbances_are_left_out_one_by_one(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("ablation", out, "--workers", "1")
+    rows = table(out / "ablation.csv")
+    assert [(row["scenario"], row["disturbance"], row["left out"], row["trials"]) for row in rows] == [
+        ("circle", "delay of 2 steps", "delay", "1"),
+        ("circle", "delay of 2 steps", "all of them", "1"),
+    ]
+    assert {row["with"] for row in rows} == {"1, 0"}
+    completed("ablation", tmp_path / "again", "--trials", str(out / "ablation.parquet"))
+    assert table(tmp_path / "again" / "ablation.csv") == rows
+
+
+def test_gradient_ascent_through_the_dynamics_raises_the_reward(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("jax_functional", out)
+    rewards = [float(row["reward"]) for row in table(out / "jax_functional.csv")]
+    assert rewards[-1] > rewards[0] + 0.05
+
+
+@pytest.mark.slow
+def test_a_network_learns_from_a_planner(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3")
+    out = tmp_path / "out"
+    completed("imitate_expert", out)
+    rows = table(out / "imitate_expert.csv")
+    assert [row["learned by"] for row in rows] == [
+        *("cloning", "DAgger", "PPO from there", "PPO from there", "PPO from nothing", "PPO from nothing")
+    ]
+    success = [float(row["success"].removesuffix("%")) for row in rows]
+    assert max(success[:2]) >= 40
+    assert max(success[2:4]) >= 40
+    assert success[2] > success[4], "it begins where the other took it"
+    completed("imitate_expert", tmp_path / "again", "--trials", str(out / "imitate_expert.parquet"))
+    assert table(tmp_path / "again" / "imitate_expert.csv") == rows
+
+
+@pytest.mark.slow
+def test_ppo_in_one_jit_learns_to_arrive(tmp_path: Path) -> None:
+    pytest.importorskip("optax")
+    out = tmp_path / "out"
+    completed("jax_ppo", out)
+    success = [float(row["success"].removesuffix("%")) for row in table(out / "jax_ppo.csv")]
+    assert success[0] < 20
+    assert success[-1] > 50
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "module"),
+    [
+        ("cleanrl_ppo", "torch"),
+        ("torchrl_mappo", "torchrl"),
+        ("benchmarl_mappo", "benchmarl.environments"),
+        ("rllib_ppo", "ray.rllib"),
+    ],
+)
+def test_recipes_learn_something(name: str, module: str, tmp_path: Path) -> None:
+    pytest.importorskip(module, exc_type=ImportError)
+    out = tmp_path / "out"
+    completed(name, out)
+    success = [float(row["success"].removesuffix("%")) for row in table(out / f"{name}.csv")]
+    assert success[0] < 10
+    assert success[-1] > 20
+
+
+def test_a_policy_gives_a_planner_its_first_guess(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("warm_start", out)
+    rows = table(out / "warm_start.csv")
+    assert [row["from"] for row in rows] == ["nothing", "ppo"] * 2
+    assert {row["solved"] for row in rows} == {"2 of 2"}
+    without, warm = (float(row["iterations, median"]) for row in rows[:2])
+    assert warm <= without
+
+
+@pytest.mark.slow
+def test_d4orm_finds_several_kinds_of_solution_and_no_robot_weaves(tmp_path: Path) -> None:
+    pytest.importorskip("casadi")
+    out = tmp_path / "out"
+    completed("multimodality", out)
+    rows = table(out / "multimodality.csv")
+    assert len({row["signs"] for row in rows}) == len(rows) == 8
+    plans = {row["top to bottom"]: int(row["d4orm: plans"]) for row in rows}
+    assert sum(plans.values()) == 8, "every seed solves so easy a problem"
+    assert sum(number > 0 for number in plans.values()) >= 3
+    assert plans["0 over 1 over O over 0"] == plans["1 over 0 over O over 1"] == 0
+    assert all(5 < float(row["d4orm: travel time [s]"]) < 8 for row in rows if row["d4orm: plans"] != "0")
+    assert (out / "multimodality.png").read_bytes().startswith(PNG)
+
+
+@pytest.mark.slow
+def test_planners_find_several_kinds_of_solution_for_a_team(tmp_path: Path) -> None:
+    pytest.importorskip("casadi")
+    out = tmp_path / "out"
+    completed("multimodality_team", out)
+    rows = {row["planner"]: row for row in table(out / "multimodality_team.csv")}
+    assert list(rows) == ["d4orm", "d4orm, preset paper", "ipopt"]
+    assert rows["d4orm"]["solved"] == "4 of 4", "every seed solves so easy a problem"
+    assert all(1 <= int(row["classes"]) <= int(row["solved"].split()[0]) for row in rows.values())
+    assert (out / "multimodality_team.png").read_bytes().startswith(PNG)
+
+
+@pytest.mark.slow
+def test_big_team_example_ends_without_failures_and_draws_the_plan(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("sixty_four_robots", out)
+    rows = table(out / "sixty_four_robots.csv")
+    assert [int(row["iteration"]) for row in rows] == list(range(1, len(rows) + 1))
+    assert int(rows[0]["failed"]) > int(rows[-1]["failed"]) == 0
+    plan = Plan.load(out / "sixty_four_robots.npz")
+    assert plan.solved
+    assert plan.problem.num_robots == 12
+    assert (out / "sixty_four_robots.png").read_bytes().startswith(PNG)
+    with Image.open(out / "sixty_four_robots.gif") as animation:
+        assert animation.n_frames > 5
+
+
+@pytest.mark.slow
+def test_closed_loop_survives_the_noise_that_the_open_loop_does_not(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("noisy_control", out)
+    rows = {row["policy"]: row for row in table(out / "noisy_control.csv")}
+    assert rows["d4orm-c2f"]["success"] == "True"
+    assert rows["d4orm-c2f"]["arrived"] == "4 of 4"
+    assert rows["d4orm-d"]["success"] == "False"
+    assert all(float(row["loop, median [ms]"]) <= float(row["loop, 95th percentile [ms]"]) for row in rows.values())
+    assert (out / "noisy_control.png").read_bytes().startswith(PNG)
+
+
+@pytest.mark.slow
+def test_results_are_read_alike_from_all_three_files(tmp_path: Path) -> None:
+    pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    out = tmp_path / "out"
+    completed("read_results", out)
+    rows = table(out / "read_results.csv")
+    assert [(row["policy"], row["scenario"], row["trials"]) for row in rows] == [
+        (policy, scenario, "2")
+        for policy in ("d4orm", "d4orm, few samples", "orca")
+        for scenario in ("circle", "random")
+    ]
+    assert all(0 <= float(row["success"]) <= 1 and float(row["computing per s of motion"]) >= 0 for row in rows)
+    assert (out / "read_results.png").read_bytes().startswith(PNG)
+    before = (out / "read_results.csv").read_text()
+    for kind in ("parquet", "csv", "sqlite"):
+        result = run("read_results", out, "--results", str(out / "evaluation"), "--format", kind)
+        assert result.returncode == 0, result.stderr
+        assert (out / "read_results.csv").read_text() == before
+
+
+@pytest.mark.slow
+def test_lifelong_example_stays_below_its_bound(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("lifelong", out)
+    (row,) = table(out / "lifelong.csv")
+    assert row["simulated [s]"] == "6.0"
+    goals, rate = int(row["goals reached"]), float(row["goals per robot-minute"])
+    assert goals >= 2
+    assert rate == pytest.approx(goals / (4 * 0.1), abs=0.01)
+    assert rate < float(row["bound"])
+    assert row["robots that touched"] == row["robot-steps in contact"] == "0"
+    with Image.open(out / "lifelong.gif") as animation:
+        assert animation.n_frames > 5
+        assert animation.info["duration"] == 100
+
+
+@pytest.mark.slow
+def test_scaling_example_solves_every_team(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("scaling", out)
+    rows = table(out / "scaling.csv")
+    assert [(row["robots"], row["side [m]"], row["solved"]) for row in rows] == [
+        ("4", "2.5", "1 of 1"),
+        ("8", "3.5", "1 of 1"),
+    ]
+    assert all(float(row["seconds, median"]) == float(row["seconds, most"]) for row in rows)
+    assert (out / "scaling.png").read_bytes().startswith(PNG)
+
+
+@pytest.mark.parametrize(
+    ("position", "velocity", "seconds"),
+    [
+        (0.0, 0.0, 1 + (4 - 0.5)),  # half a metre to reach 1 m/s
+        (0.0, 1.0, 4.0),
+        (0.0, -1.0, 2 + 4.0),  # two seconds to stop and come back at top speed
+        (3.92, 0.0, np.sqrt(2 * 0.08)),
+        (4.05, 0.0, 0.0),
+    ],
+    ids=["from rest", "at top speed", "backwards", "near", "there already"],
+)
+def test_lifelong_bound_is_the_time_of_a_straight_drive(
+    monkeypatch: pytest.MonkeyPatch, position: float, velocity: float, seconds: float
+) -> None:
+    """A single robot on a line, limits of 1 m/s and 1 m/s^2, and the goal's disc begins at 4 m."""
+    monkeypatch.syspath_prepend(EXAMPLES)
+    lifelong = importlib.import_module("lifelong")
+    problem = make_problem("circle", num_robots=1)
+    goal = np.array([[4 + problem.goal_radius, 0]], np.float32)
+    states = np.array([[position, 0, velocity, 0]], np.float32)
+    joint = JointState(states, goal, np.zeros((1, 2), np.float32), np.zeros(1, bool), 0)
+    assert lifelong.least_times(problem, joint) == pytest.approx([seconds], abs=1e-5)
+
+
+def test_lifelong_drives_are_summed_up_over_their_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    lifelong = importlib.import_module("lifelong")
+    drive = {"scenario": "random", "robots": 2, "seconds": 60.0, "touched": 1, "contacts": 3, "replanned": 4}
+    first = {**drive, "goals": 20, "least_time": 3.0, "loop_seconds": [0.01, 0.03]}
+    second = {**drive, "goals": 24, "least_time": 3.75, "loop_seconds": [0.02]}
+    row = lifelong.summary([first, second])
+    assert (row["seeds"], row["simulated [s]"], row["goals reached"]) == (2, "120.0", 44)
+    assert (row["goals per robot-minute"], row["bound"]) == ("11.00", "18.00")
+    # Shares of 1/2 and 3/4: their mean, and 12.706 (Student's t of one degree of freedom) standard errors of 1/8.
+    assert (row["share of the bound"], row["interval"]) == ("62.5%", "-96.3% to 221.3%")
+    assert (row["robots that touched"], row["robot-steps in contact"], row["guidance planned anew"]) == (2, 6, 8)
+    assert (row["loop, median [ms]"], row["loop, slowest [ms]"]) == ("20", "30")
+    assert lifelong.summary([first])["interval"] == "-"
+
+
+@pytest.fixture
+def multimodality(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    return importlib.import_module("multimodality")
+
+
+@pytest.mark.parametrize(
+    ("path", "turns"),
+    [
+        ([(1, 0), (0, 1), (-1, 0)], 0.5),
+        ([(1, 0), (0, -1), (-1, 0)], -0.5),
+        ([(-2, 0), (-2, 3), (2, 3), (2, 0)], -0.5),
+        ([(1, 0), (0, 1), (-1, 0), (0, -1), (1, 0), (0, 1)], 1.25),
+        ([(1, 0), (1, 1), (1, 0), (1, -1)], -0.125),
+        ([(-1, 0.1), (-1, -0.1), (-1, 0.1)], 0.0),
+        ([(3, 4)], 0.0),
+    ],
+    ids=[
+        "over it",
+        "under it",
+        "over it, rightward",
+        "more than once round",
+        "there and back",
+        "across the cut",
+        "still",
+    ],
+)
+def test_winding_is_the_angle_swept_about_the_origin(
+    multimodality: ModuleType, path: list[tuple[float, float]], turns: float
+) -> None:
+    assert multimodality.winding(np.array(path)) == pytest.approx(2 * np.pi * turns, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("signs", "order"), [(signs, order) for order, signs in {
+        "1 over O over 0": (-1, -1, -1),
+        "0 over O over 1": (1, 1, 1),
+        "O over 1 over 0": (-1, 1, -1),
+        "O over 0 over 1": (-1, 1, 1),
+        "1 over 0 over O": (1, -1, -1),
+        "0 over 1 over O": (1, -1, 1),
+    }.items()]
+)  # fmt: skip
+def test_signature_tells_the_order_from_top_to_bottom(
+    multimodality: ModuleType, signs: tuple[int, int, int], order: str
+) -> None:
+    """Robots that pass each other and the obstacle at heights in that order, robot 0 leftward."""
+    height = {name: float(y) for name, y in zip(order.split(" over "), (1, 0, -1))}
+    x = np.linspace(3, -3, 31)
+    bump = np.maximum(1 - np.abs(x) / 3, 0)
+    paths = [np.column_stack([side * x, bump * (height[name] - height["O"])]) for side, name in ((1, "0"), (-1, "1"))]
+    assert multimodality.signature(np.stack(paths, axis=1)) == signs
+    assert multimodality.CLASSES[signs][0] == order
+
+
+def test_robots_that_weave_have_one_of_the_two_other_signatures(multimodality: ModuleType) -> None:
+    """Robot 1 goes over the obstacle and under robot 0, which waits there and then goes under the obstacle."""
+    second = np.array([(-3, 0), (-1, 1), (1, 1), (2, -1), (3, 0), (3, 0), (3, 0), (3, 0)], float)
+    first = np.array([(3, 0), (2.5, 0), (2, 0), (2, 0), (2, 0), (1, -1), (-1, -1), (-3, 0)], float)
+    assert multimodality.signature(np.stack([first, second], axis=1)) == (-1, -1, 1)
+    assert multimodality.CLASSES[-1, -1, 1][0] == "0 over 1 over O over 0"
+
+
+def test_principal_components_are_distances_of_plans(multimodality: ModuleType) -> None:
+    """Two plans whose robots are 3 m apart at every step: 1.5 m on either side of their mean, on one line."""
+    points, shares = multimodality.principal_components([np.full((11, 2, 2), [y, 0]) for y in (0.0, 3.0)])
+    assert sorted(points[:, 0]) == pytest.approx([-1.5, 1.5])
+    assert points[:, 1] == pytest.approx([0, 0])
+    assert shares == pytest.approx([1, 0])
+
+
+@pytest.mark.slow
+def test_supersuit_trains_a_policy_that_acts(tmp_path: Path) -> None:
+    pytest.importorskip("supersuit")
+    out = tmp_path / "out"
+    completed("supersuit_ppo", out)
+    assert [row["seed"] for row in table(out / "supersuit_ppo.csv")] == ["0", "1"]
+
+
+@pytest.mark.slow
+def test_a_trained_policy_is_compared_with_planners_under_noise(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3")
+    out = tmp_path / "out"
+    result = run("train_and_compare", out)
+    assert result.returncode == 0, result.stderr
+    rows = table(out / "train_and_compare.csv")
+    assert [(row["policy"], row["control_noise_std"]) for row in rows] == [
+        (policy, noise) for policy in ("ppo", "d4orm-c2f", "orca") for noise in ("0.0", "0.5")
+    ]
+    assert {row["success"] for row in rows if row["policy"] == "d4orm-c2f" and row["control_noise_std"] == "0.0"} == {
+        "2 of 2"
+    }
+    assert (out / "comparison" / "robustness.png").read_bytes().startswith(PNG)
+
+
+@pytest.mark.slow
+def test_learners_are_trained_with_several_seeds_and_their_curves_read_again(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3")
+    out, again = tmp_path / "out", tmp_path / "again"
+    completed("training_seeds", out, "--seeds", "2")
+    rows = table(out / "training_seeds.csv")
+    assert [row["learner"].split(",")[0] for row in rows] == ["PPO", "PPO", "PPO", "SAC", "SAC"]
+    assert {row["seeds"] for row in rows} == {"2"}
+    assert (out / "training_seeds.png").read_bytes().startswith(PNG)
+    completed("training_seeds", again, "--curves", str(out / "training_curves.csv"))
+    assert table(again / "training_seeds.csv") == rows
+
+
+@pytest.mark.slow
+def test_policies_are_rolled_out_among_walls(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3")
+    out = tmp_path / "out"
+    completed("policy_rates", out)
+    rows = table(out / "policy_rates_walls.csv")
+    assert {row["policy"] for row in rows} == {"`ppo-walls`"}
+    assert len(rows) == 7
+    assert sum(row["succeeded"] == "1 of 1" for row in rows) >= 3
+    assert not (out / "policy_rates.csv").exists(), "nothing was measured on open ground"
+    completed("policy_rates", tmp_path / "again", "--trials", str(out / "policy_rates.parquet"))
+    assert table(tmp_path / "again" / "policy_rates_walls.csv") == rows
+
+
+def test_count_of_seeds_below_one_is_refused(tmp_path: Path) -> None:
+    result = run("one_dimension", tmp_path / "out", "--seeds", "0")
+    assert result.returncode == 2
+    assert "0 is too few; give at least 1" in result.stderr
+
+
+def test_a_file_of_trials_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    result = run("ablation", tmp_path / "out", "--trials", "nowhere.parquet")
+    assert result.returncode == 2
+    assert "nowhere.parquet is no file; give a Parquet file of trials" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_cost_of_a_message_is_measured(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("message_overhead", out)
+    rows = table(out / "message_overhead.csv")
+    assert [row["transport"] for row in rows] == ["local", "zenoh"]
+    for row in rows:
+        # 100 steps of 4 robots with 2 controls, as float32, and header and checksum.
+        assert 3200 < float(row["bytes"]) < 3400
+        assert float(row["overhead"]) == pytest.approx(
+            sum(float(row[part]) for part in ("write", "send", "read")), rel=0.05
+        )

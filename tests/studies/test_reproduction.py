@@ -1,0 +1,470 @@
+"""The paper's figures: the quick version of each, what counts as solved, and the paper's numbers beside ours."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from d4orm_planners import list_planners
+from d4orm_planners.evaluation import evaluate
+from d4orm_planners.evaluation.comparison import steps_to_solution
+from d4orm_planners.evaluation.tables import read_parquet, write_parquet
+from d4orm_planners.evaluation.store import Trial, TrialStore
+from d4orm_planners.reproduction.figure import Figure, Group, Section, regrouped, reproduce
+from d4orm_planners.reproduction.numbers import METRICS, first_solution, measured
+from d4orm_planners.reproduction.paper_figures import FIGURES, find_figure
+from d4orm_planners.reproduction.plots import PLOTS, best_reward
+from d4orm_planners.reproduction.figure_report import markdown, write_reproduction
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def trial(seed: int = 0, **changes: Any) -> Trial:
+    values = {
+        "policy": "d4orm",
+        "config": "{}",
+        "problem": "abc",
+        "control_noise_std": 0.0,
+        "scenario": "circle",
+        "num_robots": 8,
+    }
+    values |= {"label": "d4orm", "model": "holonomic2d", "dt": 0.1, "steps": 50, "date": "2026-11-21"}
+    outcome = {"success": True, "status": "solved", "wall_time": 3.0, "preparation": 3.0, "travel_time": 6.0}
+    outcome |= {"history": "[[0.5,0,0.6],[1.5,1,0.5],[2.5,1,0.7]]", "makespan": 7.0, "mean_squared_jerk": 40.0}
+    return Trial(**{**values, **outcome, "seed": seed, **changes})
+
+
+def figure(**changes: Any) -> Figure:
+    section = Section(title="Circle", policies={"d4orm": {}}, scenarios=("circle",), num_robots=(2,))
+    values = {"name": "test", "title": "A test", "source": "nowhere", "sections": (section,), "across": "num_robots"}
+    return Figure(**{**values, "metrics": ("success", "runtime"), "plots": ("runtime",), **changes})
+
+
+@pytest.fixture
+def d4orm(d4orm):
+    """Runs ``d4orm reproduce``."""
+    return partial(d4orm, "reproduce")
+
+
+def available(chosen: Figure) -> bool:
+    """Whether all its planners are there; IPOPT's comes with an extra."""
+    return all("ipopt" not in section.policies or "ipopt" in list_planners() for section in chosen.sections)
+
+
+# Every figure, small.
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FIGURES)
+def test_the_quick_version_writes_its_tables_and_picture_and_is_not_run_twice(d4orm, tmp_path: Path, name: str) -> None:
+    chosen = FIGURES[name].quick()
+    if not available(chosen):
+        pytest.skip("there is no planner ipopt")
+    status, out, err = d4orm(name, "--quick")
+    assert status == 0, err
+    folder = tmp_path / "reproduction" / f"{name}-quick"
+    written = {f"{name}.csv", f"{name}.md", f"{name}.png", "trials.csv"}
+    assert written <= {path.name for path in folder.iterdir()}
+    assert all(str(Path("reproduction", folder.name, file)) in out for file in written)
+    with (folder / f"{name}.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["section"], row["scenario"], row["label"], float(row["control_noise_std"])) for row in rows] == [
+        (section.title, scenario, label, noise)
+        for section in chosen.sections
+        for _ in section.nodes or (None,)
+        for scenario in section.scenarios
+        for _ in section.num_robots
+        for label in section.policies
+        for noise in section.control_noise_std
+    ]
+    assert not any(row["error"] for row in rows)
+    assert any(int(row["successes"]) for row in rows)
+    page = (folder / f"{name}.md").read_text(encoding="utf-8")
+    assert chosen.title in page
+    assert "Quick version" in page
+    assert (folder / f"{name}.png").read_bytes().startswith(PNG)
+
+    stored = TrialStore.existing(folder).trials()
+    assert len(stored) == len(rows)
+    assert d4orm(name, "--quick", "--quiet") == (0, "", "")
+    assert TrialStore.existing(folder).trials() == stored, "the same command runs nothing again"
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_what_a_figure_names_exists(name: str) -> None:
+    chosen = FIGURES[name]
+    sections = {section.title: section for section in chosen.sections}
+    assert len(sections) == len(chosen.sections)
+    assert set(chosen.metrics) <= set(METRICS)
+    assert set(chosen.plots) <= set(PLOTS)
+    for title, _, metric in chosen.paper:
+        assert title in sections
+        assert metric in chosen.metrics
+    if available(chosen):
+        for section in (*chosen.sections, *chosen.quick().sections):
+            for study in section.studies(1):
+                assert len(study.configurations()) == len(section.policies)
+
+
+def test_trials_of_a_file_are_not_run_again(d4orm, tmp_path: Path) -> None:
+    part = ("coarseness", "--quick", "--policy", "f=1, o=1", "--quiet")
+    assert d4orm(*part, "--out", "first")[0] == 0
+    file = str(tmp_path / "first" / "coarseness-quick" / "trials.parquet")
+    assert d4orm(*part, "--out", "second", "--go-on-from", file)[0] == 0
+    before, after = (TrialStore.existing(tmp_path / name / "coarseness-quick").trials() for name in ("first", "second"))
+    assert before == after, "with the times of the first"
+    status, _, error = d4orm("coarseness", "--trials", file, "--go-on-from", file)
+    assert (status, error) == (2, "d4orm: --go-on-from is about running trials; leave it out beside --trials\n")
+    assert d4orm(*part, "--out", "third", "--go-on-from", "no.parquet")[0] == 2
+    assert not (tmp_path / "third").exists()
+
+
+def test_a_figure_is_made_of_trials_of_other_times(d4orm, tmp_path: Path) -> None:
+    part = ("robustness", "--section", "2D Holonomic", "--policy", "d4orm-d, defaults")
+    status, out, err = d4orm(*part, "--seeds", "2", "--workers", "2")
+    assert status == 0, err
+    folder = tmp_path / "reproduction" / "robustness"
+    kept = folder / "trials.parquet"
+    assert str(Path("reproduction", "robustness", "trials.parquet")) in out
+    first = {name: (folder / f"robustness.{name}").read_text(encoding="utf-8") for name in ("csv", "md")}
+    earlier = read_parquet(kept)
+    # Settings that the defaults do not have any more.
+    write_parquet(kept, [replace(trial, config='{"num_samples": 3}') for trial in earlier])
+    status, out, err = d4orm("robustness", "--trials", str(kept), "--out", "again")
+    assert status == 0, err
+    again = tmp_path / "again" / "robustness"
+    assert {path.name for path in again.iterdir()} == {f"robustness.{kind}" for kind in ("csv", "md", "png")}
+    for name, text in first.items():
+        assert (again / f"robustness.{name}").read_text(encoding="utf-8") == text
+    few = [trial for trial in earlier if trial.control_noise_std == 0 and trial.seed == 1]
+    (group,) = regrouped(FIGURES["robustness"], few)
+    assert (group.section, group.label, list(group.trials)) == ("2D Holonomic", "d4orm-d, defaults", few)
+    for arguments, complaint in (
+        (("ipopt", "--trials", str(kept)), "none of the 14 trials is one of the figure 'ipopt'"),
+        (("robustness", "--trials", str(kept), "--seeds", "3"), "--seeds is about running trials"),
+        (("robustness", "--trials", str(folder / "robustness.md")), "is no Parquet file of trials"),
+        (("robustness", "--trials", "nowhere.parquet"), "nowhere.parquet"),
+    ):
+        status, out, err = d4orm(*arguments)
+        assert (status, out, err.count("\n")) == (2, "", 1)
+        assert complaint in err
+
+
+def test_a_call_that_was_broken_off_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    few = {"num_samples": 64, "num_steps": 5, "max_iterations": 1}
+    section = Section(title="Circle", policies={"d4orm": few, "mppi": few}, scenarios=("circle",), num_robots=(2,))
+    chosen = figure(sections=(section, replace(section, title="Others", num_robots=(3,))))
+    run_here, ran = evaluate.run_here, []
+
+    def stopping(jobs: Any) -> Any:
+        for job, trials in zip(jobs, run_here(jobs)):
+            ran.append((job.policy.label, job.problem.num_robots))
+            yield trials
+            if len(ran) == 3:
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr(evaluate, "run_here", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        reproduce(chosen, tmp_path, seeds=1)
+    groups = reproduce(chosen, tmp_path, seeds=1)
+    assert sorted(ran) == [("d4orm", 2), ("d4orm", 3), ("mppi", 2), ("mppi", 3)]
+    assert [(group.section, group.label) for group in groups] == [
+        ("Circle", "d4orm"), ("Circle", "mppi"), ("Others", "d4orm"), ("Others", "mppi"),
+    ]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_d4orm_solves_no_less_than_mppi_and_cem_with_as_many_samples(tmp_path: Path) -> None:
+    # 200 steps of 1024 samples; those of the defaults have 256 and, for the last 70 of every 100, 128.
+    spent = {"preset": "paper", "max_iterations": 2}
+    policies = {"d4orm": {"max_iterations": 12}, "mppi": spent, "cem": spent}
+    section = Section(title="Circle", policies=policies, scenarios=("circle",), num_robots=(8,))
+    rows = [measured(group) for group in reproduce(figure(sections=(section,)), tmp_path, seeds=2)]
+    solved = {row.label: row.successes for row in rows}
+    # Two seeds and 200 steps are too few for medians, and only the defaults are sure to solve both within them.
+    assert solved["d4orm"] == 2 >= max(solved.values())
+
+
+@pytest.mark.slow
+def test_coarser_guidance_and_other_schedules_solve_as_well(tmp_path: Path) -> None:
+    coarse = {
+        f"{factor}, {refine}": {"policy": "d4orm-c2f", "coarse_factor": factor, "refine": refine}
+        for factor in (1, 4)
+        for refine in ("off", "background")
+    }
+    schedules = {f"{last}": {"policy": "d4orm", "beta_start": 1e-4, "beta_end": last} for last in (0.01, 0.05)}
+    circle = Section(title="Circle", policies=schedules, scenarios=("circle",), num_robots=(4,))
+    sections = (
+        Section(title="Obstacles", policies=coarse, scenarios=("four_obstacles",), num_robots=(4,)),
+        circle,
+        replace(circle, title="Drives", model="differential_drive"),
+    )
+    rows = [measured(group) for group in reproduce(figure(sections=sections), tmp_path, seeds=1)]
+    assert [row.successes for row in rows] == [1] * (4 + 2 + 2)
+    assert all(4.5 < row.travel_time <= row.makespan < 10 for row in rows)  # type: ignore[operator]
+
+
+# What counts as solved, and when.
+
+
+def test_a_plan_counts_from_its_first_solution_on() -> None:
+    assert first_solution(trial()) == 1.5
+
+
+def test_a_plan_within_the_margin_is_no_solution_although_nobody_touched() -> None:
+    assert first_solution(trial(history="[[0.5,0,0.6]]", status="time_limit")) is None
+
+
+def test_under_noise_counts_what_happened() -> None:
+    assert first_solution(trial(control_noise_std=0.1, success=False)) is None
+    assert first_solution(trial(control_noise_std=0.1, success=True)) == 1.5
+    assert first_solution(trial(control_noise_std=0.1, history="[[0.5,0,0.6]]", status="time_limit")) == 3.0
+
+
+def test_a_controllers_time_is_that_of_its_first_plan() -> None:
+    acting = {"status": "", "history": "[]", "preparation": 0.2}
+    assert first_solution(trial(**acting)) == 0.2
+    assert first_solution(trial(**acting, success=False)) is None
+    row = measured(Group("Circle", "d4orm-c2f", [trial(**acting)]))
+    assert row.step_time == pytest.approx((3.0 - 0.2) / 50)
+
+
+def test_an_error_is_a_failure() -> None:
+    row = measured(Group("Circle", "d4orm", [trial(), trial(1, error="OSError: no", status="", success=False)]))
+    assert (row.trials, row.successes, row.errors, row.error) == (2, 1, 1, "OSError: no")
+
+
+def test_times_are_over_all_trials_and_their_mean_over_the_successes() -> None:
+    trials = [trial(seed, history=f"[[{seconds},1,0.5]]") for seed, seconds in enumerate((1, 2, 3, 4, 5))]
+    failed = [trial(seed, history="[]", status="time_limit", travel_time=99.0) for seed in range(9, 15)]
+    row = measured(Group("Circle", "d4orm", trials))
+    assert (row.runtime_lower, row.runtime, row.runtime_upper, row.runtime_mean) == (2, 3, 4, 3)
+    row = measured(Group("Circle", "d4orm", [*trials, *failed[:2]]))
+    assert (row.runtime_lower, row.runtime, row.runtime_upper, row.runtime_mean) == (2.5, 4, None, 3)
+    assert METRICS["runtime"].text(row) == "4.00 (2.50-∞)"
+    row = measured(Group("Circle", "d4orm", [*trials, *failed]))
+    assert (row.runtime_lower, row.runtime, row.runtime_upper, row.runtime_mean) == (3.5, None, None, 3)
+    assert METRICS["runtime"].text(row) == "∞ (3.50-∞)"
+    assert METRICS["runtime"].text(measured(Group("Circle", "d4orm", failed))) == "-"
+    row = measured(Group("Circle", "d4orm", [*trials, failed[0]]))
+    assert row.runtime_deviation == pytest.approx(np.std([1, 2, 3, 4, 5], ddof=1))
+    assert row.travel_time == 6.0
+    assert row.successes == 5
+    assert row.reward == 0.5
+
+
+def test_the_reward_is_that_of_the_last_best_plan_of_every_trial() -> None:
+    trials = [trial(), trial(1, history="[[0.5,0,0.3]]", status="time_limit")]
+    assert measured(Group("Circle", "d4orm", trials)).reward == pytest.approx((0.7 + 0.3) / 2)
+
+
+def test_the_best_reward_is_a_staircase() -> None:
+    rewards = best_reward(trial(), np.array([0.1, 0.5, 1.0, 1.5, 9.0]))
+    assert rewards == pytest.approx([np.nan, 0.6, 0.6, 0.5, 0.7], nan_ok=True)
+
+
+def test_denoising_steps_are_counted_where_rows_tell_them(tmp_path: Path) -> None:
+    known = [trial(seed, history=f"[[0.1,0,0.4,50],[0.5,1,0.5,{steps}]]") for seed, steps in enumerate((100, 200, 300))]
+    never = [trial(seed, history="[[0.1,0,0.4,50]]", status="iteration_limit", success=False) for seed in (3, 4)]
+    assert [steps_to_solution(one) for one in [*known, *never]] == [100, 200, 300, None, None]
+    assert steps_to_solution(trial(policy="ipopt", iterations=3)) is None, "it denoises nothing"
+    row = measured(Group("Circle", "d4orm", [*known, *never]))
+    assert (row.first_steps_lower, row.first_steps, row.first_steps_upper) == (200, 300, None)
+    assert METRICS["first_steps"].text(row) == "300 (200-∞)"
+    assert best_reward(known[0], np.array([49, 50, 100]), counted=True) == pytest.approx(
+        [np.nan, 0.4, 0.5], nan_ok=True
+    )
+    rivals = [trial(seed, history=f"[[9,1,0.5,{100 * seed + 50}]]") for seed in range(5)]
+    by_steps = figure(compared_by="first_steps", reference="d4orm", metrics=("first_steps", "runtime"),
+                      plots=("first_steps", "survival", "anytime", "runtime")).without_times()  # fmt: skip
+    assert by_steps.metrics == ("first_steps",)
+    assert by_steps.plots == ("first_steps", "survival", "anytime")
+    groups = [Group("Circle", "d4orm", [*known, *never]), Group("Circle", "mppi", rivals)]
+    # Steps of the rival: 50 to 450; of d4orm 100 to 300, and two without, each of which counts 900.
+    page = markdown(by_steps, groups)
+    assert "the median difference in denoising steps" in page
+    assert "| mppi | 8 | 5 | 2 | 0 | 0.5 | -50.00 |" in page
+    assert write_reproduction(tmp_path, by_steps, groups, trials=False)
+
+
+def test_what_is_never_can_be_drawn(tmp_path: Path) -> None:
+    solved, never = trial(0, history="[[0.5,1,0.5]]"), trial(1, history="[]", status="time_limit")
+    drawn = figure(plots=("runtime", "survival"))
+    paths = write_reproduction(tmp_path, drawn, [Group("Circle", "ipopt", [solved, solved, never])], trials=False)
+    assert paths[-1].read_bytes().startswith(PNG)
+
+
+def test_every_policy_is_run_with_every_number_of_nodes(tmp_path: Path) -> None:
+    few = {"policy": "d-d4orm", "engine": "cpu", "num_samples": 64, "num_steps": 5, "max_iterations": 1}
+    policies = {"top-k": few, "max": {**few, "selection": "max"}}
+    section = Section(title="Circle", policies=policies, scenarios=("circle",), num_robots=(2,), nodes=(1, 3))
+    chosen = figure(sections=(section,), across="nodes", metrics=("success", "messages"))
+    rows = [measured(group) for group in reproduce(chosen, tmp_path, seeds=2)]
+    assert [(row.label, row.nodes) for row in rows] == [("top-k", 1), ("max", 1), ("top-k", 3), ("max", 3)]
+
+
+def test_what_nodes_sent_is_over_the_successes() -> None:
+    config = '{"nodes": null}'
+    trials = [trial(seed, config=config, messages=2 + seed, message_bytes=500, waiting_share=0.25) for seed in range(2)]
+    row = measured(Group("Circle", "d-d4orm", [*trials, trial(2, history="[]", messages=99)]))
+    assert (row.nodes, row.messages, row.message_bytes, row.waiting_share) == (8, 2.5, 500, 0.25)
+    page = markdown(
+        figure(across="nodes", metrics=("messages", "message_bytes", "waiting_share")),
+        [Group("Circle", "d-d4orm", trials)],
+    )
+    assert "|  | nodes | 8 |" in page
+    assert "| messages, kB | d-d4orm | 0.5 |" in page
+    assert "| waiting, % | d-d4orm | 25 |" in page
+    alone = measured(Group("Circle", "d4orm", [trial()]))
+    assert (alone.nodes, alone.messages) == (1, None)
+
+
+# Tables.
+
+
+def test_the_papers_rows_stand_below_ours_and_its_other_methods_too() -> None:
+    paper = {("Circle", "d4orm", "runtime"): {"8": "0.13"}, ("Circle", "rival", "runtime"): {"8": "9.99"}}
+    page = markdown(figure(paper=paper), [Group("Circle", "d4orm", [trial()])])
+    assert "|  | num_robots | 8 |" in page
+    ours = page.index("| runtime, s | d4orm | 1.50 (1.50-1.50) |")
+    assert ours < page.index("| runtime, s | d4orm (the paper) | 0.13 |")
+    assert "| runtime, s | rival (the paper) | 9.99 |" in page
+    assert "| success | d4orm | 1 of 1 (21% to 100%) |" in page
+
+
+def test_the_papers_numbers_stand_beside_ours_where_policies_are_the_rows() -> None:
+    paper = {("Circle", "d4orm", "runtime"): {"d4orm": "0.13"}}
+    page = markdown(figure(across="policy", paper=paper), [Group("Circle", "d4orm", [trial()])])
+    assert "| policy | success | runtime, s | runtime, s (the paper) |" in page
+    assert "| d4orm | 1 of 1 (21% to 100%) | 1.50 (1.50-1.50) | 0.13 |" in page
+
+
+def test_policies_are_compared_with_the_reference_trial_by_trial() -> None:
+    ours = [trial(seed, history=f"[[{seconds},1,0.5]]") for seed, seconds in enumerate((1, 2, 3, 4, 5, 6))]
+    rival = [trial(seed, history=f"[[{seconds},1,0.5]]") for seed, seconds in enumerate((2, 4, 6, 8, 10))]
+    rival.append(trial(5, history="[]", status="time_limit", success=False))
+    groups = [Group("Circle", "d4orm", ours), Group("Circle", "mppi", rival), Group("Square", "mppi", rival)]
+    page = markdown(figure(reference="d4orm"), groups)
+    # Differences of 1 to 5 s, and 14 where it failed: all one way, of which there are 2 in 2 ** 6.
+    assert "| policy | num_robots | pairs | only it | only d4orm | p | difference | p |" in page
+    assert "| mppi | 8 | 6 | 0 | 1 | 1 | +3.50 | 0.031 |" in page
+    assert page.count("| mppi | 8 | 6 |") == 1, "where the reference is"
+    assert "Compared with" not in markdown(figure(), groups)
+    # Within the margin, though nothing is touched: no solution, in this table as in that of success.
+    rival[5] = replace(rival[5], success=True)
+    groups = [Group("Circle", "d4orm", ours), Group("Circle", "mppi", rival)]
+    page = markdown(figure(reference="d4orm"), groups)
+    assert "| success | mppi | 5 of 6 (44% to 97%) |" in page
+    assert "| mppi | 8 | 6 | 0 | 1 | 1 | +3.50 | 0.031 |" in page
+    slower = [replace(one, travel_time=one.travel_time + 0.5) for one in ours]
+    groups = [Group("Circle", "d4orm", ours), Group("Circle", "mppi", slower)]
+    page = markdown(figure(reference="d4orm", compared_by="travel_time", across="policy"), groups)
+    assert "| mppi | 6 | 0 | 0 | 1 | +0.50 | 0.031 |" in page
+    assert "the median difference in travel time [s]" in page
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_without_times_a_figure_says_nothing_of_seconds(name: str, tmp_path: Path) -> None:
+    timeless = FIGURES[name].without_times()
+    label = timeless.reference or next(iter(timeless.sections[0].policies))
+    groups = [Group(timeless.sections[0].title, label, [trial(), trial(1, history="[]", status="time_limit")])]
+    page = markdown(timeless, groups)
+    assert "| runtime, s" not in page
+    assert "within a deadline" not in page
+    assert "| control loop, ms" not in page
+    write_reproduction(tmp_path, timeless, groups, trials=False)
+    columns = (tmp_path / f"{name}.csv").read_text().splitlines()[0].split(",")
+    assert "success_rate" in columns or "successes" in columns
+    assert not [column for column in columns if "runtime" in column or column in ("step_time", "waiting_share")]
+    assert (tmp_path / f"{name}.png").read_bytes().startswith(PNG)
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_references_are_policies_of_their_figures(name: str) -> None:
+    reference = FIGURES[name].reference
+    for section in FIGURES[name].sections:
+        assert reference is None or reference in section.policies
+
+
+def test_deadlines_and_errors_have_their_tables() -> None:
+    groups = [Group("Circle", "d4orm", [trial(), trial(1, error="OSError: no", status="", success=False)])]
+    page = markdown(figure(deadlines=(1.0, 2.0)), groups)
+    assert "| d4orm | 0% (0% to 66%) | 50% (9% to 91%) |" in page
+    assert "- `d4orm`: OSError: no" in page
+
+
+def test_the_papers_tables_are_copied_right() -> None:
+    assert FIGURES["ipopt"].paper["2D Holonomic", "ipopt", "mean_runtime"]["16"] == "failed"
+    coarse = {key[1:]: values for key, values in FIGURES["coarseness"].paper.items()}
+    assert coarse["f=4, o=1", "runtime"] == {"f=4, o=1": "0.23"}
+    assert coarse["f=1, o=10", "makespan"] == {"f=1, o=10": "7.58"}
+    jerk = FIGURES["amswarm"].paper["Ten 3D holonomic robots", "d4orm-d", "jerk"]
+    assert jerk["amswarm_5"] == "42.33"
+
+
+# The command line.
+
+
+def test_without_a_name_the_figures_are_listed(d4orm, tmp_path: Path) -> None:
+    status, out, _ = d4orm()
+    assert status == 0
+    assert [line.split()[0] for line in out.splitlines()] == list(FIGURES)
+    assert d4orm("--list") == (0, out, "")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("fig4",), f"'fig4' is unknown; choose one of {', '.join(FIGURES)}"),
+        (("big-teams", "--section", "Nowhere"), "no section 'Nowhere'; choose of Differential Drive; 2D Holonomic"),
+        (("ipopt", "--policy", "cobyla"), "no policy 'cobyla'; choose of ipopt; d4orm; d4orm, defaults"),
+        (("amswarm", "--quick", "--seeds", "0"), "seeds"),
+        (("amswarm", "--quick", "--workers", "0"), "workers"),
+    ],
+)
+def test_bad_input_gets_one_line(d4orm, arguments: tuple[str, ...], complaint: str) -> None:
+    status, out, err = d4orm(*arguments)
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1
+    assert complaint in err
+
+
+def test_a_planner_that_is_not_there_is_named_before_anything_runs(tmp_path: Path) -> None:
+    section = Section(title="Circle", policies={"d4orm": {}}, scenarios=("circle",), num_robots=(2,))
+    chosen = figure(sections=(section, replace(section, title="Others", policies={"perfect": {}})))
+    with pytest.raises(ValueError, match="policy 'perfect' is unknown"):
+        reproduce(chosen, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_part_of_a_figure() -> None:
+    part = find_figure("big-teams").only(["2D Holo Random"], ["d4orm-d, defaults", "d4orm-c2f"])
+    assert [(section.num_robots, list(section.policies)) for section in part.sections] == [
+        ((16, 32, 64), ["d4orm-d, defaults", "d4orm-c2f"]),
+    ]
+    assert find_figure("big-teams").only() == FIGURES["big-teams"]
+    for labels, limit in ((["d4orm-c2f"], None), (["d4orm-c2f", "d4orm-d"], 30.0)):  # which is a planner's
+        assert {section.time_limit for section in find_figure("robustness").only((), labels).sections} == {limit}
+
+
+# The store.
+
+
+def test_the_time_before_the_first_action_is_stored(tmp_path: Path) -> None:
+    few = {"num_samples": 64, "num_steps": 5, "max_iterations": 1}
+    policies = {"d4orm": few, "d4orm-c2f": {"refine": "off", "coarse_iterations": 1, "num_steps": 2}}
+    section = Section(title="Circle", policies=policies, scenarios=("circle",), num_robots=(2,))
+    groups = reproduce(figure(sections=(section,)), tmp_path, seeds=1)
+    (plan,), (acting,) = (group.trials for group in groups)
+    assert plan.preparation == plan.wall_time
+    assert 0 < acting.preparation < acting.wall_time
+    assert json.loads(acting.history) == []
+    assert {field.name for field in fields(Trial)} >= {"preparation"}
