@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from d4orm_planners.base.episode import Episode, run_episode
-    from d4orm_planners.evaluation.evaluate import evaluate
     from d4orm_planners.base.names import register_planner, register_policy
     from d4orm_planners.base.plan import IterationRecord, Plan, load_plan
     from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
-    from d4orm_planners.base.policy import OpenLoop, Policy
     from d4orm_planners.base.planner_registry import list_planners, list_policies, make_planner, make_policy
+    from d4orm_planners.base.policy import OpenLoop, Policy
     from d4orm_planners.base.solve import Search
+    from d4orm_planners.evaluation.evaluate import evaluate
 
 __all__ = [
     "Episode",

@@ -18,8 +18,8 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.dynamics.models import COMMON
 from d4orm_env.core.problem import Problem
+from d4orm_env.dynamics.models import COMMON
 
 
 class PlainTeam(NamedTuple):

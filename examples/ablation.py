@@ -22,9 +22,9 @@ from outputs import argument_parser, count, go_on_argument, save_table, stored, 
 
 from d4orm_planners.evaluation.comparison import in_common, paired
 from d4orm_planners.evaluation.evaluate import run_study
-from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
+from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 
 ALL, WITHOUT_ALL = "d4orm-c2f", "all of them"
 MEASURES: dict[str, dict[str, Any]] = {

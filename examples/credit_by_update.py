@@ -34,10 +34,10 @@ from outputs import (
 )
 
 from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_steps, steps_to_solution, survival
-from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import wilson_interval
+from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 
 TEAMS = (("paper_circle", 8), ("paper_circle", 16), ("paper_random", 16), ("paper_heterogeneous", 8))
 CREDITS: dict[str, dict[str, Any]] = {

@@ -37,10 +37,10 @@ from d4orm_env.disturbances import (
     StateNoise,
 )
 from d4orm_planners.evaluation.evaluate import run_study
-from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import wilson_interval
+from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 from d4orm_planners.evaluation.trials import Condition
 
 ROBOTS = 8

@@ -25,8 +25,8 @@ import numpy as np
 from outputs import COLOURS, argument_parser, count, measured, plt, save_figure, save_table, trials_argument
 
 from d4orm_env import Problem, make_problem
-from d4orm_env.engine.types import SamplingRules, SamplingTask
 from d4orm_env.engine.choice import get_engine
+from d4orm_env.engine.types import SamplingRules, SamplingTask
 from d4orm_planners.evaluation.summary import mean_interval
 from d4orm_planners.sampling.schedule import annealed
 from d4orm_planners.sampling.weights import GroupWeights, SoftmaxWeights

@@ -22,10 +22,10 @@ from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.base.machine import commit, describe_machine
 from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_steps
 from d4orm_planners.evaluation.evaluate import run_study
-from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import wilson_interval
+from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 
 COLOURS = {"d4orm": "#0072B2", "default": "#56B4E9", "mppi": "#D55E00", "cem": "#009E73", "i-mbd": "#CC79A7"}
 """One colour per method in every plot, told apart by the colour-blind too."""

@@ -25,9 +25,9 @@ from outputs import argument_parser, count, save_table, trials_argument
 from d4orm_planners import make_planner
 from d4orm_planners.evaluation.comparison import is_solved, penalised_steps
 from d4orm_planners.evaluation.evaluate import run_study
-from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
+from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 
 TEAMS = (("paper_circle", 8), ("paper_random", 16), ("paper_heterogeneous", 8), ("paper_obstacles", 8))
 FIRST_SEED = 100

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from d4orm_planners.evaluation.tables import read_parquet
 from d4orm_planners.evaluation.store import Trial
+from d4orm_planners.evaluation.tables import read_parquet
 
 pytest.importorskip("pyarrow", reason="needs pip install d4orm-env[evaluate]")
 

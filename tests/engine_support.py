@@ -13,12 +13,12 @@ import numpy as np
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.dynamics.robot_model import Ops
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
+from d4orm_env.dynamics.robot_model import Ops
 from d4orm_env.engine import noise
-from d4orm_env.engine.types import Engine, SamplingRules, SamplingTask, Sight, StepResult
 from d4orm_env.engine.choice import get_engine
+from d4orm_env.engine.types import Engine, SamplingRules, SamplingTask, Sight, StepResult
 
 ENGINE_NAMES = ("cpu", "jax")
 MODEL_NAMES = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive")

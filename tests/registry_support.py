@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from d4orm_env.dynamics.models import MODEL_CODES
 from d4orm_env.core.registry import Registry
+from d4orm_env.dynamics.models import MODEL_CODES
 
 
 @contextmanager

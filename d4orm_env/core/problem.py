@@ -21,12 +21,12 @@ from d4orm_env.core.arrays import (
     shown,
     whole_number,
 )
-from d4orm_env.dynamics.models import MODEL_CODES, NUM_BUILT_IN, model_digest
 from d4orm_env.core.problem_arrays import ProblemArrays, inverse_initial_distance
 from d4orm_env.core.problem_checks import check_places, check_resolution, check_states, check_turning
 from d4orm_env.core.summary_line import Row, count, joined, team_text
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
+from d4orm_env.dynamics.models import MODEL_CODES, NUM_BUILT_IN, model_digest
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

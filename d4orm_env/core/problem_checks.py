@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.dynamics.robot_model import SPEED, STANDARD_LIMITS, TURN_RATE, Model
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
+from d4orm_env.dynamics.robot_model import SPEED, STANDARD_LIMITS, TURN_RATE, Model
 
 MAX_HEADING = 1000.0
 """Largest heading of a start [rad]; float32 resolves it to 6e-5 rad."""

@@ -6,8 +6,8 @@ import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.portable import NUMPY_OPS
-from d4orm_env.dynamics.robot_model import TimeStep
 from d4orm_env.disturbances.disturbance import Scene
+from d4orm_env.dynamics.robot_model import TimeStep
 
 
 def brake(scene: Scene, states: FloatArray, robots: BoolArray) -> FloatArray:

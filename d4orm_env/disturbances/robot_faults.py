@@ -13,11 +13,11 @@ from d4orm_env.core.arrays import LARGEST, FloatArray, positive_number, whole_nu
 from d4orm_env.core.observation_layout import Spare
 from d4orm_env.core.portable import cos, sin
 from d4orm_env.core.problem import Problem
-from d4orm_env.dynamics.robot_model import STANDARD_LIMITS
 from d4orm_env.disturbances.brakes import brake
 from d4orm_env.disturbances.disturbance import Disturbance, Effect, Memory, Scene
 from d4orm_env.disturbances.draws import Draws
 from d4orm_env.disturbances.levels import share, standard_deviation
+from d4orm_env.dynamics.robot_model import STANDARD_LIMITS
 
 _NEVER = 2**62
 

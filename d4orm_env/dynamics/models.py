@@ -10,13 +10,13 @@ import numpy as np
 
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.registry import Registry
-from d4orm_env.dynamics.robot_model import OWN_LIMITS, PYTHON_OPS, Model, RungeKutta
-from d4orm_env.dynamics.source_digest import pieces
-from d4orm_env.dynamics.transition import TimeStep
 from d4orm_env.dynamics.car import CAR
 from d4orm_env.dynamics.differential_drive import DIFFERENTIAL_DRIVE
 from d4orm_env.dynamics.holonomic2d import HOLONOMIC2D
 from d4orm_env.dynamics.holonomic3d import HOLONOMIC3D
+from d4orm_env.dynamics.robot_model import OWN_LIMITS, PYTHON_OPS, Model, RungeKutta
+from d4orm_env.dynamics.source_digest import pieces
+from d4orm_env.dynamics.transition import TimeStep
 from d4orm_env.dynamics.unicycle import UNICYCLE
 from d4orm_env.dynamics.velocity2d import VELOCITY2D
 

@@ -10,11 +10,8 @@ import numpy as np
 from numba.extending import register_jitable
 from numba.np.unsafe import ndarray
 
-from d4orm_env.dynamics import collision
-from d4orm_env.dynamics import reward
-from d4orm_env.dynamics import robot_model
-from d4orm_env.dynamics import transition
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.dynamics import collision, reward, robot_model, transition
 
 ZERO = np.float32(0)
 ONE = np.float32(1)

@@ -13,8 +13,12 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine import noise
-from d4orm_planners.engine import average as averaging
-from d4orm_planners.engine import score as sampling
+from d4orm_env.engine.episodes import WorldBatch
+from d4orm_env.engine.noise import DRAWS, TURNS
+from d4orm_env.engine.observing import ObservationSpec
+from d4orm_env.engine.sample_noise import Drawing
+from d4orm_env.engine.simd import TILE
+from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_env.engine.types import (
     WATCHED_SAMPLES,
     DenoisingStep,
@@ -27,15 +31,11 @@ from d4orm_env.engine.types import (
     StepWatcher,
     checked_controls,
 )
-from d4orm_env.engine.episodes import WorldBatch
-from d4orm_env.engine.simd import TILE
-from d4orm_env.engine.noise import DRAWS, TURNS
-from d4orm_env.engine.observing import ObservationSpec
-from d4orm_planners.engine.proximity import bound_boxes, make_bodies
-from d4orm_env.engine.sample_noise import Drawing
-from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_env.engine.world_tiles import WorldArrays
 from d4orm_env.engine.worlds import WorldKernels, kernels_of_codes
+from d4orm_planners.engine import average as averaging
+from d4orm_planners.engine import score as sampling
+from d4orm_planners.engine.proximity import bound_boxes, make_bodies
 
 
 class CpuEngine:

@@ -13,8 +13,8 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine import observing
 from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
 from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, aligned_zeros, compiled, inlined
-from d4orm_env.engine.simd import TILE, use_wide_registers
 from d4orm_env.engine.observing import ObservationSpec, allocate_sensed, observe
+from d4orm_env.engine.simd import TILE, use_wide_registers
 from d4orm_env.engine.stepping import models_key
 from d4orm_env.engine.tiles import (
     DISTANCE2,

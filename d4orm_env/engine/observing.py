@@ -10,19 +10,16 @@ import numpy as np
 from numba.extending import register_jitable
 
 from d4orm_env.core import observation
-from d4orm_env.dynamics import collision
-from d4orm_env.dynamics import reward
-from d4orm_env.dynamics import robot_model
-from d4orm_env.dynamics import transition
 from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.dynamics import collision, reward, robot_model, transition
 from d4orm_env.engine import world_tiles
-from d4orm_env.engine.types import Sight
 from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
 from d4orm_env.engine.compiling import INLINED, ONE, OPTIONS, ZERO, aligned_zeros, compiled, inlined
 from d4orm_env.engine.simd import TILE
 from d4orm_env.engine.stepping import models_key
 from d4orm_env.engine.tiles import STATE, STRIDE, MotionReader, motion_reader
+from d4orm_env.engine.types import Sight
 from d4orm_env.engine.world_tiles import WorldArrays, load
 
 if TYPE_CHECKING:

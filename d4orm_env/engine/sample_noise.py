@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.engine import noise
 from d4orm_env.engine.compiling import INLINED, compiled, inlined
-from d4orm_env.engine.simd import copy_chunk, use_wide_registers
 from d4orm_env.engine.noise import DRAWS
+from d4orm_env.engine.simd import copy_chunk, use_wide_registers
 from d4orm_env.engine.tile_layout import Row
 
 

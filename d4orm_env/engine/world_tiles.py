@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.dynamics import reward
 from d4orm_env.core.arrays import BoolArray, FloatArray, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.dynamics import reward
 from d4orm_env.engine import obstacles, tiles
-from d4orm_env.engine.types import Sight
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
 from d4orm_env.engine.simd import NOWHERE, TILE
 from d4orm_env.engine.tiles import (
@@ -27,6 +26,7 @@ from d4orm_env.engine.tiles import (
     STRIDE,
     mark_pairs,
 )
+from d4orm_env.engine.types import Sight
 
 if TYPE_CHECKING:
     from d4orm_env.engine.episodes import WorldBatch

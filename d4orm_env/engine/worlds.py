@@ -13,16 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray, IntArray
-from d4orm_env.dynamics.models import COMMON, names_of_codes
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.engine.types import Sight
+from d4orm_env.dynamics.models import COMMON, names_of_codes
 from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, aligned_zeros
 from d4orm_env.engine.episodes import WorldBatch, advance_worlds_kernel
-from d4orm_env.engine.simd import TILE, use_wide_registers
 from d4orm_env.engine.observing import SOURCES, ObservationSpec, observe_worlds_kernel
+from d4orm_env.engine.simd import TILE, use_wide_registers
 from d4orm_env.engine.stepping import models_key, models_of_kernel
 from d4orm_env.engine.tiles import STRIDE, measure_goal_distance, robot_mover
+from d4orm_env.engine.types import Sight
 from d4orm_env.engine.world_tiles import WorldArrays, judge, load, load_world, store_world
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from d4orm_env.envs.viewer import Frame, Viewer
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import Effect
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.simulation import Simulation
+from d4orm_env.envs.viewer import Frame, Viewer
 
 
 class EnvironmentShell:

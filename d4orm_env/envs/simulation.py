@@ -17,13 +17,13 @@ from d4orm_env.core.disturbance_events import Marks
 from d4orm_env.core.observation_layout import ObservationLayout, Spare
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays, inverse_initial_distance
+from d4orm_env.disturbances.chosen import total_spare
 from d4orm_env.disturbances.disturbance import Effect, Scene, Seen
 from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
 from d4orm_env.disturbances.recorded_events import marks_of
-from d4orm_env.disturbances.chosen import total_spare
 from d4orm_env.engine.types import Sight, StepResult, WorldEngine
-from d4orm_env.envs.inputs import checked_cycles, checked_states
 from d4orm_env.envs.episode_record import EpisodeRecord
+from d4orm_env.envs.inputs import checked_cycles, checked_states
 from d4orm_env.envs.joint_state import JointState, join_state, state_bounds
 from d4orm_env.envs.lifelong import fresh_goal, goal_region, reached_goals
 from d4orm_env.envs.options import EnvOptions

@@ -15,8 +15,8 @@ from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
 from d4orm_env.envs.simulation import Simulation
 
 if TYPE_CHECKING:
-    from d4orm_env.engine.types import Sight
     from d4orm_env.engine.episodes import WorldBatch
+    from d4orm_env.engine.types import Sight
 
 Worlds = NDArray[np.intp]
 

@@ -11,26 +11,26 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, whole_number
+from d4orm_env.core.observation_layout import ObservationLayout
+from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.envs.episode_record import EpisodeCounts, episode_metrics
+from d4orm_env.envs.inputs import checked_states, joint_controls
+from d4orm_env.envs.joint_env import joint_spaces
+from d4orm_env.envs.options import EnvOptions
+from d4orm_env.envs.rewards import RewardInput, along_ways, compute_rewards, no_terms
+from d4orm_env.envs.simulation import Simulation
+from d4orm_env.envs.team_step import Info
 from d4orm_env.envs.vector_disturbances import DisturbedBatch
 from d4orm_env.envs.vector_infos import final_infos, masked
 from d4orm_env.envs.vector_inputs import checked_autoreset_mode, reset_mask, world_seeds
 from d4orm_env.envs.world_draws import OWN_ARRAYS, WorldDraws
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, whole_number
-from d4orm_env.core.observation_layout import ObservationLayout
-from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.envs.inputs import checked_states, joint_controls
-from d4orm_env.envs.episode_record import EpisodeCounts, episode_metrics
-from d4orm_env.envs.joint_env import joint_spaces
-from d4orm_env.envs.options import EnvOptions
-from d4orm_env.envs.rewards import RewardInput, along_ways, compute_rewards, no_terms
-from d4orm_env.scenarios.problems import ScenarioLike
-from d4orm_env.envs.simulation import Simulation
-from d4orm_env.envs.team_step import Info
 from d4orm_env.paths.shortest_paths import ahead_in_each, observe_ways
+from d4orm_env.scenarios.problems import ScenarioLike
 
 if TYPE_CHECKING:
-    from d4orm_env.engine.types import WorldEngine
     from d4orm_env.engine.episodes import WorldBatch
+    from d4orm_env.engine.types import WorldEngine
 
 __all__ = ["NavigationVectorEnv"]
 

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
-from d4orm_env.scenarios.problems import ScenarioLike
 from d4orm_env.envs.team_step import Info
 from d4orm_env.envs.vector_env import NavigationVectorEnv
+from d4orm_env.scenarios.problems import ScenarioLike
 
 try:
     import torch

@@ -25,12 +25,12 @@ from jax.typing import ArrayLike
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.dynamics.robot_model import STANDARD_LIMITS
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
+from d4orm_env.dynamics.robot_model import STANDARD_LIMITS
+from d4orm_env.envs.rewards import RewardFunction, RewardInput, find_reward
 from d4orm_env.jax.jax_engine import Worlds, advance_worlds, goal_distance, judge
 from d4orm_env.jax.jax_observation import observe_team
-from d4orm_env.envs.rewards import RewardFunction, RewardInput, find_reward
 
 __all__ = ["State", "Step", "observe", "reset", "step"]
 

@@ -16,15 +16,15 @@ import numpy as np
 from jax.tree_util import PyTreeDef
 from numpy.typing import ArrayLike
 
-from d4orm_env.jax import functional
 from d4orm_env.core.arrays import whole_number
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.controls import ControlNoise
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.rewards import find_reward
-from d4orm_env.scenarios.problems import ScenarioLike
 from d4orm_env.envs.simulation import Simulation
+from d4orm_env.jax import functional
+from d4orm_env.scenarios.problems import ScenarioLike
 
 __all__ = ["EnvState", "FunctionalEnv", "Transition"]
 

@@ -17,15 +17,13 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from d4orm_env.dynamics import collision
-from d4orm_env.dynamics import reward
-from d4orm_env.dynamics import transition
 from d4orm_env.core.arrays import BoolArray, FloatArray
-from d4orm_env.dynamics.models import MODELS, names_of_codes
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.dynamics.robot_model import Ops
 from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.dynamics import collision, reward, transition
+from d4orm_env.dynamics.models import MODELS, names_of_codes
+from d4orm_env.dynamics.robot_model import Ops
 from d4orm_env.engine import noise
 from d4orm_env.engine.types import (
     MovingObstacles,

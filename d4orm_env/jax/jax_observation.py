@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from d4orm_env.dynamics import transition
 from d4orm_env.core.arrays import FloatArray, IntArray
-from d4orm_env.dynamics.models import MODELS
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.dynamics import transition
+from d4orm_env.dynamics.models import MODELS
 from d4orm_env.jax.jax_engine import OPS, Worlds
 
 T = TypeVar("T")

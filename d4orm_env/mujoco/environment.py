@@ -6,15 +6,15 @@ from pettingzoo import AECEnv
 from pettingzoo.utils import OrderEnforcingWrapper
 
 from d4orm_env import navigation_v0
-from d4orm_env.envs.viewer import RENDER_MODES
 from d4orm_env.core.arrays import FloatArray, shown
-from d4orm_env.mujoco.physics import Physics
+from d4orm_env.envs.options import EnvOptions
+from d4orm_env.envs.simulation import Simulation
+from d4orm_env.envs.viewer import RENDER_MODES
 from d4orm_env.mujoco.mujoco_simulation import MujocoSimulation
 from d4orm_env.mujoco.mujoco_viewer import RENDERERS, MujocoViewer
+from d4orm_env.mujoco.physics import Physics
 from d4orm_env.navigation_v0 import TurnByTurn
-from d4orm_env.envs.options import EnvOptions
 from d4orm_env.scenarios.problems import ScenarioLike
-from d4orm_env.envs.simulation import Simulation
 
 
 class parallel_env(navigation_v0.parallel_env):

@@ -12,12 +12,12 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.transition import stands
 from d4orm_env.engine.types import StepResult
 from d4orm_env.envs.lifelong import reached_goals
-from d4orm_env.mujoco.bodies import TeamBodies
-from d4orm_env.mujoco.physics import Physics
-from d4orm_env.mujoco.scene import check_problem
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.simulation import Simulation
 from d4orm_env.envs.team_step import TeamStep
+from d4orm_env.mujoco.bodies import TeamBodies
+from d4orm_env.mujoco.physics import Physics
+from d4orm_env.mujoco.scene import check_problem
 
 _WHIRL = 100.0
 """How far the heading of a robot that others run into may wind up beyond what it commands [rad]."""

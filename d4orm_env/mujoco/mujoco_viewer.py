@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from d4orm_env.envs.simulation import Simulation
 from d4orm_env.envs.viewer import Frame, Viewer
 from d4orm_env.mujoco.camera import Camera, NoCameraError
 from d4orm_env.mujoco.mujoco_simulation import MujocoSimulation
-from d4orm_env.envs.simulation import Simulation
 
 RENDERERS = ("auto", "mujoco", "pictures")
 """Who may draw frames."""

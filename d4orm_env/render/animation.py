@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from d4orm_env.core.arrays import positive_number, whole_number
-from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.disturbance_events import Marks
+from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.metrics import arrival_times
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory

@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.disturbance_events import Marks
+from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.metrics import arrival_times
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import count

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TypeAlias, TypeGuard
 
 from d4orm_env.core.problem import Problem
-from d4orm_env.scenarios.scenario_registry import FILE_SUFFIXES, SCENARIOS
 from d4orm_env.scenarios.scenario import Scenario, complain
+from d4orm_env.scenarios.scenario_registry import FILE_SUFFIXES, SCENARIOS
 
 ScenarioLike: TypeAlias = str | os.PathLike[str] | Callable[..., Problem] | Scenario
 """A name, a YAML file, a callable, or where one is, ``"package.module:function"`` or ``"folder/file.py:function"``."""

@@ -11,12 +11,12 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from d4orm_env.dynamics.models import get_model
 from d4orm_env.core.portable import arctan2
 from d4orm_env.core.problem import Arrival, Problem
-from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
+from d4orm_env.dynamics.models import get_model
+from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.scenarios.scenario_registry import SCENARIOS
 
 FLOAT32_MAX = float(str(np.finfo(np.float32).max))

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import positive_number, whole_number
-from d4orm_env.dynamics.models import get_model
 from d4orm_env.core.problem import MAX_HORIZON, Arrival, check_arrival
 from d4orm_env.core.team import Team
+from d4orm_env.dynamics.models import get_model
 
 MAX_COUNT = 10_000
 """Most robots or obstacles a generator makes: a slip of the finger must not fill the memory."""

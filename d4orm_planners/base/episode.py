@@ -18,8 +18,8 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.disturbances.recorded_events import marks_of
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.envs.team_step import AgentInfos
-from d4orm_planners.base.planner_registry import PolicyLike, make_policy
 from d4orm_planners.base.display import Shown
+from d4orm_planners.base.planner_registry import PolicyLike, make_policy
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv

@@ -24,8 +24,8 @@ from d4orm_env.rollout import rollout
 from d4orm_env.scenarios.schema import describe, parse
 from d4orm_env.verify import verify
 from d4orm_planners.base.conflict_groups import conflicts
-from d4orm_planners.base.provenance import Provenance
 from d4orm_planners.base.display import Shown
+from d4orm_planners.base.provenance import Provenance
 
 Status = Literal["solved", "iteration_limit", "time_limit", "stopped", "interrupted", "refuted"]
 """How a search ended; see :class:`Plan`."""

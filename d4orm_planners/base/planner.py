@@ -14,8 +14,8 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.engine.types import StepWatcher
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.plan import IterationRecord, Plan, Status
-from d4orm_planners.base.solve import Search
 from d4orm_planners.base.settings import CheckedSettings, Count, EngineName
+from d4orm_planners.base.solve import Search
 
 Callback = Callable[[IterationRecord], object]
 

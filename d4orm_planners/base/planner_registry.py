@@ -9,10 +9,10 @@ from typing import Any, TypeAlias, TypeGuard, TypeVar
 from d4orm_env.core.arrays import duration, shown
 from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.core.registry import load_reference
+from d4orm_planners.base.import_paths import source_digest, written
 from d4orm_planners.base.names import PLANNERS, POLICIES, is_planner_class
 from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.policy import OpenLoop, Policy, RobotFunction, TeamFunction, plain_attributes
-from d4orm_planners.base.import_paths import source_digest, written
 from d4orm_planners.base.settings import NOTHING, CheckedSettings
 
 RECOMMENDED = "d4orm-d"

@@ -15,6 +15,7 @@ from d4orm_env.core.arrays import FloatArray, whole_number
 from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
+from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.types import (
     DenoisingStep,
     Engine,
@@ -24,7 +25,6 @@ from d4orm_env.engine.types import (
     StepWatcher,
     checked_controls,
 )
-from d4orm_env.engine.choice import get_engine
 from d4orm_planners.base.candidate import Candidate, evaluate_controls
 from d4orm_planners.base.plan import IterationRecord, Plan, Status
 from d4orm_planners.base.provenance import Provenance

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import Floats, IntArray
-from d4orm_env.dynamics.collision import axis_gap
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import inverse_initial_distance
+from d4orm_env.dynamics.collision import axis_gap
 from d4orm_env.dynamics.robot_model import SPEED, Ops
 from d4orm_env.dynamics.transition import TimeStep
 from d4orm_planners.baselines.abandoning import run_or_abandon

@@ -10,10 +10,10 @@ from pydantic import Field
 
 from d4orm_env.core.seeds import Stream
 from d4orm_planners.base.candidate import Candidate, evaluate_controls
-from d4orm_planners.baselines.collocation import Contacts, Motion, TeamProgram, load_casadi
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
-from d4orm_planners.base.solve import Search
 from d4orm_planners.base.settings import Count, NotNegative, Positive
+from d4orm_planners.base.solve import Search
+from d4orm_planners.baselines.collocation import Contacts, Motion, TeamProgram, load_casadi
 from d4orm_planners.tracking.steering import prepare_drives, straight_drives
 
 FOUND = ("Solve_Succeeded", "Solved_To_Acceptable_Level")

@@ -19,7 +19,12 @@ from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.base.policy import StatePolicy
 from d4orm_planners.base.settings import CheckedSettings, NotNegative, Positive, Whole
-from d4orm_planners.tracking.steering import goals_along_ways, preferred_velocities, present_velocities, track_velocities
+from d4orm_planners.tracking.steering import (
+    goals_along_ways,
+    preferred_velocities,
+    present_velocities,
+    track_velocities,
+)
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv

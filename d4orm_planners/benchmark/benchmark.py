@@ -10,12 +10,13 @@ from typing import TypeAlias
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.dynamics.models import COMMON
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.types import SamplingTask
+from d4orm_env.dynamics.models import COMMON
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.threads import available_cores
+from d4orm_env.engine.types import SamplingTask
 from d4orm_env.scenarios import make_problem
+from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.benchmark.env_steps import (
     DISTURBANCES,
     RIGID,
@@ -30,7 +31,6 @@ from d4orm_planners.benchmark.settings import BenchmarkSettings
 from d4orm_planners.benchmark.timing import Row, Spread, in_turn, measure
 from d4orm_planners.benchmark.walls import Where, measure_index, measure_obstacles
 from d4orm_planners.sampling.d4orm import D4orm
-from d4orm_planners.base.planner_registry import make_planner
 
 PRESETS = (None, "paper")
 

@@ -10,10 +10,10 @@ import numpy as np
 from d4orm_env.disturbances import Delay, Dropout, StateNoise
 from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.scenarios import make_problem
+from d4orm_planners.base.episode import open_env
 from d4orm_planners.benchmark.settings import BenchmarkSettings
 from d4orm_planners.benchmark.timing import Row, Spread, measure
 from d4orm_planners.benchmark.walls import boxed_problem
-from d4orm_planners.base.episode import open_env
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv

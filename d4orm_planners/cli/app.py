@@ -15,12 +15,12 @@ from typing import Annotated, Any
 import typer
 
 from d4orm_planners.cli.bench import bench
+from d4orm_planners.cli.common_options import Quiet
 from d4orm_planners.cli.dataset_command import dataset
 from d4orm_planners.cli.demo import demo
 from d4orm_planners.cli.evaluate_command import evaluate
 from d4orm_planners.cli.leaderboard_command import leaderboard
 from d4orm_planners.cli.node_command import node
-from d4orm_planners.cli.common_options import Quiet
 from d4orm_planners.cli.outputs import print_table
 from d4orm_planners.cli.plan_command import plan
 from d4orm_planners.cli.play import play

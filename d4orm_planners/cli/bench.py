@@ -28,8 +28,8 @@ def bench(
     quiet: Quiet = False,
 ) -> None:
     """Measure the engines, the environments and the planner on this machine."""
-    from d4orm_planners.benchmark.benchmark import parts, run_parts
     from d4orm_planners.benchmark.bench_report import circumstances, write_report
+    from d4orm_planners.benchmark.benchmark import parts, run_parts
     from d4orm_planners.benchmark.settings import QUICK, BenchmarkSettings
     from d4orm_planners.cli.progress import parts_progress
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from d4orm_planners.cli.dataclass_options import takes
 from d4orm_planners.cli.arguments import make_folder, parse_settings, refuse_options, seed_list, single_levels
 from d4orm_planners.cli.common_options import Model, Quiet, ScenarioSettings
+from d4orm_planners.cli.dataclass_options import takes
 
 if TYPE_CHECKING:
     from d4orm_planners.rl.dataset import Demonstrations

@@ -32,8 +32,8 @@ def demo(
         return
     from d4orm_env import make_problem, navigation_v0, verify
     from d4orm_planners.base.episode import run_episode
-    from d4orm_planners.base.policy import OpenLoop
     from d4orm_planners.base.planner_registry import make_planner
+    from d4orm_planners.base.policy import OpenLoop
 
     make_folder(out)
     problem = make_problem("warehouse", num_robots=num_robots, seed=seed)
@@ -76,8 +76,8 @@ def show_denoising(out: Path, num_robots: int, seed: int, engine: str) -> None:
     from d4orm_env import make_problem
     from d4orm_env.render.denoising_frames import save_denoising
     from d4orm_env.render.replay import Replay
-    from d4orm_planners.sampling.denoising import DenoisingFilm
     from d4orm_planners.base.planner_registry import make_planner
+    from d4orm_planners.sampling.denoising import DenoisingFilm
 
     make_folder(out)
     problem = make_problem("circle", num_robots=num_robots, seed=seed)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from d4orm_planners.cli.dataclass_options import takes
 from d4orm_planners.cli.arguments import (
     decimals,
     make_folder,
@@ -20,6 +19,7 @@ from d4orm_planners.cli.arguments import (
     seed_list,
 )
 from d4orm_planners.cli.common_options import Physics, Quiet, ScenarioSettings, TimeLimit
+from d4orm_planners.cli.dataclass_options import takes
 
 if TYPE_CHECKING:
     from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup
@@ -130,9 +130,9 @@ def report(
 ) -> tuple[list[SuccessRate], list[Path]]:
     """Run the trials and write what they came to; the success rates and what was written."""
     from d4orm_planners.cli.progress import tell_results
-    from d4orm_planners.evaluation.tables import markdown
     from d4orm_planners.evaluation.robustness import write_disturbances
     from d4orm_planners.evaluation.summary import success_rates
+    from d4orm_planners.evaluation.tables import markdown
 
     groups = options.run()
     rates = success_rates(groups)

@@ -23,8 +23,8 @@ def leaderboard(
 ) -> None:
     """Write a page with the results of all trials in a store, or in several."""
     from d4orm_planners.evaluation.leaderboard import leaderboard as page
-    from d4orm_planners.evaluation.tables import read_parquet, target
     from d4orm_planners.evaluation.store import TrialStore
+    from d4orm_planners.evaluation.tables import read_parquet, target
 
     if out.suffix != ".md":
         raise ValueError(f"output file {str(out)!r} must end in .md")

@@ -57,8 +57,8 @@ def load_node(path: str | os.PathLike[str]) -> NodeTask:
 
 def _task(content: object, folder: Path) -> NodeTask:
     from d4orm_env.core.arrays import duration, whole_number
-    from d4orm_planners.d_d4orm.planner import DD4orm
     from d4orm_planners.base.planner_registry import make_planner
+    from d4orm_planners.d_d4orm.planner import DD4orm
 
     fields = _mapping("the file", content)
     for name in fields:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from d4orm_planners.cli.dataclass_options import takes
 from d4orm_planners.cli.arguments import check_target, parse_settings, refuse_options
 from d4orm_planners.cli.common_options import Engine, PictureOptions, ProblemOptions, TimeLimit
+from d4orm_planners.cli.dataclass_options import takes
 from d4orm_planners.cli.outputs import print_plan, require_solved
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ from typing import Annotated
 
 import typer
 
-from d4orm_planners.cli.dataclass_options import takes
 from d4orm_planners.cli.arguments import names
 from d4orm_planners.cli.common_options import ProblemOptions
+from d4orm_planners.cli.dataclass_options import takes
 
 
 @dataclass(frozen=True, kw_only=True)

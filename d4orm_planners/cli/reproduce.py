@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from d4orm_planners.cli.dataclass_options import takes
 from d4orm_planners.cli.arguments import MOST_SEEDS, make_folder, refuse_options
 from d4orm_planners.cli.common_options import Quiet
+from d4orm_planners.cli.dataclass_options import takes
 
 if TYPE_CHECKING:
     from d4orm_planners.reproduction.figure import Figure
@@ -63,11 +63,11 @@ def reproduce(options: ReproduceOptions) -> None:
         return
     from d4orm_planners.cli.progress import resumable, tell_results
     from d4orm_planners.cli.warmup import warm_up
-    from d4orm_planners.evaluation.tables import read_parquet
     from d4orm_planners.evaluation.store import STORE, TrialStore
+    from d4orm_planners.evaluation.tables import read_parquet
     from d4orm_planners.reproduction.figure import reproduce as run
-    from d4orm_planners.reproduction.paper_figures import find_figure
     from d4orm_planners.reproduction.figure_report import markdown, write_reproduction
+    from d4orm_planners.reproduction.paper_figures import find_figure
 
     figure = find_figure(options.figure).only(options.sections or (), options.policies or ())
     if not options.times:

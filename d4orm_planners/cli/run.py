@@ -11,9 +11,9 @@ import typer
 
 from d4orm_env.core.summary_line import count
 from d4orm_env.disturbances.disturbance import AnyDisturbance
-from d4orm_planners.cli.dataclass_options import takes
 from d4orm_planners.cli.arguments import check_target, names, refuse_options, single_levels
 from d4orm_planners.cli.common_options import Physics, PictureOptions, ProblemOptions
+from d4orm_planners.cli.dataclass_options import takes
 from d4orm_planners.cli.outputs import episode_rows, print_table
 
 if TYPE_CHECKING:
@@ -70,8 +70,8 @@ class RunOptions(PictureOptions, ProblemOptions):
             ValueError: For an option that makes no sense, or does not go with a plan file.
         """
         from d4orm_planners.base.plan import Plan
-        from d4orm_planners.base.policy import OpenLoop
         from d4orm_planners.base.planner_registry import make_policy
+        from d4orm_planners.base.policy import OpenLoop
 
         if self.plan_file is None:
             chosen = {} if self.preset is None else {"preset": self.preset}

@@ -19,17 +19,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.dynamics.models import COMMON
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
-from d4orm_env.engine.types import SamplingRules, SamplingTask
+from d4orm_env.dynamics.models import COMMON
 from d4orm_env.engine.caching import Kernel, has_to_be_compiled
 from d4orm_env.engine.choice import get_engine
+from d4orm_env.engine.types import SamplingRules, SamplingTask
 from d4orm_env.envs.joint_state import JointState
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.planner_registry import make_planner
-from d4orm_planners.sampling.weights import SoftmaxWeights
 from d4orm_planners.base.solve import Search
+from d4orm_planners.sampling.weights import SoftmaxWeights
 
 if TYPE_CHECKING:
     from numba.core.dispatcher import Dispatcher
@@ -68,8 +68,8 @@ def compile_for_planning(
         announce: Called before it begins, if there is anything to do.
         drives: Whether straight drives are needed too.
     """
-    from d4orm_planners.engine.score import score_kernel
     from d4orm_env.engine.worlds import world_kernels
+    from d4orm_planners.engine.score import score_kernel
 
     if has_to_be_compiled(score_kernel(models)) and has_to_be_compiled(world_kernels(models).roll_out):
         announce()
@@ -207,12 +207,12 @@ def _kernels() -> list[Dispatcher[Callable[..., object]]]:
     from numba.core.dispatcher import Dispatcher
 
     from d4orm_env import engine
-    from d4orm_planners.mapf.beam_search import search_kernel
-    from d4orm_planners.tracking.straight_drives import drive_kernel
-    from d4orm_planners.engine.score import score_kernel
     from d4orm_env.engine.worlds import world_kernels
     from d4orm_planners import d4orm_c2f
     from d4orm_planners import mapf as guidance
+    from d4orm_planners.engine.score import score_kernel
+    from d4orm_planners.mapf.beam_search import search_kernel
+    from d4orm_planners.tracking.straight_drives import drive_kernel
 
     modules = [import_module(f"{package.__name__}.{module.name}") for package in (engine, guidance, d4orm_c2f)
                for module in pkgutil.iter_modules(package.__path__) if module.name != "jax"]  # fmt: skip

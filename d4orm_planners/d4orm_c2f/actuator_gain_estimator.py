@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.dynamics.robot_model import STANDARD_LIMITS
 from d4orm_env.core.team import Team
+from d4orm_env.dynamics.robot_model import STANDARD_LIMITS
 
 AT_LIMIT = 0.95
 """Share of its limits from which a robot is asked for the most that it can do."""

@@ -13,6 +13,7 @@ from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.engine.types import Engine
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.base.candidate import Candidate
+from d4orm_planners.base.solve import Search
 from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.coarse_plan import (
     Guidance,
@@ -23,15 +24,14 @@ from d4orm_planners.d4orm_c2f.coarse_plan import (
     rest_of,
     subgoal_indices,
 )
-from d4orm_planners.d4orm_c2f.warm_start import episode_of
 from d4orm_planners.d4orm_c2f.following import BARRED_AFTER, STUCK_AFTER, WAITING_WITHIN, Patience, keep_time
-from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.d4orm_c2f.lookahead import within_sight
+from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
+from d4orm_planners.d4orm_c2f.warm_start import episode_of
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
 from d4orm_planners.mapf.planner import Guide as Ways
 from d4orm_planners.mapf.relay import relay_ways
-from d4orm_planners.base.solve import Search
 from d4orm_planners.tracking.steering import straight_drives
 
 NEARER = 0.05

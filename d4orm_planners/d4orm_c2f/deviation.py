@@ -9,13 +9,13 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine.types import Engine
 from d4orm_env.envs.joint_state import JointState
-from d4orm_planners.d4orm_c2f.state_filter import StateFilter
+from d4orm_planners.d4orm_c2f.actuator_gain_estimator import Weakness
 from d4orm_planners.d4orm_c2f.direct_final_approach import docking_radius
 from d4orm_planners.d4orm_c2f.latency_estimator import Lateness
 from d4orm_planners.d4orm_c2f.packet_loss_estimator import Losses
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.d4orm_c2f.stall_estimator import Standing
-from d4orm_planners.d4orm_c2f.actuator_gain_estimator import Weakness
+from d4orm_planners.d4orm_c2f.state_filter import StateFilter
 from d4orm_planners.tracking.steering import present_velocities
 
 DECAY = 0.98

@@ -7,8 +7,8 @@ import numpy as np
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine.types import Engine
 from d4orm_planners.tracking.steering import NEAR_VIA, drives, standing, straight_drives
 

@@ -13,16 +13,16 @@ from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.seeds import Stream, derived_seed, generator
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_planners.base.policy import StatePolicy
+from d4orm_planners.base.settings import CheckedSettings
 from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.barrier import safe_velocities
 from d4orm_planners.d4orm_c2f.coarse_plan import Guidance, Waypoints
-from d4orm_planners.d4orm_c2f.deviation import Deviation
 from d4orm_planners.d4orm_c2f.coarse_plan_tracker import Guide
+from d4orm_planners.d4orm_c2f.deviation import Deviation
+from d4orm_planners.d4orm_c2f.fine_plan import Prediction, Situation, Window
 from d4orm_planners.d4orm_c2f.settings import PAPER_CONTROL, D4ormC2FConfig
 from d4orm_planners.d4orm_c2f.stall_estimator import PROBE
-from d4orm_planners.d4orm_c2f.fine_plan import Prediction, Situation, Window
-from d4orm_planners.base.policy import StatePolicy
-from d4orm_planners.base.settings import CheckedSettings
 from d4orm_planners.tracking.steering import drive_to_goal, present_velocities, track_velocities
 
 if TYPE_CHECKING:

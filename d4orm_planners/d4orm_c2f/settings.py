@@ -7,8 +7,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from d4orm_planners.sampling.settings import PAPER, DiffusionSettings, SoftmaxSettings
 from d4orm_planners.base.settings import Count, EngineName, NotNegative, Positive, Samples, Steps, Whole, one_of
+from d4orm_planners.sampling.settings import PAPER, DiffusionSettings, SoftmaxSettings
 
 Credit = Annotated[str, one_of(("robot", "team"))]
 CoarsePreset = Annotated[str, one_of(("paper",))] | None

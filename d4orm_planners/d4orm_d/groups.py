@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from d4orm_planners.d4orm_d.deformed_plan import DeformedTeam
 from d4orm_planners.base.conflict_groups import Graph, conflicts, failure_groups, reconnected
+from d4orm_planners.d4orm_d.deformed_plan import DeformedTeam
 
 
 @dataclass(frozen=True, eq=False)

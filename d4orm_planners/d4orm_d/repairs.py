@@ -12,9 +12,9 @@ from d4orm_env.core.arrays import IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_planners.d4orm_d.settings import RULES, D4ormDConfig
-from d4orm_planners.d4orm_d.deformed_plan import DeformedTeam
 from d4orm_planners.base.conflict_groups import components, independent_robots
+from d4orm_planners.d4orm_d.deformed_plan import DeformedTeam
+from d4orm_planners.d4orm_d.settings import RULES, D4ormDConfig
 from d4orm_planners.tracking.steering import drives
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
+from d4orm_planners.base.settings import Count, Positive, Samples, Steps, one_of
 from d4orm_planners.sampling.d4orm import D4ormConfig
 from d4orm_planners.sampling.settings import Credit
-from d4orm_planners.base.settings import Count, Positive, Samples, Steps, one_of
 
 Decoupling = Annotated[str, one_of(("independent", "groups"))]
 Start = Annotated[str, one_of(("auto", "team", "straight", "guided"))]

@@ -6,9 +6,9 @@ import logging
 from collections.abc import Callable
 
 from d4orm_planners.base.candidate import Candidate
-from d4orm_planners.d_d4orm.node_pool import SyncCrew
 from d4orm_planners.d_d4orm.evaluator import Judge
 from d4orm_planners.d_d4orm.node import Node
+from d4orm_planners.d_d4orm.node_pool import SyncCrew
 from d4orm_planners.d_d4orm.transport import Transport
 
 logger = logging.getLogger(__name__)

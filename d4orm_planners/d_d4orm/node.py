@@ -11,15 +11,15 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_planners.base.candidate import Candidate
-from d4orm_planners.d_d4orm.node_events import Event, Observer
-from d4orm_planners.d_d4orm.inbox import TOLERANCE, Inbox
-from d4orm_planners.d_d4orm.evaluator import Judge
-from d4orm_planners.d_d4orm.messages import Message, encode
-from d4orm_planners.d_d4orm.traffic import Meter
-from d4orm_planners.d_d4orm.selection import choose
-from d4orm_planners.d_d4orm.transport import Transport
 from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.solve import Search
+from d4orm_planners.d_d4orm.evaluator import Judge
+from d4orm_planners.d_d4orm.inbox import TOLERANCE, Inbox
+from d4orm_planners.d_d4orm.messages import Message, encode
+from d4orm_planners.d_d4orm.node_events import Event, Observer
+from d4orm_planners.d_d4orm.selection import choose
+from d4orm_planners.d_d4orm.traffic import Meter
+from d4orm_planners.d_d4orm.transport import Transport
 
 RESEND = 0.2
 """Seconds after which a candidate is sent again, as messages may get lost."""

@@ -11,12 +11,12 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 
 from d4orm_planners.base.candidate import Candidate
-from d4orm_planners.d_d4orm.inbox import Inbox
-from d4orm_planners.d_d4orm.evaluator import Judge, Stopped
-from d4orm_planners.d_d4orm.node import Node
-from d4orm_planners.d_d4orm.transport import Transport
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import Search
+from d4orm_planners.d_d4orm.evaluator import Judge, Stopped
+from d4orm_planners.d_d4orm.inbox import Inbox
+from d4orm_planners.d_d4orm.node import Node
+from d4orm_planners.d_d4orm.transport import Transport
 
 logger = logging.getLogger(__name__)
 

@@ -9,19 +9,19 @@ from typing import ClassVar
 
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.threads import available_cores
-from d4orm_planners.d4orm_d.planner import D4ormD
-from d4orm_planners.d_d4orm.settings import DD4ormConfig
-from d4orm_planners.d_d4orm.node_pool import AsyncCrew, Crew, SyncCrew
-from d4orm_planners.d_d4orm.inbox import Inbox
-from d4orm_planners.d_d4orm.evaluator import Judge
-from d4orm_planners.d_d4orm.network_node import NetworkCrew
-from d4orm_planners.d_d4orm.node import Node, Task, node_seed
-from d4orm_planners.d_d4orm.ray_connection import RayConnection, import_ray
-from d4orm_planners.d_d4orm.ray_planner import ray_planners
-from d4orm_planners.d_d4orm.transport import LocalNetwork
-from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings, ZenohTransport
 from d4orm_planners.base.planner import Iteration, Planner
 from d4orm_planners.base.solve import Search
+from d4orm_planners.d4orm_d.planner import D4ormD
+from d4orm_planners.d_d4orm.evaluator import Judge
+from d4orm_planners.d_d4orm.inbox import Inbox
+from d4orm_planners.d_d4orm.network_node import NetworkCrew
+from d4orm_planners.d_d4orm.node import Node, Task, node_seed
+from d4orm_planners.d_d4orm.node_pool import AsyncCrew, Crew, SyncCrew
+from d4orm_planners.d_d4orm.ray_connection import RayConnection, import_ray
+from d4orm_planners.d_d4orm.ray_planner import ray_planners
+from d4orm_planners.d_d4orm.settings import DD4ormConfig
+from d4orm_planners.d_d4orm.transport import LocalNetwork
+from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings, ZenohTransport
 
 
 @dataclass(frozen=True)

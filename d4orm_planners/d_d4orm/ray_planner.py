@@ -14,10 +14,10 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.threads import available_cores
 from d4orm_planners.base.candidate import evaluate_controls
-from d4orm_planners.d_d4orm.messages import Message, decode, encode
-from d4orm_planners.d_d4orm.ray_connection import RayConnection
 from d4orm_planners.base.planner import Iteration, Planner
 from d4orm_planners.base.solve import Search
+from d4orm_planners.d_d4orm.messages import Message, decode, encode
+from d4orm_planners.d_d4orm.ray_connection import RayConnection
 
 RESTARTS = 3
 """How many times an actor that was lost is started again, before its node is done without."""

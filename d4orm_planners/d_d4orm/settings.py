@@ -10,15 +10,15 @@ from typing import Annotated, Any, Self
 from pydantic import Field, InstanceOf, SkipValidation
 
 from d4orm_env.core.arrays import shown
-from d4orm_planners.sampling.d4orm import D4orm, D4ormConfig
+from d4orm_planners.base.planner import PlannerConfig
+from d4orm_planners.base.settings import NOTHING, Count, Seconds, Whole, one_of
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d_d4orm.node_pool import MODES
 from d4orm_planners.d_d4orm.ray_connection import host_and_port
 from d4orm_planners.d_d4orm.selection import SELECTIONS, shares
 from d4orm_planners.d_d4orm.transport import TRANSPORTS
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings
-from d4orm_planners.base.planner import PlannerConfig
-from d4orm_planners.base.settings import NOTHING, Count, Seconds, Whole, one_of
+from d4orm_planners.sampling.d4orm import D4orm, D4ormConfig
 
 NODE_PLANNERS: Mapping[str, type[D4orm]] = MappingProxyType({kind.name: kind for kind in (D4orm, D4ormD)})
 """The planners that a node can run."""

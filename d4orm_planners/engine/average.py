@@ -7,8 +7,8 @@ from d4orm_env.engine import compiling, noise
 from d4orm_env.engine import simd as lanes
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS, ZERO, aligned_zeros, compiled
-from d4orm_env.engine.simd import add_turned, add_turned_squares, use_wide_registers
 from d4orm_env.engine.noise import DRAWS
+from d4orm_env.engine.simd import add_turned, add_turned_squares, use_wide_registers
 
 SOURCES = fingerprint((noise, lanes, compiling))
 

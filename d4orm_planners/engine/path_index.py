@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.dynamics import collision
 from d4orm_env.core.arrays import FloatArray, IntArray, Ints, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.dynamics import collision
 from d4orm_env.engine import compiling, elementary, obstacles
 from d4orm_env.engine import simd as lanes
 from d4orm_env.engine.caching import cached_kernel, fingerprint

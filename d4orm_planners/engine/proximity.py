@@ -17,6 +17,7 @@ from d4orm_env.core.arrays import FloatArray, Ints, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine import simd as lanes
 from d4orm_env.engine.compiling import aligned_zeros, compiled, inlined
+from d4orm_env.engine.obstacles import may_touch
 from d4orm_env.engine.simd import (
     BLOCK,
     BOX,
@@ -33,7 +34,6 @@ from d4orm_env.engine.simd import (
     worlds_overlap_2,
     worlds_overlap_3,
 )
-from d4orm_env.engine.obstacles import may_touch
 from d4orm_env.engine.tiles import near_round
 
 SLACK = np.float32(1e-4)

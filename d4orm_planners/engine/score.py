@@ -16,25 +16,22 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.dynamics import collision
-from d4orm_env.dynamics import reward
-from d4orm_env.dynamics import robot_model
-from d4orm_env.dynamics import transition
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
-from d4orm_env.dynamics.models import MODELS
 from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.dynamics import collision, reward, robot_model, transition
+from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import TimeStep
 from d4orm_env.engine import noise, obstacles, sample_noise, tiles
-from d4orm_planners.engine import proximity
 from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
 from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, aligned_zeros, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
-from d4orm_env.engine.simd import BLOCK, NOWHERE, TILE, subtract_where, use_wide_registers
 from d4orm_env.engine.noise import DRAWS
-from d4orm_planners.engine.proximity import Bodies, Scratch, enclose, make_scratch, mark_robots, near_static, place_of
-from d4orm_env.engine.tile_layout import READ, WRITE, Row
 from d4orm_env.engine.sample_noise import TURN, VECTOR, Drawing, draw_block, fill_keys
+from d4orm_env.engine.simd import BLOCK, NOWHERE, TILE, subtract_where, use_wide_registers
 from d4orm_env.engine.stepping import Docking, dispatch, make_stepper, models_key, models_of_kernel
+from d4orm_env.engine.tile_layout import READ, WRITE, Row
+from d4orm_planners.engine import proximity
+from d4orm_planners.engine.proximity import Bodies, Scratch, enclose, make_scratch, mark_robots, near_static, place_of
 
 SOURCES = fingerprint(
     (robot_model, transition, collision, reward, noise, sample_noise, obstacles, *tiles.PARTS, tiles, proximity)

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_planners.evaluation.comparison import PairedPolicies, compare_pairs
-from d4orm_planners.evaluation.tables import markdown, panels, table, target, write_csv, write_rates
 from d4orm_planners.evaluation.summary import THRESHOLD, SuccessRate, Tolerance, TrialGroup, success_rates, tolerances
+from d4orm_planners.evaluation.tables import markdown, panels, table, target, write_csv, write_rates
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

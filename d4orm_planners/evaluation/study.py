@@ -12,15 +12,15 @@ from typing import Any, TypeAlias, TypeVar
 from d4orm_env.core.arrays import duration, positive_number, shown, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances import Disturbance
+from d4orm_env.disturbances.chosen import at_work, checked_disturbances
 from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.disturbances.disturbance_registry import attributes_of, disturbance_at
-from d4orm_env.disturbances.chosen import at_work, checked_disturbances
 from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_env.scenarios.problems import is_scenario_file
 from d4orm_planners.base.episode import check_physics
+from d4orm_planners.base.planner_registry import PolicyLike, is_brought, list_policies, make_policy, origin
 from d4orm_planners.evaluation.store import LARGEST_NUMBER
 from d4orm_planners.evaluation.trials import Condition, Configuration, Job
-from d4orm_planners.base.planner_registry import PolicyLike, is_brought, list_policies, make_policy, origin
 
 T = TypeVar("T")
 

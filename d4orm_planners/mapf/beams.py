@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.dynamics.robot_model import Model
-from d4orm_planners.mapf.beam_search import BeamRules, Moves, Seekers, search_kernel
-from d4orm_planners.engine.path_index import BLOCK
 from d4orm_env.engine.threads import Threads, available_cores
+from d4orm_planners.engine.path_index import BLOCK
+from d4orm_planners.mapf.beam_search import BeamRules, Moves, Seekers, search_kernel
 from d4orm_planners.mapf.working_plan import TeamPaths
 from d4orm_planners.tracking.steering import Drives, by_model
 

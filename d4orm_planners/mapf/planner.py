@@ -10,8 +10,8 @@ import numpy as np
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
-from d4orm_planners.base.solve import Search
 from d4orm_planners.base.settings import Count
+from d4orm_planners.base.solve import Search
 
 if TYPE_CHECKING:
     from d4orm_planners.mapf.roadmap import Roadmap

@@ -9,9 +9,9 @@ import numpy as np
 from numba.extending import register_jitable
 
 from d4orm_env.core.arrays import Floats, IntArray, Ints, Whole
-from d4orm_env.paths import wavefront
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS, compiled
+from d4orm_env.paths import wavefront
 from d4orm_env.paths.wavefront import Space, is_free_line
 from d4orm_planners.mapf import near_neighbours as nearness
 from d4orm_planners.mapf import pibt

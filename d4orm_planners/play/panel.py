@@ -16,9 +16,9 @@ from d4orm_env.scenarios import list_scenarios, make_problem
 from d4orm_env.scenarios.problem_files import scenario_text
 from d4orm_env.scenarios.schema import parse
 from d4orm_planners.play import edits
-from d4orm_planners.play.sliders import Dials
 from d4orm_planners.play.scene_frame import Frame
 from d4orm_planners.play.session import Session
+from d4orm_planners.play.sliders import Dials
 from d4orm_planners.play.view import View
 
 POLICIES = {

@@ -12,8 +12,8 @@ import viser
 
 from d4orm_env.core.problem import Problem
 from d4orm_planners.play.origin_check import LOOPBACK, Admission
-from d4orm_planners.play.proxy import Gate
 from d4orm_planners.play.panel import THEME, Panel
+from d4orm_planners.play.proxy import Gate
 from d4orm_planners.play.session import Session
 from d4orm_planners.play.view import View
 

@@ -21,11 +21,11 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import count
 from d4orm_env.disturbances.disturbance_registry import disturbances_at
 from d4orm_env.render.replay import Replay
+from d4orm_planners.base.planner_registry import make_policy, setting_names
+from d4orm_planners.base.policy import Policy
 from d4orm_planners.play.edits import Edit, followed
 from d4orm_planners.play.scene_frame import Frame, Status
 from d4orm_planners.play.viewport import Lane, Terms
-from d4orm_planners.base.policy import Policy
-from d4orm_planners.base.planner_registry import make_policy, setting_names
 
 _IDLE = 0.1
 

@@ -9,11 +9,11 @@ import numpy as np
 import viser
 
 from d4orm_env.render.panels import view_limits
-from d4orm_planners.play.viewpoint import Camera
-from d4orm_planners.play.scene_frame import Frame
-from d4orm_planners.play.viewport_view import LaneView
-from d4orm_planners.play.session import Session
 from d4orm_planners.play.meshes import Points, in_space
+from d4orm_planners.play.scene_frame import Frame
+from d4orm_planners.play.session import Session
+from d4orm_planners.play.viewpoint import Camera
+from d4orm_planners.play.viewport_view import LaneView
 
 GAP = 0.12
 """Between two scenes, in sizes of one."""

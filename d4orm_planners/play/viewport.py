@@ -15,10 +15,10 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.disturbances.robot_faults import pushed
 from d4orm_env.envs.joint_state import JointState, split_state
-from d4orm_planners.play.edits import check_robot
-from d4orm_planners.play.scene_frame import Frame, Status, closest_approach, guidance, plan
-from d4orm_planners.play.episode_buffer import Recording
 from d4orm_planners.base.policy import Policy
+from d4orm_planners.play.edits import check_robot
+from d4orm_planners.play.episode_buffer import Recording
+from d4orm_planners.play.scene_frame import Frame, Status, closest_approach, guidance, plan
 
 MOST_CYCLES = 10_000_000
 """Steps of an episode that ends only when somebody changes it."""

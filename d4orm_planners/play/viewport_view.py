@@ -15,8 +15,6 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.render.panels import robot_colors, view_limits
 from d4orm_planners.play import edits
-from d4orm_planners.play.scene_frame import Frame
-from d4orm_planners.play.session import Session
 from d4orm_planners.play.meshes import (
     NO_LINES,
     Colors,
@@ -30,6 +28,8 @@ from d4orm_planners.play.meshes import (
     puck,
     solid,
 )
+from d4orm_planners.play.scene_frame import Frame
+from d4orm_planners.play.session import Session
 
 CONTACT, OBSTACLE, BOUND, MARGIN = (208, 2, 27), (150, 156, 166), (90, 98, 110), (200, 60, 60)
 INK, BODY = (20, 24, 30), (120, 124, 134)

@@ -10,10 +10,10 @@ from types import MappingProxyType
 from typing import Literal
 
 from d4orm_env.core.arrays import whole_number
+from d4orm_planners.base.planner_registry import list_planners
 from d4orm_planners.evaluation.evaluate import Progress, run_study
 from d4orm_planners.evaluation.store import Trial, TrialKey
 from d4orm_planners.evaluation.study import Study
-from d4orm_planners.base.planner_registry import list_planners
 
 PaperNumbers = Mapping[tuple[str, str, str], Mapping[str, str]]
 """By section, label and metric: what the paper says, by column."""

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from d4orm_planners.evaluation.comparison import paired, steps_to_solution
 from d4orm_planners.evaluation.leaderboard import origin
-from d4orm_planners.evaluation.tables import deadline_table, errors, table, target, write_csv, write_parquet
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import SuccessWithin, success_by
+from d4orm_planners.evaluation.tables import deadline_table, errors, table, target, write_csv, write_parquet
 from d4orm_planners.reproduction.figure import Figure, Group
 from d4orm_planners.reproduction.numbers import METRICS, Measured, column, first_solution, is_time, measured
 from d4orm_planners.reproduction.plots import draw

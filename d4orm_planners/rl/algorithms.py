@@ -16,9 +16,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from d4orm_planners.rl.features import Features
 from d4orm_planners.rl.masking import MaskedReplayBuffer, MaskedRolloutBuffer
-from d4orm_planners.rl.task_mixture import MixedVecEnv
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 from d4orm_planners.rl.sb3_sets import SetExtractor
+from d4orm_planners.rl.task_mixture import MixedVecEnv
 
 _AS_THEY_ARE: Mapping[str, float] = MappingProxyType({})
 

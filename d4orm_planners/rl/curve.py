@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core.files import replaced_when_done
-from d4orm_planners.rl.task_mixture import MixedVecEnv
 from d4orm_planners.rl.network import Network
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
+from d4orm_planners.rl.task_mixture import MixedVecEnv
 
 
 class Outcome(NamedTuple):

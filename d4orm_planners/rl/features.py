@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.dynamics.models import get_model
 from d4orm_env.core.observation_layout import ObservationSlices
+from d4orm_env.dynamics.models import get_model
 from d4orm_planners.tracking.steering import along_ways
 
 TURNED_MODELS = frozenset({"holonomic2d", "holonomic3d", "velocity2d"})

@@ -25,17 +25,17 @@ from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.seeds import Stream, derived_seed, generator
 from d4orm_planners.base.planner_registry import make_policy, setting_names
+from d4orm_planners.base.settings import Count, PathText
 from d4orm_planners.rl.algorithms import ALGORITHMS
 from d4orm_planners.rl.checkpoints import Checkpoints
 from d4orm_planners.rl.cloning import clone, imitation_error, normalize
 from d4orm_planners.rl.curve import Evaluation, evaluate_network, write_curve
 from d4orm_planners.rl.dataset_samples import dataset_samples
 from d4orm_planners.rl.network import CLIP, EPSILON, Network
-from d4orm_planners.rl.train_config import VALIDATION_SEED, Many, Practice
 from d4orm_planners.rl.samples import Samples, record_samples
 from d4orm_planners.rl.sb3_network import network_of
+from d4orm_planners.rl.train_config import VALIDATION_SEED, Many, Practice
 from d4orm_planners.rl.training import Progress, TrainingResult
-from d4orm_planners.base.settings import Count, PathText
 
 LEARNER = "ppo"
 """Whose network learns, and whose policy it is then."""

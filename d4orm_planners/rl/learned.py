@@ -12,8 +12,8 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.envs.joint_state import split_state
 from d4orm_planners.base.policy import Actions, Observations, Policy, require_reset, robot_indices
-from d4orm_planners.rl.network import SUFFIX, Network, load_network
 from d4orm_planners.base.settings import CheckedSettings, PathText
+from d4orm_planners.rl.network import SUFFIX, Network, load_network
 from d4orm_planners.tracking.steering import goals_along_ways
 
 if TYPE_CHECKING:

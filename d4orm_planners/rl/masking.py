@@ -11,8 +11,8 @@ from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer, RolloutBu
 from stable_baselines3.common.type_aliases import ReplayBufferSamples, RolloutBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from d4orm_planners.rl.task_mixture import MixedVecEnv
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
+from d4orm_planners.rl.task_mixture import MixedVecEnv
 
 
 class _MaskedBuffer(BaseBuffer):

@@ -14,9 +14,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.dynamics.models import get_model
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.observation_layout import ObservationSlices
+from d4orm_env.dynamics.models import get_model
 from d4orm_planners.rl.features import Features
 from d4orm_planners.rl.set_network import array_shapes, encode, encoded_size
 

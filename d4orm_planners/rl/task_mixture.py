@@ -17,9 +17,9 @@ from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.yaml_text import parse_yaml
 from d4orm_env.disturbances.disturbance_registry import disturbances_at
+from d4orm_env.envs.team_step import Info
 from d4orm_env.scenarios import make_problem
 from d4orm_env.scenarios.problems import find_scenario, unknown_argument
-from d4orm_env.envs.team_step import Info
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 
 _LOOSENED = "d4orm_planners.rl.perturbed_scenarios:loosened"

@@ -10,9 +10,9 @@ from pydantic import Field
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios.problems import unknown_argument
-from d4orm_planners.rl.task_mixture import Exercise, MixedVecEnv
-from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 from d4orm_planners.base.settings import CheckedSettings, Count, Whole
+from d4orm_planners.rl.robot_vec_env import RobotVecEnv
+from d4orm_planners.rl.task_mixture import Exercise, MixedVecEnv
 
 VALIDATION_SEED = 0
 """Worlds are seeded one by one from here in validation, and in training from numbers of 64 random bits."""

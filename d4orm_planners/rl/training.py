@@ -25,17 +25,17 @@ from stable_baselines3.common.vec_env import VecNormalize
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.envs.rewards import TrainingReward
+from d4orm_planners.base.settings import Count, Number, PathText, Positive, Whole, one_of
 from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm
 from d4orm_planners.rl.checkpoints import Checkpoints
 from d4orm_planners.rl.curriculum import Lesson, common_batch, make_lessons, team_sizes
 from d4orm_planners.rl.curve import Evaluation, evaluate_network, write_curve
-from d4orm_planners.rl.task_mixture import Exercise, Instances, MixedVecEnv, gather_parts, parse_mixture
 from d4orm_planners.rl.network import CLIP, EPSILON, Network, load_network
-from d4orm_planners.rl.train_config import VALIDATION_SEED, Many, Practice
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 from d4orm_planners.rl.sb3_network import network_of, set_network
 from d4orm_planners.rl.sb3_sets import leave_as_they_are
-from d4orm_planners.base.settings import Count, Number, PathText, Positive, Whole, one_of
+from d4orm_planners.rl.task_mixture import Exercise, Instances, MixedVecEnv, gather_parts, parse_mixture
+from d4orm_planners.rl.train_config import VALIDATION_SEED, Many, Practice
 
 Progress = Callable[[str, int, int], object]
 _INSTANCES, _STEPS_PER_INSTANCE = 256, 25_000

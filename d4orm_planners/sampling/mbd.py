@@ -8,11 +8,11 @@ from typing import ClassVar
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_planners.base.settings import Count, Steps
+from d4orm_planners.base.solve import Search
 from d4orm_planners.sampling.loop import DenoisingPlanner, standard_normal
 from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, DenoisingConfig
 from d4orm_planners.sampling.tuned import TUNED
-from d4orm_planners.base.solve import Search
-from d4orm_planners.base.settings import Count, Steps
 
 
 @dataclass(frozen=True, kw_only=True)

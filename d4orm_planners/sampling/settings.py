@@ -10,9 +10,9 @@ from pydantic import Field
 from d4orm_env.core.arrays import FloatArray
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.planner import PlannerConfig
+from d4orm_planners.base.settings import CheckedSettings, NotNegative, Positive, Samples, Steps, Variance, one_of
 from d4orm_planners.sampling.schedule import annealed
 from d4orm_planners.sampling.weights import SoftmaxWeights
-from d4orm_planners.base.settings import CheckedSettings, NotNegative, Positive, Samples, Steps, Variance, one_of
 
 Credit = Annotated[str, one_of(("team", "robot", "alternate", "group"))]
 Cutoff = Annotated[NotNegative, Field(lt=1)]

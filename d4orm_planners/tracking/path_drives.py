@@ -11,19 +11,18 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from d4orm_env.dynamics import robot_model
-from d4orm_env.dynamics import transition
 from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, Floats, IntArray
-from d4orm_env.dynamics.models import MODELS
 from d4orm_env.core.problem import Problem
+from d4orm_env.dynamics import robot_model, transition
+from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE
 from d4orm_env.engine import stepping
 from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS, ZERO, to_fixed_tuple
 from d4orm_env.engine.stepping import make_stepper, models_key
+from d4orm_planners.mapf.routes import Routes
 from d4orm_planners.tracking import pursuit
 from d4orm_planners.tracking.pursuit import lookaheads, point_ahead, point_reached, square_to, steering
-from d4orm_planners.mapf.routes import Routes
 
 SOURCES = fingerprint((robot_model, transition, *stepping.PARTS, stepping, pursuit))
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from d4orm_env.core.arrays import Floats
-from d4orm_env.dynamics.models import MODELS
 from d4orm_env.core.problem import Problem
+from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import Model, TimeStep
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
 from d4orm_env.engine.elementary import OPS, cosine, sine

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
-from d4orm_env.dynamics.models import MODELS
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
+from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.dynamics.transition import TimeStep
 
@@ -158,8 +158,8 @@ def drives(
         vias: ``(R, V, P, d)`` the points [m]; none by default.
     """
     # Here, because importing numba takes long.
-    from d4orm_planners.tracking.straight_drives import DrivenWays, DriveRules, drive_kernel
     from d4orm_env.engine.threads import Threads, available_cores
+    from d4orm_planners.tracking.straight_drives import DrivenWays, DriveRules, drive_kernel
 
     switch, arrays = np.asarray(switch_times, np.int64), problem.arrays
     num_steps, dimension = problem.horizon, problem.dimension

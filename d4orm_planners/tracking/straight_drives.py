@@ -8,17 +8,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.dynamics import robot_model
-from d4orm_env.dynamics import transition
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
-from d4orm_env.dynamics.models import MODELS
 from d4orm_env.core.problem import Problem
+from d4orm_env.dynamics import robot_model, transition
+from d4orm_env.dynamics.models import MODELS
 from d4orm_env.engine import stepping
 from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
-from d4orm_env.engine.tile_layout import SQUARED_GAP
 from d4orm_env.engine.stepping import make_stepper, models_key
+from d4orm_env.engine.tile_layout import SQUARED_GAP
 
 SOURCES = fingerprint((robot_model, transition, *stepping.PARTS, stepping))
 

@@ -7,19 +7,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d4orm_env.dynamics import transition
 from d4orm_env.core.arrays import FloatArray, Floats
-from d4orm_env.dynamics.models import MODELS
 from d4orm_env.core.problem import Problem
+from d4orm_env.dynamics import transition
+from d4orm_env.dynamics.models import MODELS
 from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS, ZERO, inlined, to_fixed_tuple
-from d4orm_planners.tracking.straight_drives import LoneRobot
 from d4orm_env.engine.stepping import make_stepper, models_key
+from d4orm_planners.mapf.routes import Route, Stops
 from d4orm_planners.tracking import path_drives as execution
 from d4orm_planners.tracking import pursuit
 from d4orm_planners.tracking.path_drives import BEYOND, RESERVE
 from d4orm_planners.tracking.pursuit import point_ahead, point_reached, square_to, steering
-from d4orm_planners.mapf.routes import Route, Stops
+from d4orm_planners.tracking.straight_drives import LoneRobot
 
 SOURCES = execution.SOURCES + fingerprint((execution,))
 

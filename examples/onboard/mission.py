@@ -9,9 +9,9 @@ import numpy as np
 
 from d4orm_env import Problem, Team, World
 from d4orm_env.scenarios import make_problem
-from d4orm_planners.sampling.d4orm import D4ormConfig
 from d4orm_planners.d_d4orm.settings import DD4ormConfig
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings, ZenohTransport
+from d4orm_planners.sampling.d4orm import D4ormConfig
 
 TICK = 0.1
 """Time step of the world and of plans [s]."""

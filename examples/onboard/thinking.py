@@ -11,9 +11,9 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.engine.types import Engine
 from d4orm_planners.base.candidate import Candidate
-from d4orm_planners.d_d4orm.node_events import Event
 from d4orm_planners.d_d4orm.evaluator import Judge
 from d4orm_planners.d_d4orm.node import Node, Task
+from d4orm_planners.d_d4orm.node_events import Event
 from d4orm_planners.d_d4orm.transport import Transport
 from onboard.course import Course, digest
 from onboard.mission import Mission

@@ -15,17 +15,16 @@ import pytest
 
 from d4orm_env import make_problem, rollout
 from d4orm_env.engine import worlds
-from d4orm_planners.engine import average as averaging
-from d4orm_planners.engine import path_index
-from d4orm_planners.engine import score as sampling
-from d4orm_planners.engine import softmax
-from d4orm_env.paths import wavefront
-from d4orm_planners.mapf.beam_search import search_kernel
 from d4orm_env.engine.compiling import OPTIONS
-from d4orm_planners.tracking.straight_drives import drive_kernel
-from d4orm_planners.engine.softmax import softmax_weights
+from d4orm_env.paths import wavefront
 from d4orm_planners.baselines.amswarm.alternation import alternate
 from d4orm_planners.cli.warmup import sample_once
+from d4orm_planners.engine import average as averaging
+from d4orm_planners.engine import path_index, softmax
+from d4orm_planners.engine import score as sampling
+from d4orm_planners.engine.softmax import softmax_weights
+from d4orm_planners.mapf.beam_search import search_kernel
+from d4orm_planners.tracking.straight_drives import drive_kernel
 
 PORTABILITY = Path(__file__).parent / "portability"
 sys.path.insert(0, str(PORTABILITY))

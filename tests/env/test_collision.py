@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from d4orm_env.dynamics.collision import axis_gap, leaves
 from d4orm_env.core.world import World
+from d4orm_env.dynamics.collision import axis_gap, leaves
 from d4orm_env.engine.choice import get_engine
 
 RADIUS, MARGIN = 0.25, 0.25

@@ -45,8 +45,6 @@ from d4orm_env.disturbances import (
     StateDelay,
     StateNoise,
 )
-from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
-from d4orm_env.disturbances.draws import episode_keys
 from d4orm_env.disturbances.disturbance_registry import (
     DISTURBANCES,
     disturbance_at,
@@ -54,10 +52,12 @@ from d4orm_env.disturbances.disturbance_registry import (
     name_of,
     register_disturbance,
 )
+from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
+from d4orm_env.disturbances.draws import episode_keys
 from d4orm_env.envs.joint_env import JointNavigationEnv
 from d4orm_env.envs.joint_state import split_state
-from d4orm_env.render import plot_trajectory, save_animation
 from d4orm_env.envs.vector_env import NavigationVectorEnv
+from d4orm_env.render import plot_trajectory, save_animation
 from d4orm_planners import run_episode
 
 NAMES = pytest.mark.parametrize("name", CASES)

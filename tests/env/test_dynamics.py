@@ -12,10 +12,10 @@ from engine_support import ENGINE_NAMES, NUMPY_OPS, PYTHON_OPS
 from hypothesis import given
 from hypothesis import strategies as st
 
-from d4orm_env.dynamics.models import MODEL_CODES, MODELS, get_model
 from d4orm_env.core.problem import Problem
-from d4orm_env.dynamics.robot_model import Ops
 from d4orm_env.core.team import Team
+from d4orm_env.dynamics.models import MODEL_CODES, MODELS, get_model
+from d4orm_env.dynamics.robot_model import Ops
 from d4orm_env.dynamics.transition import TimeStep, advance
 from d4orm_env.engine.choice import get_engine
 

@@ -15,18 +15,18 @@ from engine_support import ENGINE_NAMES, MODEL_NAMES, NUMPY_OPS, open_problem, r
 from env_support import case_name, mixed_problem, scenario_cases
 
 from d4orm_env import rollout
-from d4orm_env.dynamics.models import MODELS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.transition import TimeStep, advance
 from d4orm_env.engine import elementary, threads, tiles
-from d4orm_env.engine.types import StepResult
 from d4orm_env.engine.caching import fingerprint
 from d4orm_env.engine.choice import ENGINES, get_engine
 from d4orm_env.engine.cpu import CpuEngine
-from d4orm_env.jax.jax_engine import JaxEngine
 from d4orm_env.engine.threads import Threads, available_cores
+from d4orm_env.engine.types import StepResult
+from d4orm_env.jax.jax_engine import JaxEngine
 from d4orm_env.scenarios import make_problem
 
 CPU, JAX = CpuEngine(), JaxEngine()

@@ -12,11 +12,11 @@ import pytest
 from engine_support import ENGINE_NAMES, MODEL_NAMES, random_controls
 from env_support import mixed_problem
 
-from d4orm_env.jax import functional
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.engine.choice import get_engine
+from d4orm_env.jax import functional
 from d4orm_env.scenarios import make_problem
 
 KEY = jax.random.key(0)

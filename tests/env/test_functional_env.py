@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from d4orm_env import make_problem, navigation_v0
-from d4orm_env.jax import functional
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.disturbances import ControlNoise, Delay
-from d4orm_env.jax.functional_env import EnvState, FunctionalEnv
 from d4orm_env.envs.rewards import RewardInput
+from d4orm_env.jax import functional
+from d4orm_env.jax.functional_env import EnvState, FunctionalEnv
 
 KEY = jax.random.key(0)
 

@@ -11,8 +11,8 @@ from d4orm_env import make_problem
 
 pytest.importorskip("jaxmarl", reason="JaxMARL is not installed: it asks for an older Gymnasium")
 
-from d4orm_env.jax.functional_env import FunctionalEnv
 from d4orm_env.integrations.jaxmarl import JaxMARLNavigation
+from d4orm_env.jax.functional_env import FunctionalEnv
 
 PROBLEM = make_problem("circle", num_robots=2, model="velocity2d")
 KEY = jax.random.key(0)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from env_support import line_problem
 
-from d4orm_env.dynamics.models import MODELS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
+from d4orm_env.dynamics.models import MODELS
 from d4orm_env.envs.lifelong import fresh_goal, reached_goals
 
 

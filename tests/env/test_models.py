@@ -16,13 +16,13 @@ from engine_support import ENGINE_NAMES, PYTHON_OPS, observe_team, random_contro
 from registry_support import forgetting
 
 from d4orm_env import Problem, Team, load_problem, make_problem, register_model, rollout, save_problem, verify
-from d4orm_env.jax import functional
-from d4orm_env.dynamics.models import MODEL_CODES, MODELS, get_model, model_digest
 from d4orm_env.core.observation_layout import ObservationLayout
+from d4orm_env.dynamics import OWN_LIMITS, SPEED, Limit, Model, ModelFunctions, clip
+from d4orm_env.dynamics.models import MODEL_CODES, MODELS, get_model, model_digest
 from d4orm_env.dynamics.transition import TimeStep, advance
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.worlds import kernels_of_codes, world_kernels
-from d4orm_env.dynamics import OWN_LIMITS, SPEED, Limit, Model, ModelFunctions, clip
+from d4orm_env.jax import functional
 from d4orm_env.verify import integrated
 from d4orm_env.verify.integrated import Integrated
 from d4orm_env.verify.motion import TeamMotion

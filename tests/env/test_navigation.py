@@ -24,8 +24,8 @@ from d4orm_env.core.world import World
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.envs.joint_env import JointNavigationEnv
 from d4orm_env.envs.joint_state import split_state
-from d4orm_env.scenarios import make_problem
 from d4orm_env.envs.vector_env import NavigationVectorEnv
+from d4orm_env.scenarios import make_problem
 
 INFO_TYPES = {"arrived": bool, "collided": bool, "margin_violated": bool, "distance_to_goal": float}
 

@@ -10,8 +10,8 @@ from engine_support import ENGINE_NAMES, NUMPY_BITS, SameWeights, engine_noise, 
 from scipy import stats
 
 from d4orm_env.engine import noise
-from d4orm_env.engine.types import SamplingRules, SamplingTask
 from d4orm_env.engine.choice import get_engine
+from d4orm_env.engine.types import SamplingRules, SamplingTask
 
 NUM_DRAWS = 1_000_000
 

@@ -17,8 +17,8 @@ from d4orm_env import load_problem, navigation_v0, rollout, save_problem, verify
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.geometry.world_index import FEW, MAX_BYTES, build_index, nearest_distance
 from d4orm_env.engine.choice import get_engine
+from d4orm_env.geometry.world_index import FEW, MAX_BYTES, build_index, nearest_distance
 from d4orm_env.verify.geometry import polygon_approach
 from d4orm_planners import make_planner
 from d4orm_planners.tracking.steering import straight_drives

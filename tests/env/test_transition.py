@@ -11,12 +11,12 @@ from engine_support import ENGINE_NAMES, NUMPY_OPS, rk4
 from hypothesis import given
 from hypothesis import strategies as st
 
-from d4orm_env.dynamics.models import MODELS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
+from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.transition import TimeStep, advance, arrives
-from d4orm_env.engine.types import StepResult
 from d4orm_env.engine.choice import get_engine
+from d4orm_env.engine.types import StepResult
 
 DIFFERENTIAL_DRIVE = MODELS["differential_drive"].functions
 HOLONOMIC = MODELS["holonomic2d"].functions

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
-from d4orm_env.dynamics.transition import TimeStep
 from d4orm_env.core.world import World
+from d4orm_env.dynamics.transition import TimeStep
 from d4orm_env.verify import VerificationReport, Violation, verify
 
 CHORD = 3e-5  # what curves and chords may differ by, for a pair

@@ -15,14 +15,14 @@ from numba.core import config
 
 from d4orm_env.dynamics.models import COMMON, MODEL_CODES, NUM_BUILT_IN
 from d4orm_env.scenarios import make_problem
-from d4orm_planners.cli import app as cli
 from d4orm_planners.base.machine import commit, describe_machine
-from d4orm_planners.benchmark import benchmark, timing
 from d4orm_planners.benchmark import bench_report as report
+from d4orm_planners.benchmark import benchmark, timing
 from d4orm_planners.benchmark.benchmark import parts, run_parts, thread_counts
 from d4orm_planners.benchmark.probes import measure_startup
 from d4orm_planners.benchmark.settings import MODELS, QUICK, BenchmarkSettings
 from d4orm_planners.benchmark.timing import Spread, measure
+from d4orm_planners.cli import app as cli
 
 TINY: dict[str, Any] = {
     "num_robots": (2, 3),

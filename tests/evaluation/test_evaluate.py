@@ -22,14 +22,14 @@ from planner_support import program
 
 from d4orm_env import make_problem, save_problem
 from d4orm_planners import IterationRecord, evaluate
-from d4orm_planners.evaluation import trials
 from d4orm_planners.evaluation import tables as report
+from d4orm_planners.evaluation import trials
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.leaderboard import leaderboard
-from d4orm_planners.evaluation.tables import markdown, read_parquet, write_csv, write_parquet, write_results
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import mean_interval, solved_after, success_by, success_rate, wilson_interval
+from d4orm_planners.evaluation.tables import markdown, read_parquet, write_csv, write_parquet, write_results
 from d4orm_planners.evaluation.trials import Configuration
 
 QUICK = {"engine": "cpu", "num_samples": 64, "num_steps": 5, "max_iterations": 3}

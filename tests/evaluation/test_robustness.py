@@ -23,18 +23,18 @@ from typing import Any
 import pytest
 
 from d4orm_planners import make_policy
+from d4orm_planners.base.policy import DriveToGoal
 from d4orm_planners.evaluation import evaluate as evaluate_module
 from d4orm_planners.evaluation import pool as pool_module
 from d4orm_planners.evaluation import store as store_module
 from d4orm_planners.evaluation import trials as trials_module
 from d4orm_planners.evaluation.evaluate import run_study
-from d4orm_planners.evaluation.tables import HEADER, markdown, read_parquet, write_parquet
 from d4orm_planners.evaluation.robustness import write_robustness
 from d4orm_planners.evaluation.store import APPLICATION_ID, STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import SuccessRate, success_rate, success_rates, wilson_interval
+from d4orm_planners.evaluation.tables import HEADER, markdown, read_parquet, write_parquet
 from d4orm_planners.evaluation.trials import Job
-from d4orm_planners.base.policy import DriveToGoal
 
 TINY: dict[str, Any] = {"num_robots": [2], "control_noise_std": [0.0, 0.3], "seeds": range(2), "workers": 1}
 
@@ -492,7 +492,16 @@ def test_the_number_of_workers_makes_no_difference(tmp_path: Path) -> None:
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, workers: int) -> None:
     arguments = f"--policies goal --num-robots 8 --seeds 60 --control-noise-std 0,0.1 --out {tmp_path}".split()
-    command = [sys.executable, "-m", "d4orm_planners.cli.app", "robustness", *arguments, "--workers", str(workers), "-q"]
+    command = [
+        sys.executable,
+        "-m",
+        "d4orm_planners.cli.app",
+        "robustness",
+        *arguments,
+        "--workers",
+        str(workers),
+        "-q",
+    ]
     process = subprocess.Popen(command)
     deadline = time.monotonic() + 120
     while time.monotonic() < deadline:

@@ -16,8 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from planner_support import CHEAP
 
-from d4orm_planners.cli import app as cli
 from d4orm_planners.base.planner_registry import PLANNERS, list_planners, list_policies
+from d4orm_planners.cli import app as cli
 
 SCENARIO = "version: 1\nrobots:\n  - {model: velocity2d, start: [0, 0], goal: [0.3, 0]}\n"
 TEXT = st.one_of(NUMBER_LIKE, WORD, SCALAR.map(str)).filter(lambda text: "\0" not in text and text.isprintable())

@@ -14,8 +14,8 @@ from planner_support import CHEAP, hop_problem
 from d4orm_env import navigation_v0
 from d4orm_planners import make_planner, make_policy
 from d4orm_planners.base.planner import Planner
-from d4orm_planners.base.policy import Policy
 from d4orm_planners.base.planner_registry import PLANNERS, POLICIES
+from d4orm_planners.base.policy import Policy
 
 NEEDS = {"ipopt": "casadi", "orca": "pyrvo", "ppo": "torch", "sac": "torch"}
 PROBLEM = hop_problem(2, horizon=4)

@@ -21,14 +21,14 @@ from d4orm_env.engine.choice import get_engine
 from d4orm_env.envs.joint_state import JointState
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import make_policy, run_episode
+from d4orm_planners.d4orm_c2f.actuator_gain_estimator import Weakness
 from d4orm_planners.d4orm_c2f.barrier import Barriers, find_nearest, safe_velocities
-from d4orm_planners.d4orm_c2f.state_filter import StateFilter
 from d4orm_planners.d4orm_c2f.direct_final_approach import drive_home
 from d4orm_planners.d4orm_c2f.latency_estimator import MOST, Lateness
 from d4orm_planners.d4orm_c2f.packet_loss_estimator import Losses
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
 from d4orm_planners.d4orm_c2f.stall_estimator import AFTER, BRAKING_AFTER, Standing
-from d4orm_planners.d4orm_c2f.actuator_gain_estimator import Weakness
+from d4orm_planners.d4orm_c2f.state_filter import StateFilter
 from d4orm_planners.tracking.steering import track_velocities
 
 ALL = np.ones(3, bool)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from planner_support import hop_problem, walled_in_problem
 
-from d4orm_env.engine.types import SamplingTask
 from d4orm_env.engine.choice import get_engine
+from d4orm_env.engine.types import SamplingTask
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner

@@ -14,10 +14,10 @@ import pytest
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.problem import Problem
-from d4orm_env.dynamics.robot_model import ACCELERATION
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.disturbances import Delay, Intruder, Push
+from d4orm_env.dynamics.robot_model import ACCELERATION
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.envs.joint_state import JointState, split_state
@@ -27,8 +27,8 @@ from d4orm_planners import Episode, make_policy, run_episode
 from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.coarse_plan import coarse_problem
 from d4orm_planners.d4orm_c2f.coarse_plan_tracker import Guide
-from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
 from d4orm_planners.d4orm_c2f.fine_plan import Window
+from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
 from d4orm_planners.tracking.steering import straight_drives
 
 CASES = [

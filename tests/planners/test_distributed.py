@@ -28,20 +28,19 @@ from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.base.candidate import evaluate_controls
-from d4orm_planners.sampling.d4orm import D4orm, D4ormConfig
-from d4orm_planners.d_d4orm import evaluator as judge_module
-from d4orm_planners.d_d4orm import messages
-from d4orm_planners.d_d4orm import node
-from d4orm_planners.d_d4orm.node_events import KINDS as KINDS_OF_EVENTS
-from d4orm_planners.d_d4orm.node_events import Event
-from d4orm_planners.d_d4orm.inbox import Inbox
-from d4orm_planners.d_d4orm.evaluator import Judge, Stopped
-from d4orm_planners.d_d4orm.messages import KINDS, MAGIC, Message, MessageError, decode, encode
-from d4orm_planners.d_d4orm.node import Node, Task, node_seed
-from d4orm_planners.d_d4orm.selection import choose, diverse, k_means, merge, shares, top_k
-from d4orm_planners.d_d4orm.transport import WAITING, LocalNetwork
 from d4orm_planners.base.planner import Iteration, Planner
 from d4orm_planners.base.solve import Search
+from d4orm_planners.d_d4orm import evaluator as judge_module
+from d4orm_planners.d_d4orm import messages, node
+from d4orm_planners.d_d4orm.evaluator import Judge, Stopped
+from d4orm_planners.d_d4orm.inbox import Inbox
+from d4orm_planners.d_d4orm.messages import KINDS, MAGIC, Message, MessageError, decode, encode
+from d4orm_planners.d_d4orm.node import Node, Task, node_seed
+from d4orm_planners.d_d4orm.node_events import KINDS as KINDS_OF_EVENTS
+from d4orm_planners.d_d4orm.node_events import Event
+from d4orm_planners.d_d4orm.selection import choose, diverse, k_means, merge, shares, top_k
+from d4orm_planners.d_d4orm.transport import WAITING, LocalNetwork
+from d4orm_planners.sampling.d4orm import D4orm, D4ormConfig
 
 PROBLEM = hop_problem(2, horizon=4)
 SHAPE = (4, 2, 2)

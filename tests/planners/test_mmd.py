@@ -20,8 +20,6 @@ from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.baselines.mmd.conflicts import count_conflicts, first_conflict
 from d4orm_planners.baselines.mmd.constraint_tree import Constraint, Planning
-from d4orm_planners.baselines.mmd.training_set import draw_examples, modes_of
-from d4orm_planners.baselines.mmd.reverse_process import Denoiser
 from d4orm_planners.baselines.mmd.guiding import Surroundings, guide
 from d4orm_planners.baselines.mmd.planner import MMDConfig
 from d4orm_planners.baselines.mmd.prior import (
@@ -35,8 +33,18 @@ from d4orm_planners.baselines.mmd.prior import (
     posterior,
     predict,
 )
+from d4orm_planners.baselines.mmd.reverse_process import Denoiser
 from d4orm_planners.baselines.mmd.tracking import drive_along
-from d4orm_planners.baselines.mmd.way_frame import FEATURES, MODES, POINTS, WayFrame, make_frame, sine_table, world_space
+from d4orm_planners.baselines.mmd.training_set import draw_examples, modes_of
+from d4orm_planners.baselines.mmd.way_frame import (
+    FEATURES,
+    MODES,
+    POINTS,
+    WayFrame,
+    make_frame,
+    sine_table,
+    world_space,
+)
 
 # The network.
 
@@ -61,8 +69,8 @@ def test_the_network_is_a_residual_perceptron() -> None:
 @pytest.mark.slow
 def test_training_writes_what_the_planner_reads(tmp_path: Path) -> None:
     pytest.importorskip("torch")
-    from d4orm_planners.baselines.mmd.training_set import Examples
     from d4orm_planners.baselines.mmd.prior_training import save_prior, train
+    from d4orm_planners.baselines.mmd.training_set import Examples
 
     random = np.random.default_rng(0)
     # Motions that follow from what the network is told: only one that has learned comes near to them.

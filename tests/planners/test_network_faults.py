@@ -26,13 +26,13 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
-from d4orm_planners.sampling.d4orm import D4orm
+from d4orm_planners.base.planner import Callback, Iteration
+from d4orm_planners.base.solve import Search
 from d4orm_planners.d_d4orm import messages as message_module
 from d4orm_planners.d_d4orm.messages import KINDS, Message, encode
 from d4orm_planners.d_d4orm.node import node_seed
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings, ZenohTransport
-from d4orm_planners.base.planner import Callback, Iteration
-from d4orm_planners.base.solve import Search
+from d4orm_planners.sampling.d4orm import D4orm
 
 pytestmark = pytest.mark.slow
 

@@ -21,9 +21,9 @@ from planner_support import hop_problem, walled_in_problem
 
 from d4orm_env.scenarios import make_problem, save_problem
 from d4orm_env.verify import verify
+from d4orm_planners.base.plan import Plan
 from d4orm_planners.cli import app as cli
 from d4orm_planners.cli.node_file import load_node
-from d4orm_planners.base.plan import Plan
 
 GOOD: dict[str, Any] = {
     "node": 1,

@@ -13,8 +13,8 @@ from reference import judge, position_error
 from d4orm_env import make_problem
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
-from d4orm_env.engine.types import SamplingRules, SamplingTask
 from d4orm_env.engine.choice import get_engine
+from d4orm_env.engine.types import SamplingRules, SamplingTask
 from d4orm_planners import reference as plain
 from d4orm_planners.sampling.weights import SoftmaxWeights
 

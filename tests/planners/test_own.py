@@ -19,12 +19,26 @@ from registry_support import forgetting
 from d4orm_env import navigation_v0
 from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.envs.joint_state import split_state
-from d4orm_planners import Iteration, OpenLoop, Planner, PlannerConfig, Policy, evaluate, list_planners, list_policies, make_planner, make_policy, register_planner, register_policy, run_episode
-from d4orm_planners.cli import app as cli
-from d4orm_planners.evaluation.store import STORE, TrialStore
+from d4orm_planners import (
+    Iteration,
+    OpenLoop,
+    Planner,
+    PlannerConfig,
+    Policy,
+    evaluate,
+    list_planners,
+    list_policies,
+    make_planner,
+    make_policy,
+    register_planner,
+    register_policy,
+    run_episode,
+)
 from d4orm_planners.base.names import PLANNERS, POLICIES
 from d4orm_planners.base.planner_registry import describe_policy
 from d4orm_planners.base.settings import CheckedSettings, Positive
+from d4orm_planners.cli import app as cli
+from d4orm_planners.evaluation.store import STORE, TrialStore
 
 ROOT = Path(__file__).resolve().parents[1]
 PROBLEM = line_problem([9.0, 9.0, 9.0], horizon=20)

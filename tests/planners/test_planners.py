@@ -29,10 +29,10 @@ from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import IterationRecord, Plan, list_planners, make_planner
 from d4orm_planners.base.planner_registry import PLANNERS, describe_planner
+from d4orm_planners.base.solve import Search
 from d4orm_planners.sampling.loop import SamplingPlanner, standard_normal
 from d4orm_planners.sampling.schedule import alpha_bar, annealed
 from d4orm_planners.sampling.tuned import TUNED
-from d4orm_planners.base.solve import Search
 from d4orm_planners.tracking.steering import straight_drives
 
 ALL = pytest.mark.parametrize("name", list_planners())

@@ -16,8 +16,8 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.envs.joint_state import split_state
-from d4orm_env.scenarios import make_problem
 from d4orm_env.envs.wrappers import GaussianControlNoise
+from d4orm_env.scenarios import make_problem
 from d4orm_planners import OpenLoop, Plan, Policy, list_planners, list_policies, make_policy, run_episode
 from d4orm_planners.base.planner_registry import PLANNERS, POLICIES, describe_policy
 from d4orm_planners.rl.learned import LearnedPolicy

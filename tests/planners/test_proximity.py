@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from d4orm_env import World, make_problem
-from d4orm_planners.engine import proximity
 from d4orm_env.engine.compiling import aligned_zeros
 from d4orm_env.engine.simd import BLOCK, TILE
+from d4orm_planners.engine import proximity
 from d4orm_planners.engine.proximity import bound_boxes, make_bodies, make_scratch
 
 

@@ -10,17 +10,17 @@ from engine_support import MODEL_NAMES
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
-from d4orm_planners.engine import path_index
-from d4orm_planners.mapf.beam_search import BeamRules
 from d4orm_env.engine.threads import Threads
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import make_planner
+from d4orm_planners.base.solve import Search
+from d4orm_planners.engine import path_index
 from d4orm_planners.mapf import beams
+from d4orm_planners.mapf.beam_search import BeamRules
 from d4orm_planners.mapf.beams import Company, Manner, find_ways
 from d4orm_planners.mapf.lns import shorten_ways
 from d4orm_planners.mapf.working_plan import TeamPaths
-from d4orm_planners.base.solve import Search
 from d4orm_planners.tracking.steering import straight_drives
 
 STRAIGHT, STRICT = Manner((45.0, 90.0), (1.0, 0.5, 0.0)), BeamRules(32, 1e6, 0.1)

@@ -12,15 +12,15 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.engine import cpu
-from d4orm_planners.engine import path_index
 from d4orm_env.engine.threads import Threads
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import make_planner
+from d4orm_planners.base.solve import Search
 from d4orm_planners.d4orm_d.rerouting import reroute
+from d4orm_planners.engine import path_index
 from d4orm_planners.mapf import beams
 from d4orm_planners.mapf.working_plan import TeamPaths
-from d4orm_planners.base.solve import Search
 from d4orm_planners.tracking.steering import straight_drives
 
 

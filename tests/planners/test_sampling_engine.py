@@ -13,16 +13,16 @@ from env_support import mixed_problem
 from reference import ROUNDOFF, judge, position_error
 from scenario_support import needed
 
-from d4orm_env.dynamics.models import MODELS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.engine.types import MovingObstacles, SamplingResult, SamplingRules, SamplingTask
+from d4orm_env.dynamics.models import MODELS
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.cpu import CpuEngine
+from d4orm_env.engine.types import MovingObstacles, SamplingResult, SamplingRules, SamplingTask
 from d4orm_env.jax.jax_engine import JaxEngine
-from d4orm_planners.engine.score import score_kernel
 from d4orm_env.scenarios import list_scenarios, make_problem
+from d4orm_planners.engine.score import score_kernel
 from d4orm_planners.sampling.schedule import annealed
 from d4orm_planners.sampling.weights import EliteWeights, SoftmaxWeights
 

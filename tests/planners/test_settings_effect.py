@@ -273,7 +273,9 @@ def test_every_setting_of_a_policy_changes_something(
     if setting == "engine":
         asked: list[str] = []
         engine = get_engine("cpu")
-        monkeypatch.setattr("d4orm_planners.d4orm_c2f.receding_horizon.get_engine", lambda name, *_: asked.append(name) or engine)
+        monkeypatch.setattr(
+            "d4orm_planners.d4orm_c2f.receding_horizon.get_engine", lambda name, *_: asked.append(name) or engine
+        )
         make_policy(name, engine="jax")
         assert set(asked) == {"jax"}
     elif setting == "path":

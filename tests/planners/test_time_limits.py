@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from planner_support import cheap_planner, hop_problem, walled_in_problem
 
-from d4orm_env.engine.types import SamplingRules, SamplingTask
 from d4orm_env.engine.choice import get_engine
+from d4orm_env.engine.types import SamplingRules, SamplingTask
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import Plan, list_planners, make_planner
-from d4orm_planners.baselines.collocation import ABANDONED
-from d4orm_planners.baselines.ipopt import OUT_OF_TIME
 from d4orm_planners.base.planner_registry import PLANNERS
-from d4orm_planners.sampling.weights import SoftmaxWeights
 from d4orm_planners.base.solve import Search
 from d4orm_planners.base.stopwatch import Stopwatch
+from d4orm_planners.baselines.collocation import ABANDONED
+from d4orm_planners.baselines.ipopt import OUT_OF_TIME
+from d4orm_planners.sampling.weights import SoftmaxWeights
 
 ALL = pytest.mark.parametrize("name", list_planners())
 LOOKS = 40

@@ -22,11 +22,11 @@ from d4orm_env import World, make_problem
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance_registry import DISTURBANCES
 from d4orm_env.scenarios.problem_files import scenario_text
-from d4orm_planners.play import edits
-from d4orm_planners.play.scene_frame import closest_approach
-from d4orm_planners.play.proxy import Gate
-from d4orm_planners.play.session import Session
 from d4orm_planners.base.policy import DriveToGoal
+from d4orm_planners.play import edits
+from d4orm_planners.play.proxy import Gate
+from d4orm_planners.play.scene_frame import closest_approach
+from d4orm_planners.play.session import Session
 
 PATIENCE = 60.0
 

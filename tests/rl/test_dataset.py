@@ -17,9 +17,9 @@ import pytest
 from d4orm_env import make_problem, navigation_v0
 from d4orm_env.disturbances import Delay, Push, StateNoise
 from d4orm_planners import make_policy
+from d4orm_planners.base.policy import DriveToGoal
 from d4orm_planners.rl.dataset import Demonstrations, RecordedEpisode, record_episode, write_dataset
 from d4orm_planners.rl.dataset import recording as recording_module
-from d4orm_planners.base.policy import DriveToGoal
 
 minari = pytest.importorskip("minari")
 

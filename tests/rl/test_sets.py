@@ -15,9 +15,9 @@ from d4orm_env import make_problem, navigation_v0
 from d4orm_env.core.observation_layout import ObservationSlices
 from d4orm_planners import make_policy, run_episode
 from d4orm_planners.cli import app as cli
-from d4orm_planners.rl.perturbed_scenarios import clearing, loosened
 from d4orm_planners.rl.features import Features
 from d4orm_planners.rl.network import Header, Network, load_network
+from d4orm_planners.rl.perturbed_scenarios import clearing, loosened
 
 OWN, NEIGHBOR, OBSTACLE = 11, 9, 5
 
@@ -168,8 +168,8 @@ pytest.importorskip("stable_baselines3")
 from d4orm_planners.rl.algorithms import ALGORITHMS  # noqa: E402
 from d4orm_planners.rl.curriculum import Lesson  # noqa: E402
 from d4orm_planners.rl.curve import evaluate_network  # noqa: E402
-from d4orm_planners.rl.task_mixture import MIXTURES, Exercise, MixedVecEnv, parse_mixture  # noqa: E402
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv  # noqa: E402
+from d4orm_planners.rl.task_mixture import MIXTURES, Exercise, MixedVecEnv, parse_mixture  # noqa: E402
 from d4orm_planners.rl.training import TrainingSettings, train  # noqa: E402
 
 TINY = TrainingSettings(

@@ -15,13 +15,13 @@ import pytest
 from d4orm_planners import list_planners
 from d4orm_planners.evaluation import evaluate
 from d4orm_planners.evaluation.comparison import steps_to_solution
-from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 from d4orm_planners.evaluation.store import Trial, TrialStore
+from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 from d4orm_planners.reproduction.figure import Figure, Group, Section, regrouped, reproduce
+from d4orm_planners.reproduction.figure_report import markdown, write_reproduction
 from d4orm_planners.reproduction.numbers import METRICS, first_solution, measured
 from d4orm_planners.reproduction.paper_figures import FIGURES, find_figure
 from d4orm_planners.reproduction.plots import PLOTS, best_reward
-from d4orm_planners.reproduction.figure_report import markdown, write_reproduction
 
 PNG = b"\x89PNG\r\n\x1a\n"
 

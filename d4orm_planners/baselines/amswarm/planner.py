@@ -11,8 +11,8 @@ from pydantic import Field
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig, State
-from d4orm_planners.base.solve import Search
 from d4orm_planners.base.settings import Count, NotNegative, Number, Positive, Share, Steps
+from d4orm_planners.base.solve import Search
 
 Degree = Annotated[Count, Field(ge=5, le=30)]
 Lookahead = Annotated[Count, Field(ge=2, le=1000)]

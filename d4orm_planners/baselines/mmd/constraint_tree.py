@@ -13,8 +13,8 @@ from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.paths.wavefront import Space
 from d4orm_planners.baselines.mmd.conflicts import count_conflicts, first_conflict
-from d4orm_planners.baselines.mmd.reverse_process import Batch, Denoiser
 from d4orm_planners.baselines.mmd.guiding import Surroundings
+from d4orm_planners.baselines.mmd.reverse_process import Batch, Denoiser
 from d4orm_planners.baselines.mmd.way_frame import WayFrame
 
 if TYPE_CHECKING:

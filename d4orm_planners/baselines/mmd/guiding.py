@@ -14,12 +14,11 @@ from numba.extending import register_jitable
 
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
 from d4orm_env.engine import compiling
-from d4orm_env.paths import wavefront
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS, compiled
+from d4orm_env.paths import wavefront
 from d4orm_env.paths.wavefront import Space, clearance_at
-from d4orm_planners.baselines.mmd import clock
-from d4orm_planners.baselines.mmd import way_frame
+from d4orm_planners.baselines.mmd import clock, way_frame
 from d4orm_planners.baselines.mmd.clock import fill_clock
 from d4orm_planners.baselines.mmd.way_frame import WayFrame, locate, trace
 

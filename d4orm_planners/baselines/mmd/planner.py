@@ -10,10 +10,10 @@ from pydantic import Field
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
-from d4orm_planners.mapf.planner import NoWays
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
-from d4orm_planners.base.solve import Search
 from d4orm_planners.base.settings import Count, NotNegative, Number, Samples, ShareOrNone, Steps
+from d4orm_planners.base.solve import Search
+from d4orm_planners.mapf.planner import NoWays
 
 if TYPE_CHECKING:
     from d4orm_planners.baselines.mmd.constraint_tree import Tree
@@ -125,8 +125,8 @@ def _seeds(search: Search, count: int) -> list[int]:
 def compile_mmd(problem: Problem) -> None:
     """Compile what the method needs for such a team, if it is not yet."""
     from d4orm_planners.baselines.mmd.constraint_tree import Planning
-    from d4orm_planners.baselines.mmd.reverse_process import Denoiser
     from d4orm_planners.baselines.mmd.guiding import guide
+    from d4orm_planners.baselines.mmd.reverse_process import Denoiser
     from d4orm_planners.baselines.mmd.tracking import tracking_kernel
     from d4orm_planners.baselines.mmd.way_frame import make_frame, world_space
 

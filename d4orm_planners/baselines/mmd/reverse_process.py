@@ -12,7 +12,16 @@ from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.counter_draws import draw_normals, draw_uniforms
 from d4orm_planners.baselines.mmd.guiding import Surroundings, guide
-from d4orm_planners.baselines.mmd.prior import SIZE, Prior, condition, kept_signal, level_features, load_prior, posterior, predict
+from d4orm_planners.baselines.mmd.prior import (
+    SIZE,
+    Prior,
+    condition,
+    kept_signal,
+    level_features,
+    load_prior,
+    posterior,
+    predict,
+)
 from d4orm_planners.baselines.mmd.tracking import Tracked, drive_along
 from d4orm_planners.baselines.mmd.way_frame import WayFrame, sine_table
 

@@ -7,23 +7,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d4orm_env.dynamics import robot_model
-from d4orm_env.dynamics import transition
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray
-from d4orm_env.dynamics.models import MODELS
 from d4orm_env.core.problem import Problem
+from d4orm_env.dynamics import robot_model, transition
+from d4orm_env.dynamics.models import MODELS
 from d4orm_env.engine import stepping
-from d4orm_env.paths import wavefront
 from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS, ZERO, compiled, inlined, to_fixed_tuple
-from d4orm_planners.tracking.straight_drives import LoneRobot
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.stepping import make_stepper, models_key
+from d4orm_env.paths import wavefront
 from d4orm_env.paths.wavefront import Space, clearance_at
-from d4orm_planners.baselines.mmd import clock
-from d4orm_planners.baselines.mmd import way_frame
+from d4orm_planners.baselines.mmd import clock, way_frame
 from d4orm_planners.baselines.mmd.clock import fill_clock
 from d4orm_planners.baselines.mmd.way_frame import WayFrame, trace
+from d4orm_planners.tracking.straight_drives import LoneRobot
 
 SOURCES = fingerprint((robot_model, transition, *stepping.PARTS, stepping, wavefront, clock, way_frame))
 

@@ -11,8 +11,8 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios import make_problem
-from d4orm_planners.baselines.mmd.way_frame import POINTS, WayFrame, make_frame, sine_table, world_space
 from d4orm_planners.base.planner_registry import make_planner
+from d4orm_planners.baselines.mmd.way_frame import POINTS, WayFrame, make_frame, sine_table, world_space
 
 KINDS: tuple[tuple[str, dict[str, object]], ...] = (
     ("random", {"size": 5.0}),

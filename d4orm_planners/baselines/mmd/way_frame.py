@@ -16,9 +16,9 @@ from d4orm_env.core.portable import sin
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine import compiling
-from d4orm_env.paths import wavefront
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
+from d4orm_env.paths import wavefront
 from d4orm_env.paths.wavefront import Space, clearance_at, make_space
 
 SOURCES = fingerprint((compiling, wavefront))

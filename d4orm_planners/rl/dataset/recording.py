@@ -12,10 +12,10 @@ from pathlib import Path
 from d4orm_env.core.errors import describe
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.engine.threads import available_cores
+from d4orm_planners.base.import_paths import check_sendable
+from d4orm_planners.evaluation.pool import Lost, ProcessPool, Sign
 from d4orm_planners.rl.dataset.demonstrations import Demonstrations
 from d4orm_planners.rl.dataset.recorded_episode import RecordedEpisode
-from d4orm_planners.evaluation.pool import Lost, ProcessPool, Sign
-from d4orm_planners.base.import_paths import check_sendable
 
 IDENTITY = "demonstrations.json"
 
