@@ -36,5 +36,5 @@ def __getattr__(name: str) -> object:
     if name in ("load_problem", "save_problem"):
         return getattr(import_module("d4orm_env.scenarios"), name)
     if name in ("functional", "navigation_v0"):
-        return import_module(f"d4orm_env.{name}")
+        return import_module("d4orm_env.jax.functional" if name == "functional" else "d4orm_env.navigation_v0")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

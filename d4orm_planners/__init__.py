@@ -37,14 +37,14 @@ __all__ = [
 ]
 
 _HOMES = {
-    "episode": ("Episode", "run_episode"),
+    "base.episode": ("Episode", "run_episode"),
     "evaluation.evaluate": ("evaluate",),
-    "names": ("register_planner", "register_policy"),
-    "plan": ("IterationRecord", "Plan", "load_plan"),
-    "planner": ("Iteration", "Planner", "PlannerConfig"),
-    "policy": ("OpenLoop", "Policy"),
-    "registry": ("list_planners", "list_policies", "make_planner", "make_policy"),
-    "search": ("Search",),
+    "base.names": ("register_planner", "register_policy"),
+    "base.plan": ("IterationRecord", "Plan", "load_plan"),
+    "base.planner": ("Iteration", "Planner", "PlannerConfig"),
+    "base.policy": ("OpenLoop", "Policy"),
+    "base.planner_registry": ("list_planners", "list_policies", "make_planner", "make_policy"),
+    "base.solve": ("Search",),
 }
 
 

@@ -25,8 +25,8 @@ import numpy as np
 from outputs import COLOURS, argument_parser, count, measured, plt, save_figure, save_table, trials_argument
 
 from d4orm_env import Problem, make_problem
-from d4orm_env.engine.choice import get_engine
-from d4orm_env.engine.types import SamplingRules, SamplingTask
+from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
+from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.evaluation.summary import mean_interval
 from d4orm_planners.sampling.schedule import annealed
 from d4orm_planners.sampling.weights import GroupWeights, SoftmaxWeights
@@ -92,7 +92,7 @@ def normal_limit(num_samples: int, draws: int = 400) -> dict[str, float]:
 
 def iteration(num_robots: int, credit: str, num_samples: int, num_steps: int, seed: int) -> dict[str, Any]:
     """What the first step's weights were, and what one iteration came to."""
-    engine, problem = get_engine("cpu"), crossing(num_robots)
+    engine, problem = get_sampling_engine("cpu"), crossing(num_robots)
     base = np.zeros((problem.horizon, num_robots, problem.control_size), np.float32)
     task = SamplingTask(problem, base, collisions=False, credit="robot")
     rule = Watched(num_robots, robots_that_share(credit, num_robots))

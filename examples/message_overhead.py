@@ -18,12 +18,12 @@ import numpy as np
 from outputs import argument_parser, count, require, save_table
 
 from d4orm_env import make_problem
-from d4orm_env.engine.choice import get_engine
 from d4orm_planners import make_planner
 from d4orm_planners.base.candidate import evaluate_controls
 from d4orm_planners.d_d4orm.messages import Message, decode, encode
 from d4orm_planners.d_d4orm.transport import LocalNetwork, Transport
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings, ZenohTransport
+from d4orm_planners.engine.select import get_sampling_engine
 
 
 def seconds(work: Callable[[], Any], repetitions: int) -> float:
@@ -55,7 +55,7 @@ def measure(robots: int, ends: tuple[Transport, Transport], repetitions: int) ->
     problem = make_problem("circle", num_robots=robots)
     plan = make_planner("d4orm", engine="cpu").solve(problem, seed=0, max_iterations=1)
     message = Message(0, 1, plan.controls, plan.metrics["reward"], plan.solved)
-    data, engine = encode(message, problem), get_engine("cpu")
+    data, engine = encode(message, problem), get_sampling_engine("cpu")
 
     def send() -> None:
         ends[0].publish(data)

@@ -17,8 +17,9 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.robot_model import Ops
 from d4orm_env.engine import noise
-from d4orm_env.engine.choice import get_engine
-from d4orm_env.engine.types import Engine, SamplingRules, SamplingTask, Sight, StepResult
+from d4orm_env.engine.types import Engine, Sight, StepResult
+from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
+from d4orm_planners.engine.select import get_sampling_engine
 
 ENGINE_NAMES = ("cpu", "jax")
 MODEL_NAMES = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive")
@@ -43,7 +44,7 @@ def observe_team(
     """``(K, D)`` what the robots of one team see."""
     out = np.empty((1, len(states), layout.size), np.float32)
     sight = Sight.of_team(arrays.goal, states, controls, arrived, time_left)
-    get_engine("cpu").observe_worlds(arrays, layout, sight, out)
+    get_sampling_engine("cpu").observe_worlds(arrays, layout, sight, out)
     return out[0]
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from engine_support import engine_noise
 
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.types import SamplingTask
 from d4orm_planners import reference as plain
+from d4orm_planners.engine.sampling_types import SamplingTask
 
 TEMPERATURE = 0.3
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE
-from d4orm_env.engine.types import SamplingTask
+from d4orm_planners.engine.sampling_types import SamplingTask
 
 ROUNDOFF = 2.0**-24
 """Relative error of one float32 operation."""

@@ -20,17 +20,26 @@ def get_engine(name: str = "auto", num_threads: int | None = None) -> Engine:
     Raises:
         ValueError: If there is no such engine.
     """
-    if name not in ENGINES:
-        raise ValueError(f"engine {name!r} is unknown; choose one of {', '.join(ENGINES)}")
-    if name == "auto":
-        name = "jax" if _accelerator_visible() else "cpu"
-    if name == "jax":
+    if resolve_engine(name) == "jax":
         from d4orm_env.jax.jax_engine import JaxEngine
 
         return JaxEngine()
     from d4orm_env.engine.cpu import CpuEngine
 
     return CpuEngine(num_threads)
+
+
+def resolve_engine(name: str) -> str:
+    """Return ``"cpu"`` or ``"jax"``, whichever a name means here.
+
+    Raises:
+        ValueError: If there is no such engine.
+    """
+    if name not in ENGINES:
+        raise ValueError(f"engine {name!r} is unknown; choose one of {', '.join(ENGINES)}")
+    if name == "auto":
+        name = "jax" if _accelerator_visible() else "cpu"
+    return name
 
 
 def _accelerator_visible() -> bool:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -39,120 +37,8 @@ class StepResult(NamedTuple):
     rewards: FloatArray
 
 
-class MovingObstacles(NamedTuple):
-    """Bodies that move along known paths, such as the robots outside a group that is replanned.
-
-    Attributes:
-        positions: ``(H, O, d)`` where each body is after every step [m].
-        radius: ``(O,)`` [m].
-    """
-
-    positions: FloatArray
-    radius: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class SamplingTask:
-    """What to sample around and how to score it.
-
-    Attributes:
-        problem: The robots that are sampled, their world and horizon.
-        base: ``(H, K, m)`` controls that the sampled deformation is added to; zeros to sample controls themselves.
-        collisions: Whether robots are penalised for coming near each other and near ``moving``.
-        credit: ``"team"`` weights samples by the mean reward of the team (the paper), ``"robot"`` weights each robot's
-            part of a sample by that robot's own reward.
-        moving: Bodies to avoid that are not sampled, or ``None``.
-        arrived: ``(K,)`` robots docked from the beginning, or ``None`` for none.
-        penalty: What a violation of the margin costs per step, against a reward of one for standing at the goal.
-        reference_distance: Distances count relative to the initial one (paper, section III-D), or to this if that is
-            less: a robot that starts next to its goal then loses no more by waiting than others do. ``None`` for the
-            paper's.
-    """
-
-    problem: Problem
-    base: FloatArray
-    collisions: bool = True
-    credit: str = "team"
-    moving: MovingObstacles | None = None
-    arrived: BoolArray | None = None
-    penalty: float = 1.0
-    reference_distance: float | None = None
-
-    @property
-    def arrays(self) -> ProblemArrays:
-        """The problem as this task scores it."""
-        arrays = self.problem.arrays
-        if self.reference_distance is None:
-            return arrays
-        inverse = np.minimum(arrays.inverse_initial_distance, np.float32(1 / self.reference_distance))
-        inverse.setflags(write=False)
-        return arrays._replace(inverse_initial_distance=inverse)
-
-
-Rule: TypeAlias = Callable[..., Any]
-"""It returns what the array library makes of its arrays."""
-
-
-class SamplingRules(NamedTuple):
-    """The rules that tell one sampling method from another: pure functions of arrays, in NumPy or JAX alike.
-
-    Attributes:
-        weights: ``(rewards, array library) -> weights``: from ``(1, M)`` or ``(K, M)`` rewards to weights that sum to
-            one over the last axis. Rewards that are not finite arrive as minus infinity and must get weight zero.
-        adapt: ``(noise, mean square deviation, array library) -> noise``: the noise of the next step, ``(H, K, m)``
-            factors on the schedule; ``None`` leaves the schedule alone and saves the second moment.
-        importance: Share of the importance-sampling term of MPPI (paper, Eq. 11) in the weights: ``weights`` then gets
-            it as ``log_ratio``, like the rewards in shape. It is the logarithm of how much likelier a sample ``U``
-            would be around zero than around ``U_hat``, the mean that it was drawn around, but for a constant:
-            ``-U_hat / sigma^2 * (U - U_hat)``, summed over time and components, and over robots for team credit.
-    """
-
-    weights: Rule
-    adapt: Rule | None = None
-    importance: float = 0.0
-
-
-class SamplingResult(NamedTuple):
-    """One denoising run.
-
-    Attributes:
-        mean: ``(H, K, m)`` the last weighted mean of the deformations.
-        rewards: ``(N,)`` mean reward of the samples at each step done: fewer than asked for where the run was stopped.
-        excluded: Samples left out because their reward was not finite.
-    """
-
-    mean: FloatArray
-    rewards: FloatArray
-    excluded: int
-
-
-class DenoisingStep(NamedTuple):
-    """One step of a denoising run, for whoever watches it.
-
-    Attributes:
-        task: What is sampled around, and how it is scored.
-        noise_scale: Standard deviation of the samples.
-        mean: ``(H, K, m)`` the weighted mean of the deformations, which the next step samples around.
-        samples: ``(S, H, K, m)`` the first deformations that it is the mean of, at most :data:`WATCHED_SAMPLES`.
-        weights: ``(S,)`` what they count for with team credit, ``(K, S)`` with robot credit; those of all ``M`` samples
-            add up to one.
-    """
-
-    task: SamplingTask
-    noise_scale: float
-    mean: FloatArray
-    samples: FloatArray
-    weights: FloatArray
-
-
-WATCHED_SAMPLES = 8
-"""Samples of a :class:`DenoisingStep`, where as many are drawn."""
-
-StepWatcher = Callable[[DenoisingStep], object]
-
-
 class Engine(Protocol):
-    """The operations that the environment and the planners need from the physics."""
+    """Operations that environments and planners alike need from the physics."""
 
     name: str
 
@@ -165,33 +51,6 @@ class Engine(Protocol):
 
     def rollout(self, problem: Problem, controls: ArrayLike) -> Trajectory:
         """Roll ``controls`` ``(H, K, m)`` out from the problem's start."""
-        ...
-
-    def prepare(self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int) -> None:
-        """Compile all that rolling out and :meth:`denoise` with arguments of this kind need, if it is not yet."""
-        ...
-
-    def denoise(
-        self,
-        task: SamplingTask,
-        rules: SamplingRules,
-        mean: FloatArray,
-        noise_scale: FloatArray,
-        num_samples: int,
-        seed: int,
-        should_stop: Callable[[], bool] | None = None,
-        watcher: StepWatcher | None = None,
-    ) -> SamplingResult:
-        """Run ``len(noise_scale)`` sample-score-update steps (paper, Algorithm 1, lines 2 to 7).
-
-        Each step draws ``num_samples`` deformations around ``mean`` ``(H, K, m)`` with the step's standard deviation,
-        rolls them out on top of ``task.base``, and replaces the mean by the weighted mean of the deformations.
-        The noise is a function of ``seed`` and the step alone. Between steps ``should_stop`` is asked whether to leave
-        the rest out; the result is then that of the steps done. After every step ``watcher`` is told of it.
-
-        Raises:
-            ValueError: If there is a watcher and the engine cannot look into its run.
-        """
         ...
 
 

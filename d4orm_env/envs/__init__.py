@@ -1,1 +1,1 @@
-"""TODO."""
+"""Environments of PettingZoo and Gymnasium, single and batched."""

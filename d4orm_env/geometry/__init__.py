@@ -1,1 +1,1 @@
-"""TODO."""
+"""Obstacles: shapes, polygons and the index that finds the nearest."""

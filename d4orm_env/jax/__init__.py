@@ -1,1 +1,1 @@
-"""TODO."""
+"""The physics and the environments in JAX."""

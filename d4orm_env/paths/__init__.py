@@ -1,1 +1,1 @@
-"""TODO."""
+"""Shortest free paths to the goals."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Planners, policies, plans and episodes: what every method shares."""

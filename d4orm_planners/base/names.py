@@ -68,25 +68,25 @@ def _refuse_name_of(other: Registry[object], name: object) -> None:
 
 
 for _name, _path in {
-    "d4orm": "d4orm:D4orm",
+    "d4orm": "sampling.d4orm:D4orm",
     "d4orm-d": "d4orm_d.planner:D4ormD",
     "d-d4orm": "d_d4orm.planner:DD4orm",
-    "mppi": "mppi:MPPI",
-    "cem": "cem:CEM",
-    "mbd": "mbd:MBD",
-    "i-mbd": "mbd:IterativeMBD",
-    "ipopt": "ipopt:Ipopt",
-    "guided": "guidance.planner:Guided",
-    "amswarm": "amswarm.planner:AMSwarm",
-    "mmd": "mmd.planner:MMD",
+    "mppi": "sampling.mppi:MPPI",
+    "cem": "sampling.cem:CEM",
+    "mbd": "sampling.mbd:MBD",
+    "i-mbd": "sampling.mbd:IterativeMBD",
+    "ipopt": "baselines.ipopt:Ipopt",
+    "guided": "mapf.planner:Guided",
+    "amswarm": "baselines.amswarm.planner:AMSwarm",
+    "mmd": "baselines.mmd.planner:MMD",
 }.items():
     register_planner(_name, f"d4orm_planners.{_path}")
 
 for _name, _path in {
-    "d4orm-c2f": "d4orm_c2f.policy:D4ormC2F",
-    "goal": "policy:DriveToGoal",
-    "random": "policy:RandomControls",
-    "orca": "orca:Orca",
+    "d4orm-c2f": "d4orm_c2f.receding_horizon:D4ormC2F",
+    "goal": "base.policy:DriveToGoal",
+    "random": "base.policy:RandomControls",
+    "orca": "baselines.orca:Orca",
     "ppo": "rl.learned:PPO",
     "sac": "rl.learned:SAC",
 }.items():

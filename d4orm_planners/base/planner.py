@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray, duration, whole_number
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.types import StepWatcher
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.plan import IterationRecord, Plan, Status
 from d4orm_planners.base.settings import CheckedSettings, Count, EngineName
 from d4orm_planners.base.solve import Search
+from d4orm_planners.engine.sampling_types import StepWatcher
 
 Callback = Callable[[IterationRecord], object]
 
@@ -118,7 +118,7 @@ class Planner(ABC):
             callback: Called with an :class:`IterationRecord` after every iteration, with the candidate that came of it;
                 returning ``True`` stops.
             initial_controls: ``(H, K, m)`` to start from, zeros by default.
-            watcher: Called with a :class:`~d4orm_env.engine.types.DenoisingStep` after every denoising step, by the CPU
+            watcher: Called with a :class:`~d4orm_planners.engine.sampling_types.DenoisingStep` after every denoising step, by the CPU
                 engine only. It changes nothing, and its time is not counted.
 
         Returns:

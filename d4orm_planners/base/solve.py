@@ -15,20 +15,13 @@ from d4orm_env.core.arrays import FloatArray, whole_number
 from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
-from d4orm_env.engine.choice import get_engine
-from d4orm_env.engine.types import (
-    DenoisingStep,
-    Engine,
-    SamplingResult,
-    SamplingRules,
-    SamplingTask,
-    StepWatcher,
-    checked_controls,
-)
+from d4orm_env.engine.types import Engine, checked_controls
 from d4orm_planners.base.candidate import Candidate, evaluate_controls
 from d4orm_planners.base.plan import IterationRecord, Plan, Status
 from d4orm_planners.base.provenance import Provenance
 from d4orm_planners.base.stopwatch import Stopwatch
+from d4orm_planners.engine.sampling_types import DenoisingStep, SamplingResult, SamplingRules, SamplingTask, StepWatcher
+from d4orm_planners.engine.select import get_sampling_engine
 
 if TYPE_CHECKING:
     from d4orm_planners.base.planner import Planner, State
@@ -74,7 +67,7 @@ class Search:
     ) -> None:
         self.planner = planner
         self.problem = problem
-        self.engine = engine or get_engine(planner.config.engine)
+        self.engine = engine or get_sampling_engine(planner.config.engine)
         self.seed = whole_number(seed, "seed", 0)
         shape = (problem.horizon, problem.num_robots, problem.control_size)
         if initial_controls is None:

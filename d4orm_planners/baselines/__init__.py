@@ -1,1 +1,1 @@
-"""TODO."""
+"""Rivals of the paper: IPOPT, AMSwarm, MMD and ORCA."""

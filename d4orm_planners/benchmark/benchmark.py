@@ -12,9 +12,7 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.models import COMMON
-from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.threads import available_cores
-from d4orm_env.engine.types import SamplingTask
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.benchmark.env_steps import (
@@ -30,6 +28,8 @@ from d4orm_planners.benchmark.probes import measure_memory, measure_startup
 from d4orm_planners.benchmark.settings import BenchmarkSettings
 from d4orm_planners.benchmark.timing import Row, Spread, in_turn, measure
 from d4orm_planners.benchmark.walls import Where, measure_index, measure_obstacles
+from d4orm_planners.engine.sampling_types import SamplingTask
+from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.sampling.d4orm import D4orm
 
 PRESETS = (None, "paper")
@@ -151,7 +151,7 @@ def _engine_run(
     problem: Problem, settings: BenchmarkSettings, name: str, preset: str | None, num_threads: int | None = None
 ) -> Run:
     planner = _d4orm(preset=preset, num_samples=settings.num_samples)
-    engine, rules = get_engine(name, num_threads), planner.rules()
+    engine, rules = get_sampling_engine(name, num_threads), planner.rules()
     base = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
 
     def run(noise_scale: FloatArray, collisions: bool) -> None:

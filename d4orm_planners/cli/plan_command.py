@@ -67,11 +67,11 @@ def solving(
     planner: Planner, problem: Problem, max_iterations: int | None = None, quiet: bool = False
 ) -> AbstractContextManager[Callback]:
     """Compile what planning needs, and show a live line meanwhile; gives the callback of the solve."""
-    from d4orm_env.engine.choice import get_engine
     from d4orm_planners.cli.progress import solve_progress
     from d4orm_planners.cli.warmup import compile_for_planning
+    from d4orm_planners.engine.select import get_sampling_engine
 
-    if get_engine(planner.config.engine).name == "cpu":
+    if get_sampling_engine(planner.config.engine).name == "cpu":
         compile_for_planning(
             problem.team.models,
             lambda: typer.echo("compiling, once per installation ...", err=True),

@@ -23,12 +23,12 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.dynamics.models import COMMON
 from d4orm_env.engine.caching import Kernel, has_to_be_compiled
-from d4orm_env.engine.choice import get_engine
-from d4orm_env.engine.types import SamplingRules, SamplingTask
 from d4orm_env.envs.joint_state import JointState
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.base.solve import Search
+from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
+from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.sampling.weights import SoftmaxWeights
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def roll_out_once(models: tuple[str, ...], *, drives: bool = True) -> None:
     rewards = np.zeros((1, 2), np.float32)
     run = Sampling(SamplingTask(problem, _no_controls(problem)), _RULES, rewards.size, 0, Threads(1))
     run.moments(_RULES.weights(rewards, np), with_second=False)
-    get_engine("cpu").rollout(problem, _no_controls(problem))
+    get_sampling_engine("cpu").rollout(problem, _no_controls(problem))
     if drives:
         # What it drives by itself, and how it looks for ways around others.
         planner = make_planner("d4orm-d", engine="cpu")
@@ -110,7 +110,7 @@ def sample_once(teams: tuple[tuple[str, ...], ...]) -> None:
     for models in teams:
         problem = _smallest_problem(models)
         task = SamplingTask(problem, _no_controls(problem))
-        get_engine("cpu").prepare(task, _RULES, np.ones(1, np.float32), 2)
+        get_sampling_engine("cpu").prepare(task, _RULES, np.ones(1, np.float32), 2)
 
 
 def find_ways() -> None:
@@ -206,16 +206,17 @@ def _kernels() -> list[Dispatcher[Callable[..., object]]]:
     """The kernels of engines, guided plans and D4orm-C2F that are kept on disk."""
     from numba.core.dispatcher import Dispatcher
 
-    from d4orm_env import engine
+    from d4orm_env import engine, paths
     from d4orm_env.engine.worlds import world_kernels
-    from d4orm_planners import d4orm_c2f
-    from d4orm_planners import mapf as guidance
+    from d4orm_planners import d4orm_c2f, mapf, tracking
+    from d4orm_planners import engine as sampling_engine
     from d4orm_planners.engine.score import score_kernel
     from d4orm_planners.mapf.beam_search import search_kernel
     from d4orm_planners.tracking.straight_drives import drive_kernel
 
-    modules = [import_module(f"{package.__name__}.{module.name}") for package in (engine, guidance, d4orm_c2f)
-               for module in pkgutil.iter_modules(package.__path__) if module.name != "jax"]  # fmt: skip
+    packages = (engine, paths, sampling_engine, tracking, mapf, d4orm_c2f)
+    modules = [import_module(f"{package.__name__}.{module.name}") for package in packages
+               for module in pkgutil.iter_modules(package.__path__) if "jax" not in module.name]  # fmt: skip
     found = {name: value for module in modules for name, value in vars(module).items() if isinstance(value, Dispatcher)}
     worlds = {kernel for models in TEAMS for kernel in world_kernels(models)}
     kernels: list[Kernel[..., object]] = [

@@ -9,10 +9,11 @@ import numpy as np
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.engine.types import Engine, MovingObstacles, SamplingRules, SamplingTask
+from d4orm_env.engine.types import Engine
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.d4orm_c2f.direct_final_approach import ROUNDING, docking_radius, drive_home
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
+from d4orm_planners.engine.sampling_types import MovingObstacles, SamplingRules, SamplingTask
 from d4orm_planners.tracking.steering import track_velocities
 
 SHORTER = 3

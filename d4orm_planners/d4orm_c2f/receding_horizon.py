@@ -11,7 +11,6 @@ import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.seeds import Stream, derived_seed, generator
-from d4orm_env.engine.choice import get_engine
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.policy import StatePolicy
 from d4orm_planners.base.settings import CheckedSettings
@@ -23,6 +22,7 @@ from d4orm_planners.d4orm_c2f.deviation import Deviation
 from d4orm_planners.d4orm_c2f.fine_plan import Prediction, Situation, Window
 from d4orm_planners.d4orm_c2f.settings import PAPER_CONTROL, D4ormC2FConfig
 from d4orm_planners.d4orm_c2f.stall_estimator import PROBE
+from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.tracking.steering import drive_to_goal, present_velocities, track_velocities
 
 if TYPE_CHECKING:
@@ -79,9 +79,9 @@ class D4ormC2F(StatePolicy):
 
     def __init__(self, config: D4ormC2FConfig | None = None) -> None:
         self.config = config or D4ormC2FConfig()
-        self._engine = get_engine(self.config.engine)
+        self._engine = get_sampling_engine(self.config.engine)
         # On one thread the refinement leaves the other cores, and their threads, to the control loop.
-        self._refiner = get_engine(self.config.engine, 1 if self.config.refine == "background" else None)
+        self._refiner = get_sampling_engine(self.config.engine, 1 if self.config.refine == "background" else None)
         self._refinement: Background[Guidance] = Background(yielding=True)
         self._control: Background[Prediction] = Background()
 

@@ -11,9 +11,9 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.engine.types import MovingObstacles, SamplingTask
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import Search
+from d4orm_planners.engine.sampling_types import MovingObstacles, SamplingTask
 from d4orm_planners.mapf.working_plan import TeamPaths
 from d4orm_planners.sampling.d4orm import D4orm
 

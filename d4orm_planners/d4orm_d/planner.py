@@ -9,7 +9,6 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.types import SamplingTask
 from d4orm_planners.base.conflict_groups import conflicts
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import Search
@@ -17,6 +16,7 @@ from d4orm_planners.d4orm_d.deformed_plan import DeformedTeam
 from d4orm_planners.d4orm_d.groups import Groups
 from d4orm_planners.d4orm_d.repairs import Repairs
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
+from d4orm_planners.engine.sampling_types import SamplingTask
 from d4orm_planners.mapf.improvement import FIRST_ROUNDS, GUIDED_ROUNDS, refined_iteration, shorten_first_ways
 from d4orm_planners.mapf.planner import (
     Guide,

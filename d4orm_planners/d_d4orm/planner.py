@@ -7,7 +7,6 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import ClassVar
 
-from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.threads import available_cores
 from d4orm_planners.base.planner import Iteration, Planner
 from d4orm_planners.base.solve import Search
@@ -22,6 +21,7 @@ from d4orm_planners.d_d4orm.ray_planner import ray_planners
 from d4orm_planners.d_d4orm.settings import DD4ormConfig
 from d4orm_planners.d_d4orm.transport import LocalNetwork
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings, ZenohTransport
+from d4orm_planners.engine.select import get_sampling_engine
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class DD4orm(Planner):
         assert config.node is not None
         planner = config.node_planners(task.num_nodes)[config.node]
         transport = ZenohTransport(zenoh)
-        judge = Judge(get_engine(config.engine), search.problem)
+        judge = Judge(get_sampling_engine(config.engine), search.problem)
         # Numbered by the clock, what a restarted node sends is newer than what it sent before.
         node = Node(config.node, task, planner, transport, judge, sequence=time.time_ns())
         return NetworkCrew(node, transport, config.patience, judge, zenoh.linger)
@@ -106,7 +106,7 @@ class DD4orm(Planner):
                 seeds = [node_seed(search.seed, i) for i in range(number)]
                 planners = list(ray_planners(connection, planners, problem, seeds))
         # Nodes of one machine share its cores.
-        engine = get_engine(config.engine, max(available_cores() // number, 1))
+        engine = get_sampling_engine(config.engine, max(available_cores() // number, 1))
         network, judge = LocalNetwork(), Judge(engine, problem, 2 * number)
         ends = [network.join() for _ in planners]
         nodes = [

@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 
 from d4orm_env.core.errors import first_line
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.threads import available_cores
 from d4orm_planners.base.candidate import evaluate_controls
 from d4orm_planners.base.planner import Iteration, Planner
 from d4orm_planners.base.solve import Search
 from d4orm_planners.d_d4orm.messages import Message, decode, encode
 from d4orm_planners.d_d4orm.ray_connection import RayConnection
+from d4orm_planners.engine.select import get_sampling_engine
 
 RESTARTS = 3
 """How many times an actor that was lost is started again, before its node is done without."""
@@ -62,7 +62,7 @@ class Worker:
 
     def __init__(self, node: int, num_nodes: int, planner: Planner, problem: Problem, seed: int, sharing: int) -> None:
         self._node, self._num_nodes = node, num_nodes
-        self._engine = get_engine(planner.config.engine, max(available_cores() // sharing, 1))
+        self._engine = get_sampling_engine(planner.config.engine, max(available_cores() // sharing, 1))
         self._search = Search(planner, problem, seed, None, self._engine)
 
     def ready(self) -> int:

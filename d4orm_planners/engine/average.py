@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from d4orm_env.core.arrays import FloatArray, IntArray
-from d4orm_env.engine import compiling, noise
-from d4orm_env.engine import simd as lanes
+from d4orm_env.engine import compiling, noise, simd
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS, ZERO, aligned_zeros, compiled
 from d4orm_env.engine.noise import DRAWS
 from d4orm_env.engine.simd import add_turned, add_turned_squares, use_wide_registers
 
-SOURCES = fingerprint((noise, lanes, compiling))
+SOURCES = fingerprint((noise, simd, compiling))
 
 
 @compiled

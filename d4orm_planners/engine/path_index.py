@@ -15,14 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 from d4orm_env.core.arrays import FloatArray, IntArray, Ints, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import collision
-from d4orm_env.engine import compiling, elementary, obstacles
-from d4orm_env.engine import simd as lanes
+from d4orm_env.engine import compiling, elementary, obstacles, simd
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
 from d4orm_env.engine.obstacles import is_closed, touches_static
 from d4orm_env.engine.threads import Threads, available_cores
 
-SOURCES = fingerprint((collision, lanes, compiling, elementary, obstacles))
+SOURCES = fingerprint((collision, simd, compiling, elementary, obstacles))
 
 BLOCK = 8
 """Steps in a block."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray, Ints, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.engine import simd as lanes
+from d4orm_env.engine import simd
 from d4orm_env.engine.compiling import aligned_zeros, compiled, inlined
 from d4orm_env.engine.obstacles import may_touch
 from d4orm_env.engine.simd import (
@@ -132,7 +132,7 @@ def enclose(k: int, reach: np.float32, dimension: int, places: FloatArray, boxes
     """Make the boxes of robot ``k`` in this block, for its radius and half of the margin as reach."""
     for axis in range(dimension):
         first, begin = place_of(k, 0, dimension) + axis * TILE, box_of(k, dimension) + axis * BOX
-        lanes.enclose(places, first, dimension * TILE, reach + SLACK, boxes, begin)
+        simd.enclose(places, first, dimension * TILE, reach + SLACK, boxes, begin)
 
 
 @inlined

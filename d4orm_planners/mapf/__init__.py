@@ -1,1 +1,1 @@
-"""Path finding for the whole team on a graph in the free space, and driving along what it found."""
+"""Multi-agent path finding on a roadmap, and large-neighbourhood search on what was found."""

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Ints, Whole
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS, compiled
-from d4orm_planners.mapf import near_neighbours as nearness
+from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.near_neighbours import squared_gap
 from d4orm_planners.mapf.roadmap import Roadmap
 
-SOURCES = fingerprint((nearness,))
+SOURCES = fingerprint((near_neighbours,))
 
 FREE, MOVING, DONE = 0, 1, 2
 """Robots that have not moved yet in a step; that are about to, once others have made way; that have, or stay."""

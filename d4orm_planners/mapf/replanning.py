@@ -13,13 +13,12 @@ from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_env.paths import wavefront
 from d4orm_env.paths.wavefront import Space, is_free_line
-from d4orm_planners.mapf import near_neighbours as nearness
-from d4orm_planners.mapf import pibt
+from d4orm_planners.mapf import near_neighbours, pibt
 from d4orm_planners.mapf.near_neighbours import Cells, cells_about
 from d4orm_planners.mapf.pibt import Footprints
 from d4orm_planners.mapf.roadmap import Roadmap
 
-SOURCES = fingerprint((nearness, pibt, wavefront))
+SOURCES = fingerprint((near_neighbours, pibt, wavefront))
 
 
 BLOCK = 16
@@ -128,7 +127,7 @@ def straighten(
         depart, tail = way[j, 1], nodes[way[i, 0]]
         while j + 1 < way.shape[0]:
             head = nodes[way[j + 1, 0]]
-            near = nearness.squared_gap(nodes, goal, nodes, way[i, 0], nodes, way[j + 1, 0])
+            near = near_neighbours.squared_gap(nodes, goal, nodes, way[i, 0], nodes, way[j + 1, 0])
             if bodies.docks and way[j + 1, 0] != goal and near < docked * docked:
                 break
             # Nested, because the compiler leaves out what is never reached.
@@ -288,7 +287,11 @@ def find_way(roadmap: Roadmap, cells: Cells, bodies: Footprints, others: Others,
             left = costs[head] / stride
             if roadmap.room[e] < bodies.reach[k] or not costs[head] < np.inf:
                 continue
-            if bodies.docks and head != goal and nearness.squared_gap(nodes, goal, nodes, node, nodes, head) < aside:
+            if (
+                bodies.docks
+                and head != goal
+                and near_neighbours.squared_gap(nodes, goal, nodes, node, nodes, head) < aside
+            ):
                 continue
             steps, depart, failures = np.int64(np.ceil(roadmap.lengths[e] / stride)), arrived, 0
             while depart < ends[node, begin]:

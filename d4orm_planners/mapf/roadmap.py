@@ -12,10 +12,10 @@ from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.paths.shortest_paths import in_space, lay_lattice
 from d4orm_env.paths.wavefront import Space, free_lines, make_space
-from d4orm_planners.mapf import near_neighbours as nearness
+from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.near_neighbours import find_near, sort_into_cells
 
-SOURCES = fingerprint((nearness,))
+SOURCES = fingerprint((near_neighbours,))
 
 PAIR_SLACK = 0.06
 """Distance that robots keep from each other beyond radii and margin [m]: what they stray from their ways."""
@@ -139,4 +139,4 @@ def measure_gaps(
     """How near to edges nodes are: ``gaps`` is output, all others as in :class:`Roadmap`."""
     for e in range(tails.shape[0]):
         for number in range(near_first[e], near_first[e + 1]):
-            gaps[number] = np.sqrt(nearness.squared_gap(nodes, near[number], nodes, tails[e], nodes, heads[e]))
+            gaps[number] = np.sqrt(near_neighbours.squared_gap(nodes, near[number], nodes, tails[e], nodes, heads[e]))

@@ -17,11 +17,11 @@ from d4orm_env.core.arrays import Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS
-from d4orm_planners.mapf import near_neighbours as nearness
+from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.near_neighbours import Cells, cells_about, sort_into_cells
 from d4orm_planners.mapf.roadmap import Roadmap
 
-SOURCES = fingerprint((nearness,))
+SOURCES = fingerprint((near_neighbours,))
 
 SPACING = 0.04
 """Distance between the points of a route [m], at most."""

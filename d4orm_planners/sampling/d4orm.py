@@ -8,10 +8,10 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.engine.types import SamplingTask
 from d4orm_planners.base.planner import Iteration, State
 from d4orm_planners.base.settings import Positive, Samples, Share, ShareOrNone, Steps, one_of
 from d4orm_planners.base.solve import Search
+from d4orm_planners.engine.sampling_types import SamplingTask
 from d4orm_planners.mapf.improvement import refined_iteration
 from d4orm_planners.mapf.planner import Guide, compile_roadmap, first_ways, guided_iteration, leads_round
 from d4orm_planners.sampling.loop import DenoisingPlanner, standard_normal

@@ -15,10 +15,10 @@ import numpy as np
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.seeds import Stream
-from d4orm_env.engine.types import SamplingRules, SamplingTask
 from d4orm_planners.base.conflict_groups import Groups, components, conflicts
 from d4orm_planners.base.planner import Iteration, Planner, State
 from d4orm_planners.base.solve import Search
+from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
 from d4orm_planners.sampling.schedule import alpha_bar
 from d4orm_planners.sampling.settings import DenoisingConfig, SamplingConfig
 from d4orm_planners.sampling.weights import GroupWeights

@@ -8,9 +8,9 @@ from typing import ClassVar
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.engine.types import SamplingRules
 from d4orm_planners.base.settings import Positive, ShareOrNone
 from d4orm_planners.base.solve import Search
+from d4orm_planners.engine.sampling_types import SamplingRules
 from d4orm_planners.sampling.loop import SamplingPlanner
 from d4orm_planners.sampling.schedule import constant
 from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, SamplingConfig, SoftmaxSettings

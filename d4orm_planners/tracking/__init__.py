@@ -1,1 +1,1 @@
-"""TODO."""
+"""Tracking: robots driven along references under their own dynamics."""

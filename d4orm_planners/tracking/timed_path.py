@@ -15,13 +15,12 @@ from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS, ZERO, inlined, to_fixed_tuple
 from d4orm_env.engine.stepping import make_stepper, models_key
 from d4orm_planners.mapf.routes import Route, Stops
-from d4orm_planners.tracking import path_drives as execution
-from d4orm_planners.tracking import pursuit
+from d4orm_planners.tracking import path_drives, pursuit
 from d4orm_planners.tracking.path_drives import BEYOND, RESERVE
 from d4orm_planners.tracking.pursuit import point_ahead, point_reached, square_to, steering
 from d4orm_planners.tracking.straight_drives import LoneRobot
 
-SOURCES = execution.SOURCES + fingerprint((execution,))
+SOURCES = path_drives.SOURCES + fingerprint((path_drives,))
 
 HURRYING = 0.85
 """Share of its acceleration that a robot counts on that hurries: if it leaves its route so, it drives by the clock."""
@@ -164,8 +163,8 @@ def drive_by_clock(
         departs, arrives = np.where(waits, departs, 0.0), np.zeros(len(arrives))
     moves = np.diff(route.points, axis=0)
     arcs = np.append(0.0, np.cumsum(np.sqrt(moves[:, 0] ** 2 + moves[:, 1] ** 2 + moves[:, 2] ** 2)))
-    share = HURRYING if hurrying else execution.BRAKING
-    paces = execution.paces_along(problem, robot, arcs, route.bends, share)
+    share = HURRYING if hurrying else path_drives.BRAKING
+    paces = path_drives.paces_along(problem, robot, arcs, route.bends, share)
     controls = np.zeros((steps, problem.control_size), np.float32)
     places = np.empty((steps + 1, 3))
     sight = pursuit.lookaheads(problem)[robot]

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from d4orm_env.engine.choice import get_engine
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.d_d4orm.transport import Transport
+from d4orm_planners.engine.select import get_sampling_engine
 from onboard import wire
 from onboard.course import Course, first_guess, goals_to_plan_for, present_problem
 from onboard.log import Log
@@ -42,7 +42,7 @@ class Robot:
     def __init__(self, mission: Mission, number: int, team: Transport, log: Log) -> None:
         self._mission, self._number, self._team, self._log = mission, number, team, log
         self._problem = mission.problem()
-        self._engine = get_engine("cpu", 1)
+        self._engine = get_sampling_engine("cpu", 1)
         self._course = Course.standing(self._problem, 0, self._problem.start)
         self._round: Round | None = None
         self._former: Round | None = None

@@ -55,7 +55,9 @@ def test_making_and_judging_a_problem_loads_nothing_heavy() -> None:
 
 
 def test_the_cpu_engine_does_without_jax() -> None:
-    code = "from d4orm_env.engine.choice import get_engine\nassert get_engine('cpu').name == 'cpu'"
+    code = (
+        "from d4orm_planners.engine.select import get_sampling_engine\nassert get_sampling_engine('cpu').name == 'cpu'"
+    )
     assert loaded_by(code) == set()
 
 

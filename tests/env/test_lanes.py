@@ -4,59 +4,59 @@ import numba
 import numpy as np
 import pytest
 
-from d4orm_env.engine import simd as lanes
+from d4orm_env.engine import simd
 from d4orm_env.engine.compiling import aligned_zeros
 from d4orm_env.engine.simd import BLOCK, BOX, CHUNK, TILE
 
 
 @numba.njit
 def _within_2(w, a, b, reach2):
-    return lanes.within_2(w, a, b, reach2)
+    return simd.within_2(w, a, b, reach2)
 
 
 @numba.njit
 def _within_3(w, a, b, reach2):
-    return lanes.within_3(w, a, b, reach2)
+    return simd.within_3(w, a, b, reach2)
 
 
 @numba.njit
 def _at_most(w, offset, bound):
-    return lanes.at_most(w, offset, bound)
+    return simd.at_most(w, offset, bound)
 
 
 @numba.njit
 def _subtract_where(w, offset, mask, amount):
-    lanes.subtract_where(w, offset, mask, amount)
+    simd.subtract_where(w, offset, mask, amount)
 
 
 @numba.njit
 def _chunk_within_2(w, a, b, reach2):
-    return lanes.chunk_within_2(w, a, b, reach2)
+    return simd.chunk_within_2(w, a, b, reach2)
 
 
 @numba.njit
 def _enclose(w, first, step, widening, boxes, begin):
-    lanes.enclose(w, first, step, widening, boxes, begin)
+    simd.enclose(w, first, step, widening, boxes, begin)
 
 
 @numba.njit
 def _overlap(boxes, a, b):
-    return lanes.worlds_overlap_2(boxes, a, b), lanes.lanes_overlap_2(boxes, a, b)
+    return simd.worlds_overlap_2(boxes, a, b), simd.lanes_overlap_2(boxes, a, b)
 
 
 @numba.njit
 def _copy_chunk(source, a, target, b):
-    lanes.copy_chunk(source, a, target, b)
+    simd.copy_chunk(source, a, target, b)
 
 
 @numba.njit
 def _add_turned(sums, a, draws, b, cosine, c, sine, d):
-    lanes.add_turned(sums, a, draws, b, cosine, c, sine, d)
+    simd.add_turned(sums, a, draws, b, cosine, c, sine, d)
 
 
 @numba.njit
 def _add_turned_squares(sums, a, draws, b, cosine, c, sine, d):
-    lanes.add_turned_squares(sums, a, draws, b, cosine, c, sine, d)
+    simd.add_turned_squares(sums, a, draws, b, cosine, c, sine, d)
 
 
 def bits(mask):

@@ -10,8 +10,8 @@ from engine_support import ENGINE_NAMES, NUMPY_BITS, SameWeights, engine_noise, 
 from scipy import stats
 
 from d4orm_env.engine import noise
-from d4orm_env.engine.choice import get_engine
-from d4orm_env.engine.types import SamplingRules, SamplingTask
+from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
+from d4orm_planners.engine.select import get_sampling_engine
 
 NUM_DRAWS = 1_000_000
 
@@ -206,7 +206,7 @@ def test_engines_draw_these_very_numbers(engine: str, dimension: int, num_sample
     zeros = np.zeros((9, 4, problem.control_size), np.float32)
     task = SamplingTask(problem, zeros, credit="robot")
     rules = SamplingRules(SameWeights.picking(picked, num_samples))
-    result = get_engine(engine).denoise(task, rules, zeros, np.ones(1, np.float32), num_samples, seed=6)
+    result = get_sampling_engine(engine).denoise(task, rules, zeros, np.ones(1, np.float32), num_samples, seed=6)
     expected = engine_noise(problem, 6, 0, num_samples)
     for robot, sample in enumerate(picked):
         np.testing.assert_allclose(result.mean[:, robot], expected[sample, :, robot], rtol=1e-6, atol=1e-6)
@@ -219,6 +219,6 @@ def test_every_step_of_a_run_draws_anew(engine: str) -> None:
     zeros = np.zeros((5, 2, 2), np.float32)
     rules = SamplingRules(SameWeights.picking((40,), 64))
     sigma = np.array([1.0, 0.5, 0.25], np.float32)
-    result = get_engine(engine).denoise(SamplingTask(problem, zeros), rules, zeros, sigma, 64, seed=2**40)
+    result = get_sampling_engine(engine).denoise(SamplingTask(problem, zeros), rules, zeros, sigma, 64, seed=2**40)
     expected: Any = sum(s * engine_noise(problem, 2**40, step, 64)[40] for step, s in enumerate(sigma))
     np.testing.assert_allclose(result.mean, expected, rtol=2e-6, atol=2e-6)

@@ -16,8 +16,7 @@ from numba.core import config
 from d4orm_env.dynamics.models import COMMON, MODEL_CODES, NUM_BUILT_IN
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.machine import commit, describe_machine
-from d4orm_planners.benchmark import bench_report as report
-from d4orm_planners.benchmark import benchmark, timing
+from d4orm_planners.benchmark import bench_report, benchmark, timing
 from d4orm_planners.benchmark.benchmark import parts, run_parts, thread_counts
 from d4orm_planners.benchmark.probes import measure_startup
 from d4orm_planners.benchmark.settings import MODELS, QUICK, BenchmarkSettings
@@ -145,7 +144,7 @@ def test_whole_iterations_that_would_take_too_long_are_left_out(results: dict[st
     _, _, work = next(parts(settings))
     row = work()
     assert row["iteration"] is None
-    assert report.milliseconds(row["iteration"]) == "-"
+    assert bench_report.milliseconds(row["iteration"]) == "-"
 
 
 def test_the_record_tells_processors_of_one_name_apart(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,10 +156,10 @@ def test_the_record_tells_processors_of_one_name_apart(monkeypatch: pytest.Monke
 
 def test_report_files(results: dict[str, list[Any]], tmp_path: Path) -> None:
     settings = BenchmarkSettings(**TINY)
-    report.write_report(tmp_path, settings, report.circumstances("d4orm bench"), results)
+    bench_report.write_report(tmp_path, settings, bench_report.circumstances("d4orm bench"), results)
     assert {path.name for path in tmp_path.iterdir()} == {"bench.json", "bench.md"}
     document = json.loads((tmp_path / "bench.json").read_text())
-    assert document["format"] == report.FORMAT
+    assert document["format"] == bench_report.FORMAT
     assert document["settings"]["num_robots"] == [2, 3]
     assert document["commit"] == commit()
     assert document["machine"]["processor"]

@@ -22,8 +22,7 @@ from planner_support import program
 
 from d4orm_env import make_problem, save_problem
 from d4orm_planners import IterationRecord, evaluate
-from d4orm_planners.evaluation import tables as report
-from d4orm_planners.evaluation import trials
+from d4orm_planners.evaluation import tables, trials
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.leaderboard import leaderboard
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
@@ -430,7 +429,7 @@ def test_a_disk_that_fills_up_while_exporting_is_one_line(
     def full(path: Path) -> Any:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(report, "replaced_when_done", full)
+    monkeypatch.setattr(tables, "replaced_when_done", full)
     status, _, err = d4orm("evaluate", "-p", "goal", "-k", "2", "-n", "1", "-j", "1", "-q", "-o", "here")
     assert status == 2
     assert err.count("\n") == 1

@@ -19,10 +19,10 @@ from planner_support import hop_problem
 
 from d4orm_env import load_problem, verify
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.choice import get_engine
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.cli.node_file import load_node
 from d4orm_planners.d_d4orm.messages import Message, decode, encode
+from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.evaluation.store import Trial, TrialStore
 
 PROBLEM = hop_problem(2, horizon=4)
@@ -46,7 +46,7 @@ LONG = 1_000
 
 def check_problem(problem: Problem) -> None:
     """A problem that was accepted can be stepped, whatever the robots do, and stays finite."""
-    engine = get_engine("cpu")
+    engine = get_sampling_engine("cpu")
     for sign in (0, 1, -1):
         controls = sign * np.where(np.isfinite(problem.team.control_limits), problem.team.control_limits, 0)
         states, arrived = problem.start, np.zeros(problem.num_robots, bool)

@@ -17,7 +17,6 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.disturbances import Bias, Delay, Dropout, LimitMismatch, Push, Stall, StateDelay
-from d4orm_env.engine.choice import get_engine
 from d4orm_env.envs.joint_state import JointState
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import make_policy, run_episode
@@ -29,6 +28,7 @@ from d4orm_planners.d4orm_c2f.packet_loss_estimator import Losses
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
 from d4orm_planners.d4orm_c2f.stall_estimator import AFTER, BRAKING_AFTER, Standing
 from d4orm_planners.d4orm_c2f.state_filter import StateFilter
+from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.tracking.steering import track_velocities
 
 ALL = np.ones(3, bool)
@@ -181,7 +181,7 @@ def test_a_command_may_be_held_for_so_many_steps_before_robots_brake(steps: int,
     ahead, nobody = np.array([[1, 0]], np.float32), np.zeros(1, bool)
     present = joint(problem, states, controls=ahead)
     held = policy._braking_in_time(present, ahead, 0.0, 0.0, steps)
-    engine, gap = get_engine("cpu"), np.inf
+    engine, gap = get_sampling_engine("cpu"), np.inf
     for step in range(20):
         braking = track_velocities(problem, states, np.zeros((1, 2), np.float32))
         states = engine.step(problem.arrays, states, nobody, held if step < 6 else braking).states
@@ -215,7 +215,7 @@ def test_who_is_nearly_there_drives_straight_home() -> None:
     states[:, 1] += [0.1, 0.1, 0.1, 0.1]
     states[:, 2] = [1.0, 1.0, 1.0, 1.0]
     controls = np.zeros((20, 4, 2), np.float32)
-    window, engine = problem.resumed_at(states, problem.goal), get_engine("cpu")
+    window, engine = problem.resumed_at(states, problem.goal), get_sampling_engine("cpu")
     nobody = np.zeros(4, bool)
     chosen, home = drive_home(window, engine, controls, np.array([True, False, True, True]), nobody)
     assert home.tolist() == [True, False, True, False]
@@ -241,9 +241,9 @@ def test_a_car_beside_its_goal_drives_away_and_comes_again(beside: float) -> Non
     """Within its turning circle there is no way home that does not lead away first."""
     problem, docked = parked_cars(beside=beside), np.array([False, True])
     window, still = problem.replace(horizon=20), np.zeros((20, 2, 2), np.float32)
-    controls, home = drive_home(window, get_engine("cpu"), still, np.zeros(2, bool), docked)
+    controls, home = drive_home(window, get_sampling_engine("cpu"), still, np.zeros(2, bool), docked)
     assert home.tolist() == [True, False]
-    places = get_engine("cpu").rollout(window, controls).positions[:, 0]
+    places = get_sampling_engine("cpu").rollout(window, controls).positions[:, 0]
     assert np.linalg.norm(places - problem.goal[0], axis=1).max() > beside + 0.05
     env = navigation_v0.parallel_env(problem=problem, control_noise_std=0.2)
     assert run_episode(env, controller(), seed=0).metrics["success"]
@@ -257,7 +257,7 @@ def test_no_manoeuvre_leads_through_what_stands() -> None:
     goal[0] = [0, 1]
     problem = Problem(Team(("car",) * 7), start, goal, horizon=30)
     controls, docked = np.zeros((problem.horizon, 7, 2), np.float32), np.arange(7) > 0
-    chosen, home = drive_home(problem, get_engine("cpu"), controls, ~docked, docked)
+    chosen, home = drive_home(problem, get_sampling_engine("cpu"), controls, ~docked, docked)
     assert not home.any()
     np.testing.assert_array_equal(chosen, controls)
 
@@ -287,7 +287,7 @@ def test_who_stands_whatever_it_is_told_is_taken_for_docked_until_it_moves() -> 
 
 
 def test_who_brakes_whatever_it_is_told_is_taken_for_docked_where_it_will_come_to_rest() -> None:
-    problem, engine = hop_problem(2), get_engine("cpu")
+    problem, engine = hop_problem(2), get_sampling_engine("cpu")
     standing, states = Standing(problem), problem.start.copy()
     states[:, 2] = 0.9
     told = np.array([[0.0, 0.9], [0.0, -0.9]], np.float32)
@@ -311,7 +311,7 @@ def test_two_robots_that_follow_safe_velocities_never_touch(seed: int) -> None:
     start[:, :2] = np.array([[1, 0], [-1, 0]]) + random.uniform(-0.4, 0.4, (2, 2))
     # Nobody comes to its goal: who docks stands at once, whatever its speed, and so cannot be followed safely.
     problem = Problem(hop_problem(2).team, start, start[:, :2] + 50, horizon=60)
-    engine, states, free = get_engine("cpu"), problem.start, np.ones(2, bool)
+    engine, states, free = get_sampling_engine("cpu"), problem.start, np.ones(2, bool)
     for step in range(60):
         if step % 15 == 0:
             towards = states[::-1, :2] - states[:, :2] + random.uniform(-0.5, 0.5, (2, 2))

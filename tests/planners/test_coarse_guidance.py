@@ -11,7 +11,6 @@ from planner_support import hop_problem
 
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
-from d4orm_env.engine.choice import get_engine
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.base.plan import failed_robots
 from d4orm_planners.base.solve import Search
@@ -27,6 +26,7 @@ from d4orm_planners.d4orm_c2f.following import STUCK_AFTER, STUCK_WITHIN, Patien
 from d4orm_planners.d4orm_c2f.lookahead import LEAST, within_sight
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
+from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.mapf.working_plan import TeamPaths
 
 
@@ -133,7 +133,7 @@ def test_the_rest_begins_at_the_next_coarse_step(index: int, step: int) -> None:
     problem = hop_problem(num_robots=2, horizon=30)
     coarse = coarse_problem(problem, 2)
     controls = np.random.default_rng(1).uniform(-0.5, 0.5, (15, 2, 2)).astype(np.float32)
-    plan = get_engine("cpu").rollout(coarse, controls)
+    plan = get_sampling_engine("cpu").rollout(coarse, controls)
     guidance = Guidance(
         problem=coarse,
         controls=plan.controls,
@@ -146,7 +146,7 @@ def test_the_rest_begins_at_the_next_coarse_step(index: int, step: int) -> None:
     np.testing.assert_array_equal(left.start, plan.states[step])
     np.testing.assert_array_equal(rest, plan.controls[step:])
     # Executed from there, it is the rest of the plan.
-    again = get_engine("cpu").rollout(left, rest)
+    again = get_sampling_engine("cpu").rollout(left, rest)
     np.testing.assert_allclose(again.states, plan.states[step:], atol=1e-5)
 
 
@@ -200,7 +200,7 @@ def test_who_does_not_get_on_is_stuck() -> None:
 
 
 def test_a_path_is_followed() -> None:
-    problem, engine, path = hop_problem(1, horizon=100), get_engine("cpu"), right_angle(1)
+    problem, engine, path = hop_problem(1, horizon=100), get_sampling_engine("cpu"), right_angle(1)
     present = problem.resumed_at(problem.start, path[-1])
     controls = keep_time(problem, engine, joint(present, problem.start), path, np.zeros(1, int), 100)
     places = engine.rollout(present, controls).positions[:, 0]

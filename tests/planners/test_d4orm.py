@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from planner_support import hop_problem, walled_in_problem
 
-from d4orm_env.engine.choice import get_engine
-from d4orm_env.engine.types import SamplingTask
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.base.solve import Search
+from d4orm_planners.engine.sampling_types import SamplingTask
+from d4orm_planners.engine.select import get_sampling_engine
 
 BUDGET = 25
 """Five times the iterations that any of some twenty seeds takes: other rounding makes another plan."""
@@ -38,7 +38,7 @@ def assert_solves(case: dict[str, Any], seed: int, max_iterations: int, **config
     report = verify(problem, plan.controls)
     assert report.ok, report.violations
     assert np.isfinite(report.arrival_times).all()
-    again = get_engine("cpu").rollout(problem, plan.controls)
+    again = get_sampling_engine("cpu").rollout(problem, plan.controls)
     assert again.arrived[-1].all()
     assert not again.margin_violated.any()
     assert plan.metrics["success"] == 1

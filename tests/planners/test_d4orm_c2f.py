@@ -18,8 +18,6 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.disturbances import Delay, Intruder, Push
 from d4orm_env.dynamics.robot_model import ACCELERATION
-from d4orm_env.engine.choice import get_engine
-from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
@@ -29,6 +27,8 @@ from d4orm_planners.d4orm_c2f.coarse_plan import coarse_problem
 from d4orm_planners.d4orm_c2f.coarse_plan_tracker import Guide
 from d4orm_planners.d4orm_c2f.fine_plan import Window
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
+from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
+from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.tracking.steering import straight_drives
 
 CASES = [
@@ -172,10 +172,17 @@ def test_a_loop_deforms_what_is_left_of_the_last_plan(monkeypatch: pytest.Monkey
     """A lone robot in the open: nothing stops it from doing as it has planned."""
     problem, ahead, samples = circle(1, horizon=20), 12, 72
     bases, plans = [], []
-    sample = CpuEngine.denoise
+    sample = CpuSamplingEngine.denoise
 
     def denoise(
-        self: CpuEngine, task: Any, rules: Any, mean: Any, scale: Any, num_samples: int, *more: Any, **options: Any
+        self: CpuSamplingEngine,
+        task: Any,
+        rules: Any,
+        mean: Any,
+        scale: Any,
+        num_samples: int,
+        *more: Any,
+        **options: Any,
     ) -> Any:
         result = sample(self, task, rules, mean, scale, num_samples, *more, **options)
         if num_samples == samples:  # a control loop, and not the coarse plan
@@ -185,7 +192,7 @@ def test_a_loop_deforms_what_is_left_of_the_last_plan(monkeypatch: pytest.Monkey
         return result
 
     policy = controller(predict_horizon=ahead, execute_horizon=execute, num_samples=samples)
-    monkeypatch.setattr(CpuEngine, "denoise", denoise)
+    monkeypatch.setattr(CpuSamplingEngine, "denoise", denoise)
     executed = episode(policy, problem).trajectory.controls
     bases, plans = bases[-len(policy.loops) :], plans[-len(policy.loops) :]
     assert len(bases) == len(policy.loops) >= 6
@@ -266,7 +273,7 @@ def test_refined_guidance_is_one_plan_from_beginning_to_end() -> None:
     episode(policy, problem)
     assert any(loop.refined for loop in policy.loops)
     guidance = policy.guidance
-    plan = get_engine("cpu").rollout(guidance.problem, guidance.controls)
+    plan = get_sampling_engine("cpu").rollout(guidance.problem, guidance.controls)
     # Who has docked by the waypoint from which the rest is refined may drive on a little.
     places = guidance.states[..., : problem.dimension]
     np.testing.assert_allclose(places, plan.positions, atol=problem.goal_radius)
@@ -287,7 +294,9 @@ def test_a_job_in_the_background_is_one_at_a_time_and_gives_its_result_once() ->
 def test_the_control_loop_is_compiled_before_the_first_step(monkeypatch: pytest.MonkeyPatch) -> None:
     prepared = []
     monkeypatch.setattr(
-        CpuEngine, "prepare", lambda self, task, rules, scale, samples: prepared.append((task.problem.horizon, samples))
+        CpuSamplingEngine,
+        "prepare",
+        lambda self, task, rules, scale, samples: prepared.append((task.problem.horizon, samples)),
     )
     env = navigation_v0.parallel_env(problem=circle(2))
     env.reset(seed=0)
@@ -425,7 +434,7 @@ def test_with_new_goals_for_some_the_others_keep_to_their_ways(monkeypatch: pyte
         some += changed.any() and not changed.all()
         coarse = coarse_problem(problem.resumed_at(joint.states, joint.goals), factor)
         ways = guidance.path[index - index % factor :: factor][: len(initial) + 1, ~changed]
-        driven = get_engine("cpu").rollout(coarse, initial).positions[: len(ways), ~changed]
+        driven = get_sampling_engine("cpu").rollout(coarse, initial).positions[: len(ways), ~changed]
         off = np.linalg.norm(driven - ways, axis=2)
         assert (off <= np.maximum(off[0], 0.25)).all()
         np.testing.assert_array_equal(initial[:, changed], straight(problem, joint, factor)[:, changed])
@@ -442,7 +451,7 @@ def test_ways_of_robots_that_were_pushed_lead_on_to_their_ends() -> None:
     everybody = np.ones(4, bool)
     initial = policy._guide._beginning(joint._replace(states=states), everybody)
     coarse = coarse_problem(problem.resumed_at(states, problem.goal), policy.config.coarse_factor)
-    assert get_engine("cpu").rollout(coarse, initial).arrived[-1].all()
+    assert get_sampling_engine("cpu").rollout(coarse, initial).arrived[-1].all()
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -456,7 +465,7 @@ def test_a_plan_that_comes_before_the_episode_ends_is_preferred(seed: int) -> No
     states[0, 2:] = -1.1, 0.0  # A push may make a robot faster than a problem lets it start.
     late = joint._replace(states=states, steps=env.max_cycles - left * policy.config.coarse_factor)
     plan = policy._guide.plan(late, nobody, None, 20, thorough=True)
-    assert get_engine("cpu").rollout(plan.problem, plan.controls).arrived[left].all()
+    assert get_sampling_engine("cpu").rollout(plan.problem, plan.controls).arrived[left].all()
 
 
 def test_who_is_behind_robots_that_have_docked_is_barred() -> None:

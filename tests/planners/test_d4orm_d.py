@@ -11,14 +11,14 @@ from planner_support import hop_problem, walled_in_problem
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.engine.cpu import CpuEngine
-from d4orm_env.engine.types import SamplingResult, SamplingTask
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import make_planner
 from d4orm_planners.base.conflict_groups import conflicts, failure_groups, reconnected
 from d4orm_planners.base.solve import Search
 from d4orm_planners.d4orm_d.planner import D4ormD
+from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
+from d4orm_planners.engine.sampling_types import SamplingResult, SamplingTask
 
 CASES = [
     pytest.param({"scenario": "circle", "num_robots": 16}, id="circle-16"),
@@ -120,7 +120,7 @@ def test_an_independent_repair_leaves_whoever_does_not_fail_alone() -> None:
     assert search.best.solved
 
 
-class Astray(CpuEngine):
+class Astray(CpuSamplingEngine):
     """Sampling that goes wrong: it sends everybody to the right at full throttle."""
 
     def denoise(self, task: Any, rules: Any, mean: Any, noise_scale: Any, *more: Any, **options: Any) -> Any:

@@ -9,11 +9,11 @@ import pytest
 from engine_support import engine_noise
 
 from d4orm_env import make_problem
-from d4orm_env.engine.choice import get_engine
-from d4orm_env.engine.types import WATCHED_SAMPLES, DenoisingStep, SamplingTask
 from d4orm_env.render.denoising_frames import Denoising, save_denoising
 from d4orm_planners import make_planner
 from d4orm_planners.base.plan import IterationRecord, Plan
+from d4orm_planners.engine.sampling_types import WATCHED_SAMPLES, DenoisingStep, SamplingTask
+from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.sampling.denoising import DenoisingFilm
 
 QUICK = {"num_samples": 64, "num_steps": 8, "engine": "cpu"}
@@ -32,7 +32,7 @@ def test_a_step_tells_of_its_first_samples(problem, credit: str, num_samples: in
     steps: list[DenoisingStep] = []
     sigmas = np.array([1.0, 0.5], np.float32)
     rules = make_planner("d4orm").rules()
-    result = get_engine("cpu").denoise(task, rules, task.base, sigmas, num_samples, 7, None, steps.append)
+    result = get_sampling_engine("cpu").denoise(task, rules, task.base, sigmas, num_samples, 7, None, steps.append)
     kept = min(num_samples, WATCHED_SAMPLES)
     mean = task.base
     for number, step in enumerate(steps):

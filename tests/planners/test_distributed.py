@@ -22,7 +22,6 @@ from network_support import PATIENCE, wait_until
 from planner_support import cheap_planner, hop_problem, walled_in_problem
 
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.threads import Threads
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
@@ -40,6 +39,7 @@ from d4orm_planners.d_d4orm.node_events import KINDS as KINDS_OF_EVENTS
 from d4orm_planners.d_d4orm.node_events import Event
 from d4orm_planners.d_d4orm.selection import choose, diverse, k_means, merge, shares, top_k
 from d4orm_planners.d_d4orm.transport import WAITING, LocalNetwork
+from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.sampling.d4orm import D4orm, D4ormConfig
 
 PROBLEM = hop_problem(2, horizon=4)
@@ -263,7 +263,7 @@ def test_collecting_waits_for_a_message_or_the_end() -> None:
 def inbox() -> tuple[Inbox, Any]:
     network = LocalNetwork()
     own, other = network.join(), network.join()
-    return Inbox(Judge(get_engine("cpu"), PROBLEM), own, 3, own=0), other
+    return Inbox(Judge(get_sampling_engine("cpu"), PROBLEM), own, 3, own=0), other
 
 
 def test_what_is_no_message_is_dropped_counted_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -286,7 +286,7 @@ def test_a_candidate_counts_for_what_it_is_not_for_what_is_claimed() -> None:
     box, other = inbox()
     other.publish(encode(message(reward=1e9, feasible=True), PROBLEM))
     (report,) = box.receive()
-    found = evaluate_controls(get_engine("cpu"), PROBLEM, message().controls)
+    found = evaluate_controls(get_sampling_engine("cpu"), PROBLEM, message().controls)
     assert report.candidate.rank == found.rank
     assert not report.candidate.solved
     assert box.false_claims == 1
@@ -302,11 +302,11 @@ def test_a_candidate_counts_for_what_it_is_not_for_what_is_claimed() -> None:
 def test_a_claim_is_false_where_either_of_its_parts_is(share: float, feasible: bool, false: bool) -> None:
     near = Problem(PROBLEM.team, PROBLEM.start, PROBLEM.start[:, :2] + [0.05, 0], horizon=4)
     controls = np.zeros(SHAPE, np.float32)
-    found = evaluate_controls(get_engine("cpu"), near, controls)
+    found = evaluate_controls(get_sampling_engine("cpu"), near, controls)
     assert found.solved
     network = LocalNetwork()
     own, other = network.join(), network.join()
-    box = Inbox(Judge(get_engine("cpu"), near), own, 2, own=0)
+    box = Inbox(Judge(get_sampling_engine("cpu"), near), own, 2, own=0)
     reward = float(found.trajectory.rewards.mean())
     other.publish(encode(message(controls=controls, reward=share * reward, feasible=feasible), near))
     (report,) = box.receive()
@@ -344,7 +344,7 @@ def test_what_is_told_again_is_not_judged_again(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_what_a_process_has_made_is_judged_once() -> None:
-    judge = Judge(get_engine("cpu"), PROBLEM, remembered=2)
+    judge = Judge(get_sampling_engine("cpu"), PROBLEM, remembered=2)
     made = [judge.own(message().controls * scale) for scale in (0.25, 0.5, 1.0)]
     assert judge.received(made[2].controls.copy()) is made[2]
     assert judge.received(made[1].controls) is made[1]
@@ -359,11 +359,11 @@ def test_what_a_process_has_made_is_judged_once() -> None:
 def alone(planner: Planner, judge: Judge | None = None) -> Node:
     """A network's only node."""
     task = Task(1, 0, None, "max", 1)
-    return Node(0, task, planner, LocalNetwork().join(), judge or Judge(get_engine("cpu"), PROBLEM))
+    return Node(0, task, planner, LocalNetwork().join(), judge or Judge(get_sampling_engine("cpu"), PROBLEM))
 
 
 def test_the_word_to_stop_ends_judging_and_denoising() -> None:
-    judge = Judge(get_engine("cpu"), PROBLEM, remembered=1)
+    judge = Judge(get_sampling_engine("cpu"), PROBLEM, remembered=1)
     judge.stop.set()
     with pytest.raises(Stopped):
         judge.own(message().controls)
@@ -648,7 +648,7 @@ def test_an_observer_is_told_what_a_node_does() -> None:
     planner = D4orm(D4ormConfig(engine="cpu", num_samples=64, num_steps=5))
     events: list[Event] = []
     controls = np.zeros((problem.horizon, 2, 2), np.float32)
-    task, judge = Task(2, 0, controls, "max", 1), Judge(get_engine("cpu"), problem)
+    task, judge = Task(2, 0, controls, "max", 1), Judge(get_sampling_engine("cpu"), problem)
     nodes = [
         Node(i, task, planner, network.join(), judge, observer=observer)
         for i, observer in enumerate((events.append, None))
@@ -671,7 +671,7 @@ def test_an_observer_is_told_what_a_node_does() -> None:
 def test_settling_says_whether_all_others_have_a_solution_as_good() -> None:
     problem, network = hop_problem(2), LocalNetwork()
     task = Task(2, 0, distributed().solve(problem).controls, "max", 1)
-    judge = Judge(get_engine("cpu"), problem)
+    judge = Judge(get_sampling_engine("cpu"), problem)
     first, second = (Node(i, task, cheap_planner("d4orm"), network.join(), judge) for i in range(2))
     assert not first.settle(0), "nobody has told it anything"
     assert second.settle(0)

@@ -13,11 +13,11 @@ from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
-from d4orm_env.engine.choice import get_engine
 from d4orm_env.envs.joint_state import JointState
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import Episode, OpenLoop, make_policy, run_episode
 from d4orm_planners.base.policy import StatePolicy
+from d4orm_planners.engine.select import get_sampling_engine
 
 
 class Script(StatePolicy):
@@ -100,7 +100,7 @@ def test_a_docked_robot_that_is_run_into_counts_too() -> None:
     # robot_0 docks after one step and leaves; robot_1 then drives into it from above.
     problem = line_problem([0.1, 1.0], horizon=9)
     episode = drive(problem, [[1, 0], [0, -1]])
-    trajectory = get_engine("cpu").rollout(problem, np.broadcast_to(np.float32([[1, 0], [0, -1]]), (9, 2, 2)))
+    trajectory = get_sampling_engine("cpu").rollout(problem, np.broadcast_to(np.float32([[1, 0], [0, -1]]), (9, 2, 2)))
     assert episode.trajectory.collided[:, 0].tolist() == [False] * 8 + [True] * 2
     for name in ("collided", "margin_violated"):
         np.testing.assert_array_equal(getattr(episode.trajectory, name), getattr(trajectory, name))
@@ -144,7 +144,7 @@ def test_rolling_the_executed_controls_out_again_gives_the_episode() -> None:
     problem = env.unwrapped.problem
     episode = run_episode(env, make_policy("goal"), seed=8)
     steps = len(episode.trajectory.controls)
-    again = get_engine("cpu").rollout(problem.replace(horizon=steps), episode.trajectory.controls)
+    again = get_sampling_engine("cpu").rollout(problem.replace(horizon=steps), episode.trajectory.controls)
     np.testing.assert_allclose(again.states, episode.trajectory.states, atol=1e-4)
     for name in ("arrived", "collided", "margin_violated"):
         np.testing.assert_array_equal(getattr(again, name), getattr(episode.trajectory, name), err_msg=name)

@@ -14,8 +14,8 @@ from planner_support import walled_in_problem
 
 from d4orm_env import Problem, Team, World, make_problem, verify
 from d4orm_env.dynamics.models import MODELS
-from d4orm_env.engine.choice import get_engine
 from d4orm_planners import make_planner
+from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.mapf.lacam import Moves, find_moves
 from d4orm_planners.mapf.planner import leads_round
 from d4orm_planners.mapf.replanning import Others, Trip, find_way
@@ -194,7 +194,7 @@ def test_a_drive_along_found_moves_is_what_the_engine_makes_of_its_controls(mode
     problem = make_problem("maze", num_robots=6, seed=1, model=model, horizon=900)
     roadmap, moves = found(problem, 1.25)
     driven = drive_moves(problem, roadmap, moves.moves)
-    trajectory = get_engine("cpu").rollout(problem, driven.until(problem.horizon))
+    trajectory = get_sampling_engine("cpu").rollout(problem, driven.until(problem.horizon))
     steps = len(driven.controls)
     # A control inside the limits is clipped once more, which may round it.
     np.testing.assert_allclose(trajectory.positions[: steps + 1], driven.places[:, :, :2], atol=1e-4)

@@ -15,11 +15,11 @@ from planner_support import hop_problem, walled_in_problem
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.engine.choice import get_engine
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.baselines.collocation import Motion, TeamProgram
+from d4orm_planners.engine.select import get_sampling_engine
 
 MODELS = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive", "unicycle", "car")
 
@@ -116,7 +116,7 @@ def test_the_motion_is_what_the_engine_rolls_out(model: str) -> None:
     still = Motion(np.repeat(problem.start[None].astype(float), 46, axis=0), np.zeros((45, 2, problem.control_size)))
     motion, note = program.solve(still, {}, np.array([45, 45]), {"tol": 1e-3}, lambda: False)
     assert note == "Solve_Succeeded"
-    rolled_out = get_engine("cpu").rollout(problem, motion.controls)
+    rolled_out = get_sampling_engine("cpu").rollout(problem, motion.controls)
     moving = ~rolled_out.arrived
     np.testing.assert_allclose(motion.states[moving], rolled_out.states[moving], atol=1e-3)
     assert rolled_out.arrived[-1].all()

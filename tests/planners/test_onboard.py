@@ -23,9 +23,9 @@ from PIL import Image
 from test_examples import EXAMPLES, PNG, ROOT, run, table
 
 from d4orm_env import Problem, Team, World
-from d4orm_env.engine.choice import get_engine
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.base.candidate import evaluate_controls
+from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.tracking.steering import straight_drives
 
 
@@ -55,7 +55,7 @@ def corridor() -> Problem:
 
 def under_way(onboard: Any, problem: Problem) -> Any:
     """Everybody drives straight to the goal."""
-    engine = get_engine("cpu", 1)
+    engine = get_sampling_engine("cpu", 1)
     candidate = evaluate_controls(engine, problem, straight_drives(problem).controls[:, :, 0])
     course = onboard.course.Course.of(10, problem, engine, candidate)
     assert course is not None, "driving straight solves it"
@@ -78,7 +78,7 @@ def test_course_ends_at_rest(onboard: Any) -> None:
 
 
 def test_who_would_run_into_a_body_stops_and_the_others_go_on(onboard: Any) -> None:
-    problem, engine = corridor(), get_engine("cpu", 1)
+    problem, engine = corridor(), get_sampling_engine("cpu", 1)
     course = under_way(onboard, problem)
     stopped = course.with_stops(problem, engine, joint_at(problem, course, 12), [0])
     assert stopped.begin == 12
@@ -114,7 +114,7 @@ def test_plans_begin_with_less_margin_only_where_robots_are_nearer(onboard: Any)
 
 @pytest.mark.parametrize("lost", [[], [1]])
 def test_a_plan_has_the_same_name_after_it_was_passed_on(onboard: Any, lost: list[int]) -> None:
-    engine, whole = get_engine("cpu", 1), corridor()
+    engine, whole = get_sampling_engine("cpu", 1), corridor()
     problem = onboard.course.present_problem(whole, whole.start, whole.goal, lost)
     random = np.random.default_rng(0)
     candidate = evaluate_controls(engine, problem, random.normal(0, 2, (40, 3, 2)).astype(np.float32))

@@ -13,9 +13,9 @@ from reference import judge, position_error
 from d4orm_env import make_problem
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
-from d4orm_env.engine.choice import get_engine
-from d4orm_env.engine.types import SamplingRules, SamplingTask
 from d4orm_planners import reference as plain
+from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
+from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.sampling.weights import SoftmaxWeights
 
 RULES = SamplingRules(SoftmaxWeights(oracle.TEMPERATURE))
@@ -43,7 +43,7 @@ def test_rollout_rewards_agree(model: str, among_obstacles: bool) -> None:
     # The cases are worth nothing unless robots lose reward to each other.
     assert (oracle.score(problem, candidates[-1][None]) < 0).any() or expected.min() < 0.2
     for name in ENGINE_NAMES:
-        rewards = [get_engine(name).rollout(problem, controls).rewards.mean(axis=0) for controls in candidates]
+        rewards = [get_sampling_engine(name).rollout(problem, controls).rewards.mean(axis=0) for controls in candidates]
         np.testing.assert_allclose(rewards, expected, atol=2e-4)
 
 
@@ -54,7 +54,7 @@ def test_docking_agrees(goal_speed: float | None, step: int) -> None:
     # At the speed limit a step is 0.105 m, since the limit comes after the integration. So 4.595 m after 49 steps, and
     # then braking: 4.775 m and 0.8 m/s after 51 steps, 5.05 m and 0.3 m/s after 56.
     controls[49:] *= -1
-    trajectory = get_engine("cpu").rollout(problem, controls)
+    trajectory = get_sampling_engine("cpu").rollout(problem, controls)
     assert (trajectory.arrived.argmax(axis=0) == step).all()
     np.testing.assert_allclose(oracle.score(problem, controls[None])[0], trajectory.rewards.mean(axis=0), atol=2e-4)
 
@@ -63,7 +63,7 @@ def test_docking_agrees(goal_speed: float | None, step: int) -> None:
 def test_sampled_rewards_agree(model: str) -> None:
     problem = make_problem("circle", num_robots=5, model=model, horizon=40)
     task = SamplingTask(problem, toward_goals(problem), credit="robot")
-    rewards = cpu_rewards(get_engine("cpu"), task, 0.7, 96, seed=3)
+    rewards = cpu_rewards(get_sampling_engine("cpu"), task, 0.7, 96, seed=3)
     samples = oracle.sample_controls(task, np.zeros_like(task.base), 0.7, 96, 3, 0)
     expected = oracle.score(problem, task.base[None] + samples).T
     # A comparison with a threshold may fall either way by rounding, and then one step's penalty makes the difference.
@@ -78,7 +78,7 @@ def test_a_denoising_run_agrees(name: str) -> None:
     problem = make_problem("circle", num_robots=4, horizon=30)
     task = SamplingTask(problem, toward_goals(problem), credit="team")
     noise_scale, mean, recorded = np.array([1.0, 0.6, 0.3], np.float32), np.zeros_like(task.base), RecordedRules(RULES)
-    result = get_engine(name).denoise(task, recorded.rules, mean, noise_scale, 128, 5)
+    result = get_sampling_engine(name).denoise(task, recorded.rules, mean, noise_scale, 128, 5)
     for step, (sigma, rewards) in enumerate(zip(noise_scale, recorded.rewards, strict=True)):
         samples = oracle.sample_controls(task, mean, sigma, 128, 5, step)
         clear = judge(task, task.base + samples).doubt > position_error(task, samples, control_error=1e-5)

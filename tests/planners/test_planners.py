@@ -23,13 +23,13 @@ from planner_support import (
 from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
-from d4orm_env.engine.choice import get_engine
-from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import IterationRecord, Plan, list_planners, make_planner
 from d4orm_planners.base.planner_registry import PLANNERS, describe_planner
 from d4orm_planners.base.solve import Search
+from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
+from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.sampling.loop import SamplingPlanner, standard_normal
 from d4orm_planners.sampling.schedule import alpha_bar, annealed
 from d4orm_planners.sampling.tuned import TUNED
@@ -99,7 +99,7 @@ def test_the_history_tells_of_every_iteration(name: str) -> None:
 def test_the_controls_lead_to_the_trajectory(name: str) -> None:
     problem = make_problem("circle", num_robots=4)
     plan = cheap_planner(name).solve(problem, seed=1)
-    again = get_engine("cpu").rollout(problem, plan.controls)
+    again = get_sampling_engine("cpu").rollout(problem, plan.controls)
     np.testing.assert_allclose(again.states, plan.trajectory.states, atol=1e-5)
     np.testing.assert_array_equal(plan.controls, plan.trajectory.controls)
 
@@ -281,15 +281,15 @@ def test_the_best_of_start_and_search_is_returned(name: str) -> None:
     given = np.zeros((problem.horizon, 1, 2), np.float32)
     given[:14, 0, 0] = 1
     given[14:28, 0, 0] = -1
-    start = get_engine("cpu").rollout(problem, given)
+    start = get_sampling_engine("cpu").rollout(problem, given)
     plan = cheap_planner(name).solve(problem, initial_controls=given, max_iterations=2)
     assert plan.metrics["reward"] >= start.rewards.mean() - 1e-6
 
 
 @pytest.mark.parametrize("name", SAMPLING)
 def test_samples_that_were_left_out_are_in_the_history(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    denoise = CpuEngine.denoise
-    monkeypatch.setattr(CpuEngine, "denoise", lambda *a, **k: denoise(*a, **k)._replace(excluded=3))
+    denoise = CpuSamplingEngine.denoise
+    monkeypatch.setattr(CpuSamplingEngine, "denoise", lambda *a, **k: denoise(*a, **k)._replace(excluded=3))
     plan = cheap_planner(name).solve(walled_in_problem(), max_iterations=2)
     # D4orm has two stages, and what D4orm-D does second is a repair, which has one.
     expected = {"d4orm": [6, 6], "d4orm-d": [6, 3]}.get(name, [3, 3])
@@ -330,7 +330,7 @@ def test_unusable_initial_controls_are_refused(controls: Any, message: str) -> N
 def test_improving_goes_on_to_the_budget_and_never_gets_worse(name: str) -> None:
     problem = hop_problem(2)
     first = straight_ahead(problem, 0.4)
-    start = get_engine("cpu").rollout(problem, first)
+    start = get_sampling_engine("cpu").rollout(problem, first)
     recorder = Recorder()
     plan = cheap_planner(name, improve=True).solve(problem, initial_controls=first, max_iterations=4, callback=recorder)
     assert plan.status == "iteration_limit"
@@ -344,7 +344,7 @@ def test_improving_goes_on_to_the_budget_and_never_gets_worse(name: str) -> None
 
 def test_improving_improves() -> None:
     problem = hop_problem(2)
-    start = get_engine("cpu").rollout(problem, straight_ahead(problem, 0.4))
+    start = get_sampling_engine("cpu").rollout(problem, straight_ahead(problem, 0.4))
     planner = make_planner("d4orm", engine="cpu", num_samples=128, num_steps=20, improve=True)
     plan = planner.solve(problem, initial_controls=straight_ahead(problem, 0.4), max_iterations=5)
     assert plan.solved
@@ -547,7 +547,7 @@ def start_of(name: str, problem: Problem, **config: Any) -> Search:
 
 def rewards_of(search: Search, base: np.ndarray) -> Any:
     """Rewards of samples by rolling each of them out alone: the team's for team credit, else every robot's."""
-    engine, problem = get_engine("cpu"), search.problem
+    engine, problem = get_sampling_engine("cpu"), search.problem
 
     def reward(samples: np.ndarray) -> np.ndarray:
         rollouts = (engine.rollout(problem, (base + sample).astype(np.float32)) for sample in samples)
@@ -607,7 +607,7 @@ def test_d4orm_by_default_starts_its_deformation_at_zero(num_robots: int, credit
     ],
 )
 def test_late_steps_go_on_with_fewer_samples(late: Any, parts: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    denoise, calls = CpuEngine.denoise, []
+    denoise, calls = CpuSamplingEngine.denoise, []
 
     def recorded(
         engine: Any, task: Any, rules: Any, mean: Any, scale: Any, num_samples: int, seed: int, *rest: Any
@@ -616,7 +616,7 @@ def test_late_steps_go_on_with_fewer_samples(late: Any, parts: Any, monkeypatch:
         calls.append((mean, scale, num_samples, seed, result))
         return result
 
-    monkeypatch.setattr(CpuEngine, "denoise", recorded)
+    monkeypatch.setattr(CpuSamplingEngine, "denoise", recorded)
     planner = make_planner("d4orm", num_samples=40, num_steps=10, **late)
     search = Search(planner, walled_in_problem(), 0, None)
     _, iteration = planner.iterate(search, None)

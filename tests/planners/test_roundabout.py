@@ -7,8 +7,8 @@ import pytest
 
 from d4orm_env import Problem, Team, make_problem, rollout, verify
 from d4orm_env.dynamics.models import MODELS
-from d4orm_env.engine.choice import get_engine
 from d4orm_planners import make_planner
+from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.mapf.roundabout import drive_roundabout
 
 PLANAR = [name for name, model in MODELS.items() if model.dimension == 2]
@@ -21,7 +21,7 @@ def test_a_circle_crosses_in_it_in_the_least_time_that_its_symmetry_allows(
 ) -> None:
     """Steps of the fastest way past a disc that leaves room for all, from a nonlinear program (see docs)."""
     problem = make_problem("circle", num_robots=num_robots)
-    controls = drive_roundabout(problem, get_engine("cpu"), side)
+    controls = drive_roundabout(problem, get_sampling_engine("cpu"), side)
     assert controls is not None
     trajectory = rollout(problem, controls)
     assert (trajectory.arrived.argmax(axis=0) == steps).all()
@@ -36,7 +36,7 @@ def test_a_circle_crosses_in_it_in_the_least_time_that_its_symmetry_allows(
 @pytest.mark.parametrize("model", PLANAR)
 def test_robots_of_any_planar_model_drive_in_it(model: str) -> None:
     problem = make_problem("circle", num_robots=6, model=model)
-    controls = drive_roundabout(problem, get_engine("cpu"), 1)
+    controls = drive_roundabout(problem, get_sampling_engine("cpu"), 1)
     assert controls is not None
     assert np.isfinite(controls).all()
     assert (np.abs(controls) <= problem.team.control_limits).all()
@@ -46,11 +46,11 @@ def test_there_is_none_where_ways_do_not_cross() -> None:
     states = np.zeros((3, 4))
     states[:, :2] = [[-3, 0], [3, 1], [-3, 2]]
     problem = Problem(Team(("holonomic2d",) * 3), states, [[3, 0], [-3, 1], [3, 2]])
-    assert drive_roundabout(problem, get_engine("cpu"), 1) is None
+    assert drive_roundabout(problem, get_sampling_engine("cpu"), 1) is None
 
 
 def test_there_is_none_in_space_nor_where_somebody_begins_within() -> None:
-    engine = get_engine("cpu")
+    engine = get_sampling_engine("cpu")
     assert drive_roundabout(make_problem("sphere", num_robots=6), engine, 1) is None
     states = np.zeros((3, 4))
     states[:, :2] = [[0, 0.1], [2, 0], [-1, 2]]
@@ -61,7 +61,7 @@ def test_there_is_none_in_space_nor_where_somebody_begins_within() -> None:
 def test_improving_a_crossing_ends_in_it_or_better() -> None:
     problem = make_problem("circle", num_robots=6)
     plan = make_planner("d4orm-d", improve=True).solve(problem, seed=1, max_iterations=3)
-    controls = drive_roundabout(problem, get_engine("cpu"), 1)
+    controls = drive_roundabout(problem, get_sampling_engine("cpu"), 1)
     assert controls is not None
     assert plan.metrics["reward"] >= rollout(problem, controls).rewards.mean() - 1e-6
     assert verify(problem, plan.controls).ok

@@ -17,16 +17,16 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.models import MODELS
-from d4orm_env.engine.choice import get_engine
-from d4orm_env.engine.cpu import CpuEngine
-from d4orm_env.engine.types import MovingObstacles, SamplingResult, SamplingRules, SamplingTask
-from d4orm_env.jax.jax_engine import JaxEngine
 from d4orm_env.scenarios import list_scenarios, make_problem
+from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
+from d4orm_planners.engine.jax_sampling import JaxSamplingEngine
+from d4orm_planners.engine.sampling_types import MovingObstacles, SamplingResult, SamplingRules, SamplingTask
 from d4orm_planners.engine.score import score_kernel
+from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.sampling.schedule import annealed
 from d4orm_planners.sampling.weights import EliteWeights, SoftmaxWeights
 
-CPU, JAX = CpuEngine(), JaxEngine()
+CPU, JAX = CpuSamplingEngine(), JaxSamplingEngine()
 SOFTMAX = SamplingRules(SoftmaxWeights(0.3))
 NUM_SAMPLES = 200  # three tiles and a bit
 CREDITS = ("team", "robot")
@@ -379,7 +379,7 @@ def test_a_long_run_improves_the_team(engine: str) -> None:
 @pytest.mark.parametrize("rules", [SOFTMAX, SamplingRules(EliteWeights(0.1), Spread(0.1))], ids=["softmax", "elite"])
 def test_the_number_of_threads_changes_no_bit(name: str, rules: SamplingRules) -> None:
     task = replace(TASKS[name](), credit="robot")
-    single, *others = (run(CpuEngine(num_threads=n), task, 4, rules, num_samples=333) for n in (1, 2, 3, 8))
+    single, *others = (run(CpuSamplingEngine(num_threads=n), task, 4, rules, num_samples=333) for n in (1, 2, 3, 8))
     for other in others:
         assert other.mean.tobytes() == single.mean.tobytes()
         assert other.rewards.tobytes() == single.rewards.tobytes()
@@ -387,7 +387,7 @@ def test_the_number_of_threads_changes_no_bit(name: str, rules: SamplingRules) -
 
 @pytest.mark.parametrize("engine", ENGINE_NAMES)
 def test_the_same_seed_repeats_and_another_does_not(engine: str) -> None:
-    task, physics = TASKS["mixed"](), get_engine(engine)
+    task, physics = TASKS["mixed"](), get_sampling_engine(engine)
     physics.prepare(task, SOFTMAX, annealed(3, 1e-4, 2e-2), NUM_SAMPLES)
     first, again = (run(physics, task, 3, seed=2**33) for _ in range(2))
     assert first.mean.tobytes() == again.mean.tobytes()
@@ -399,7 +399,7 @@ def test_the_same_seed_repeats_and_another_does_not(engine: str) -> None:
 def test_arguments_are_left_alone(engine: str) -> None:
     task, mean = TASKS["docked, moving"](), np.full((25, 5, 2), 0.1, np.float32)
     before = task.base.copy(), mean.copy(), np.copy(task.arrived), task.moving.positions.copy()
-    get_engine(engine).denoise(task, SOFTMAX, mean, annealed(2, 1e-4, 2e-2), 64, 0)
+    get_sampling_engine(engine).denoise(task, SOFTMAX, mean, annealed(2, 1e-4, 2e-2), 64, 0)
     for old, new in zip(before, (task.base, mean, task.arrived, task.moving.positions), strict=True):
         np.testing.assert_array_equal(old, new)
 
@@ -438,7 +438,7 @@ def test_samples_that_blow_up_are_excluded_and_counted_and_change_no_other(credi
     recorded = RecordedRules(SamplingRules(SOFTMAX.weights, burst))
     sigma = np.ones(2, np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
-        result = get_engine(engine).denoise(task, recorded.rules, 0 * task.base, sigma, NUM_SAMPLES, seed=4)
+        result = get_sampling_engine(engine).denoise(task, recorded.rules, 0 * task.base, sigma, NUM_SAMPLES, seed=4)
         controls = bursting_controls(task, burst)
         blown = ~np.isfinite(np.square(controls, dtype=np.float32)).all(axis=(1, 2, 3))
     assert 20 < blown.sum() < 80
@@ -470,7 +470,9 @@ def test_with_all_samples_excluded_the_mean_stays(engine: str) -> None:
     task = TASKS["holonomic2d"]()
     base, mean = task.base.copy(), np.full_like(task.base, 0.25)
     base[3, 2] = np.nan
-    result = get_engine(engine).denoise(replace(task, base=base), SOFTMAX, mean, np.ones(3, np.float32), 100, 0)
+    result = get_sampling_engine(engine).denoise(
+        replace(task, base=base), SOFTMAX, mean, np.ones(3, np.float32), 100, 0
+    )
     np.testing.assert_array_equal(result.mean, mean)
     assert result.excluded == 300
     assert result.rewards.tolist() == [0, 0, 0]
@@ -481,7 +483,9 @@ def test_a_robot_without_a_usable_sample_keeps_its_mean_and_the_others_go_on(eng
     task = replace(TASKS["holonomic2d"](), credit="robot")
     base, mean = task.base.copy(), np.full_like(task.base, 0.25)
     base[0, 2] = np.nan
-    result = get_engine(engine).denoise(replace(task, base=base), SOFTMAX, mean, np.ones(2, np.float32), 100, 0)
+    result = get_sampling_engine(engine).denoise(
+        replace(task, base=base), SOFTMAX, mean, np.ones(2, np.float32), 100, 0
+    )
     np.testing.assert_array_equal(result.mean[:, 2], mean[:, 2])
     assert (np.abs(result.mean[:, [0, 1, 3, 4]] - 0.25).max(axis=(0, 2)) > 0.1).all()
     assert np.isfinite(result.mean).all()

@@ -14,10 +14,10 @@ import pytest
 from d4orm_env import navigation_v0
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances import Dropout, LimitMismatch, Push, Stall, StateNoise
-from d4orm_env.engine.choice import get_engine
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import Search, make_planner, make_policy, run_episode
 from d4orm_planners.base.names import PLANNERS, POLICIES
+from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.tracking.steering import straight_drives
 
 TESTS = Path(__file__).parent
@@ -157,7 +157,7 @@ def test_every_setting_of_a_planner_changes_something(name: str, setting: str) -
         assert f"def {test}(" in (TESTS / file).read_text()
     elif setting == "engine":
         engine = Search(make_planner(name, engine="jax"), crossing(), 0).engine
-        assert type(engine) is type(get_engine("jax"))
+        assert type(engine) is type(get_sampling_engine("jax"))
     elif setting == "improve":
         solution = straight_drives(lone()).controls[:, :, 0]
         for improve in (False, True):
@@ -272,9 +272,10 @@ def test_every_setting_of_a_policy_changes_something(
         pytest.skip("needs pyrvo")
     if setting == "engine":
         asked: list[str] = []
-        engine = get_engine("cpu")
+        engine = get_sampling_engine("cpu")
         monkeypatch.setattr(
-            "d4orm_planners.d4orm_c2f.receding_horizon.get_engine", lambda name, *_: asked.append(name) or engine
+            "d4orm_planners.d4orm_c2f.receding_horizon.get_sampling_engine",
+            lambda name, *_: asked.append(name) or engine,
         )
         make_policy(name, engine="jax")
         assert set(asked) == {"jax"}

@@ -11,10 +11,10 @@ from env_support import line_problem, mixed_problem
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.engine.cpu import CpuEngine
+from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
 from d4orm_planners.tracking.steering import Drives, drives
 
-CPU = CpuEngine()
+CPU = CpuSamplingEngine()
 SWITCH_TIMES = (0, 3, 10, 25, 79)
 
 

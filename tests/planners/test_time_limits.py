@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from planner_support import cheap_planner, hop_problem, walled_in_problem
 
-from d4orm_env.engine.choice import get_engine
-from d4orm_env.engine.types import SamplingRules, SamplingTask
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import Plan, list_planners, make_planner
 from d4orm_planners.base.planner_registry import PLANNERS
@@ -18,6 +16,8 @@ from d4orm_planners.base.solve import Search
 from d4orm_planners.base.stopwatch import Stopwatch
 from d4orm_planners.baselines.collocation import ABANDONED
 from d4orm_planners.baselines.ipopt import OUT_OF_TIME
+from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
+from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.sampling.weights import SoftmaxWeights
 
 ALL = pytest.mark.parametrize("name", list_planners())
@@ -116,7 +116,7 @@ def test_an_engine_stops_between_steps(engine: str) -> None:
     mean, scale = np.zeros_like(task.base), np.linspace(1, 0.1, 9, dtype=np.float32)
 
     def run(steps: int, should_stop: Any = None) -> Any:
-        return get_engine(engine).denoise(task, rules, mean, scale[:steps], 64, 3, should_stop)
+        return get_sampling_engine(engine).denoise(task, rules, mean, scale[:steps], 64, 3, should_stop)
 
     whole, never = run(9), run(9, lambda: False)
     np.testing.assert_array_equal(whole.mean, never.mean)

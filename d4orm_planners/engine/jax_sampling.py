@@ -1,0 +1,215 @@
+"""The JAX engine's sampling: a whole denoising run is one compiled loop.
+
+Nothing returns to the host before it ends, or before the next look at whether it is to be stopped.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.engine import noise
+from d4orm_env.jax.jax_engine import (
+    BIT_OPS,
+    JaxEngine,
+    Worlds,
+    advance_worlds,
+    moving_contacts,
+    obstacle_contacts,
+    rewards_of,
+    robot_contacts,
+)
+from d4orm_planners.engine.sampling_types import (
+    MovingObstacles,
+    SamplingResult,
+    SamplingRules,
+    SamplingTask,
+    StepWatcher,
+)
+
+LOOK = 0.03
+"""Seconds between looks at whether a run is to be stopped, if that is more than a step; at most twice as many."""
+
+
+class _Static(NamedTuple):
+    """What a compiled denoising run depends on besides shapes."""
+
+    models: tuple[str, ...]
+    rules: SamplingRules
+    num_samples: int
+    collisions: bool
+    credit: str
+
+
+class _Inputs(NamedTuple):
+    """What it is called with."""
+
+    arrays: ProblemArrays
+    base: Array
+    docked: Array
+    moving: MovingObstacles | None
+    penalty: Array
+    seed: tuple[Array, Array]
+
+
+def _deformations(static: _Static, inputs: _Inputs, step: Array, time: Array, mean: Array, scale: Array) -> Array:
+    """``(K, m, M)`` samples of the deformation at one time step."""
+    num_robots, size = mean.shape
+    counters, cosine, sine = noise.turned(jnp.arange(static.num_samples, dtype=jnp.uint32)[None, :], BIT_OPS)
+    robots = jnp.arange(num_robots, dtype=jnp.uint32)[:, None]
+    low, high = inputs.seed
+    draws: list[Array] = []
+    for pair in range((size + 1) // 2):
+        key = noise.stream_key(low, high, step, robots, time, jnp.uint32(pair), BIT_OPS)
+        x, y = noise.normal_pair(counters, key, BIT_OPS)
+        draws += [cosine * x - sine * y, sine * x + cosine * y]
+    return mean[..., None] + scale[..., None] * jnp.stack(draws[:size], axis=1)
+
+
+def _score(static: _Static, inputs: _Inputs, step: Array, mean: Array, scale: Array) -> tuple[Array, Array]:
+    """Roll all samples out; returns rewards ``(K, M)`` summed over time and the deformations ``(H, K, m, M)``."""
+    arrays = inputs.arrays
+    d = arrays.goal.shape[1]
+    num_robots = arrays.goal.shape[0]
+
+    def advance(
+        carry: tuple[Worlds, Array], xs: tuple[Array, Array, Array, Array, FloatArray | None]
+    ) -> tuple[tuple[Worlds, Array], Array]:
+        worlds, total = carry
+        time, base, mean_now, scale_now, obstacle = xs
+        deformation = _deformations(static, inputs, step, time, mean_now, scale_now)
+        worlds = advance_worlds(static.models, arrays, worlds, base[..., None] + deformation)
+        place = worlds.state[:, :d]
+        near_robot = jnp.zeros((num_robots, static.num_samples), bool)
+        if static.collisions:
+            near_robot = robot_contacts(arrays, place, arrays.margin)
+            if inputs.moving is not None and obstacle is not None:
+                near_robot |= moving_contacts(arrays, place, obstacle, inputs.moving.radius, arrays.margin)
+        near_obstacle = obstacle_contacts(arrays, place, arrays.margin)
+        return (worlds, total + rewards_of(arrays, place, near_robot, near_obstacle, inputs.penalty)), deformation
+
+    worlds = Worlds(
+        jnp.broadcast_to(arrays.start[..., None], (*arrays.start.shape, static.num_samples)),
+        jnp.broadcast_to(inputs.docked[:, None], (num_robots, static.num_samples)),
+        jnp.zeros((num_robots, mean.shape[2], static.num_samples)),
+    )
+    times = jnp.arange(len(mean), dtype=jnp.uint32)
+    obstacles = None if inputs.moving is None else inputs.moving.positions
+    carry = (worlds, jnp.zeros((num_robots, static.num_samples)))
+    (_, total), deformations = jax.lax.scan(advance, carry, (times, inputs.base, mean, scale, obstacles))
+    return total / len(mean), deformations
+
+
+class _Run(NamedTuple):
+    """A denoising run on its way: means, factors on the schedule, rewards ``(N,)`` so far, samples left out."""
+
+    mean: Array
+    factor: Array
+    rewards: Array
+    excluded: Array
+
+
+def _denoise(static: _Static, inputs: _Inputs, noise_scale: Array, run: _Run, begin: Array, end: Array) -> _Run:
+    """The steps from ``begin`` to before ``end``; both are arguments, so that one compilation serves all parts."""
+
+    def update(step: Array, run: _Run) -> _Run:
+        mean, factor, sigma = run.mean, run.factor, noise_scale[step]
+        rewards, deformations = _score(static, inputs, step.astype(jnp.uint32), mean, factor * sigma)
+        if static.credit == "team":
+            rewards = rewards.mean(axis=0, keepdims=True)
+        finite = jnp.isfinite(rewards)
+        # A sample that blew up has weight zero, and zero times infinity must not reach the mean.
+        usable = jnp.where(jnp.isfinite(deformations), deformations, 0)
+        extra: tuple[Array, ...] = ()
+        if static.rules.importance:
+            slope = (inputs.base + mean) / (factor * sigma) ** 2
+            ratio = -jnp.einsum("tkms,tkm->ks", usable - mean[..., None], slope)
+            ratio = ratio.sum(axis=0, keepdims=True) if static.credit == "team" else ratio
+            extra = (static.rules.importance * ratio,)
+        weights = static.rules.weights(jnp.where(finite, rewards, -jnp.inf), jnp, *extra)
+        weights = jnp.broadcast_to(weights, (mean.shape[1], static.num_samples))
+        new_mean = jnp.einsum("tkms,ks->tkm", usable, weights)
+        # Nothing to go by: every sample was excluded.
+        new_mean = jnp.where((weights.sum(axis=-1) > 0)[None, :, None], new_mean, mean)
+        if static.rules.adapt is not None:
+            deviation2 = jnp.einsum("tkms,ks->tkm", (usable - new_mean[..., None]) ** 2, weights)
+            factor = static.rules.adapt(deviation2, jnp)
+        average = jnp.where(finite, rewards, 0).sum() / jnp.maximum(finite.sum(), 1)
+        return _Run(new_mean, factor, run.rewards.at[step].set(average), run.excluded + (~finite).sum())
+
+    return jax.lax.fori_loop(begin, end, update, run)
+
+
+@lru_cache(maxsize=256)
+def _compiled_denoise(
+    static: _Static, treedef: jax.tree_util.PyTreeDef, shapes: tuple[tuple[tuple[int, ...], np.dtype[np.generic]], ...]
+) -> jax.stages.Compiled:
+    """The denoising run compiled for arguments of these shapes, ahead of the call."""
+    arguments = jax.tree.unflatten(treedef, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes])
+    return jax.jit(partial(_denoise, static)).lower(*arguments).compile()
+
+
+class JaxSamplingEngine(JaxEngine):
+    """The JAX engine that samples as well. Stateless: all instances are alike."""
+
+    def _lower(
+        self,
+        task: SamplingTask,
+        rules: SamplingRules,
+        mean: FloatArray,
+        noise_scale: FloatArray,
+        num_samples: int,
+        seed: int,
+    ) -> tuple[jax.stages.Compiled, tuple[_Inputs, Array, _Run, Array, Array]]:
+        problem = task.problem
+        docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
+        scored = (task.arrays, task.base, docked, task.moving, np.float32(task.penalty), noise.seed_words(seed))
+        static = _Static(problem.team.models, rules, num_samples, task.collisions, task.credit)
+        scale = np.asarray(noise_scale, np.float32)
+        begun = (mean, np.ones_like(mean), np.zeros_like(scale), np.int32(0))
+        scored, scale, begun = jax.tree.map(jnp.asarray, (scored, scale, begun))
+        arguments = (_Inputs(*scored), scale, _Run(*begun), jnp.int32(0), jnp.int32(len(scale)))
+        leaves, treedef = jax.tree.flatten(arguments)
+        return _compiled_denoise(static, treedef, tuple((leaf.shape, leaf.dtype) for leaf in leaves)), arguments
+
+    def prepare(self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int) -> None:
+        """See :meth:`d4orm_env.engine.types.Engine.prepare`."""
+        self._lower(task, rules, task.base, noise_scale, num_samples, 0)
+
+    def denoise(
+        self,
+        task: SamplingTask,
+        rules: SamplingRules,
+        mean: FloatArray,
+        noise_scale: FloatArray,
+        num_samples: int,
+        seed: int,
+        should_stop: Callable[[], bool] | None = None,
+        watcher: StepWatcher | None = None,
+    ) -> SamplingResult:
+        """See :meth:`d4orm_env.engine.types.Engine.denoise`.
+
+        Raises:
+            ValueError: If there is a watcher: the steps are compiled into one program.
+        """
+        if watcher is not None:
+            raise ValueError("engine 'jax' runs all denoising steps as one program; to watch them, use engine='cpu'")
+        compiled, (inputs, scale, run, *_) = self._lower(task, rules, mean, noise_scale, num_samples, seed)
+        done, total = 0, len(noise_scale)
+        part = total if should_stop is None else 1
+        while done < total and not (should_stop is not None and should_stop()):
+            start, first = time.perf_counter(), done
+            done = min(done + part, total)
+            run = jax.block_until_ready(compiled(inputs, scale, run, jnp.int32(first), jnp.int32(done)))
+            if time.perf_counter() - start < LOOK:
+                part *= 2
+        return SamplingResult(np.asarray(run.mean), np.asarray(run.rewards)[:done], int(run.excluded))
