@@ -70,13 +70,14 @@ def _refuse_name_of(other: Registry[object], name: object) -> None:
 for _name, _path in {
     "d4orm": "sampling.d4orm:D4orm",
     "d4orm-d": "d4orm_d.planner:D4ormD",
+    "hybrid": "hybrid.planner:Hybrid",
     "d-d4orm": "d_d4orm.planner:DD4orm",
     "mppi": "sampling.mppi:MPPI",
     "cem": "sampling.cem:CEM",
     "mbd": "sampling.mbd:MBD",
     "i-mbd": "sampling.mbd:IterativeMBD",
     "ipopt": "baselines.ipopt:Ipopt",
-    "guided": "mapf.planner:Guided",
+    "mapf": "mapf.planner:MAPF",
     "amswarm": "baselines.amswarm.planner:AMSwarm",
     "mmd": "baselines.mmd.planner:MMD",
 }.items():
@@ -84,7 +85,7 @@ for _name, _path in {
 
 for _name, _path in {
     "d4orm-c2f": "d4orm_c2f.receding_horizon:D4ormC2F",
-    "goal": "base.policy:DriveToGoal",
+    "go-to-goal": "baselines.go_to_goal:GoToGoal",
     "random": "base.policy:RandomControls",
     "orca": "baselines.orca:Orca",
     "ppo": "rl.learned:PPO",

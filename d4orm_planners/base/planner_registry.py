@@ -15,7 +15,7 @@ from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.policy import OpenLoop, Policy, RobotFunction, TeamFunction, plain_attributes
 from d4orm_planners.base.settings import NOTHING, CheckedSettings
 
-RECOMMENDED = "d4orm-d"
+RECOMMENDED = "hybrid"
 """The planner that solves most problems, and soonest."""
 
 Presets: TypeAlias = Mapping[str, Mapping[str, object]]

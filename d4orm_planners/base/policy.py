@@ -17,7 +17,6 @@ from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.plan import Plan
 from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.settings import CheckedSettings
-from d4orm_planners.tracking.steering import drive_to_goal
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
@@ -200,12 +199,3 @@ class RandomControls(StatePolicy):
     def _controls(self, joint: JointState) -> FloatArray:
         limit = self.problem.team.control_limits
         return self._generator.uniform(-limit, limit).astype(np.float32)
-
-
-class DriveToGoal(StatePolicy):
-    """Drives straight to the goal and brakes for it, as if nobody else were there."""
-
-    name = "goal"
-
-    def _controls(self, joint: JointState) -> FloatArray:
-        return drive_to_goal(self.problem, joint.states, joint.goals)

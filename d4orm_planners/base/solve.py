@@ -15,12 +15,19 @@ from d4orm_env.core.arrays import FloatArray, whole_number
 from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
-from d4orm_env.engine.types import Engine, checked_controls
+from d4orm_env.engine.types import checked_controls
 from d4orm_planners.base.candidate import Candidate, evaluate_controls
 from d4orm_planners.base.plan import IterationRecord, Plan, Status
 from d4orm_planners.base.provenance import Provenance
 from d4orm_planners.base.stopwatch import Stopwatch
-from d4orm_planners.engine.sampling_types import DenoisingStep, SamplingResult, SamplingRules, SamplingTask, StepWatcher
+from d4orm_planners.engine.sampling_types import (
+    DenoisingStep,
+    SamplingEngine,
+    SamplingResult,
+    SamplingRules,
+    SamplingTask,
+    StepWatcher,
+)
 from d4orm_planners.engine.select import get_sampling_engine
 
 if TYPE_CHECKING:
@@ -61,7 +68,7 @@ class Search:
         problem: Problem,
         seed: int,
         initial_controls: ArrayLike | None = None,
-        engine: Engine | None = None,
+        engine: SamplingEngine | None = None,
         judge: Callable[[FloatArray], Candidate] | None = None,
         check_interval: int = 1,
     ) -> None:
@@ -119,7 +126,7 @@ class Search:
         num_samples: int,
         seed: int,
     ) -> SamplingResult:
-        """See :meth:`d4orm_env.engine.types.Engine.denoise`; compiling is not counted, and time may end it."""
+        """See :meth:`d4orm_planners.engine.sampling_types.SamplingEngine.denoise`; compiling is not counted, and time may end it."""
         with self.watch.paused():
             self.engine.prepare(task, rules, noise_scale, num_samples)
         # Engines of others need not know of watchers.

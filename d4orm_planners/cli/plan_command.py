@@ -25,7 +25,7 @@ class PlanOptions(PictureOptions, ProblemOptions):
 
     planner: Annotated[
         str, typer.Option("--planner", "-p", help="Planner (see `d4orm planners`), or package.module:Name.")
-    ] = "d4orm-d"
+    ] = "hybrid"
     preset: Annotated[
         str | None, typer.Option("--preset", help="`paper` for the paper's parameters, `tuned` for tuned ones.")
     ] = None

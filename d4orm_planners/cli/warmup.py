@@ -101,7 +101,7 @@ def roll_out_once(models: tuple[str, ...], *, drives: bool = True) -> None:
     get_sampling_engine("cpu").rollout(problem, _no_controls(problem))
     if drives:
         # What it drives by itself, and how it looks for ways around others.
-        planner = make_planner("d4orm-d", engine="cpu")
+        planner = make_planner(engine="cpu")
         planner.init(Search(planner, problem, seed=0))
 
 
@@ -117,7 +117,7 @@ def find_ways() -> None:
     """Find the shortest free ways among walls, and guide a team along them."""
     problem = make_problem("doorway", num_robots=4)
     problem.ways.distance(problem.goal)
-    make_planner("guided", engine="cpu").solve(problem, seed=0)
+    make_planner("mapf", engine="cpu").solve(problem, seed=0)
 
 
 def warm_up() -> WarmupReport:

@@ -13,6 +13,7 @@ from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.engine.types import Engine
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.base.candidate import Candidate
+from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.solve import Search
 from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.coarse_plan import (
@@ -30,6 +31,8 @@ from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.d4orm_c2f.warm_start import episode_of
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
+from d4orm_planners.hybrid.planner import Hybrid
+from d4orm_planners.hybrid.settings import HybridConfig
 from d4orm_planners.mapf.planner import Guide as Ways
 from d4orm_planners.mapf.relay import relay_ways
 from d4orm_planners.tracking.steering import straight_drives
@@ -314,16 +317,15 @@ class Guide:
         return replace(guidance, controls=all_controls, states=states, path=path)
 
 
-def _coarse_planner(config: D4ormC2FConfig, reroute: bool) -> D4ormD:
-    """D4orm-D as it plans coarsely, with or without looking for ways around all others."""
-    given: dict[str, Any] = {} if config.coarse_preset is None else {**D4ormD.presets[config.coarse_preset]}
-    given |= {
+def _coarse_planner(config: D4ormC2FConfig, reroute: bool) -> Planner:
+    """The hybrid planner, with or without search for paths around all others; with a preset D4orm-D, as it plans coarsely."""
+    given: dict[str, Any] = {
         "engine": config.engine,
         "num_samples": config.coarse_samples,
         "num_steps": config.coarse_steps,
         "repair_steps": config.coarse_repair_steps,
         "improve": True,
-        "reroute": reroute,
-        "shorten": False,
     }
-    return D4ormD(D4ormDConfig(**given))
+    if config.coarse_preset is None:
+        return Hybrid(HybridConfig(**given, reroute=reroute, improver="denoising"))
+    return D4ormD(D4ormDConfig(**{**D4ormD.presets[config.coarse_preset], **given}))

@@ -9,11 +9,10 @@ import numpy as np
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.engine.types import Engine
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.d4orm_c2f.direct_final_approach import ROUNDING, docking_radius, drive_home
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
-from d4orm_planners.engine.sampling_types import MovingObstacles, SamplingRules, SamplingTask
+from d4orm_planners.engine.sampling_types import MovingObstacles, SamplingEngine, SamplingRules, SamplingTask
 from d4orm_planners.tracking.steering import track_velocities
 
 SHORTER = 3
@@ -71,7 +70,7 @@ class Window:
         problem: The problem, with the limits that the robots are believed to have now.
     """
 
-    def __init__(self, problem: Problem, config: D4ormC2FConfig, engine: Engine, docks: bool) -> None:
+    def __init__(self, problem: Problem, config: D4ormC2FConfig, engine: SamplingEngine, docks: bool) -> None:
         self.problem, self._config, self._engine, self._docks = problem, config, engine, docks
         self._rules = SamplingRules(config.weights)
         self._noise_scale = config.noise_scale(config.num_steps)

@@ -14,8 +14,8 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import Search
 from d4orm_planners.engine.sampling_types import MovingObstacles, SamplingTask
-from d4orm_planners.mapf.working_plan import TeamPaths
-from d4orm_planners.sampling.d4orm import D4orm
+from d4orm_planners.sampling.d4orm import DeformingPlanner
+from d4orm_planners.tracking.working_plan import TeamPaths
 
 
 class DeformedTeam(TeamPaths):
@@ -27,7 +27,7 @@ class DeformedTeam(TeamPaths):
         trajectory: What the team does at first.
     """
 
-    def __init__(self, planner: D4orm, search: Search, trajectory: Trajectory) -> None:
+    def __init__(self, planner: DeformingPlanner, search: Search, trajectory: Trajectory) -> None:
         super().__init__(search, trajectory)
         self.planner = planner
         self._denoising_steps = self._excluded = self._runs = 0

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import ClassVar
 
-import numpy as np
-
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_planners.base.conflict_groups import conflicts
@@ -17,30 +15,14 @@ from d4orm_planners.d4orm_d.groups import Groups
 from d4orm_planners.d4orm_d.repairs import Repairs
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
 from d4orm_planners.engine.sampling_types import SamplingTask
-from d4orm_planners.mapf.improvement import FIRST_ROUNDS, GUIDED_ROUNDS, refined_iteration, shorten_first_ways
-from d4orm_planners.mapf.planner import (
-    Guide,
-    GuidedConfig,
-    better_ways,
-    first_ways,
-    going_on_from_best,
-    guided_iteration,
-)
-from d4orm_planners.mapf.working_plan import TeamPaths
-from d4orm_planners.sampling.d4orm import D4orm
+from d4orm_planners.sampling.d4orm import PAPER_DEFORMATION, DeformingPlanner
 from d4orm_planners.tracking.steering import prepare_drives, straight_drives
 
-State = Groups | Repairs | Guide
-"""What is kept between iterations, by the way of decoupling, or once ways have been found on a roadmap."""
-
-GUIDED = GuidedConfig()
-GUIDED_AFTER = 6
-"""Iterations without a solution after which ways are looked for on a roadmap."""
-GUIDED_TURNS = 5
-"""Of so many iterations after guided ways one refines the motions, the others replan on the roadmap."""
+State = Groups | Repairs
+"""What is kept between iterations, by the way of decoupling."""
 
 
-class D4ormD(D4orm):
+class D4ormD(DeformingPlanner):
     """Failure-aware decoupling: replan only the robots that fail, around all others, until nobody fails."""
 
     name: ClassVar[str] = "d4orm-d"
@@ -48,7 +30,7 @@ class D4ormD(D4orm):
     drives_straight: ClassVar[bool] = True
     presets: ClassVar = {
         "paper": {
-            **D4orm.presets["paper"],
+            **PAPER_DEFORMATION,
             # The authors' code clips the controls of robots that keep failing; the paper says nothing of it.
             "clip_between_iterations": True,
             "decoupling": "groups",
@@ -62,66 +44,20 @@ class D4ormD(D4orm):
 
     def init(self, search: Search) -> State:
         """See :meth:`Planner.init`."""
-        # Here, because importing numba takes long.
-        from d4orm_planners.mapf.beams import prepare_beams
-
         with search.watch.paused():
             prepare_drives(search.problem)
-            if self.config.decoupling == "groups":
-                return Groups()
-            if self.config.reroute or self.config.shorten:
-                prepare_beams(TeamPaths(search, search.current.trajectory))
-        return Repairs.of(search.problem.num_robots)
+        return Groups() if self.config.decoupling == "groups" else Repairs.of(search.problem.num_robots)
 
     def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
         """See :meth:`Planner.iterate`: the whole team at first and once nobody fails, the failed robots in between."""
-        if isinstance(state, Guide):
-            return self.go_on_guided(search, state)
-        if self.is_guided(search):
-            guide = first_ways(search)
-            if isinstance(guide, Guide):
-                return guide, self.guided(search, guide)
         if search.iteration == 0 and not search.current.controls.any():
             drives = self.straight_start(search.problem)
             return self.whole_team(search, state) if drives is None else (state, Iteration(drives))
-        if self.config.shorten and search.best.solved:
-            return state, refined_iteration(search)
         if not search.current.failed.any() or (isinstance(state, Groups) and search.best.solved):
             return self.whole_team(search, state)
         team = DeformedTeam(self, search, search.current.trajectory)
-        if isinstance(state, Groups):
-            return state.replan(team), team.iteration()
-        state = state.repair(team, self.config)
-        self.shorten_first(team)
+        state = state.replan(team) if isinstance(state, Groups) else state.repair(team, self.config)
         return state, team.iteration()
-
-    def guided(self, search: Search, guide: Guide) -> Iteration:
-        """What a team does that has ways; they become a little shorter if that is all that is left to do."""
-        iteration = guided_iteration(search, guide)
-        if not self.config.shorten:
-            return iteration
-        team = DeformedTeam(self, search, search.engine.rollout(search.problem, iteration.controls))
-        self.shorten_first(team, GUIDED_ROUNDS)
-        return replace(iteration, controls=team.controls)
-
-    def go_on_guided(self, search: Search, guide: Guide) -> tuple[Guide, Iteration]:
-        """Better ways for a team that has some: mostly on the roadmap, and by turns by search among its motions.
-
-        The first finds other ways round, the second cuts corners and leaves out stops.
-        """
-        if search.best.solved and self.config.shorten:
-            if search.iteration % GUIDED_TURNS == 1:
-                return guide, refined_iteration(search)
-            guide = going_on_from_best(search, guide)
-        guide = better_ways(search, guide, GUIDED.neighbours, GUIDED.replannings)
-        return guide, guided_iteration(search, guide)
-
-    def is_guided(self, search: Search) -> bool:
-        """Whether this iteration is to find ways on a roadmap: the first, or one after some without a solution."""
-        if search.iteration == 0:
-            return super().is_guided(search)
-        stuck = search.iteration == GUIDED_AFTER and not search.best.solved and search.problem.world.num_obstacles > 0
-        return stuck and self.config.start == "auto"
 
     def whole_team(self, search: Search, state: State) -> tuple[State, Iteration]:
         """Deform everybody's controls at once; unless in groups, then straight home from wherever that is as good."""
@@ -129,18 +65,7 @@ class D4ormD(D4orm):
         if not isinstance(state, Repairs):
             return state, iteration
         team = DeformedTeam(self, search, search.engine.rollout(search.problem, iteration.controls))
-        state = state.shorten(team)
-        self.shorten_first(team)
-        return state, replace(iteration, controls=team.controls)
-
-    def shorten_first(self, team: DeformedTeam, rounds: int = FIRST_ROUNDS) -> None:
-        """Let the ways of a team in which nobody fails any more become shorter."""
-        if self.config.shorten and not team.faults(np.arange(team.problem.num_robots))[0].any():
-            shorten_first_ways(team, rounds)
-
-    def is_patient(self, search: Search) -> bool:
-        """See :meth:`D4orm.is_patient`: repairs are what helps here."""
-        return False
+        return state.shorten(team), replace(iteration, controls=team.controls)
 
     def num_samples(self, search: Search) -> int:
         """See :meth:`SamplingPlanner.num_samples`."""

@@ -56,13 +56,8 @@ class _Repair:
         self.failures, self.recency = before.failures.copy(), before.recency
 
     def run(self, config: D4ormDConfig) -> None:
-        """Reroute who fails, deform who fails nevertheless, and shorten the ways home once nobody does."""
-        # Here, because importing numba takes long.
-        from d4orm_planners.d4orm_d.rerouting import reroute
-
+        """Deform who fails, and shorten the ways home once nobody does."""
         everybody = np.arange(self.problem.num_robots)
-        if config.reroute:
-            reroute(self.team)
         failed, _ = self.team.faults(everybody)
         if failed.any() and not self.search.should_stop():
             self.deform(np.flatnonzero(failed), config)

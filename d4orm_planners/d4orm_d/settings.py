@@ -6,15 +6,15 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from d4orm_planners.base.settings import Count, Positive, Samples, Steps, one_of
-from d4orm_planners.sampling.d4orm import D4ormConfig
+from d4orm_planners.sampling.d4orm import DeformationConfig
 from d4orm_planners.sampling.settings import Credit
 
 Decoupling = Annotated[str, one_of(("independent", "groups"))]
-Start = Annotated[str, one_of(("auto", "team", "straight", "guided"))]
+Start = Annotated[str, one_of(("auto", "team", "straight"))]
 
 
 @dataclass(frozen=True, kw_only=True)
-class D4ormDConfig(D4ormConfig):
+class D4ormDConfig(DeformationConfig):
     """Settings of D4orm-D. The defaults are meant for a first solution soon; the preset ``"paper"`` is Algorithm 3.
 
     Attributes:
@@ -25,12 +25,9 @@ class D4ormDConfig(D4ormConfig):
         decoupling: ``"groups"`` replans every group of robots that conflict, the team's reward within it (the paper).
             ``"independent"`` replans robots that have no conflict with each other at once, each by its own reward,
             around all others, and takes over only what is no worse.
-        reroute: Whether robots that fail look for ways among all others' before they are repaired independently.
         start: What the first iteration does without initial controls. ``"team"`` deforms the whole team at once;
-            ``"straight"`` sends everybody straight to its goal and leaves the rest to repairs; ``"guided"`` finds ways
-            on a roadmap and goes on making them better (:mod:`d4orm_planners.mapf`). ``"auto"`` is guided where
-            obstacles lead somebody far round, or repairs have not helped for some time; else it is straight where
-            robots so meet less than half of the others on average.
+            ``"straight"`` sends everybody straight to its goal and leaves the rest to repairs; ``"auto"`` does the
+            second where robots so meet less than half of the others on average.
         first_collisions: Whether the first iteration over the whole team minds collisions.
         repair_samples: ``M`` of an independent repair. A few may be better than many: their error is a search of
             its own.
@@ -41,7 +38,6 @@ class D4ormDConfig(D4ormConfig):
     """
 
     big_team: Count | None = 32
-    reroute: bool = True
     decoupling: Decoupling = "independent"
     start: Start = "auto"
     first_collisions: bool = True
@@ -49,42 +45,6 @@ class D4ormDConfig(D4ormConfig):
     repair_steps: Steps = 50
     credit: Credit = "alternate"
     penalty: Positive = 3.0
-
-
-@dataclass(frozen=True)
-class RerouteRules:
-    """The numbers of the search for ways around others.
-
-    Attributes:
-        sweeps: How many times in turn the robots that fail look for a way in an iteration.
-        batch: Robots that look for ways at the same time, not minding each other's: so that all cores have work.
-        width: Ways that a search keeps after each block of steps.
-        contact: What being near another robot for a block of steps costs in the first sweep [s]: waiting that long is
-            cheaper.
-        contact_growth: Times as much it costs in the next sweep: what cannot be had for little may be had for more.
-        apart: How far apart the ways that are kept must be [m], or else twice as much in speed [m/s].
-        earlier: Blocks before a robot's first fault at which its new way begins: from one number to the other, which
-            doubles with each sweep.
-        angles: By which a robot turns off from the way to its goal [degrees]; in space up and down as well.
-        swing: From one sweep to the next all of them change by up to so much either way [degrees].
-        paces: Shares of its speed with which a robot heads for its goal: waiting has no direction.
-        standing: Blocks for which, of two robots that meet only each other, the second is taken to stay where it starts
-            while the first looks for a way.
-        detours: Random points by which it tries to drive if it has found no way.
-    """
-
-    sweeps: int = 6
-    batch: int = 16
-    width: int = 32
-    contact: float = 1.25
-    contact_growth: float = 2.0
-    apart: float = 0.15
-    earlier: tuple[int, int] = (2, 5)
-    angles: tuple[float, ...] = (30.0, 60.0, 90.0, 135.0, 180.0)
-    swing: float = 14.0
-    paces: tuple[float, ...] = (1.0, 0.5, 0.0)
-    standing: int = 4
-    detours: int = 32
 
 
 @dataclass(frozen=True)
@@ -119,4 +79,4 @@ class RepairRules:
     batch: int = 64
 
 
-REROUTE_RULES, RULES = RerouteRules(), RepairRules()
+RULES = RepairRules()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Self, TypeAlias
 
 from pydantic import Field, InstanceOf, SkipValidation
 
@@ -18,9 +18,11 @@ from d4orm_planners.d_d4orm.ray_connection import host_and_port
 from d4orm_planners.d_d4orm.selection import SELECTIONS, shares
 from d4orm_planners.d_d4orm.transport import TRANSPORTS
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings
-from d4orm_planners.sampling.d4orm import D4orm, D4ormConfig
+from d4orm_planners.hybrid.planner import Hybrid
+from d4orm_planners.sampling.d4orm import D4orm, D4ormConfig, DeformationConfig
 
-NODE_PLANNERS: Mapping[str, type[D4orm]] = MappingProxyType({kind.name: kind for kind in (D4orm, D4ormD)})
+NodePlanner: TypeAlias = D4orm | D4ormD | Hybrid
+NODE_PLANNERS: Mapping[str, type[NodePlanner]] = MappingProxyType({k.name: k for k in (D4orm, D4ormD, Hybrid)})
 """The planners that a node can run."""
 
 MOST_NODES = 1024
@@ -31,7 +33,8 @@ MOST_NODES = 1024
 class DD4ormConfig(PlannerConfig):
     """Settings of D-D4orm. :func:`~d4orm_planners.make_planner` takes those of ``refinement`` beside the others.
 
-    There, ``planner`` says what every node refines its candidate with, ``"d4orm"`` (the default) or ``"d4orm-d"``.
+    There, ``planner`` says what every node refines its candidate with, ``"d4orm"`` (the default), ``"d4orm-d"`` or
+    ``"hybrid"``.
 
     Attributes:
         refinement: The settings of that planner. Its ``num_samples`` and ``repair_samples`` are those of all nodes
@@ -53,7 +56,7 @@ class DD4ormConfig(PlannerConfig):
             mapping of them; over a network only.
     """
 
-    refinement: InstanceOf[D4ormConfig] = field(default_factory=D4ormConfig)
+    refinement: InstanceOf[DeformationConfig] = field(default_factory=D4ormConfig)
     nodes: Annotated[Count, Field(le=MOST_NODES)] | None = 2
     selection: Annotated[str, one_of(SELECTIONS)] = "top-k"
     k: Count = 4
@@ -97,11 +100,11 @@ class DD4ormConfig(PlannerConfig):
         return {"planner": self.node_planner.name, **self.refinement.keywords(), **own}
 
     @property
-    def node_planner(self) -> type[D4orm]:
+    def node_planner(self) -> type[NodePlanner]:
         """What every node refines its candidate with."""
         return next(kind for kind in NODE_PLANNERS.values() if kind.config_class is type(self.refinement))
 
-    def node_planners(self, nodes: int) -> list[D4orm]:
+    def node_planners(self, nodes: int) -> list[NodePlanner]:
         """The planner of each of so many nodes.
 
         Raises:
@@ -139,7 +142,7 @@ def _own_names() -> tuple[str, ...]:
     return tuple(own.name for own in fields(DD4ormConfig) if own.name != "refinement")
 
 
-def _node_planner(given: Mapping[str, object]) -> type[D4orm]:
+def _node_planner(given: Mapping[str, object]) -> type[NodePlanner]:
     name = given.get("planner", D4orm.name)
     if not isinstance(name, str):
         raise ValueError(f"planner must be text, not {shown(name)}")

@@ -182,7 +182,7 @@ class JaxSamplingEngine(JaxEngine):
         return _compiled_denoise(static, treedef, tuple((leaf.shape, leaf.dtype) for leaf in leaves)), arguments
 
     def prepare(self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int) -> None:
-        """See :meth:`d4orm_env.engine.types.Engine.prepare`."""
+        """See :meth:`d4orm_planners.engine.sampling_types.SamplingEngine.prepare`."""
         self._lower(task, rules, task.base, noise_scale, num_samples, 0)
 
     def denoise(
@@ -196,7 +196,7 @@ class JaxSamplingEngine(JaxEngine):
         should_stop: Callable[[], bool] | None = None,
         watcher: StepWatcher | None = None,
     ) -> SamplingResult:
-        """See :meth:`d4orm_env.engine.types.Engine.denoise`.
+        """See :meth:`d4orm_planners.engine.sampling_types.SamplingEngine.denoise`.
 
         Raises:
             ValueError: If there is a watcher: the steps are compiled into one program.

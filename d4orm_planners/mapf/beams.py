@@ -14,8 +14,8 @@ from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_planners.engine.path_index import BLOCK
 from d4orm_planners.mapf.beam_search import BeamRules, Moves, Seekers, search_kernel
-from d4orm_planners.mapf.working_plan import TeamPaths
 from d4orm_planners.tracking.steering import Drives, by_model
+from d4orm_planners.tracking.working_plan import TeamPaths
 
 
 @dataclass(frozen=True)

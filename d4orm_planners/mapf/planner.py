@@ -30,7 +30,7 @@ STEPS = 3000
 
 
 @dataclass(frozen=True, kw_only=True)
-class GuidedConfig(PlannerConfig):
+class MAPFConfig(PlannerConfig):
     """Settings of path finding.
 
     Attributes:
@@ -69,14 +69,14 @@ class NoWays:
     why: str
 
 
-class Guided(Planner):
+class MAPF(Planner):
     """Path finding on a roadmap, one robot after another or for all at once, driven under the robots' own dynamics."""
 
-    name: ClassVar[str] = "guided"
-    config_class = GuidedConfig
+    name: ClassVar[str] = "mapf"
+    config_class = MAPFConfig
     # The paper names path finding as what is missing, and so has no parameters for it.
     presets: ClassVar = {"paper": {}}
-    config: GuidedConfig
+    config: MAPFConfig
 
     def iterate(self, search: Search, state: Guide | NoWays | None) -> tuple[Guide | NoWays, Iteration]:
         """See :meth:`Planner.iterate`: first ways for the whole team, then better ones for some robots at a time."""

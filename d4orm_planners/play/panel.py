@@ -27,8 +27,8 @@ POLICIES = {
     "ppo": "PPO",
     "sac": "SAC",
     "goal": "straight",
-    "d4orm-d": "open loop: D4orm-D",
-    "guided": "open loop: guided",
+    "hybrid": "open loop: hybrid",
+    "mapf": "open loop: path finding",
 }
 """Policies that the page offers, and what it calls them."""
 

@@ -3,40 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_planners.base.planner import Iteration, State
-from d4orm_planners.base.settings import Positive, Samples, Share, ShareOrNone, Steps, one_of
+from d4orm_planners.base.settings import Positive, Samples, Share, ShareOrNone, Steps
 from d4orm_planners.base.solve import Search
 from d4orm_planners.engine.sampling_types import SamplingTask
-from d4orm_planners.mapf.improvement import refined_iteration
-from d4orm_planners.mapf.planner import Guide, compile_roadmap, first_ways, guided_iteration, leads_round
 from d4orm_planners.sampling.loop import DenoisingPlanner, standard_normal
 from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, Credit, DenoisingConfig
 from d4orm_planners.sampling.tuned import TUNED
 
-SPELL, PATIENT_SAMPLES = 8, 4
+FALLBACK_PERIOD, FALLBACK_SAMPLE_FACTOR = 8, 4
 """Iterations without a solution after which ``"alternate"`` weights by the team's reward for as many, in turn; and how
 many times as many samples it draws meanwhile."""
 
-PAPER_DEFORMATION = {
-    **PAPER,
-    "credit": "team",
-    "penalty": 1.0,
-    "late_samples": 1.0,
-    "shorten": False,
-    "start": "team",
-    "random_start": False,
-}
-Start = Annotated[str, one_of(("auto", "team", "guided"))]
+PAPER_DEFORMATION = {**PAPER, "credit": "team", "penalty": 1.0, "late_samples": 1.0, "random_start": False}
 
 
 @dataclass(frozen=True, kw_only=True)
-class D4ormConfig(ContinuationSettings, DenoisingConfig):
-    """Settings of D4orm. The defaults are meant for a first solution soon; the preset ``"paper"`` has the paper's.
+class DeformationConfig(ContinuationSettings, DenoisingConfig):
+    """Settings of planners that deform controls. The defaults are meant for a first solution soon.
 
     Attributes:
         num_samples: ``M``.
@@ -48,11 +36,6 @@ class D4ormConfig(ContinuationSettings, DenoisingConfig):
             in the rollout only.
         late_steps: Share of the steps, the last ones, at which the noise is small enough for fewer samples.
         late_samples: Share of the samples that these steps draw.
-        shorten: Whether, once there is a solution, groups of robots look for faster ways around all others, rather than
-            the whole team being deformed again (:mod:`d4orm_planners.mapf`).
-        start: What the first iteration does without initial controls. ``"team"`` deforms standing still, as in the
-            paper; ``"guided"`` drives on ways found on a roadmap (:mod:`d4orm_planners.mapf`), which later
-            iterations deform; ``"auto"`` does the second where obstacles lead somebody far round.
         random_start: Start every deformation from ``U_N ~ N(0, I)``, as Algorithm 1 is written, rather than from zero.
             The code that the paper's authors published starts from zero, and so does the preset: it solves more.
     """
@@ -64,59 +47,17 @@ class D4ormConfig(ContinuationSettings, DenoisingConfig):
     clip_between_iterations: bool = True
     late_steps: ShareOrNone = 0.7
     late_samples: Share = 0.5
-    shorten: bool = True
-    start: Start = "auto"
     random_start: bool = False
 
 
-class D4orm(DenoisingPlanner):
-    """Iterative deformation: denoise a change of the team's controls and add it to them, until everyone passes."""
+class DeformingPlanner(DenoisingPlanner):
+    """A planner that denoises a change of the team's controls and adds it to them."""
 
-    name: ClassVar[str] = "d4orm"
-    config_class = D4ormConfig
-    presets: ClassVar = {"paper": PAPER_DEFORMATION, "tuned": {**PAPER_DEFORMATION, **TUNED["d4orm"]}}
-    config: D4ormConfig
-
-    def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
-        """See :meth:`Planner.iterate`."""
-        if search.iteration == 0 and self.is_guided(search):
-            guide = first_ways(search)
-            if isinstance(guide, Guide):
-                return state, guided_iteration(search, guide)
-        if self.config.shorten and search.best.solved:
-            return state, refined_iteration(search)
-        return super().iterate(search, state)
-
-    def task(self, search: Search, base: FloatArray) -> SamplingTask:
-        """See :meth:`SamplingPlanner.task`."""
-        task = super().task(search, base)
-        return replace(task, credit="team") if self.is_patient(search) else task
-
-    def num_samples(self, search: Search) -> int:
-        """See :meth:`SamplingPlanner.num_samples`."""
-        samples = self.config.num_samples
-        return PATIENT_SAMPLES * samples if self.is_patient(search) else samples
-
-    def is_patient(self, search: Search) -> bool:
-        """Whether it goes on with more patience: what finds its way soonest may never find it among many."""
-        hasty = self.config.credit == "alternate"
-        return hasty and search.iteration // SPELL % 2 == 1 and not search.best.solved
-
-    def is_guided(self, search: Search) -> bool:
-        """Whether the first iteration is to find ways on a roadmap."""
-        if search.current.controls.any() or self.config.start not in ("auto", "guided"):
-            return False
-        if self.config.start == "guided":
-            return True
-        with search.watch.paused():
-            compile_roadmap(search.problem)
-        return leads_round(search.problem)
+    config: DeformationConfig
 
     def stages(self, search: Search) -> list[tuple[FloatArray, int]]:
         """See :meth:`SamplingPlanner.stages`."""
         noise_scale, num_samples = self.noise_scale(), self.num_samples(search)
-        if self.is_patient(search):
-            return [(noise_scale, num_samples)]
         early = len(noise_scale) - round(self.config.late_steps * len(noise_scale))
         fewer = max(2, round(self.config.late_samples * num_samples))
         if fewer == num_samples:
@@ -137,3 +78,38 @@ class D4orm(DenoisingPlanner):
         if not self.config.random_start:
             return np.zeros_like(base)
         return self.first_mean(standard_normal(search, base.shape, number))
+
+
+@dataclass(frozen=True, kw_only=True)
+class D4ormConfig(DeformationConfig):
+    """Settings of D4orm; the preset ``"paper"`` has the paper's."""
+
+
+class D4orm(DeformingPlanner):
+    """Iterative deformation: denoise a change of the team's controls and add it to them, until everyone passes."""
+
+    name: ClassVar[str] = "d4orm"
+    config_class = D4ormConfig
+    presets: ClassVar = {"paper": PAPER_DEFORMATION, "tuned": {**PAPER_DEFORMATION, **TUNED["d4orm"]}}
+    config: D4ormConfig
+
+    def task(self, search: Search, base: FloatArray) -> SamplingTask:
+        """See :meth:`SamplingPlanner.task`."""
+        task = super().task(search, base)
+        return replace(task, credit="team") if self.in_fallback(search) else task
+
+    def num_samples(self, search: Search) -> int:
+        """See :meth:`SamplingPlanner.num_samples`."""
+        samples = self.config.num_samples
+        return FALLBACK_SAMPLE_FACTOR * samples if self.in_fallback(search) else samples
+
+    def stages(self, search: Search) -> list[tuple[FloatArray, int]]:
+        """See :meth:`SamplingPlanner.stages`."""
+        if self.in_fallback(search):
+            return [(self.noise_scale(), self.num_samples(search))]
+        return super().stages(search)
+
+    def in_fallback(self, search: Search) -> bool:
+        """Return whether ``"alternate"`` has stagnated, and draws more samples for the team's reward."""
+        alternating = self.config.credit == "alternate"
+        return alternating and search.iteration // FALLBACK_PERIOD % 2 == 1 and not search.best.solved

@@ -20,9 +20,9 @@ from d4orm_env.engine import stepping
 from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS, ZERO, to_fixed_tuple
 from d4orm_env.engine.stepping import make_stepper, models_key
-from d4orm_planners.mapf.routes import Routes
 from d4orm_planners.tracking import pursuit
 from d4orm_planners.tracking.pursuit import lookaheads, point_ahead, point_reached, square_to, steering
+from d4orm_planners.tracking.routes import Routes
 
 SOURCES = fingerprint((robot_model, transition, *stepping.PARTS, stepping, pursuit))
 

@@ -14,10 +14,10 @@ from d4orm_env.dynamics.models import MODELS
 from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS, ZERO, inlined, to_fixed_tuple
 from d4orm_env.engine.stepping import make_stepper, models_key
-from d4orm_planners.mapf.routes import Route, Stops
 from d4orm_planners.tracking import path_drives, pursuit
 from d4orm_planners.tracking.path_drives import BEYOND, RESERVE
 from d4orm_planners.tracking.pursuit import point_ahead, point_reached, square_to, steering
+from d4orm_planners.tracking.routes import Route, Stops
 from d4orm_planners.tracking.straight_drives import LoneRobot
 
 SOURCES = path_drives.SOURCES + fingerprint((path_drives,))

@@ -27,7 +27,7 @@ from d4orm_planners.d4orm_c2f.lookahead import LEAST, within_sight
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
 from d4orm_planners.engine.select import get_sampling_engine
-from d4orm_planners.mapf.working_plan import TeamPaths
+from d4orm_planners.tracking.working_plan import TeamPaths
 
 
 @pytest.mark.parametrize(

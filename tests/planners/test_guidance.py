@@ -18,11 +18,12 @@ from d4orm_planners import make_planner
 from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.mapf.lacam import Moves, find_moves
 from d4orm_planners.mapf.planner import leads_round
+from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
 from d4orm_planners.mapf.replanning import Others, Trip, find_way
 from d4orm_planners.mapf.roadmap import Roadmap, lay_roadmap
 from d4orm_planners.mapf.roadmap_team import Driven, Replanning, drive_moves
-from d4orm_planners.mapf.routes import Stops, join_routes, make_routes, stops_of
 from d4orm_planners.tracking.pursuit import gear_towards
+from d4orm_planners.tracking.routes import Stops
 from d4orm_planners.tracking.timed_path import drive_by_clock
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from d4orm_planners.d4orm_d.rerouting import reroute
 from engine_support import MODEL_NAMES
 
 from d4orm_env.core.problem import Problem
@@ -17,11 +18,10 @@ from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import make_planner
 from d4orm_planners.base.solve import Search
-from d4orm_planners.d4orm_d.rerouting import reroute
 from d4orm_planners.engine import path_index
 from d4orm_planners.mapf import beams
-from d4orm_planners.mapf.working_plan import TeamPaths
 from d4orm_planners.tracking.steering import straight_drives
+from d4orm_planners.tracking.working_plan import TeamPaths
 
 
 def rerouted(problem: Problem, seed: int = 0) -> TeamPaths:

@@ -117,5 +117,5 @@ def _refuse_polygons(problem: Problem) -> None:
     if problem.world.polygons:
         raise ValueError(
             f"the world has {len(problem.world.polygons)} polygons, and planner 'amswarm' knows circles, spheres, "
-            f"cylinders and boxes only; give boxes in their place, or use planner 'd4orm-d'"
+            f"cylinders and boxes only; give boxes in their place, or use planner 'hybrid'"
         )

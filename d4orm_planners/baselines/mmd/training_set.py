@@ -23,7 +23,7 @@ KINDS: tuple[tuple[str, dict[str, object]], ...] = (
     ("corridor", {}),
 )
 """Scenarios and their settings that maps are drawn from, in turn."""
-PLANNERS = ("guided", "d4orm-d")
+PLANNERS = ("mapf", "hybrid")
 """Whose plans are learned from, in turn."""
 _PHANTOMS = 3
 """Most circles near the way that a plan has to go round and the model is not told of."""

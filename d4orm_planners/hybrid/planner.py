@@ -1,0 +1,147 @@
+"""The hybrid planner: an initialiser, a repairer and an improver, each of them a part that stands elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+
+from d4orm_planners.base.planner import Iteration, Planner
+from d4orm_planners.base.solve import Search
+from d4orm_planners.d4orm_d.deformed_plan import DeformedTeam
+from d4orm_planners.d4orm_d.groups import Groups
+from d4orm_planners.d4orm_d.planner import D4ormD
+from d4orm_planners.d4orm_d.repairs import Repairs
+from d4orm_planners.hybrid.settings import HybridConfig
+from d4orm_planners.mapf.improvement import FIRST_ROUNDS, GUIDED_ROUNDS, refined_iteration, shorten_first_ways
+from d4orm_planners.mapf.planner import (
+    Guide,
+    MAPFConfig,
+    better_ways,
+    compile_roadmap,
+    first_ways,
+    going_on_from_best,
+    guided_iteration,
+    leads_round,
+)
+from d4orm_planners.tracking.working_plan import TeamPaths
+
+State = Groups | Repairs | Guide
+"""What is kept between iterations: the repairer's state, or the roadmap solution once there is one."""
+
+REPLANNING = MAPFConfig()
+MAPF_AFTER = 6
+"""Iterations without a solution after which paths are looked for on a roadmap."""
+LNS_PERIOD = 5
+"""Of so many iterations on a roadmap solution one improves the motions, the others replan on the roadmap."""
+
+
+class Hybrid(Planner):
+    """Path finding where it helps, D4orm-D where robots conflict, and anytime improvement of what was found."""
+
+    name: ClassVar[str] = "hybrid"
+    config_class = HybridConfig
+    drives_straight: ClassVar[bool] = True
+    config: HybridConfig
+
+    def __init__(self, config: HybridConfig) -> None:
+        super().__init__(config)
+        self.denoiser = D4ormD(config)
+
+    def init(self, search: Search) -> State:
+        """See :meth:`Planner.init`."""
+        state = self.denoiser.init(search)
+        if isinstance(state, Repairs) and (self.config.reroute or self.improves_by_lns):
+            # Here, because importing numba takes long.
+            from d4orm_planners.mapf.beams import prepare_beams
+
+            with search.watch.paused():
+                prepare_beams(TeamPaths(search, search.current.trajectory))
+        return state
+
+    @property
+    def improves_by_lns(self) -> bool:
+        """Return whether solutions become better by large-neighbourhood search."""
+        return self.config.improver == "lns"
+
+    def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
+        """See :meth:`Planner.iterate`: initialise, then repair who fails, then improve."""
+        if isinstance(state, Guide):
+            return self.improve_roadmap_solution(search, state)
+        if self.finds_paths(search):
+            solution = first_ways(search)
+            if isinstance(solution, Guide):
+                return solution, self.follow(search, solution)
+        if search.iteration == 0 and not search.current.controls.any():
+            drives = self.denoiser.straight_start(search.problem)
+            return self.whole_team(search, state) if drives is None else (state, Iteration(drives))
+        if self.improves_by_lns and search.best.solved:
+            return state, refined_iteration(search)
+        if not search.current.failed.any() or (isinstance(state, Groups) and search.best.solved):
+            return self.whole_team(search, state)
+        team = DeformedTeam(self.denoiser, search, search.current.trajectory)
+        if isinstance(state, Groups):
+            return state.replan(team), team.iteration()
+        return self.repair(team, state), team.iteration()
+
+    def repair(self, team: DeformedTeam, state: Repairs) -> Repairs:
+        """Search for paths around others for who fails, and deform who fails nevertheless."""
+        if self.config.reroute:
+            # Here, because importing numba takes long.
+            from d4orm_planners.hybrid.rerouting import reroute
+
+            reroute(team)
+        state = state.repair(team, self.config)
+        self.improve_first(team)
+        return state
+
+    def whole_team(self, search: Search, state: State) -> tuple[State, Iteration]:
+        """Deform everybody's controls at once, as D4orm-D does, and improve them if nobody fails."""
+        assert not isinstance(state, Guide)
+        state, iteration = self.denoiser.whole_team(search, state)
+        if not isinstance(state, Repairs):
+            return state, iteration
+        team = DeformedTeam(self.denoiser, search, search.engine.rollout(search.problem, iteration.controls))
+        self.improve_first(team)
+        return state, replace(iteration, controls=team.controls)
+
+    def follow(self, search: Search, solution: Guide) -> Iteration:
+        """What a team does on a roadmap solution, a little improved if that is all that is left to do."""
+        iteration = guided_iteration(search, solution)
+        if not self.improves_by_lns:
+            return iteration
+        team = DeformedTeam(self.denoiser, search, search.engine.rollout(search.problem, iteration.controls))
+        self.improve_first(team, GUIDED_ROUNDS)
+        return replace(iteration, controls=team.controls)
+
+    def improve_roadmap_solution(self, search: Search, solution: Guide) -> tuple[Guide, Iteration]:
+        """Replan robots on the roadmap, and by turns search among the motions.
+
+        The first finds other ways round, the second cuts corners and leaves out stops.
+        """
+        if search.best.solved and self.improves_by_lns:
+            if search.iteration % LNS_PERIOD == 1:
+                return solution, refined_iteration(search)
+            solution = going_on_from_best(search, solution)
+        solution = better_ways(search, solution, REPLANNING.neighbours, REPLANNING.replannings)
+        return solution, guided_iteration(search, solution)
+
+    def finds_paths(self, search: Search) -> bool:
+        """Return whether this iteration is to find paths: the first, or one after some without a solution."""
+        start = self.config.start
+        if search.iteration == 0:
+            if search.current.controls.any() or start not in ("auto", "mapf"):
+                return False
+            if start == "mapf":
+                return True
+            with search.watch.paused():
+                compile_roadmap(search.problem)
+            return leads_round(search.problem)
+        stuck = search.iteration == MAPF_AFTER and not search.best.solved and search.problem.world.num_obstacles > 0
+        return stuck and start == "auto"
+
+    def improve_first(self, team: DeformedTeam, rounds: int = FIRST_ROUNDS) -> None:
+        """Improve a team in which nobody fails any more, for some rounds."""
+        if self.improves_by_lns and not team.faults(np.arange(team.problem.num_robots))[0].any():
+            shorten_first_ways(team, rounds)
