@@ -10,7 +10,6 @@ import numpy as np
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
-from d4orm_env.engine.types import Engine
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.planner import Planner
@@ -31,6 +30,7 @@ from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.d4orm_c2f.warm_start import episode_of
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
+from d4orm_planners.engine.sampling_types import SamplingEngine
 from d4orm_planners.hybrid.planner import Hybrid
 from d4orm_planners.hybrid.settings import HybridConfig
 from d4orm_planners.mapf.planner import Guide as Ways
@@ -71,7 +71,7 @@ class Guide:
         problem: Problem,
         config: D4ormC2FConfig,
         seed: int,
-        refiner: Engine,
+        refiner: SamplingEngine,
         background: Background[Guidance],
         lifelong: bool,
         last_step: int,
@@ -169,11 +169,11 @@ class Guide:
         walls = self.guidance.ordered
         return within_sight(self.problem, positions, path, self._indices, targets, docked, walls)
 
-    def followed(self, joint: JointState, engine: Engine, horizon: int) -> FloatArray:
+    def followed(self, joint: JointState, engine: SamplingEngine, horizon: int) -> FloatArray:
         """``(horizon, K, m)`` controls that take every robot along its path, from where on it it is."""
         return keep_time(self.problem, engine, joint, self.guidance.path, self._indices, horizon)
 
-    def timed(self, joint: JointState, engine: Engine, horizon: int) -> FloatArray:
+    def timed(self, joint: JointState, engine: SamplingEngine, horizon: int) -> FloatArray:
         """``(horizon, K, m)`` controls that take every robot along its path in the team's time."""
         return keep_time(self.problem, engine, joint, self.guidance.path, self._clock(), horizon)
 

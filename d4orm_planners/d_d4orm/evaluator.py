@@ -6,8 +6,8 @@ import threading
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.types import Engine
 from d4orm_planners.base.candidate import Candidate, evaluate_controls
+from d4orm_planners.engine.sampling_types import SamplingEngine
 
 
 class Stopped(Exception):
@@ -29,7 +29,7 @@ class Judge:
         solution_ends: Whether to set it at the first solution.
     """
 
-    def __init__(self, engine: Engine, problem: Problem, remembered: int = 0) -> None:
+    def __init__(self, engine: SamplingEngine, problem: Problem, remembered: int = 0) -> None:
         self.stop = threading.Event()
         self.solution_ends = False
         self.engine, self.problem, self._remembered = engine, problem, remembered

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Annotated, Any, Self, TypeAlias
@@ -121,7 +121,8 @@ class DD4ormConfig(PlannerConfig):
                 )
             for own, share in zip(settings, shares(total, nodes), strict=True):
                 own[name] = share
-        return [self.node_planner(replace(self.refinement, **own)) for own in settings]
+        make: Callable[[Any], NodePlanner] = self.node_planner  # whose settings these are
+        return [make(replace(self.refinement, **own)) for own in settings]
 
     def check_node(self, nodes: int) -> None:
         """Raise ``ValueError`` if this process is none of so many nodes."""
