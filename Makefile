@@ -33,7 +33,7 @@ test: $(DEV_STAMP) ## Run the whole test suite; PYTEST_ARGS='-m "not slow"' for 
 # RLlib and JaxMARL pin an older Gymnasium, BenchMARL an older TorchRL than the rest is tested with.
 test-apart = $(PYTHON) -m venv $(VENV)-$(1) && \
   $(VENV)-$(1)/bin/python -m pip install --quiet --editable . pytest $(2) && \
-  $(VENV)-$(1)/bin/python -m pytest --noconftest -W default tests/test_$(1).py
+  $(VENV)-$(1)/bin/python -m pytest --noconftest -W default tests/env/test_$(1).py
 integrations: ## Test the integrations whose libraries need an environment of their own: RLlib, BenchMARL, JaxMARL
 	$(call test-apart,rllib,'ray[rllib]==2.60.0' torch==2.13.0)
 	$(call test-apart,benchmarl,benchmarl==1.5.2)

@@ -26,7 +26,7 @@ from d4orm_planners.engine.softmax import softmax_weights
 from d4orm_planners.mapf.beam_search import search_kernel
 from d4orm_planners.tracking.straight_drives import drive_kernel
 
-PORTABILITY = Path(__file__).parent / "portability"
+PORTABILITY = Path(__file__).parents[1] / "portability"
 sys.path.insert(0, str(PORTABILITY))
 import plans  # noqa: E402
 

@@ -28,7 +28,7 @@ from d4orm_env.verify.integrated import Integrated
 from d4orm_env.verify.motion import TeamMotion
 from d4orm_planners import make_planner
 
-PAGE = Path(__file__).parents[1] / "docs" / "own_robot.md"
+PAGE = Path(__file__).parents[2] / "docs" / "own_robot.md"
 STEP = TimeStep(0.1, 0.1 / 2, 0.1 / 3, 0.1 / 6)
 
 

@@ -19,7 +19,7 @@ from d4orm_env.scenarios.scenario_registry import SCENARIOS
 from d4orm_planners import OpenLoop, evaluate, make_planner, run_episode
 from d4orm_planners.cli.app import main
 
-PAGE = Path(__file__).parents[1] / "docs" / "own_scenario.md"
+PAGE = Path(__file__).parents[2] / "docs" / "own_scenario.md"
 
 
 def lanes(seed: int, num_robots: int, *, gap: float = 1.0) -> Problem:

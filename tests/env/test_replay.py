@@ -107,7 +107,7 @@ def test_rounding_is_to_a_65535th_of_the_range(values: np.ndarray) -> None:
 
 
 def test_the_replays_that_the_pages_show_are_made() -> None:
-    docs = Path(__file__).resolve().parents[1] / "docs"
+    docs = Path(__file__).resolve().parents[2] / "docs"
     made = runpy.run_path(str(docs / "replays.py"))["REPLAYS"]
     shown = {name for page in docs.rglob("*.md") for name in re.findall(r"replays/(\w+)\.html", page.read_text())}
     assert shown == set(made)

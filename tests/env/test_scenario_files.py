@@ -20,7 +20,7 @@ from d4orm_env.core.yaml_text import parse_yaml
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.scenarios import list_scenarios, load_problem, make_problem, save_problem
 
-EXAMPLE = Path(__file__).parents[1] / "examples" / "scenarios" / "mixed_team.yaml"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "scenarios" / "mixed_team.yaml"
 CASES: list[tuple[str, str | None]] = [
     (name, model) for name in ("circle", "random", "four_obstacles", "swap") for model in MODELS
 ]

@@ -40,7 +40,7 @@ from d4orm_planners.base.settings import CheckedSettings, Positive
 from d4orm_planners.cli import app as cli
 from d4orm_planners.evaluation.store import STORE, TrialStore
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PROBLEM = line_problem([9.0, 9.0, 9.0], horizon=20)
 
 

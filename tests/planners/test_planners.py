@@ -495,7 +495,7 @@ def test_a_preset_says_nothing_of_what_no_planner_has(name: str) -> None:
 
 
 def test_the_tuned_presets_are_the_best_of_the_tuning() -> None:
-    with (Path(__file__).parents[1] / "docs" / "tables" / "tuning.csv").open(newline="") as file:
+    with (Path(__file__).parents[2] / "docs" / "tables" / "tuning.csv").open(newline="") as file:
         best = {row["method"]: row["settings"] for row in reversed(list(csv.DictReader(file)))}
     assert best.keys() == TUNED.keys()
     for name, found in best.items():

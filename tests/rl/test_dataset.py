@@ -25,7 +25,7 @@ minari = pytest.importorskip("minari")
 
 RANDOM = {"scenario": "random", "num_robots": 3}
 IN_TIME = {"policy": "goal", "environment": RANDOM, "seeds": range(4)}
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def written(folder: Path, **changes: Any) -> Any:

@@ -21,7 +21,7 @@ from d4orm_planners import Plan
 from d4orm_planners.evaluation.tables import read_parquet
 from d4orm_planners.sampling.tuned import TUNED
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = ROOT / "examples"
 PNG = b"\x89PNG"
 SOLVE_RATES = {"paper": 1, "big": 1, "canonical": 1, "walls": 1, "few": 3}
