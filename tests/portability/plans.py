@@ -35,6 +35,7 @@ CASES = {
     "d4orm of the paper": Case(
         "d4orm", {"preset": "paper", "num_steps": 10, "random_start": True}, "circle", {"num_robots": 4}
     ),
+    "hybrid": Case("hybrid", {}, "random", {"num_robots": 24, "size": 6.0}, 30),
     "d4orm-d": Case("d4orm-d", {}, "random", {"num_robots": 24, "size": 6.0}, 30),
     "d4orm-d of the paper": Case("d4orm-d", {"preset": "paper", "num_steps": 10}, "random", {"num_robots": 8}, 4),
     "d-d4orm": Case("d-d4orm", {}, "circle", {"num_robots": 6}),
@@ -43,22 +44,22 @@ CASES = {
     "mbd": Case("mbd", {"num_steps": 20}, "swap", {"num_robots": 4}),
     "i-mbd": Case("i-mbd", {"num_steps": 10}, "swap", {"num_robots": 4}),
     "mixed models": Case("d4orm", {}, "heterogeneous", {"num_robots": 6}),
-    "differential drives": Case("d4orm-d", {}, "random", {"num_robots": 8, "model": "differential_drive"}, 30),
+    "differential drives": Case("hybrid", {}, "random", {"num_robots": 8, "model": "differential_drive"}, 30),
     "first-order robots": Case("d4orm", {}, "circle", {"num_robots": 6, "model": "velocity2d"}),
     "unicycles": Case("d4orm", {}, "circle", {"num_robots": 4, "model": "unicycle"}),
     "cars": Case("d4orm", {}, "circle", {"num_robots": 4, "model": "car"}),
     "in space": Case("d4orm", {}, "sphere", {"num_robots": 8}),
-    "among walls": Case("d4orm-d", {"improve": True}, "rooms", {"num_robots": 8}, 3),
-    "a roundabout": Case("d4orm-d", {"improve": True}, "circle", {"num_robots": 6}, 3),
+    "among walls": Case("hybrid", {"improve": True}, "rooms", {"num_robots": 8}, 3),
+    "a roundabout": Case("hybrid", {"improve": True}, "circle", {"num_robots": 6}, 3),
     "amswarm": Case("amswarm", {}, "amswarm_3", {}, 1),
     "mmd": Case("mmd", {"improve": True}, "rooms", {"num_robots": 5}, 4),
     "under way": Case(
         "d4orm-c2f", {"refine": "sync"}, "circle", {"num_robots": 6}, 0, (Intruder(4, 0.8), Push(0.3, 0.3))
     ),
-    "through a corridor": Case("guided", {"improve": True}, "corridor", {"num_robots": 6}, 2),
+    "through a corridor": Case("mapf", {"improve": True}, "corridor", {"num_robots": 6}, 2),
 }
 
-QUICK = ("d4orm", "d4orm-d", "mppi", "cem", "mixed models")
+QUICK = ("d4orm", "hybrid", "mppi", "cem", "mixed models")
 """Cases that compile two sampling kernels only, and run through everything else."""
 
 
