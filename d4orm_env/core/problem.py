@@ -40,6 +40,8 @@ MAX_HORIZON, MAX_ROBOT_STEPS = 1_000_000, 50_000_000
 """Most steps of a problem, and most robots times steps: a slip of the finger must not fill the memory."""
 MIN_TIME_STEP, MAX_TIME_STEP = 1e-6, 1e3
 """Bounds of ``dt`` [s]."""
+ROUNDING, GRAINS = 1 / 15_000, 4
+"""Allowance for rounding, in radii of the largest robot, and in what float32 resolves at the farthest start or goal."""
 
 
 def check_arrival(value: object) -> None:
@@ -62,7 +64,7 @@ class Problem(Frozen):
     float32 resolves a start or goal to more than a hundredth of the goal radius (with the default of 0.075 m, beyond
     8192 m from the origin) or to more than a tenth of what a robot moves in a step, and where a robot at its
     limits turns too far. At constant turn rate ``w`` and speed ``v`` RK4 is Simpson's rule, which is off by at
-    most ``v dt (w dt)^4 / 2880`` per step; that must not exceed 1 cm.
+    most ``v dt (w dt)^4 / 2880`` per step; that must not exceed 2/15 of the goal radius (with the default, 1 cm).
 
     Attributes:
         team: The robots.
@@ -133,6 +135,8 @@ class Problem(Frozen):
 
     def _check(self) -> None:
         team, places = self.team, self.start[:, : self.dimension]
+        # Asked for first, so that all clearances are found by the index of the engines.
+        self.world.index(self._reach)
         if self.horizon * team.num_robots > MAX_ROBOT_STEPS:
             most = MAX_ROBOT_STEPS // team.num_robots
             raise ValueError(
@@ -140,7 +144,7 @@ class Problem(Frozen):
             )
         check_states(team, self.start)
         check_resolution(team, np.concatenate([places, self.goal], axis=1), self.dt, self.goal_radius)
-        check_turning(team, self.dt)
+        check_turning(team, self.dt, self.goal_radius)
         check_places(team, self.world, "start", places)
         check_places(team, self.world, "goal", self.goal)
 
@@ -174,6 +178,17 @@ class Problem(Frozen):
         """Whether a robot that has arrived stands there for ever."""
         return self.arrival == "dock"
 
+    @property
+    def _reach(self) -> float:
+        """The largest distance from an obstacle at which it counts [m]."""
+        return float(np.max(self.team.radius)) + self.margin
+
+    @cached_property
+    def rounding(self) -> float:
+        """Allowance for what float32 makes of distances [m]: a little of a radius, more where coordinates are large."""
+        farthest = max(np.abs(self.start[:, : self.dimension]).max(), np.abs(self.goal).max())
+        return max(ROUNDING * self.team.largest_radius, GRAINS * float(np.spacing(farthest)))
+
     @cached_property
     def arrays(self) -> ProblemArrays:
         """The problem as the engines read it."""
@@ -189,7 +204,7 @@ class Problem(Frozen):
             ),
             boxes=self.world.shapes.boxes,
             triangles=self.world.shapes.triangles,
-            grid=self.world.index(float(np.max(self.team.radius)) + self.margin),
+            grid=self.world.index(self._reach),
             bounds=self.world.bounds,
             time_step=np.array([self.dt, self.dt / 2, self.dt / 3, self.dt / 6], np.float32),
             margin=np.float32(self.margin),
@@ -205,7 +220,7 @@ class Problem(Frozen):
     def arrays_to_observe(self, num_obstacles: int) -> ProblemArrays:
         """:attr:`arrays` with an index that finds so many of the nearest obstacles of any place."""
         places = np.concatenate([self.start[:, : self.dimension], self.goal])
-        grid = self.world.index(float(np.max(self.team.radius)) + self.margin, max(num_obstacles, 1), places)
+        grid = self.world.index(self._reach, max(num_obstacles, 1), places)
         return self.arrays._replace(grid=grid)
 
     @cached_property

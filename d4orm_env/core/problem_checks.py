@@ -15,8 +15,8 @@ RESOLUTION = 100
 """The goal radius is at least so many times what float32 resolves at the farthest start or goal."""
 STEP_RESOLUTION = 10
 """A robot at its speed limit moves at least so many times that in one step."""
-INTEGRATION_ERROR = 0.01
-"""Most that one step of RK4 may be off where a robot turns at its limits [m]."""
+INTEGRATION_ERROR = 2 / 15
+"""Most that one step of RK4 may be off where a robot turns at its limits, as a share of the goal radius."""
 
 
 def check_states(team: Team, states: FloatArray, what: str = "start") -> None:
@@ -67,19 +67,19 @@ def check_resolution(team: Team, places: FloatArray, dt: float, goal_radius: flo
             )
 
 
-def check_turning(team: Team, dt: float) -> None:
+def check_turning(team: Team, dt: float, goal_radius: float) -> None:
     """Refuse a time step in which one step of RK4 does not follow a robot that turns as fast as it may."""
-    team_limits = team.limits
+    team_limits, most = team.limits, INTEGRATION_ERROR * goal_radius
     for robot, model in enumerate(team.robot_models):
         if model.heading_index is None:
             continue
         speed = float(team_limits[robot, SPEED])
         angle = model.turn_rate(team_limits[robot]) * dt
         error = speed * dt * angle**4 / 2880
-        if error > INTEGRATION_ERROR:
+        if error > most:
             raise ValueError(
                 f"robot_{robot} may turn by {angle:.3g} rad in a step of {dt:g} s, and at {speed:g} m/s one "
-                f"step of RK4 may then be {error:.2g} m off (most: {INTEGRATION_ERROR:g} m); use a smaller dt, "
+                f"step of RK4 may then be {error:.2g} m off (most: {most:.2g} m, by goal_radius); use a smaller dt, "
                 f"{_turning_limits(model)} or max_speed"
             )
 

@@ -12,7 +12,12 @@ from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray, Frozen, frozen_per_robot, shown
 from d4orm_env.dynamics.models import get_model
-from d4orm_env.dynamics.robot_model import STANDARD_LIMITS, Limit, Model
+from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, STANDARD_LIMITS, TURN_RATE, Limit, Model
+
+DEFAULT_RADIUS = 0.15
+"""Of a robot [m]."""
+DEFAULT_LIMITS = (1.0, 1.0, float(np.pi / 2))
+"""Of speed [m/s], acceleration [m/s^2] and turn rate [rad/s]."""
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -46,10 +51,10 @@ class Team(Frozen):
     def __init__(
         self,
         models: Sequence[str],
-        radius: ArrayLike = 0.15,
-        max_speed: ArrayLike = 1.0,
-        max_acceleration: ArrayLike = 1.0,
-        max_turn_rate: ArrayLike = float(np.pi / 2),
+        radius: ArrayLike = DEFAULT_RADIUS,
+        max_speed: ArrayLike = DEFAULT_LIMITS[SPEED],
+        max_acceleration: ArrayLike = DEFAULT_LIMITS[ACCELERATION],
+        max_turn_rate: ArrayLike = DEFAULT_LIMITS[TURN_RATE],
         own_limits: Mapping[str, ArrayLike] = MappingProxyType({}),
     ) -> None:
         if isinstance(models, str) or not isinstance(models, Sequence):
@@ -123,6 +128,25 @@ class Team(Frozen):
             bound[robot, : model.control_size] = limits[list(model.control_limits)]
         bound.setflags(write=False)
         return bound
+
+    @cached_property
+    def control_units(self) -> FloatArray:
+        """``(K, m)`` what methods measure each control component in: its limit over the limit's default."""
+        units = np.ones((self.num_robots, self.control_size), np.float32)
+        for robot, model in enumerate(self.robot_models):
+            defaults = np.array([*DEFAULT_LIMITS, *(limit.default for limit in model.own_limits)], np.float32)
+            size, columns = model.control_size, list(model.control_limits)
+            units[robot, :size] = self.limits[robot, columns] / defaults[columns]
+        units.setflags(write=False)
+        return units
+
+    @cached_property
+    def largest_radius(self) -> float:
+        """The largest of the radii [m], by which methods measure lengths.
+
+        It is rounded as float32 is, but so that it is the decimal number for robots of the default radius.
+        """
+        return DEFAULT_RADIUS * (float(self.radius.max()) / float(np.float32(DEFAULT_RADIUS)))
 
     @property
     def turning_radius(self) -> FloatArray:

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import LARGEST, FloatArray, Frozen, frozen_array
+from d4orm_env.core.arrays import LARGEST, SMALLEST, FloatArray, Frozen, frozen_array
 from d4orm_env.geometry.polygon import check_polygon, triangulate
 from d4orm_env.geometry.shapes import Shapes
 from d4orm_env.geometry.world_index import WorldIndex, build_index, nearest_distance
@@ -148,6 +148,12 @@ class World(Frozen):
     def _indices(self) -> dict[tuple[float, int, float, int], WorldIndex]:
         return {}
 
+    @property
+    def _usual_reach(self) -> float:
+        """What to index by when nobody has said: a share of the room that the obstacles take [m]."""
+        lower, upper = self.shapes.extent()
+        return max(float((upper - lower).max()), SMALLEST) / 32
+
     def index(self, reach: float, nearest: int = 1, places: FloatArray | None = None) -> WorldIndex:
         """The grid that finds obstacles, made once for distances of about the same size.
 
@@ -187,11 +193,11 @@ class World(Frozen):
         to_bounds = np.minimum(points - bounds[0], bounds[1] - points).min(axis=-1)
         if not self.shapes.count:
             return to_bounds
-        index = next(iter(self._indices.values()), None) or self.index(0.25)
+        index = next(iter(self._indices.values()), None) or self.index(self._usual_reach)
         flat = points.reshape(-1, self.dimension)
         return np.minimum(nearest_distance(self.shapes, index, flat).reshape(to_bounds.shape), to_bounds)
 
 
 def _rounded_up(distance: float) -> float:
     """The next power of two, so that distances of about the same size share an index."""
-    return 2.0 ** math.ceil(math.log2(max(distance, 1e-3)))
+    return 2.0 ** math.ceil(math.log2(distance))

@@ -174,7 +174,7 @@ def _indexed_contacts(arrays: ProblemArrays, place: Array, reach: Given) -> Arra
 def goal_distance(arrays: ProblemArrays, place: Array) -> Array:
     """``(K, S)`` distance of every robot to its goal; its gradient at the goal itself is zero."""
     gap2 = ((place - arrays.goal[..., None]) ** 2).sum(axis=1)
-    tiny = jnp.float32(1e-12)
+    tiny = arrays.squared_goal_radius * jnp.float32(2.0**-32)
     # Asked this way round, a place that is not a number stays one: it must not pass for the goal.
     return jnp.where(gap2 <= tiny, jnp.float32(0), jnp.sqrt(jnp.maximum(gap2, tiny)))
 

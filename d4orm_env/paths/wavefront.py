@@ -33,8 +33,8 @@ _HALVINGS = 6
 _PUSHES, _SPARE = 4, 0.03
 """How often a node is pushed away from an obstacle, and how much farther than need be, as a share of the reach; a third
 of it each time, so as to end in the middle of narrow gaps."""
-_TOLERANCE = 1e-6
-"""Rounding of clearances [m]."""
+_TOLERANCE = 5e-6
+"""Rounding of clearances, as a share of the reach."""
 _NOBODY = np.int32(-1)
 
 Place: TypeAlias = tuple[float, float, float]
@@ -293,7 +293,7 @@ def _sees(space: Space, reach: float, a: Place, own_a: float, b: Place, own_b: f
         room = _about_to_obstacles(space, x, y, z) - need
         if room < shortest:
             room = _to_obstacles(space, x, y, z) - need
-            if room < -_TOLERANCE:
+            if room < -_TOLERANCE * reach:
                 return False
         s += max(room, shortest)
     return True

@@ -11,10 +11,12 @@ import numpy as np
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.free_space import Mask
 from d4orm_env.scenarios.placement import Points
-from d4orm_env.scenarios.well_formed import RESERVE
 
 MAX_CELLS = 2**24
 """Cells of a map at most."""
+
+ROUNDING = 1e-3
+"""More than float32 rounds away over a map, as a share."""
 
 MOST_PARTS = 8
 """Lattice points per half of a cell at most; who needs more does not fit."""
@@ -59,7 +61,7 @@ class GridMap:
         if half <= reach:
             return half * max(1, int(reach / 2 / half))
         # Between two lattice points this far from a wall a robot is still clear of it; see free_space.
-        room = 2 * math.sqrt(half * half - reach * reach) * (1 - RESERVE)
+        room = 2 * math.sqrt(half * half - reach * reach) * (1 - ROUNDING)
         parts = int(half / room) + 1
         return half / min(parts, MOST_PARTS)
 

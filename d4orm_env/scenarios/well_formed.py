@@ -21,8 +21,8 @@ from d4orm_env.scenarios.layout import Layout, build
 from d4orm_env.scenarios.placement import Area, Points, round_up, with_random_obstacles
 from d4orm_env.scenarios.settings import STARTS_AND_GOALS, Settings
 
-RESERVE = 1e-3
-"""More than float32 rounds away over a map, and left free beside the margin [m]."""
+RESERVE = 1 / 150
+"""More than float32 rounds away over a map, and left free beside the margin, in radii of the largest robot."""
 
 ENOUGH_POINTS = 2**18
 """Lattice points that do where nothing is narrow."""
@@ -120,9 +120,14 @@ def draw_places(
     return space.points(placing.places[: placing.count])
 
 
+def reserve_of(settings: Settings) -> float:
+    """What is left free beside the margin [m]."""
+    return RESERVE * settings.team.largest_radius
+
+
 def reach_of(settings: Settings) -> float:
     """Distance that the centre of the largest robot keeps to obstacles [m]."""
-    return float(np.max(settings.team.radius)) + settings.margin + RESERVE
+    return float(np.max(settings.team.radius)) + settings.margin + reserve_of(settings)
 
 
 def lattice_step(settings: Settings, sides: ArrayLike, passage: tuple[str, float] | None = None) -> float:
@@ -194,7 +199,7 @@ def draw_team(
     random = settings.generator(STARTS_AND_GOALS)
     count = settings.num_robots
     # A robot may dock anywhere within the goal radius.
-    apart = settings.spacing + settings.goal_radius + RESERVE
+    apart = settings.spacing + settings.goal_radius + reserve_of(settings)
     separation = math.sqrt(apart * apart + space.step * space.step / 4)
     number = np.arange(2 * count)
     groups: list[tuple[Mask | None, int]] = [(None, 2 * count)]

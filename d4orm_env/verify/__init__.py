@@ -29,9 +29,9 @@ __all__ = ["VerificationReport", "Violation", "verify"]
 
 MIN_SUB_STEPS = 10
 MAX_SUB_STEPS = 1000
-"""More in one step are not taken: the robot would leave the straight line by 10 m within the step."""
-CHORD_ERROR = 1e-5
-"""Largest distance between a robot's curve and the chord that stands for it [m]."""
+"""More in one step are not taken: the robot would leave the straight line by 70 of its radii within the step."""
+CHORD_ERROR = 1 / 15_000
+"""Largest distance between a robot's curve and the chord that stands for it, as a share of its radius."""
 LIMIT_TOLERANCE = 1e-5
 """Relative excess over a control limit that float32 rounding may cause."""
 
@@ -40,8 +40,8 @@ def verify(problem: Problem, controls: ArrayLike) -> VerificationReport:
     """Judge a plan: do all robots arrive by the horizon, within their limits, touching nothing at any time?
 
     Contact is judged, not the safety margin: it is a gap of zero or less at any time, also between steps, known to
-    ``CHORD_ERROR`` for each moving robot. Controls above the limits are reported, and clipped before they are executed,
-    as the robot would.
+    ``CHORD_ERROR`` of its radius for each moving robot, by default 0.01 mm. Controls above the limits are reported, and
+    clipped before they are executed, as the robot would.
 
     Docking is decided at the end of each step; from then on the robot stands where it is and its controls are ignored.
     The environments decide it in float32. Where a robot ends a step so close to the goal radius, or at a speed so close
@@ -68,9 +68,9 @@ def verify(problem: Problem, controls: ArrayLike) -> VerificationReport:
     if not np.isfinite(array).all():
         return _unjudged(problem, _non_finite(array, problem.dt))
     motion = TeamMotion(problem, array)
-    sub_steps = np.ceil(problem.dt * np.sqrt(motion.bend / (8 * CHORD_ERROR)))
+    sub_steps = np.ceil(problem.dt * np.sqrt(motion.bend / (8 * CHORD_ERROR * problem.team.radius.astype(np.float64))))
     if sub_steps.max() > MAX_SUB_STEPS:
-        return _unjudged(problem, list(_too_violent(sub_steps, motion, problem.dt)))
+        return _unjudged(problem, list(_too_violent(sub_steps, motion, problem)))
     course = _Course(motion, max(MIN_SUB_STEPS, int(sub_steps.max())), problem.start.astype(np.float64))
     return _judged(problem, motion, course)
 
@@ -156,14 +156,15 @@ def _non_finite(controls: Floats, dt: float) -> list[Violation]:
     return sorted(violations, key=lambda violation: violation.time)
 
 
-def _too_violent(sub_steps: Floats, motion: TeamMotion, dt: float) -> Iterator[Violation]:
+def _too_violent(sub_steps: Floats, motion: TeamMotion, problem: Problem) -> Iterator[Violation]:
     for robot in np.flatnonzero((sub_steps > MAX_SUB_STEPS).any(axis=0)):
         step = int(np.argmax(sub_steps[:, robot] > MAX_SUB_STEPS))
+        error = CHORD_ERROR * float(problem.team.radius[robot])
         detail = (
             f"accelerates with {motion.bend[step, robot]:.4g} m/s^2 at step {step}, which {MAX_SUB_STEPS} sub-steps of "
-            f"a step of {dt:g} s do not follow to {CHORD_ERROR:g} m; use a smaller dt, or lower limits"
+            f"a step of {problem.dt:g} s do not follow to {error:.2g} m; use a smaller dt, or lower limits"
         )
-        yield Violation("not judged", (int(robot),), step * dt, detail)
+        yield Violation("not judged", (int(robot),), step * problem.dt, detail)
 
 
 def _control_limits(motion: TeamMotion, docked_after: NDArray[np.intp]) -> Iterator[Violation]:

@@ -1,7 +1,7 @@
 """What bodies come close to, and when: closest approach over continuous time.
 
-The motion is cut into sub-steps so short that each curve departs from its chord by at most ``CHORD_ERROR``, and on the
-chords the closest approach is solved exactly.
+The motion is cut into sub-steps so short that each curve departs from its chord by at most ``CHORD_ERROR`` of the
+radius, and on the chords the closest approach is solved exactly.
 """
 
 from __future__ import annotations
@@ -30,8 +30,10 @@ if TYPE_CHECKING:
 
 Indices = NDArray[np.intp]
 
-_ROUNDING = 1e-6
-"""What boxes are widened by for it [m]."""
+_ROUNDING = 2.0**-30
+"""Of distances, as a share of how far anybody gets."""
+_WIDER = 1 + 2.0**-17
+"""By how much boxes are stretched for rounding."""
 
 BLOCKS = (128, 32, 8, 1)
 """Steps that are judged at once, from many to one."""
@@ -130,7 +132,8 @@ class Watch(ABC):
             gap = self.gap(stretch, begin, pair)
             self.minimum = min(self.minimum, float(gap.min(initial=np.inf)))
             end = np.minimum(begin + block, num_steps)
-            least = gap - sum(travelled[end, body] - travelled[begin, body] for body in self.bodies(pair)) - 1e-9
+            least = gap - sum(travelled[end, body] - travelled[begin, body] for body in self.bodies(pair))
+            least -= _ROUNDING * travelled[-1].max()
             near = least < max(self.minimum, 0.0)
             if block == 1:
                 yield least[near], begin[near], pair[near]
@@ -183,7 +186,7 @@ class Pairs(Watch):
         a, b = order[:-1], order[1:]
         gap = norm(stretch.path[0, 0, a] - stretch.path[0, 0, b]) - self._radius[a] - self._radius[b]
         least = min(self.minimum, float(gap[self._robot[a] != self._robot[b]].min(initial=np.inf)))
-        widening = (self._radius + max(least, 0.0) / 2 + _ROUNDING)[:, None]
+        widening = (_WIDER * self._radius + max(least, 0.0) / 2)[:, None]
         lower, upper = lower - widening, upper + widening
         # Boxes that overlap along one axis: each with those that begin before it ends.
         order = np.argsort(lower[:, axis], kind="stable")

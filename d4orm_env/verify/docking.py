@@ -22,10 +22,11 @@ from d4orm_env.verify.report import Violation
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
 
-DOCKING_TOLERANCE = 1e-5
-"""Least distance to the goal radius [m], or to the goal speed [m/s], that rounding does not bridge."""
+RADIUS_TOLERANCE, SPEED_TOLERANCE = 1 / 7500, 1e-5
+"""Least distance to the goal radius, as a share of it, and to the goal speed, as a share of the speed limit, that
+rounding does not bridge."""
 ROUNDING = 32 * 2.0**-23
-"""The same, as a share of the coordinates or of the speed limit; 20 units in float32's last place were measured."""
+"""The same, as a share of the coordinates; 20 units in float32's last place were measured."""
 MAX_READINGS = 8
 """More readings of one robot are not followed, but reported."""
 
@@ -100,9 +101,9 @@ def _staying(problem: Problem, motion: TeamMotion, distance: Floats, certain: ND
 def _docks(problem: Problem, motion: TeamMotion, ends: Floats, distance: Floats) -> tuple[NDArray[np.bool_], ...]:
     """``(H, K)`` where a robot may dock, as rounding has it, and where it does beyond doubt."""
     extent = np.maximum.accumulate(np.abs(ends).max(axis=2), axis=0)[1:]
-    doubt = np.maximum(DOCKING_TOLERANCE, ROUNDING * extent) + motion.integration_error
+    doubt = np.maximum(RADIUS_TOLERANCE * problem.goal_radius, ROUNDING * extent) + motion.integration_error
     doubt = np.minimum(doubt, problem.goal_radius / 4)
-    speed_doubt = np.maximum(DOCKING_TOLERANCE, ROUNDING * motion.max_speed)
+    speed_doubt = SPEED_TOLERANCE * motion.max_speed
     goal_speed = np.inf if problem.goal_speed is None else problem.goal_speed
     slow = (motion.pace <= goal_speed - speed_doubt) | (motion.pace == 0)
     possible = (distance <= problem.goal_radius + doubt) & (motion.pace <= goal_speed + speed_doubt)

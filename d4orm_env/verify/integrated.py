@@ -7,7 +7,7 @@ Runge-Kutta in many sub-steps of a control step, with the same bits on every pro
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,18 +15,21 @@ from numpy.typing import ArrayLike, NDArray
 from d4orm_env.core import portable
 from d4orm_env.verify.geometry import Floats, norm
 
-Limits = NDArray[np.float32]
+if TYPE_CHECKING:
+    from d4orm_env.core.team import Team
 
+SIZE = np.float32(0.15)
+"""Radius of robots whose places are judged in metres [m]: those of others in proportion, and speeds by their limits."""
 SUB_STEPS = 20
 """To find how much the way bends within a control step."""
 STATE_ERROR = 1e-7
-"""Largest error of a control step's integration that one with more sub-steps reveals, in SI units."""
+"""Largest error of a control step's integration that one with more sub-steps reveals, in units of states."""
 GAP = 1e-10
-"""What steps may miss each other by in the end, in SI units, or as a share of the largest state."""
+"""What steps may miss each other by in the end, in units of states, or as a share of the largest state."""
 CORRECTIONS = 5
 """Times that it is tried to make good what they miss each other by: two suffice mostly."""
 ASIDE = 1e-6
-"""Differences of states by which is found out what a step makes of them, in SI units."""
+"""Differences of states by which is found out what a step makes of them, in units of states."""
 BEND_MARGIN = 1.5
 """The acceleration is measured between sub-steps, and may be this much larger at one of them."""
 LARGEST_CONTROL = 1e100
@@ -46,10 +49,13 @@ class Integrated:
     """
 
     def __init__(
-        self, model: Any, robots: NDArray[np.intp], start: Floats, controls: Floats, limits: Limits, dt: float
+        self, model: Any, robots: NDArray[np.intp], start: Floats, controls: Floats, team: Team, dt: float
     ) -> None:
         self.robots, self._model, self._dt = robots, model, dt
-        self._limits = tuple(limits.astype(np.float64)[robots].T)
+        self._limits = tuple(team.limits.astype(np.float64)[robots].T)
+        self._units = np.ones((model.state_size, 1, len(robots)))
+        self._units[: model.dimension] = (team.radius[robots] / SIZE).astype(np.float64)
+        self._units[list(model.speed_indices)] = team.max_speed[robots].astype(np.float64)
         asked = np.moveaxis(controls[:, robots, : model.control_size], 2, 0)
         within = np.clip(asked, -LARGEST_CONTROL, LARGEST_CONTROL)
         self._commands = self._call(model.functions.limit_control, within)
@@ -77,7 +83,7 @@ class Integrated:
             gaps = self._stepped(states[:, :-1], sub_steps) - states[:, 1:]
             if not np.isfinite(gaps).all():
                 break
-            if float(np.abs(gaps).max()) <= GAP * max(1.0, float(np.abs(states).max())):
+            if self._largest(gaps) <= GAP * max(1.0, self._largest(states)):
                 return states
             states = states.copy()
             states[:, 1:] += self._carried(states[:, :-1], gaps)
@@ -95,13 +101,17 @@ class Integrated:
         sub_steps = 2
         while sub_steps < SUB_STEPS:
             coarse, fine = (self._integrated(begins, self._commands, times * sub_steps) for times in (1, 2))
-            error = float(np.abs(coarse - fine).max())
+            error = self._largest(coarse - fine)
             if error <= STATE_ERROR:
                 break
             # Of order four: so many times finer, and one more.
             times_finer = (error / STATE_ERROR) ** 0.25 if np.isfinite(error) else SUB_STEPS
             sub_steps = int(min(sub_steps * times_finer + 1, SUB_STEPS))
         return sub_steps
+
+    def _largest(self, states: Floats) -> float:
+        """The largest number in ``(n, ..., R)`` states, in their units."""
+        return float((np.abs(states) / self._units).max())
 
     def _stepped(self, begins: Floats, sub_steps: int) -> Floats:
         """``(n, H, R)`` states after every step from where it begins."""
@@ -111,9 +121,9 @@ class Integrated:
         """``(n, H, R)`` what ``gaps`` after every step come to when all later steps begin that much elsewhere."""
         ends, slopes = self._stepped(begins, 1), []
         for column in range(len(begins)):
-            aside = begins.copy()
-            aside[column] += ASIDE
-            slopes.append((self._stepped(aside, 1) - ends) / ASIDE)
+            aside, difference = begins.copy(), ASIDE * self._units[column]
+            aside[column] += difference
+            slopes.append((self._stepped(aside, 1) - ends) / difference)
         carried, total = np.empty_like(gaps), np.zeros_like(gaps[:, 0])
         for t in range(gaps.shape[1]):
             # Sums of a fixed order, which a product of matrices is not.

@@ -65,7 +65,7 @@ class TeamMotion:
         models = {problem.team.models[robot]: problem.team.robot_models[robot] for robot in self._names}
         names = np.array(problem.team.models)
         return [
-            Integrated(model, np.flatnonzero(names == name), start, controls, problem.team.limits, problem.dt)
+            Integrated(model, np.flatnonzero(names == name), start, controls, problem.team, problem.dt)
             for name, model in models.items()
         ]
 

@@ -19,6 +19,7 @@ from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.metrics import mean_stretch, trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import Row, count, outcome_rows
+from d4orm_env.core.team import DEFAULT_RADIUS
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.rollout import rollout
 from d4orm_env.scenarios.schema import describe, parse
@@ -36,7 +37,8 @@ HEADER_BYTES = 64 * 2**20
 """Of a plan file's header, which has the problem and the history, at most."""
 
 TOLERANCE = 1e-3
-"""What a file's trajectory may differ from what its controls lead to, in SI units: processors round differently."""
+"""What a file's trajectory may differ from what its controls lead to, in SI units for robots of the default size:
+processors round differently."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,7 @@ class Plan(Shown):
             faults = []
             if not trajectory.arrived[-1, robot]:
                 gap = np.linalg.norm(trajectory.positions[-1, robot] - problem.goal[robot])
-                faults.append(f"ends {gap:.2f} m from its goal")
+                faults.append(f"ends {gap:.2g} m from its goal")
             others = [f"robot_{other}" for other in sorted(near[robot])]
             if others:
                 faults.append(f"comes within the margin of {', '.join(others)}")
@@ -224,7 +226,7 @@ class Plan(Shown):
     ) -> Plan:
         """The plan of a file, with what is true of its controls."""
         actual = rollout(problem, claimed.controls, engine="cpu")
-        trajectory = claimed if _agree(claimed, actual) else actual
+        trajectory = claimed if _agree(problem, claimed, actual) else actual
         solved = not failed_robots(trajectory).any() and verify(problem, trajectory.controls).ok
         if scalars["status"] in ("solved", "refuted"):
             scalars["status"] = "solved" if solved else "refuted"
@@ -297,10 +299,16 @@ def _checked_trajectory(problem: Problem, archive: ArrayArchive) -> Trajectory:
     return Trajectory(**content)
 
 
-def _agree(claimed: Trajectory, actual: Trajectory) -> bool:
+def _agree(problem: Problem, claimed: Trajectory, actual: Trajectory) -> bool:
     """Whether two trajectories are the same but for rounding."""
+    size = problem.team.largest_radius / DEFAULT_RADIUS
     return all(
-        np.allclose(getattr(claimed, name), getattr(actual, name), rtol=TOLERANCE, atol=TOLERANCE)
+        np.allclose(
+            getattr(claimed, name),
+            getattr(actual, name),
+            rtol=TOLERANCE,
+            atol=TOLERANCE * (1 if name == "rewards" else size),
+        )
         if name in _NUMBERS
         else np.array_equal(getattr(claimed, name), getattr(actual, name))
         for name in _ARRAYS

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from d4orm_env.core.arrays import Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import inverse_initial_distance
+from d4orm_env.core.team import DEFAULT_RADIUS
 from d4orm_env.dynamics.collision import axis_gap
-from d4orm_env.dynamics.robot_model import SPEED, Ops
+from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, Ops
 from d4orm_env.dynamics.transition import TimeStep
 from d4orm_planners.baselines.abandoning import run_or_abandon
 
@@ -27,13 +28,13 @@ OBJECTIVE_SCALE = 10.0
 """Of the mean cost of a step, so that IPOPT's tolerance tells good motions from bad ones."""
 
 FEASIBILITY = 1e-5
-"""Largest violation of a constraint that IPOPT may leave, in SI units; the clearance makes up for it."""
+"""Largest violation of a constraint that IPOPT may leave, in the program's units; the clearance makes up for it."""
 
 ABANDONED = "Abandoned_At_Time_Limit"
 """How a run ended that was left before IPOPT could end it."""
 
 TINY = 1e-9
-"""Added to squared distances, since the square root has no derivative at zero [m^2]."""
+"""Added to squared distances, since the square root has no derivative at zero, in the program's units."""
 
 IPOPT = {"print_level": 0, "sb": "yes", "constr_viol_tol": FEASIBILITY}
 CASADI = {"print_time": False, "show_eval_warnings": False}
@@ -68,6 +69,8 @@ class TeamProgram:
     A control is held over its step, and the defect of a step is that of the environment's own RK4, so that a solution
     is what the engines roll out. Limits hold as they do there: on a norm, or on single components.
 
+    IPOPT's tolerances are absolute, so that it is given lengths in a unit in which robots have the default size.
+
     Args:
         problem: The problem.
         clearance: Added to every distance to keep [m].
@@ -84,8 +87,16 @@ class TeamProgram:
         self.limits, self.radius = problem.team.limits.astype(float), np.asarray(problem.team.radius, float)
         self.obstacles = list(self._obstacles())
         steps = problem.horizon
-        self.states = [ca.MX.sym("x", model.state_size, steps) for model in self.models]
-        self.controls = [ca.MX.sym("u", model.control_size, steps) for model in self.models]
+        self.unit = problem.team.largest_radius / DEFAULT_RADIUS
+        self.units = self._units()
+        self.variables = [
+            [ca.MX.sym(name, own[robot].size, steps) for robot in range(problem.num_robots)]
+            for name, own in zip("xu", self.units)
+        ]
+        self.states, self.controls = (
+            [ca.repmat(ca.DM(unit), 1, steps) * variable for unit, variable in zip(own, variables, strict=True)]
+            for own, variables in zip(self.units, self.variables)
+        )
         # Each robot's states with the start ahead of them, so that columns are steps.
         self.paths = [
             ca.horzcat(ca.DM(problem.start[robot, : model.state_size].astype(float)), self.states[robot])
@@ -133,7 +144,7 @@ class TeamProgram:
         ca = self.casadi
         rows = [*self._motion_rows(), *self._goal_rows(docks), *self._contact_rows(contacts, docks)]
         program = {
-            "x": ca.vertcat(*map(ca.vec, chain(self.states, self.controls))),
+            "x": ca.vertcat(*map(ca.vec, chain(*self.variables))),
             "f": self._cost(),
             "g": ca.vertcat(*(ca.vec(row) for row, _, _ in rows)),
         }
@@ -171,9 +182,18 @@ class TeamProgram:
             return self.obstacles[body - self.problem.num_robots](places[robot])
         return self._norm(places[robot] - places[body])
 
+    def _units(self) -> tuple[list[Floats], list[Floats]]:
+        """What every component of each robot's state and control is measured in: only lengths have a unit."""
+        states, controls = [], []
+        for model in self.models:
+            lengths = [*range(model.dimension), *model.speed_indices]
+            states.append(np.where(np.isin(range(model.state_size), lengths), self.unit, 1.0))
+            controls.append(np.where(np.isin(model.control_limits, (SPEED, ACCELERATION)), self.unit, 1.0))
+        return states, controls
+
     def _norm(self, vectors: Expression) -> Expression:
         """Norm of every column; nowhere without a derivative."""
-        return self.casadi.sqrt(self.casadi.sum1(vectors**2) + TINY)
+        return self.casadi.sqrt(self.casadi.sum1(vectors**2) + TINY * self.unit**2)
 
     def _reach(self, robot: int, body: int | None = None) -> float:
         """Distance to keep from a robot's centre to another's, or to an obstacle's surface or the bounds [m].
@@ -246,10 +266,11 @@ class TeamProgram:
             limits = self.limits[robot].tolist()
             after = model.functions.integrate(ca.vertsplit(x), ca.vertsplit(u), limits, step, self.ops)
             advance = ca.Function("advance", [x, u], [ca.vertcat(*after)]).map(self.problem.horizon)
-            yield self.states[robot] - advance(self.paths[robot][:, :-1], self.controls[robot]), 0.0, 0.0
+            defect = self.states[robot] - advance(self.paths[robot][:, :-1], self.controls[robot])
+            yield defect / ca.repmat(ca.DM(self.units[0][robot]), 1, self.problem.horizon), 0.0, 0.0
             for values, components, limit in self._limited(robot):
-                if len(components) > 1:
-                    yield ca.sum1(values[components, :] ** 2), -np.inf, limit**2
+                if len(components) > 1:  # of a velocity or an acceleration
+                    yield ca.sum1((values[components, :] / self.unit) ** 2), -np.inf, (limit / self.unit) ** 2
 
     def _limited(self, robot: int) -> Iterator[tuple[Expression, list[int], float]]:
         """Variables, the components of theirs that share a limit, and that limit on their norm."""
@@ -267,13 +288,14 @@ class TeamProgram:
         problem = self.problem
         radius = problem.goal_radius - min(self.clearance, problem.goal_radius / 2)
         for robot, dock in enumerate(docks):
-            yield self._squared_goal_distance(robot)[dock - 1], -np.inf, radius**2
+            yield self._squared_goal_distance(robot)[dock - 1] / self.unit**2, -np.inf, (radius / self.unit) ** 2
             if problem.goal_speed is not None:
                 variables = self.states[robot][:, dock - 1], self.controls[robot][:, dock - 1]
                 x, u = map(self.casadi.vertsplit, variables)
                 limits = self.limits[robot].tolist()
                 velocity = self.models[robot].functions.velocity(x, u, limits, self.ops)
-                yield sum(part**2 for part in velocity), -np.inf, problem.goal_speed**2
+                pace = sum((part / self.unit) ** 2 for part in velocity)
+                yield pace, -np.inf, (problem.goal_speed / self.unit) ** 2
 
     def _contact_rows(self, contacts: Contacts, docks: IntArray) -> Iterator[Rows]:
         for (robot, body), steps in contacts.items():
@@ -285,7 +307,7 @@ class TeamProgram:
                     one: self.paths[one][: self.problem.dimension, np.minimum(moving, docks[one]).tolist()]
                     for one in pair
                 }
-                yield self._gap(robot, body, places), self._reach(robot, body), np.inf
+                yield self._gap(robot, body, places) / self.unit, self._reach(robot, body) / self.unit, np.inf
 
     def _variable_bounds(self) -> tuple[Floats, Floats]:
         """Bounds of the world on positions, and limits of every single component."""
@@ -303,8 +325,8 @@ class TeamProgram:
 
     def _packed(self, motion: Motion) -> Floats:
         """The values of the variables, in the order of the program."""
-        states = [motion.states[1:, robot, : model.state_size] for robot, model in enumerate(self.models)]
-        controls = [motion.controls[:, robot, : model.control_size] for robot, model in enumerate(self.models)]
+        states = [motion.states[1:, robot, : unit.size] / unit for robot, unit in enumerate(self.units[0])]
+        controls = [motion.controls[:, robot, : unit.size] / unit for robot, unit in enumerate(self.units[1])]
         return np.concatenate([part.ravel() for part in (*states, *controls)])
 
     def _unpacked(self, values: Floats) -> Motion:
@@ -312,12 +334,13 @@ class TeamProgram:
         states = np.zeros((problem.horizon + 1, problem.num_robots, problem.state_size))
         states[0] = problem.start
         controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size))
-        sizes = [variable.numel() for variable in chain(self.states, self.controls)]
+        sizes = [variable.numel() for variable in chain(*self.variables)]
         parts = np.split(values, np.cumsum(sizes)[:-1])
         for robot, model in enumerate(self.models):
-            states[1:, robot, : model.state_size] = parts[robot].reshape(problem.horizon, -1)
+            own = parts[robot].reshape(problem.horizon, -1)
+            states[1:, robot, : model.state_size] = self.units[0][robot] * own
             own = parts[problem.num_robots + robot].reshape(problem.horizon, -1)
-            controls[:, robot, : model.control_size] = own
+            controls[:, robot, : model.control_size] = self.units[1][robot] * own
         return Motion(states, controls)
 
 

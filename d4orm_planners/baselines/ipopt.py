@@ -35,12 +35,13 @@ class IpoptConfig(PlannerConfig):
 
     Attributes:
         max_iterations: Perturbed restarts after which :meth:`Planner.solve` gives up.
-        perturbation: Standard deviation of the noise on the warm start's states and controls, in SI units.
-        lookout: Robots are kept clear of what came nearer than this in the last solution, the margin not counted [m];
-            ``None`` keeps them clear of everything at every step, as in the paper.
+        perturbation: Standard deviation of the noise on the warm start's states and controls, in SI units for robots of
+            the default size, and as many times more for larger ones.
+        lookout: Robots are kept clear of what came nearer than this in the last solution, the margin not counted, in
+            radii of the largest robot; ``None`` keeps them clear of everything at every step, as in the paper.
         rounds: Solves per restart. As long as the rollout does not keep the margin, the next one begins where the last
             one ended; what came near is minded too, and robots stand where they docked. The paper solves once.
-        clearance: Added to every distance to keep, for what rounding and tolerances take away [m].
+        clearance: Added to every distance to keep, for what rounding and tolerances take away, in the same radii.
         tolerance: IPOPT's, on the scaled optimality error.
         barrier: IPOPT's first barrier parameter.
         solver_iterations: IPOPT's own iterations in each solve.
@@ -51,9 +52,9 @@ class IpoptConfig(PlannerConfig):
 
     max_iterations: Count = 20
     perturbation: NotNegative = 0.1
-    lookout: NotNegative | None = 0.5
+    lookout: NotNegative | None = 10 / 3
     rounds: Count = 8
-    clearance: NotNegative = 2e-3
+    clearance: NotNegative = 1 / 75
     tolerance: Positive = 1e-3
     barrier: Positive = 1.0
     solver_iterations: SolverIterations = 1000
@@ -94,7 +95,7 @@ class Ipopt(Planner):
 
     def init(self, search: Search) -> WarmStart:
         """See :meth:`Planner.init`."""
-        program = TeamProgram(search.problem, self.config.clearance)
+        program = TeamProgram(search.problem, self.config.clearance * search.problem.team.largest_radius)
         return WarmStart(program, self._warm_start(search, program))
 
     def iterate(self, search: Search, state: WarmStart) -> tuple[WarmStart, Iteration]:
@@ -105,8 +106,9 @@ class Ipopt(Planner):
 
     def _restart(self, search: Search, state: WarmStart) -> Iteration:
         config, problem, program = self.config, search.problem, state.program
-        motion = self._perturbed(search, state.motion)
-        contacts = program.contacts(motion, config.lookout)
+        motion = self._perturbed(search, program, state.motion)
+        lookout = None if config.lookout is None else config.lookout * problem.team.largest_radius
+        contacts = program.contacts(motion, lookout)
         docks = np.full(problem.num_robots, problem.horizon)
         best, note, options = None, "", self._options()
         for _ in range(config.rounds):
@@ -119,7 +121,7 @@ class Ipopt(Planner):
             # More constraints do not mend what is infeasible as it is; another start may.
             if best.solved or note not in FOUND:
                 break
-            former, contacts = contacts, _union(contacts, program.contacts(motion, config.lookout))
+            former, contacts = contacts, _union(contacts, program.contacts(motion, lookout))
             standing, docks = docks, _docks(candidate)
             if _size(contacts) == _size(former) and (docks == standing).all():
                 break
@@ -142,9 +144,15 @@ class Ipopt(Planner):
         docks = np.full(problem.num_robots, problem.horizon)
         return program.solve(_motion(straight), {}, docks, self._options(), search.should_stop)[0]
 
-    def _perturbed(self, search: Search, warm_start: Motion) -> Motion:
+    def _perturbed(self, search: Search, program: TeamProgram, warm_start: Motion) -> Motion:
         random = np.random.default_rng(search.iteration_seed(Stream.PERTURBATION))
-        return Motion(*(part + self.config.perturbation * random.standard_normal(part.shape) for part in warm_start))
+        parts = []
+        for part, units in zip(warm_start, program.units, strict=True):
+            noise = self.config.perturbation * random.standard_normal(part.shape)
+            for robot, unit in enumerate(units):
+                noise[:, robot, : unit.size] *= unit
+            parts.append(part + noise)
+        return Motion(*parts)
 
 
 def _motion(candidate: Candidate) -> Motion:

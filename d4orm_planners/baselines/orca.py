@@ -16,6 +16,7 @@ from pydantic import Field
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
+from d4orm_env.core.team import DEFAULT_RADIUS
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.base.policy import StatePolicy
 from d4orm_planners.base.settings import CheckedSettings, NotNegative, Positive, Whole
@@ -43,7 +44,7 @@ class OrcaConfig(CheckedSettings):
     Attributes:
         time_horizon: For this long the new velocities keep the robots apart [s].
         obstacle_time_horizon: The same for obstacles, bounds and docked robots, which do not give way [s].
-        neighbor_distance: Robots farther away than this are not looked at [m].
+        neighbor_distance: Robots farther away than this are not looked at, in radii of the largest robot.
         max_neighbors: So many of the nearest robots are looked at.
         clearance: Added to every robot's radius [m]; by default the problem's margin. Two robots so keep twice that
             distance, which leaves robots with inertia some room: they cannot take a new velocity at once.
@@ -57,7 +58,7 @@ class OrcaConfig(CheckedSettings):
 
     time_horizon: Positive = 1.0
     obstacle_time_horizon: Positive = 1.0
-    neighbor_distance: Positive = 10.0
+    neighbor_distance: Positive = 200 / 3
     max_neighbors: Neighbors = 10
     clearance: NotNegative | None = None
     ways: bool = True
@@ -105,32 +106,35 @@ class Orca(StatePolicy):
         simulator = self._rvo.RVOSimulator()
         simulator.set_time_step(problem.dt)
         clearance = problem.margin if config.clearance is None else config.clearance
-        radius, max_speed = np.asarray(problem.team.radius), np.asarray(problem.team.max_speed)
+        # The library has absolute constants, which are meant for robots of about the default size.
+        unit = np.float32(problem.team.largest_radius / DEFAULT_RADIUS)
+        radius, max_speed = np.asarray(problem.team.radius) / unit, np.asarray(problem.team.max_speed) / unit
+        places = joint.states[:, :2] / unit
         stands = joint.arrived & problem.docks
         moving = np.flatnonzero(~stands)
-        velocities = present_velocities(problem, joint.states, joint.controls)
+        velocities = present_velocities(problem, joint.states, joint.controls) / unit
         for robot in moving:
             simulator.add_agent(
-                joint.states[robot, :2].tolist(),
-                config.neighbor_distance,
+                places[robot].tolist(),
+                config.neighbor_distance * DEFAULT_RADIUS,
                 config.max_neighbors,
                 config.time_horizon,
                 config.obstacle_time_horizon,
-                float(radius[robot]) + clearance,
+                float(radius[robot]) + clearance / float(unit),
                 float(max_speed[robot]),
                 velocities[robot].tolist(),
             )
-        docked = [_disc(joint.states[k, 0], joint.states[k, 1], radius[k]) for k in np.flatnonzero(stands)]
-        for corners in [*self._walls, *docked]:
+        docked = [_disc(places[k, 0], places[k, 1], radius[k]) for k in np.flatnonzero(stands)]
+        for corners in [*(wall / unit for wall in self._walls), *docked]:
             simulator.add_obstacle(corners.tolist())
         simulator.process_obstacles()
         for agent, robot in enumerate(moving):
-            simulator.set_agent_pref_velocity(agent, preferred[robot].tolist())
+            simulator.set_agent_pref_velocity(agent, (preferred[robot] / unit).tolist())
         simulator.do_step()
         avoiding = np.zeros_like(preferred)
         for agent, robot in enumerate(moving):
             avoiding[robot] = simulator.get_agent_velocity(agent).to_tuple()
-        return avoiding
+        return avoiding * unit
 
 
 def _load_pyrvo() -> ModuleType:

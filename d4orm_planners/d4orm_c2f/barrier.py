@@ -16,8 +16,8 @@ from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.envs.joint_state import JointState
 
-NEAR = 1.5
-"""Only what is this near is minded [m]."""
+NEAR, STOPS = 10 / 3, 2.0
+"""Only what is this near is minded: so many radii of the largest robot, and so many of its stops from full speed."""
 
 PARTING = 2.0
 """With what is nearer than it should be, robots part at so much of what is missing per second [1/s]."""
@@ -26,10 +26,10 @@ SWEEPS = 400
 """Times that every barrier is met at most; by then there are no velocities that keep to all, or hardly any."""
 
 EXACT = 1e-6
-"""Changes of that size are none [m/s]."""
+"""Changes of that size are none, as a share of the largest speed limit."""
 
-_STEP = 1e-3
-"""For the direction away from an obstacle [m]."""
+_STEP = 1 / 150
+"""For the direction away from an obstacle, in radii of the largest robot."""
 
 Array = NDArray[np.float64]
 
@@ -62,11 +62,11 @@ def safe_velocities(
     velocities = np.where(free[:, None], wanted, 0).astype(np.float64)
     if not (barriers.missing(velocities) > 0).any():
         return velocities.astype(np.float32)
-    if not find_nearest(*barriers, velocities):
-        return np.zeros_like(wanted)
     speed = problem.team.limits[:, SPEED, None].astype(np.float64)
+    if not find_nearest(*barriers, velocities, EXACT * float(speed.max())):
+        return np.zeros_like(wanted)
     pace = np.linalg.norm(velocities, axis=1, keepdims=True)
-    return (velocities * np.minimum(1, speed / np.maximum(pace, 1e-9))).astype(np.float32)
+    return (velocities * (speed / np.maximum(pace, speed))).astype(np.float32)
 
 
 class Barriers(NamedTuple):
@@ -109,10 +109,10 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
             least = -PARTING * room
         rows.append((one, other, normal, least + speed))
 
-    reaction = problem.dt if caution else 0.0
+    reaction, near = problem.dt if caution else 0.0, _near(problem)
     offsets = places[:, None] - places
     apart = np.linalg.norm(offsets, axis=2)
-    for i, j in np.argwhere(np.triu((apart > 0) & (apart < NEAR) & (free[:, None] | free))).tolist():
+    for i, j in np.argwhere(np.triu((apart > 0) & (apart < near) & (free[:, None] | free))).tolist():
         normal, room = offsets[i, j] / apart[i, j], float(apart[i, j]) - radius[i] - radius[j] - gap
         add(i if free[i] else -1, j if free[j] else -1, normal, room, braking[i] + braking[j])
     able = np.flatnonzero(free).tolist()
@@ -120,11 +120,11 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
         for i in able:
             offset = places[i] - body[:d]
             away = float(np.linalg.norm(offset))
-            if 0 < away < NEAR:
+            if 0 < away < near:
                 normal = offset / away
                 leaving = float((normal * body[d : 2 * d]).sum())
                 add(i, -1, normal, away - radius[i] - float(body[-1]) - gap, braking[i], leaving)
-    for i, normal, room in _walls(problem, places[able], able):
+    for i, normal, room in _walls(problem, places[able], able, near):
         add(i, -1, normal, room - radius[i] - gap, braking[i])
     one, other, normals, least = zip(*rows) if rows else ((), (), (), ())
     return Barriers(
@@ -132,9 +132,17 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
     )
 
 
+def _near(problem: Problem) -> float:
+    """How near something must be to be minded [m]."""
+    speed, acceleration = (problem.team.limits[:, limit].astype(np.float64) for limit in (SPEED, ACCELERATION))
+    return NEAR * problem.team.largest_radius + STOPS * float((speed**2 / (2 * acceleration)).max())
+
+
 @cached_kernel(fingerprint((compiling,)), variant="nearest", **OPTIONS)
-def find_nearest(one: Any, other: Any, normals: Any, least: Any, velocities: Any) -> Any:
+def find_nearest(one: Any, other: Any, normals: Any, least: Any, velocities: Any, exact: float) -> Any:
     """Move ``velocities`` ``(K, d)`` to the nearest that keep to all barriers; whether any were found.
+
+    Changes below ``exact`` [m/s] are none.
 
     Every barrier in turn is met exactly, by as little as is needed in view of what it has been given so far (Hildreth,
     A quadratic programming procedure, Naval Research Logistics Quarterly 4, 1957), until none changes anything.
@@ -159,23 +167,23 @@ def find_nearest(one: Any, other: Any, normals: Any, least: Any, velocities: Any
                     velocities[i, axis] += change * normals[row, axis]
                 if j >= 0:
                     velocities[j, axis] -= change * normals[row, axis]
-        if largest < EXACT:
+        if largest < exact:
             return True
     return False
 
 
-def _walls(problem: Problem, places: Array, robots: list[int]) -> Iterator[tuple[int, Array, float]]:
+def _walls(problem: Problem, places: Array, robots: list[int], near: float) -> Iterator[tuple[int, Array, float]]:
     """What stands near robots at ``places`` ``(R, d)``: of which one, the direction away from it, and how far it is."""
     d, (lower, upper), shapes = problem.dimension, problem.world.bounds.astype(np.float64), problem.world.shapes
     axes = np.eye(d)
     inward, sides = np.concatenate([axes, -axes]), np.concatenate([places - lower, upper - places], axis=1)
-    for row, side in np.argwhere(sides < NEAR).tolist():
+    for row, side in np.argwhere(sides < near).tolist():
         yield robots[row], inward[side], float(sides[row, side])
-    rows, items = shapes.within(places, NEAR)
+    rows, items = shapes.within(places, near)
     away = shapes.signed_distance(places[rows], items)
-    near = away < NEAR
-    rows, items, away, at = rows[near], items[near], away[near], places[rows[near]]
-    steps = _STEP * axes
+    kept = away < near
+    rows, items, away, at = rows[kept], items[kept], away[kept], places[rows[kept]]
+    steps = _STEP * problem.team.largest_radius * axes
     slopes = np.stack([shapes.signed_distance(at + s, items) - shapes.signed_distance(at - s, items) for s in steps], 1)
     lengths = np.linalg.norm(slopes, axis=1)
     for n in np.flatnonzero(lengths).tolist():

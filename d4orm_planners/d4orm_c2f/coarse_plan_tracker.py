@@ -37,8 +37,8 @@ from d4orm_planners.mapf.planner import Guide as Ways
 from d4orm_planners.mapf.relay import relay_ways
 from d4orm_planners.tracking.steering import straight_drives
 
-NEARER = 0.05
-"""What counts as coming nearer to the goals, all robots together [m]."""
+NEARER = 1 / 3
+"""What counts as coming nearer to the goals, all robots together, in radii of the largest one."""
 
 
 class Guide:
@@ -77,7 +77,7 @@ class Guide:
         last_step: int,
     ) -> None:
         self.problem, self._config, self._seed, self._lifelong = problem, config, seed, lifelong
-        self._last_step = last_step
+        self._last_step, self._astray = last_step, config.replan_distance * problem.team.largest_radius
         self._refiner, self._background = refiner, background
         # Ways that fit between others to the centimetre are no guidance: fine plans cannot keep to them. But where
         # the team does not get on there may be no other ways.
@@ -206,7 +206,7 @@ class Guide:
         if not moving.any():
             return False
         if self._config.replan:
-            changed |= moving & (self._away(joint) > self._config.replan_distance)
+            changed |= moving & (self._away(joint) > self._astray)
         if not (changed | held_up).any() and not lost:
             return False
         changed |= held_up
@@ -261,17 +261,17 @@ class Guide:
         """``(K,)`` who is where it should be by now, or ahead of the team, and so has to wait."""
         due = self.guidance.path[min(self.index, len(self.guidance.path) - 1)]
         away = np.linalg.norm(joint.states[:, : self.problem.dimension] - due, axis=1)
-        waiting: BoolArray = (away < WAITING_WITHIN) | (self._indices > self.index)
+        waiting: BoolArray = (away < WAITING_WITHIN * self.problem.team.largest_radius) | (self._indices > self.index)
         return waiting
 
     def _is_lost(self, joint: JointState, moving: BoolArray) -> bool:
         """Whether the robots under way are far from their waypoints, at the end of the path, or get no nearer."""
         positions = joint.states[:, : self.problem.dimension]
         distance = float(np.linalg.norm((joint.goals - positions)[moving], axis=1).sum())
-        if distance < self._nearest - NEARER:
+        if distance < self._nearest - NEARER * self.problem.team.largest_radius:
             self._nearest, self._nearest_at = distance, joint.steps
         return bool(
-            self._away(joint)[moving].mean() > self._config.replan_distance
+            self._away(joint)[moving].mean() > self._astray
             or self.index >= len(self.guidance.path) - 1
             or joint.steps - self._nearest_at > self._config.patience
         )

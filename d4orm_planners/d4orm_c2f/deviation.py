@@ -21,20 +21,20 @@ from d4orm_planners.tracking.steering import present_velocities
 DECAY = 0.98
 """What is left after a time step of the largest deviation seen."""
 
-MOST = 0.15
-"""No more room than this is called for [m]."""
+MOST = 1.0
+"""No more room than this is called for, in radii of the largest robot."""
 
 RUN = 5
 """Time steps whose changes of velocity add up before a robot is seen to have reacted."""
 
 STEADY = 0.02
-"""Changes of velocity that add up to no more are none [m/s]."""
+"""Changes of velocity that add up to no more are none, as a share of the largest speed limit."""
 
 AT_ONCE = 1.5
 """How many times the largest change in a single step may come before that."""
 
 FASTEST = 0.4
-"""Changes are not believed to come to more [m/s]."""
+"""Changes are not believed to come to more, as a share of the largest speed limit."""
 
 
 class Deviation:
@@ -57,7 +57,7 @@ class Deviation:
 
     def __init__(self, problem: Problem, engine: Engine, config: D4ormC2FConfig, docks: bool) -> None:
         self.problem, self._engine, self._docks = problem, engine, docks
-        self.lateness = Lateness(problem.num_robots, problem.control_size, config.delay)
+        self.lateness = Lateness(problem.team, config.delay)
         self.losses = Losses(problem) if config.expect_losses else None
         self._weakness = Weakness(problem) if config.learn_limits else None
         self.standing = Standing(problem) if config.stalls else None
@@ -68,7 +68,7 @@ class Deviation:
         self._changes = np.zeros((RUN, problem.num_robots, problem.dimension), np.float32)
         self.speed = np.zeros(problem.num_robots)
         self._first_order = np.array([model.first_order for model in problem.team.robot_models])
-        self.drift = 0.0
+        self.drift, self._speed = 0.0, float(problem.team.max_speed.max())
 
     def observe(self, joint: JointState) -> JointState:
         """Compare where the robots are with where they were expected; where they will be once commands arrive."""
@@ -138,7 +138,7 @@ class Deviation:
     @property
     def caution(self) -> float:
         """How much faster than it should be a robot may soon be, whichever way it goes [m/s]."""
-        return 0.0 if self.drift < STEADY else min(self.drift, FASTEST)
+        return 0.0 if self.drift < STEADY * self._speed else min(self.drift, FASTEST * self._speed)
 
     def room(self, reaction_time: float) -> float:
         """How far robots get from where they are expected within so many seconds [m].
@@ -147,4 +147,4 @@ class Deviation:
         """
         next_command = min((1 + len(self.lateness.under_way)) * self.problem.dt, reaction_time)
         within = np.where(self._first_order, next_command, reaction_time)
-        return min(float((within * self.speed).max()), MOST)
+        return min(float((within * self.speed).max()), MOST * self.problem.team.largest_radius)

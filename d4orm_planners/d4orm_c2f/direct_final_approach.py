@@ -12,11 +12,8 @@ from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine.types import Engine
 from d4orm_planners.tracking.steering import NEAR_VIA, drives, standing, straight_drives
 
-ROUNDING = 1e-5
-"""Allowance for it [m]."""
-
-PASSING = 1e-6
-"""Goal radius of robots that drive through a place and do not dock there [m]."""
+PASSING = 1 / 75_000
+"""Share of the goal radius that is one of robots that drive through a place and do not dock there."""
 
 NEARBY = 3.0
 """Within how many radii of its turning circle of its goal a robot that cannot turn in place looks for a manoeuvre."""
@@ -30,7 +27,7 @@ LENGTH, RESERVE = 8.0, 2.0
 
 def docking_radius(problem: Problem, docks: bool) -> float:
     """The goal radius for rollouts of an episode [m]; who does not dock drives on when it arrives, to its next goal."""
-    return problem.goal_radius if docks else PASSING
+    return problem.goal_radius if docks else PASSING * problem.goal_radius
 
 
 def drive_home(
@@ -66,7 +63,8 @@ def drive_home(
         if not (near & ~home).any():
             break
         aimed = window.goal + beyond * offsets / np.maximum(away, window.goal_radius)
-        straight = straight_drives(window.resumed_at(window.start, aimed, goal_radius=PASSING)).controls[:, :, 0]
+        passing = window.resumed_at(window.start, aimed, goal_radius=docking_radius(window, docks=False))
+        straight = straight_drives(passing).controls[:, :, 0]
         trajectory = engine.rollout(window, straight)
         sooner = near & ~home & (_docking_times(trajectory) <= latest)
         if (asked := np.flatnonzero(sooner & turning)).size:
@@ -105,7 +103,7 @@ def come_again(
     angle = 2 * np.pi / DIRECTIONS * np.arange(DIRECTIONS)
     directions = np.stack([portable.cos(angle), portable.sin(angle)], axis=1)
     # A robot turns to its goal as soon as it is so near to the point before.
-    away = np.sqrt(NEAR_VIA) + circle[:, None] * np.array(BEYOND)
+    away = np.float32(NEAR_VIA * alone.team.largest_radius) + circle[:, None] * np.array(BEYOND)
     vias = alone.start[:, None, None, :2] + away[:, :, None, None] * directions
     vias = vias.reshape(len(robots), -1, 1, 2).astype(np.float32)
     ways = drives(alone, *standing(alone), np.zeros(vias.shape[:2], int), vias)
@@ -127,16 +125,16 @@ def _keeps_clear(window: Problem, positions: FloatArray, robots: IntArray, docke
     """``(R, V)`` whether ways ``(T, R, V, d)`` keep the margin to all that stands, or come no nearer than at first."""
     radius = np.asarray(window.team.radius, np.float64)
     room = window.world.clearance(positions) - radius[robots, None]
-    clear = _no_nearer(room, window.margin)
+    clear = _no_nearer(room, window)
     if docked.any():
         away = np.linalg.norm(positions[:, :, :, None] - window.start[docked, : window.dimension], axis=4)
-        clear &= _no_nearer(away - radius[robots, None, None] - radius[docked], window.margin).all(axis=2)
+        clear &= _no_nearer(away - radius[robots, None, None] - radius[docked], window).all(axis=2)
     return clear
 
 
-def _no_nearer(gaps: Floats, margin: float) -> BoolArray:
+def _no_nearer(gaps: Floats, window: Problem) -> BoolArray:
     """``(...)`` whether no gap of ``(T, ...)`` is less than the margin, or than the first one if that is less [m]."""
-    keeps: BoolArray = (gaps >= np.minimum(gaps[0] - ROUNDING, margin)).all(axis=0)
+    keeps: BoolArray = (gaps >= np.minimum(gaps[0] - window.rounding, window.margin)).all(axis=0)
     return keeps
 
 

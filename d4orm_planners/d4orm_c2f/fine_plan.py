@@ -10,7 +10,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.envs.joint_state import JointState
-from d4orm_planners.d4orm_c2f.direct_final_approach import ROUNDING, docking_radius, drive_home
+from d4orm_planners.d4orm_c2f.direct_final_approach import docking_radius, drive_home
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.engine.sampling_types import MovingObstacles, SamplingEngine, SamplingRules, SamplingTask
 from d4orm_planners.tracking.steering import track_velocities
@@ -210,7 +210,7 @@ class Window:
         if lenient.any():
             places = trajectory.positions[0]
             gap = min(least_gap(window, places[None]), float((window.world.clearance(places) - radius).min()))
-            allowed = min(gap - ROUNDING, window.margin / 2 if now.stuck.any() else window.margin)
+            allowed = min(gap - window.rounding, window.margin / 2 if now.stuck.any() else window.margin)
             nearer = window.resumed_at(window.start, window.goal, margin=max(allowed, 0.0))
             violated[lenient] = self._engine.rollout(nearer, controls).margin_violated[1:, lenient].any(axis=0)
         return trajectory, violated | self._meets_bodies(now.joint, trajectory, window.margin)

@@ -16,8 +16,8 @@ STUCK_WITHIN, STUCK_AFTER = 3, 25
 BARRED_AFTER = 8
 """The same for robots whose ways lead through those that stand for good, who will not let them pass."""
 
-WAITING_WITHIN = 0.15
-"""A robot this near to where it should be by now waits [m]."""
+WAITING_WITHIN = 1.0
+"""A robot this near to where it should be by now waits, in radii of the largest one."""
 
 CAREFUL_FOR = 30
 """Steps for which a robot that was stuck follows its path."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.team import Team
 
 MOST = 10
 """Steps late that commands may be and still be recognised."""
@@ -20,19 +21,19 @@ class Lateness:
     """Remembers the commands that were sent, and compares them with those executed.
 
     Args:
-        num_robots: ``K``.
-        control_size: ``m``.
+        team: Who is sent commands.
         known: Steps late that commands are known to be, or ``None`` to find out.
 
     Attributes:
         steps: How late they are.
     """
 
-    def __init__(self, num_robots: int, control_size: int, known: int | None) -> None:
+    def __init__(self, team: Team, known: int | None) -> None:
+        self._units = team.control_units
         self._known = known is not None
         self.steps = known or 0
         # Before the first there were none, which is as if they were zero.
-        self._sent = [np.zeros((num_robots, control_size), np.float32)] * (max(MOST, self.steps) + 1)
+        self._sent = [np.zeros_like(self._units)] * (max(MOST, self.steps) + 1)
         self._apart = np.zeros(MOST + 1)
 
     @property
@@ -49,7 +50,7 @@ class Lateness:
         """
         if not self._known:
             sent = np.stack(self._sent[: -MOST - 2 : -1])
-            self._apart = DECAY * self._apart + ((sent - executed)[:, going] ** 2).sum(axis=(1, 2))
+            self._apart = DECAY * self._apart + (((sent - executed) / self._units)[:, going] ** 2).sum(axis=(1, 2))
             best = int(self._apart.argmin())
             if self._apart[best] < BETTER * self._apart[self.steps]:
                 self.steps = best

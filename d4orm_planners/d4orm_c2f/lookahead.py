@@ -57,8 +57,8 @@ def _meets_standing(
 ) -> BoolArray:
     """``(N,)`` whether the straight way from ``begin`` by ``offset`` comes within reach of one of the others."""
     gap = others - begin[:, None]
-    square = np.maximum((offset**2).sum(axis=1), 1e-12)[:, None]
-    share = np.clip((gap * offset[:, None]).sum(axis=2) / square, 0, 1)
+    square = (offset**2).sum(axis=1)[:, None]
+    share = np.clip((gap * offset[:, None]).sum(axis=2) / np.where(square > 0, square, 1), 0, 1)
     away = ((gap - share[:, :, None] * offset[:, None]) ** 2).sum(axis=2)
     meets: BoolArray = (away <= (reach[:, None] + radius) ** 2).any(axis=1)
     return meets

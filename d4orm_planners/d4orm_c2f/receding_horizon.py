@@ -35,7 +35,7 @@ REMEMBERED = 10_000
 """Control loops; an episode with ever new goals has no end."""
 
 NEARLY = 1e-3
-"""Velocities that differ by no more are the same [m/s]."""
+"""Share of its speed limit by no more than which two velocities of a robot differ that are the same."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,7 @@ class D4ormC2F(StatePolicy):
         wanted = present_velocities(problem, states, ahead.controls)
         # Other velocities are reached by the next step, by which everybody will be elsewhere.
         safe = safe_velocities(problem, joint._replace(states=states), wanted, ~docked, gap, caution)
-        evading = np.abs(safe - wanted).max(axis=1) > NEARLY
+        evading = np.abs(safe - wanted).max(axis=1) > NEARLY * problem.team.max_speed
         if steps > 1:
             velocities = present_velocities(problem, joint.states, joint.controls)
             safe = velocities + (safe - velocities) / np.float32(steps)

@@ -23,8 +23,8 @@ RESISTING = 0.5
 COMMANDED, DONE = 0.2, 0.1
 """What counts as being commanded something, as a share of a robot's limits; and as doing it, as a share of that."""
 
-MOVED = 0.1
-"""How far it gets from there to be back [m]."""
+MOVED = 2 / 3
+"""How far it gets from there to be back, in radii of the largest robot."""
 
 PROBE = 0.1
 """Share of its limits that a robot that has stalled is commanded, so that it is seen when it obeys again."""
@@ -71,7 +71,7 @@ class Standing:
         pace = np.linalg.norm(velocity, axis=1, keepdims=True)
         to_rest = places + velocity * pace / (2 * problem.team.limits[:, ACCELERATION, None])
         self._places = np.where((self.robots & rolling | new)[:, None], to_rest, self._places).astype(np.float32)
-        self.robots &= rolling | (np.linalg.norm(places - self._places, axis=1) <= MOVED)
+        self.robots &= rolling | (np.linalg.norm(places - self._places, axis=1) <= MOVED * problem.team.largest_radius)
         if not self.robots.any():
             return joint
         stand, states = self.robots[:, None], np.zeros_like(joint.states)

@@ -51,7 +51,7 @@ class StateFilter:
         noise = np.maximum(-self._covariance / count, 0)
         walk = np.maximum(total - 2 * noise, 0)
         ahead = (walk + np.sqrt(walk**2 + 4 * walk * noise)) / 2
-        believed = np.maximum(ahead / np.maximum(ahead + noise, 1e-30), LEAST_GAIN)
+        believed = np.maximum(ahead / np.maximum(ahead + noise, np.finfo(np.float64).tiny), LEAST_GAIN)
         known = (count >= ENOUGH) & (noise > LEAST_SHARE * total)
         gains: NDArray[np.float64] = np.where(known, believed, 1.0)
         return gains

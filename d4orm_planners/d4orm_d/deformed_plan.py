@@ -50,7 +50,10 @@ class DeformedTeam(TeamPaths):
         base = np.ascontiguousarray(self.controls[:horizon, robots, : part.control_size])
         task = SamplingTask(part.resumed_at(part.start, part.goal, horizon=horizon), base, moving=moving, **scoring)
         self._runs += 1
-        start, seed = planner.start(search, base, self._runs), search.iteration_seed(Stream.REPAIR, self._runs)
+        start, seed = (
+            planner.start(search, base, part.team, self._runs),
+            search.iteration_seed(Stream.REPAIR, self._runs),
+        )
         result = search.denoise(task, planner.rules(), start, noise_scale, num_samples, seed)
         self._denoising_steps += len(result.rewards)
         self._excluded += result.excluded

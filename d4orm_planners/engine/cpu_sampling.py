@@ -48,14 +48,14 @@ class CpuSamplingEngine(CpuEngine):
     ) -> SamplingResult:
         """See :meth:`d4orm_planners.engine.sampling_types.SamplingEngine.denoise`."""
         run = Sampling(task, rules, num_samples, seed, self._threads)
-        factor = np.ones_like(task.base)
+        factor, units = np.ones_like(task.base), task.problem.team.control_units
         mean_rewards = np.empty(len(noise_scale), np.float32)
         done = excluded = 0
         for step, sigma in enumerate(noise_scale):
             if should_stop is not None and should_stop():
                 break
             done = step + 1
-            scale = factor * sigma
+            scale = factor * sigma * units
             rewards = run.score(step, mean, scale)
             mean_rewards[step] = rewards.mean()
             if not np.isfinite(mean_rewards[step]):
@@ -73,7 +73,7 @@ class CpuSamplingEngine(CpuEngine):
                 watcher(DenoisingStep(task, float(sigma), mean, samples, kept))
             if rules.adapt is not None:
                 # The square deviation of the samples from their new mean.
-                factor = rules.adapt(scale**2 * (second - first**2), np).astype(np.float32)
+                factor = rules.adapt((factor * sigma) ** 2 * (second - first**2), np).astype(np.float32)
         return SamplingResult(mean, mean_rewards[:done], excluded)
 
 

@@ -54,6 +54,7 @@ class _Inputs(NamedTuple):
     """What it is called with."""
 
     arrays: ProblemArrays
+    units: Array
     base: Array
     docked: Array
     moving: MovingObstacles | None
@@ -122,8 +123,8 @@ def _denoise(static: _Static, inputs: _Inputs, noise_scale: Array, run: _Run, be
     """The steps from ``begin`` to before ``end``; both are arguments, so that one compilation serves all parts."""
 
     def update(step: Array, run: _Run) -> _Run:
-        mean, factor, sigma = run.mean, run.factor, noise_scale[step]
-        rewards, deformations = _score(static, inputs, step.astype(jnp.uint32), mean, factor * sigma)
+        mean, factor, scale = run.mean, run.factor, run.factor * noise_scale[step] * inputs.units
+        rewards, deformations = _score(static, inputs, step.astype(jnp.uint32), mean, scale)
         if static.credit == "team":
             rewards = rewards.mean(axis=0, keepdims=True)
         finite = jnp.isfinite(rewards)
@@ -131,7 +132,7 @@ def _denoise(static: _Static, inputs: _Inputs, noise_scale: Array, run: _Run, be
         usable = jnp.where(jnp.isfinite(deformations), deformations, 0)
         extra: tuple[Array, ...] = ()
         if static.rules.importance:
-            slope = (inputs.base + mean) / (factor * sigma) ** 2
+            slope = (inputs.base + mean) / scale**2
             ratio = -jnp.einsum("tkms,tkm->ks", usable - mean[..., None], slope)
             ratio = ratio.sum(axis=0, keepdims=True) if static.credit == "team" else ratio
             extra = (static.rules.importance * ratio,)
@@ -142,7 +143,7 @@ def _denoise(static: _Static, inputs: _Inputs, noise_scale: Array, run: _Run, be
         new_mean = jnp.where((weights.sum(axis=-1) > 0)[None, :, None], new_mean, mean)
         if static.rules.adapt is not None:
             deviation2 = jnp.einsum("tkms,ks->tkm", (usable - new_mean[..., None]) ** 2, weights)
-            factor = static.rules.adapt(deviation2, jnp)
+            factor = static.rules.adapt(deviation2 / inputs.units**2, jnp)
         average = jnp.where(finite, rewards, 0).sum() / jnp.maximum(finite.sum(), 1)
         return _Run(new_mean, factor, run.rewards.at[step].set(average), run.excluded + (~finite).sum())
 
@@ -172,7 +173,15 @@ class JaxSamplingEngine(JaxEngine):
     ) -> tuple[jax.stages.Compiled, tuple[_Inputs, Array, _Run, Array, Array]]:
         problem = task.problem
         docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
-        scored = (task.arrays, task.base, docked, task.moving, np.float32(task.penalty), noise.seed_words(seed))
+        scored = (
+            task.arrays,
+            problem.team.control_units,
+            task.base,
+            docked,
+            task.moving,
+            np.float32(task.penalty),
+            noise.seed_words(seed),
+        )
         static = _Static(problem.team.models, rules, num_samples, task.collisions, task.credit)
         scale = np.asarray(noise_scale, np.float32)
         begun = (mean, np.ones_like(mean), np.zeros_like(scale), np.int32(0))

@@ -26,13 +26,13 @@ SOURCES = fingerprint((collision, simd, compiling, elementary, obstacles))
 BLOCK = 8
 """Steps in a block."""
 
-_DOUBT, _ROUNDING = 1e-4, 64 * 2.0**-23
-"""How far from the goal radius rounding may decide [m], and as a share of the coordinates: twice as far as
+_DOUBT, _ROUNDING = 1 / 750, 64 * 2.0**-23
+"""How far from the goal radius rounding may decide, as a share of it and as a share of the coordinates: farther than
 :mod:`d4orm_env.verify.docking` has it."""
 
 _NOBODY = np.int32(-1)
-_STILL = 1e-6
-"""The spread of who does not move [m]."""
+_WIDER = 1 + 2.0**-20
+"""By how much distances up to which there may be somebody are stretched for rounding."""
 
 
 class PathTable(NamedTuple):
@@ -85,7 +85,7 @@ class PathIndex:
         radii = np.array(radius, np.float64)
         reach = 2 * radii.max() + margin
         # Robots as near to each other as they may be are about one in a cell.
-        scale = 1 / max(2 * reach, 1e-6)
+        scale = 1 / (2 * reach)
         self.table = PathTable(
             BLOCK, places, radii, np.float64(margin), np.float64(reach), np.float64(scale),
             np.zeros((num_blocks, num_robots, 3)), np.zeros((num_blocks, num_robots)),
@@ -191,7 +191,7 @@ def _enclose(path: FloatArray, dimension: int, first: Whole, last: Whole) -> tup
     middle = (0.5 * (x_low + x_high), 0.5 * (y_low + y_high), 0.5 * (z_low + z_high))
     dx, dy, dz = x_high - x_low, y_high - y_low, z_high - z_low
     # Half of the diagonal, and a little for rounding.
-    return middle, 0.500001 * np.sqrt(dx * dx + dy * dy + dz * dz) + _STILL
+    return middle, 0.500001 * np.sqrt(dx * dx + dy * dy + dz * dz)
 
 
 @inlined
@@ -201,7 +201,7 @@ def _link(table: PathTable, block: Whole, robot: Whole) -> None:
     table.middle[block, robot, 0], table.middle[block, robot, 1], table.middle[block, robot, 2] = middle
     table.spread[block, robot] = spread
     table.widest[0] = max(table.widest[0], spread)
-    if spread > _STILL:
+    if spread > 0.0:
         table.moving[0] = max(table.moving[0], block)
     bucket = _own_bucket(table, block, robot)
     table.following[block, robot] = table.first[block, bucket]
@@ -255,7 +255,7 @@ def _first_near(
     """
     reach = table.radius[robot] + table.radius[other] + table.margin
     x, y, z = table.middle[block, other]
-    x, y, z, far = x - middle[0], y - middle[1], z - middle[2], reach + spread + table.spread[block, other]
+    x, y, z, far = x - middle[0], y - middle[1], z - middle[2], _WIDER * (reach + spread + table.spread[block, other])
     if x * x + y * y + z * z > far * far:
         return 0
     first, last = steps_of(table, block)
@@ -275,7 +275,7 @@ def _cells_around(
 ) -> tuple[int, int, int, int, int, int]:
     """Lowest and highest numbers of the cells around a way through a block, along three axes."""
     x, y, z = middle
-    far = table.reach + spread + table.widest[0]
+    far = _WIDER * (table.reach + spread + table.widest[0])
     flat = table.places.shape[2] == 2
     return (
         _cell(table, x - far), _cell(table, x + far), _cell(table, y - far), _cell(table, y + far),
@@ -363,7 +363,7 @@ def _count_meetings(
             for way in range(num_ways):
                 path = ways[r, way]
                 middle, spread = _enclose(path, table.places.shape[2], first, last)
-                if spread == _STILL and block > table.moving[0] + 1:
+                if spread == 0.0 and block > table.moving[0] + 1:
                     continue  # Nothing is other than it was in the block before.
                 low_i, high_i, low_j, high_j, low_k, high_k = _cells_around(table, middle, spread)
                 for i in range(low_i, high_i + 1):
@@ -415,4 +415,5 @@ def is_unsure(arrays: ProblemArrays, place: FloatArray, goal: FloatArray) -> boo
         gap = np.float64(place[axis]) - np.float64(goal[axis])
         gap2 += gap * gap
         extent = max(extent, abs(np.float64(place[axis])))
-    return abs(np.sqrt(gap2) - np.sqrt(np.float64(arrays.squared_goal_radius))) < _DOUBT + _ROUNDING * extent
+    goal_radius = np.sqrt(np.float64(arrays.squared_goal_radius))
+    return abs(np.sqrt(gap2) - goal_radius) < _DOUBT * goal_radius + _ROUNDING * extent

@@ -36,8 +36,8 @@ from d4orm_env.engine.simd import (
 )
 from d4orm_env.engine.tiles import near_round
 
-SLACK = np.float32(1e-4)
-"""Allowance for rounding [m]."""
+WIDER = np.float32(1 + 2.0**-6)
+"""By how much robots' boxes are stretched for rounding, of coordinates many thousand times as large too."""
 
 _INFINITY = np.float32(np.inf)
 _CHUNK_BITS = np.uint64((1 << CHUNK) - 1)
@@ -111,7 +111,7 @@ def make_bodies(places: FloatArray, radius: FloatArray, margin: np.float32) -> B
 
 
 def _widened(low: FloatArray, high: FloatArray, margin: np.float32) -> FloatArray:
-    widening = _HALF * margin + SLACK
+    widening = _HALF * margin
     return np.ascontiguousarray(np.stack([low - widening, high + widening], axis=-1), np.float32)
 
 
@@ -132,7 +132,7 @@ def enclose(k: int, reach: np.float32, dimension: int, places: FloatArray, boxes
     """Make the boxes of robot ``k`` in this block, for its radius and half of the margin as reach."""
     for axis in range(dimension):
         first, begin = place_of(k, 0, dimension) + axis * TILE, box_of(k, dimension) + axis * BOX
-        simd.enclose(places, first, dimension * TILE, reach + SLACK, boxes, begin)
+        simd.enclose(places, first, dimension * TILE, WIDER * reach, boxes, begin)
 
 
 @inlined
@@ -245,7 +245,7 @@ def near_static(arrays: ProblemArrays, k: int, bounds: FloatArray, boxes: FloatA
     dimension, limits, touch = arrays.goal.shape[1], bounds.reshape(-1), False
     if arrays.grid.clearance.shape[0] > 0:
         # The boxes are wider than the places by the radius and half of the margin.
-        reach, half = arrays.radius[k] + arrays.margin, arrays.radius[k] + _HALF * arrays.margin + SLACK
+        reach, half = arrays.radius[k] + arrays.margin, WIDER * (arrays.radius[k] + _HALF * arrays.margin)
         touch = may_touch(arrays.grid, reach, half, boxes, box_of(k, dimension) + 2 * TILE, BOX, spare)
     for bound in range(bounds.shape[0]):
         touch |= _meets(k, bound, dimension, boxes, limits)

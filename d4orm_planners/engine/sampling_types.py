@@ -74,8 +74,8 @@ class SamplingRules(NamedTuple):
     Attributes:
         weights: ``(rewards, array library) -> weights``: from ``(1, M)`` or ``(K, M)`` rewards to weights that sum to
             one over the last axis. Rewards that are not finite arrive as minus infinity and must get weight zero.
-        adapt: ``(noise, mean square deviation, array library) -> noise``: the noise of the next step, ``(H, K, m)``
-            factors on the schedule; ``None`` leaves the schedule alone and saves the second moment.
+        adapt: ``(mean square deviation, array library) -> noise``: the noise of the next step, ``(H, K, m)`` factors on
+            the schedule, the deviation being in units; ``None`` leaves the schedule alone and saves the second moment.
         importance: Share of the importance-sampling term of MPPI (paper, Eq. 11) in the weights: ``weights`` then gets
             it as ``log_ratio``, like the rewards in shape. It is the logarithm of how much likelier a sample ``U``
             would be around zero than around ``U_hat``, the mean that it was drawn around, but for a constant:
@@ -147,7 +147,8 @@ class SamplingEngine(Engine, Protocol):
         """Run ``len(noise_scale)`` sample-score-update steps (paper, Algorithm 1, lines 2 to 7).
 
         Each step draws ``num_samples`` deformations around ``mean`` ``(H, K, m)`` with the step's standard deviation,
-        rolls them out on top of ``task.base``, and replaces the mean by the weighted mean of the deformations.
+        in :attr:`~d4orm_env.core.team.Team.control_units`, rolls them out on top of ``task.base``, and replaces the
+        mean by the weighted mean of the deformations.
         The noise is a function of ``seed`` and the step alone. Between steps ``should_stop`` is asked whether to leave
         the rest out; the result is then that of the steps done. After every step ``watcher`` is told of it.
 

@@ -17,6 +17,8 @@ from d4orm_planners.tracking.working_plan import TeamPaths
 
 AWAY = np.float32(1e6)
 """Where a robot is that is in nobody's way [m]."""
+SPREAD = 20 / 3
+"""Deviation of detours' points from straight ways, beyond half of their lengths, in radii of the largest robot."""
 
 
 def reroute(team: TeamPaths) -> None:
@@ -33,7 +35,7 @@ def reroute(team: TeamPaths) -> None:
         swing = (2 * random.random() - 1) * REROUTE_RULES.swing
         manner = Manner(tuple(np.array(REROUTE_RULES.angles) + swing), REROUTE_RULES.paces)
         contact = REROUTE_RULES.contact * REROUTE_RULES.contact_growth**sweep
-        rules = BeamRules(REROUTE_RULES.width, contact, REROUTE_RULES.apart)
+        rules = BeamRules(REROUTE_RULES.width, contact, REROUTE_RULES.apart * team.problem.team.largest_radius)
         for first in range(0, len(failed), REROUTE_RULES.batch):
             if team.search.should_stop():
                 return
@@ -87,7 +89,7 @@ def _try_detours(team: TeamPaths, robots: IntArray, random: np.random.Generator)
     part = team.problem.select(robots.tolist())
     start, goal = (places[:, None] for places in (part.start[:, : part.dimension], part.goal))
     size = (len(robots), REROUTE_RULES.detours)
-    spread = 0.5 * np.linalg.norm(goal - start, axis=2, keepdims=True) + 1
+    spread = 0.5 * np.linalg.norm(goal - start, axis=2, keepdims=True) + SPREAD * part.team.largest_radius
     vias = start + random.random((*size, 1)) * (goal - start)
     vias = vias + spread * portable.standard_normal(random, (*size, part.dimension))
     team.take_best(robots, drives(part, *standing(part), np.zeros(size, int), vias[:, :, None]))

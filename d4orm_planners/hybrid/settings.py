@@ -41,7 +41,8 @@ class RerouteRules:
         contact: What being near another robot for a block of steps costs in the first sweep [s]: waiting that long is
             cheaper.
         contact_growth: Times as much it costs in the next sweep: what cannot be had for little may be had for more.
-        apart: How far apart the ways that are kept must be [m], or else twice as much in speed [m/s].
+        apart: How far apart the ways that are kept must be, in radii of the largest robot, or else twice as much in
+            speed [1/s].
         earlier: Blocks before a robot's first fault at which its new way begins: from one number to the other, which
             doubles with each sweep.
         angles: By which a robot turns off from the way to its goal [degrees]; in space up and down as well.
@@ -57,7 +58,7 @@ class RerouteRules:
     width: int = 32
     contact: float = 1.25
     contact_growth: float = 2.0
-    apart: float = 0.15
+    apart: float = 1.0
     earlier: tuple[int, int] = (2, 5)
     angles: tuple[float, ...] = (30.0, 60.0, 90.0, 135.0, 180.0)
     swing: float = 14.0

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, IntArray
 from d4orm_env.core.problem import Problem
-from d4orm_planners.mapf.pibt import Footprints, Workspace, fill_costs, is_open, step_team
+from d4orm_planners.mapf.pibt import ROUNDING, Footprints, Workspace, fill_costs, is_open, step_team
 from d4orm_planners.mapf.roadmap import PAIR_SLACK, Roadmap
 
 
@@ -82,9 +82,10 @@ class Team:
         radius = np.asarray(problem.team.radius, np.float64)
         self.bodies = Footprints(
             radius=radius,
-            reach=radius + problem.margin - 1e-9,
+            size=problem.team.largest_radius,
+            reach=radius * (1 - ROUNDING) + problem.margin,
             margin=float(problem.margin),
-            slack=PAIR_SLACK,
+            slack=PAIR_SLACK * problem.team.largest_radius,
             docked=float(problem.goal_radius),
             docks=problem.docks,
             starts=roadmap.starts,

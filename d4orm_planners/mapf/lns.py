@@ -31,12 +31,13 @@ class NeighbourhoodRules:
         give: How much later than before a robot of a group may arrive for the sake of those after it [s].
         temperature: How much worse the ways of a group may be and still be taken over, on average and at first [s].
         least_delay: Who arrives as soon as if it were alone is chosen as often as who arrives so much later [s].
-        nearness: How much farther away a robot may be and still be chosen for a group, at random [m].
+        nearness: How much farther away a robot may be and still be chosen for a group, at random, in radii of the
+            largest robot.
         angles: By which robots turn off [degrees], all times the same number, ...
         scales: ... which is between these and drawn for every round.
         paces: Shares of their speed with which they head for their goals.
         width: Ways that a search keeps after each block of steps.
-        apart: How far apart the ways that are kept must be [m], or else twice as much in speed [m/s].
+        apart: How far apart the ways that are kept must be, in the same radii, or else twice as much in speed [1/s].
         contact: What meeting anybody costs [s]: too much.
     """
 
@@ -45,12 +46,12 @@ class NeighbourhoodRules:
     give: float = 0.5
     temperature: float = 0.05
     least_delay: float = 0.02
-    nearness: float = 1.0
+    nearness: float = 20 / 3
     angles: tuple[float, ...] = (10.0, 20.0, 35.0, 60.0, 100.0)
     scales: tuple[float, float] = (0.4, 1.6)
     paces: tuple[float, ...] = (1.0, 0.7, 0.35, 0.0)
     width: int = 32
-    apart: float = 0.1
+    apart: float = 2 / 3
     contact: float = 1e6
 
 
@@ -134,7 +135,7 @@ class _Neighbourhoods:
                 np.ascontiguousarray(np.moveaxis(states[:, found, :member, : self.problem.dimension], 0, 2)),
                 np.asarray(self.problem.team.radius, np.float64)[before],
             )
-            rules = BeamRules(RULES.width, RULES.contact, RULES.apart)
+            rules = BeamRules(RULES.width, RULES.contact, RULES.apart * self.problem.team.largest_radius)
             ways = find_ways(self.team, robots, blocks[found], manner, rules, limits, company)
             controls[:, found, member], states[:, found, member] = ways.controls[:, :, 0], ways.states[:, :, 0]
             budget[found] -= self.costs(robots, ways.positions[:, :, 0])[0]
@@ -148,7 +149,7 @@ class _Neighbourhoods:
         robot = int(self.random.choice(self.num_robots, p=delay / delay.sum()))
         places = self.team.positions
         gap = np.sqrt(((places - places[:, [robot]]) ** 2).sum(axis=2).min(axis=0))
-        gap += RULES.nearness * self.random.random(self.num_robots)
+        gap += RULES.nearness * self.problem.team.largest_radius * self.random.random(self.num_robots)
         gap[robot] = -1.0
         return self.random.permutation(np.argsort(gap, kind="stable")[: self.size])
 

@@ -26,8 +26,9 @@ SOURCES = fingerprint((near_neighbours,))
 FREE, MOVING, DONE = 0, 1, 2
 """Robots that have not moved yet in a step; that are about to, once others have made way; that have, or stay."""
 STAY, NOTHING = -1, -2
-IDLE = 0.05
-"""Detour that a robot rather makes than stay where it is [m]."""
+IDLE, TIE, ROUNDING = 1 / 3, 1 / 150, 2.0**-27
+"""Detour that a robot rather makes than stay where it is, one that is as good as none, and what is rounding, in radii
+of the largest robot."""
 
 
 class Footprints(NamedTuple):
@@ -35,6 +36,7 @@ class Footprints(NamedTuple):
 
     Attributes:
         radius: ``(K,)`` [m].
+        size: The largest of them [m].
         reach: ``(K,)`` radius and margin to obstacles [m].
         margin: Between robots [m].
         slack: Distance beyond it that they keep where they can [m].
@@ -46,6 +48,7 @@ class Footprints(NamedTuple):
     """
 
     radius: Floats
+    size: float
     reach: Floats
     margin: float
     slack: float
@@ -105,7 +108,7 @@ def _too_near(
         need = min(need, _gap(roadmap.nodes, u, tail))
     if head == bodies.goals[k]:
         need = min(need, max(_gap(roadmap.nodes, u, head), hard))
-    return gap < need - 1e-9
+    return gap < need - ROUNDING * bodies.size
 
 
 @compiled
@@ -191,9 +194,9 @@ def _rank_options(
         elif pushed:
             continue
         else:
-            value, option = np.float64(costs[at]) + IDLE, np.int64(STAY)
+            value, option = np.float64(costs[at]) + IDLE * bodies.size, np.int64(STAY)
         # Ties are broken at random, lest two robots go on getting into each other's way.
-        value += 1e-3 * _mixed(np.uint64(seed) + np.uint64(k), np.uint64(e))
+        value += TIE * bodies.size * _mixed(np.uint64(seed) + np.uint64(k), np.uint64(e))
         place = count
         while place > 0 and worth[place - 1] > value:
             worth[place], options[place] = worth[place - 1], options[place - 1]

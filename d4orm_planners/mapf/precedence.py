@@ -24,18 +24,19 @@ from d4orm_planners.tracking.routes import Route, Routes, Stops
 
 SOURCES = fingerprint((near_neighbours,))
 
-SPACING = 0.04
-"""Distance between the points of a route [m], at most."""
+SPACING = 4 / 15
+"""Distance between the points of a route, at most, in radii of the largest robot, as all lengths below."""
 CUTS = (1.0, 0.5, 0.25)
 """Shares of the allowed cut that corners are rounded by; the first that leaves room at walls."""
-ARC_POINTS, ARC_CHECKS, ARC_SLACK = 9, 17, 0.01
-"""Points along an arc, those that are looked at for walls, and how far from those they keep beyond the margin [m]."""
+ARC_POINTS, ARC_CHECKS, ARC_SLACK = 9, 17, 1 / 15
+"""Points along an arc, those that are looked at for walls, and how far from those they keep beyond the margin."""
+TINY = float(np.finfo(np.float64).tiny)
 STRAIGHT, TURNING_BACK = 1e-4, 0.31
 """Sine and cosine of half the angle by which ways turn at corners: less is no corner, and cannot be rounded."""
-WAIT_SLACK = 0.09
-"""Distance beyond radii and margin that robots under way keep [m]."""
-SHARPEST = 0.1
-"""Radius below which corners are not rounded [m]."""
+WAIT_SLACK = 0.6
+"""Distance beyond radii and margin that robots under way keep."""
+SHARPEST = 2 / 3
+"""Radius below which corners are not rounded."""
 
 
 def stops_of(roadmap: Roadmap, moves: IntArray, num_robots: int) -> Stops:
@@ -54,7 +55,8 @@ def stops_of(roadmap: Roadmap, moves: IntArray, num_robots: int) -> Stops:
 def make_routes(problem: Problem, stops: Stops, robots: Sequence[int], cut: float) -> list[Route]:
     """The routes of robots along corners, which are rounded by ``cut`` at most [m], less where walls are near."""
     owner = np.repeat(np.asarray(robots), np.diff(stops.begin))
-    points, first, times, bends = _rounded(stops, _corner_radii(problem, stops.places, owner, cut))
+    spacing = SPACING * problem.team.largest_radius
+    points, first, times, bends = _rounded(stops, _corner_radii(problem, stops.places, owner, cut), spacing)
     ends = [slice(low, high) for low, high in pairwise(first)]
     return [Route(points[own], times[own], bends[own]) for own in ends]
 
@@ -66,8 +68,9 @@ def join_routes(problem: Problem, routes: Sequence[Route]) -> Routes:
     arcs = np.append(0.0, np.cumsum(_lengths(np.diff(points, axis=0))))
     arcs -= np.repeat(arcs[first[:-1]], np.diff(first))
     radius = np.asarray(problem.team.radius, np.float64)
-    cells = sort_into_cells(points, 2 * float(radius.max()) + problem.margin + WAIT_SLACK)
-    return Routes(points, times, bends, first, arcs, *_find_waits(cells, first, times, radius, problem.margin))
+    apart = problem.margin + WAIT_SLACK * problem.team.largest_radius
+    cells = sort_into_cells(points, 2 * float(radius.max()) + apart)
+    return Routes(points, times, bends, first, arcs, *_find_waits(cells, first, times, radius, apart))
 
 
 class Bends(NamedTuple):
@@ -94,7 +97,7 @@ def _bends_at(corners: Floats, inner: IntArray) -> Bends:
     """The corners with these numbers, each with the one before it and the one after it."""
     before, after = corners[inner] - corners[inner - 1], corners[inner + 1] - corners[inner]
     one, other = _lengths(before), _lengths(after)
-    before, after = before / np.maximum(one, 1e-12)[:, None], after / np.maximum(other, 1e-12)[:, None]
+    before, after = before / np.maximum(one, TINY)[:, None], after / np.maximum(other, TINY)[:, None]
     cosine = np.clip(before[:, 0] * after[:, 0] + before[:, 1] * after[:, 1] + before[:, 2] * after[:, 2], -1.0, 1.0)
     halves = np.sqrt((1 + cosine) / 2), np.sqrt((1 - cosine) / 2)
     return Bends(corners[inner], before, after, np.minimum(one, other) / 2, *halves)
@@ -105,11 +108,11 @@ def _arcs(bends: Bends, radius: Floats, num_points: int) -> Floats:
     reach = radius * bends.sine / bends.cosine
     begin, end = bends.corners - bends.before * reach[:, None], bends.corners + bends.after * reach[:, None]
     inward = bends.after - bends.before
-    inward /= np.maximum(_lengths(inward), 1e-12)[:, None]
+    inward /= np.maximum(_lengths(inward), TINY)[:, None]
     centre = bends.corners + inward * (radius / bends.cosine)[:, None]
     share = np.linspace(0, 1, num_points)[None, :, None]
     spokes = (begin - centre)[:, None] * (1 - share) + (end - centre)[:, None] * share
-    arcs: Floats = centre[:, None] + spokes * (radius[:, None] / np.maximum(_lengths(spokes), 1e-12))[..., None]
+    arcs: Floats = centre[:, None] + spokes * (radius[:, None] / np.maximum(_lengths(spokes), TINY))[..., None]
     return arcs
 
 
@@ -121,18 +124,18 @@ def _corner_radii(problem: Problem, corners: Floats, owner: IntArray, cut: float
     radii[inner] = 0.0
     # Who turns back does so on the spot.
     inner = inner[_bends_at(corners, inner).cosine > TURNING_BACK]
-    turning = problem.team.turning_radius.astype(np.float64)[owner]
+    turning, size = problem.team.turning_radius.astype(np.float64)[owner], problem.team.largest_radius
     for share in CUTS:
         bends = _bends_at(corners, inner)
         most = share * np.maximum(cut * bends.cosine / (1 - bends.cosine), turning[inner])
         radius = np.minimum(most, bends.straight * bends.cosine / bends.sine)
         fits = np.ones(len(inner), bool)
         if problem.world.num_obstacles:
-            reach = np.asarray(problem.team.radius, np.float64)[owner[inner]] + problem.margin + ARC_SLACK
+            reach = np.asarray(problem.team.radius, np.float64)[owner[inner]] + problem.margin + ARC_SLACK * size
             arcs = _arcs(bends, radius, ARC_CHECKS)[..., : problem.dimension]
             room = problem.world.clearance(arcs.reshape(-1, problem.dimension)).reshape(len(inner), ARC_CHECKS)
             fits = room.min(axis=1) > reach
-        rounded = fits & (radius > SHARPEST)
+        rounded = fits & (radius > SHARPEST * size)
         radii[inner[rounded]] = radius[rounded]
         inner = inner[~fits]
     return radii
@@ -143,8 +146,8 @@ def _lengths(steps: Floats) -> Floats:
     return length
 
 
-def _rounded(stops: Stops, radii: Floats) -> tuple[Floats, IntArray, Floats, Floats]:
-    """``(points, first, times, bends)`` along ways with corners that are rounded by these radii."""
+def _rounded(stops: Stops, radii: Floats, spacing: float) -> tuple[Floats, IntArray, Floats, Floats]:
+    """``(points, first, times, bends)``, so far apart at most, along ways with corners rounded by these radii."""
     corners, rounded = stops.places, np.flatnonzero((radii > 0) & np.isfinite(radii))
     arcs = _arcs(_bends_at(corners, rounded), radii[rounded], ARC_POINTS)
     # Corners that are rounded become as many points, others stay one.
@@ -164,7 +167,7 @@ def _rounded(stops: Stops, radii: Floats) -> tuple[Floats, IntArray, Floats, Flo
     start[at[stops.begin[:-1]]] = True
     steps = np.diff(places, axis=0, prepend=places[:1])
     steps[start] = 0.0
-    parts = np.maximum(np.ceil(_lengths(steps) / SPACING).astype(np.int64), 1)
+    parts = np.maximum(np.ceil(_lengths(steps) / spacing).astype(np.int64), 1)
     last = np.cumsum(parts)
     part = np.arange(last[-1]) - np.repeat(last - parts, parts) + 1
     share = part / np.repeat(parts, parts)
@@ -176,13 +179,13 @@ def _rounded(stops: Stops, radii: Floats) -> tuple[Floats, IntArray, Floats, Flo
     return points, first, times, inside
 
 
-def _find_waits(cells: Cells, first: IntArray, times: Floats, radius: Floats, margin: float) -> tuple[IntArray, ...]:
+def _find_waits(cells: Cells, first: IntArray, times: Floats, radius: Floats, apart: float) -> tuple[IntArray, ...]:
     room, num_robots = 8 * len(times), len(first) - 1
     owner = np.repeat(np.arange(num_robots), np.diff(first))
     wait_first = np.empty(num_robots + 1, np.int64)
     while True:
         waits = np.empty((room, 3), np.int64)
-        count = find_waits(cells, first, owner, times, radius, margin + WAIT_SLACK, wait_first, waits)
+        count = find_waits(cells, first, owner, times, radius, apart, wait_first, waits)
         if count <= room:
             return wait_first, *np.ascontiguousarray(waits[:count].T)
         room = count

@@ -17,8 +17,8 @@ from d4orm_planners.mapf.near_neighbours import find_near, sort_into_cells
 
 SOURCES = fingerprint((near_neighbours,))
 
-PAIR_SLACK = 0.06
-"""Distance that robots keep from each other beyond radii and margin [m]: what they stray from their ways."""
+PAIR_SLACK = 0.4
+"""Distance that robots keep from each other beyond radii and margin, in radii: what they stray from their ways."""
 WALL_SLACK = 0.15
 """The same for obstacles, as a share of radius and margin."""
 REPLACED = 0.35
@@ -67,7 +67,7 @@ def lay_roadmap(problem: Problem, fineness: float = 1.0) -> Roadmap:
         fineness: By how much nearer to each other nodes are than that.
     """
     d, radius = problem.dimension, np.asarray(problem.team.radius, np.float64)
-    spread = 2 * radius.max() + problem.margin + PAIR_SLACK
+    spread = 2 * radius.max() + problem.margin + PAIR_SLACK * problem.team.largest_radius
     step = float(np.sqrt(2.0) * spread / fineness)
     reaches = np.unique(radius + problem.margin)
     space = make_space(problem) if problem.world.num_obstacles else None

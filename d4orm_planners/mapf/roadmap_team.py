@@ -23,11 +23,11 @@ from d4orm_planners.tracking.path_drives import drive_along
 from d4orm_planners.tracking.routes import Stops
 from d4orm_planners.tracking.timed_path import drive_by_clock, timed_kernel
 
-FIRST_CUT = 0.03
-"""By how much corners are cut at most on first routes [m]."""
-MANNERS = ((1.0, 0.25), (0.9, 0.1), (0.75, 0.03), (0.6, 0.01))
-"""Shares of its speed that a robot is taken to drive at when its way is planned, and by how much it cuts corners [m];
-the next where it is late so, or comes too near to something."""
+FIRST_CUT = 0.2
+"""By how much corners are cut at most on first routes, in radii of the largest robot, as all lengths below."""
+MANNERS = ((1.0, 5 / 3), (0.9, 2 / 3), (0.75, 0.2), (0.6, 1 / 15))
+"""Shares of its speed that a robot is taken to drive at when its way is planned, and by how much it cuts corners; the
+next where it is late so, or comes too near to something."""
 LEISURE = 0.1
 """Share of that by which it is slower, at most: drawn for every way, so that no two searches are the same."""
 LAUNCH = 0.4
@@ -40,8 +40,11 @@ FAR = 1e9
 """Where robots are that are not there yet [m]."""
 LATER = 30
 """Steps by which a robot may come later for the sake of others."""
-KEEP, TOUCH = 0.06, 0.005
-"""Distances beyond radii and margin that a way is planned to keep, where starts and goals allow it, and keeps [m]."""
+KEEP, TOUCH, ROUNDING = 0.4, 1 / 30, 2.0**-17
+"""Distances beyond radii and margin that a way is planned to keep, where starts and goals allow it, and keeps; and what
+starts and goals themselves must be apart less, for rounding."""
+NEARNESS = 10 / 3
+"""How much farther away a robot may be and still be replanned with another, at random."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +82,9 @@ class Driven:
 def drive_moves(problem: Problem, roadmap: Roadmap, moves: IntArray) -> Driven:
     """Drive a team along the moves of a search."""
     stops = stops_of(roadmap, moves, problem.num_robots)
-    routes = join_routes(problem, make_routes(problem, stops, range(problem.num_robots), FIRST_CUT))
+    routes = join_routes(
+        problem, make_routes(problem, stops, range(problem.num_robots), FIRST_CUT * problem.team.largest_radius)
+    )
     return Driven(*drive_along(problem, routes, OVERTIME * problem.horizon))
 
 
@@ -102,18 +107,18 @@ class Replanning:
         self.problem, self.roadmap, self.linger = problem, roadmap, linger
         self.cells = sort_into_cells(roadmap.nodes, float(2 * np.asarray(problem.team.radius).max() + problem.margin))
         self.space = make_space(problem) if problem.world.num_obstacles else None
-        self.bodies = Team(problem, roadmap).bodies
+        self.bodies, self.size = Team(problem, roadmap).bodies, problem.team.largest_radius
         speed, acceleration = (np.asarray(problem.team.limits[:, column], np.float64) for column in (0, 1))
         self.strides = problem.dt * speed
         self.launch = np.round(LAUNCH * speed / acceleration / problem.dt).astype(np.int64)
         places = [roadmap.nodes[ends] for ends in (roadmap.starts, roadmap.goals)]
         gaps = [np.sqrt(((ends[:, None] - ends) ** 2).sum(axis=2)) for ends in places]
-        self.ends_apart = np.minimum(gaps[0], gaps[1] - self.bodies.docked) - 1e-6
+        self.ends_apart = np.minimum(gaps[0], gaps[1] - self.bodies.docked) - ROUNDING * self.size
         # Who turns in place need not back up.
         self.turns = [(False,) if model.turns_in_place else (False, True) for model in problem.team.robot_models]
         d = problem.dimension
         ends = np.stack([problem.world.clearance(place[:, :d]) for place in places])
-        self.own_room = ends.min(axis=0) - TOUCH
+        self.own_room = ends.min(axis=0) - TOUCH * self.size
         self.alone = self.bodies.costs[np.arange(problem.num_robots), roadmap.starts] / self.strides
 
     def neighbours(self, driven: Driven, random: np.random.Generator, most: int) -> IntArray:
@@ -124,7 +129,8 @@ class Replanning:
             delay[~late] = 0.0
         robot = int(random.choice(len(delay), p=delay / delay.sum()))
         places = driven.places[: int(driven.arrivals[robot]) + 1]
-        gaps = np.sqrt(((places - places[:, robot, None]) ** 2).sum(axis=2)).min(axis=0) + random.random(len(delay)) / 2
+        gaps = np.sqrt(((places - places[:, robot, None]) ** 2).sum(axis=2)).min(axis=0)
+        gaps += NEARNESS * self.size * random.random(len(delay))
         gaps[robot] = -1.0
         return random.permutation(np.argsort(gaps)[: random.integers(1, min(len(delay), most) + 1)])
 
@@ -180,7 +186,7 @@ class Replanning:
             else:
                 return None
             driven.places[:, robot] = around[:, robot]
-            apart = self.bodies.radius[robot] + self.bodies.radius + self.bodies.margin + TOUCH
+            apart = self.bodies.radius[robot] + self.bodies.radius + self.bodies.margin + TOUCH * self.size
             there = driven.places[1 : self.leaves(int(driven.arrivals[robot]))]
             gaps = np.sqrt(((there - there[:, robot, None]) ** 2).sum(axis=2))
             displaced = settled & (gaps < np.minimum(apart, self.ends_apart[robot])).any(axis=0)
@@ -204,7 +210,7 @@ class Replanning:
         """The same in one of the :data:`MANNERS`."""
         roadmap, bodies, steps = self.roadmap, self.bodies, len(driven.controls)
         apart = bodies.radius[robot] + bodies.radius + bodies.margin
-        others = Others(driven.places, np.minimum(apart + KEEP, self.ends_apart[robot]))
+        others = Others(driven.places, np.minimum(apart + KEEP * self.size, self.ends_apart[robot]))
         linger = -1 if self.linger is None else self.linger
         # Looked for among the sooner ones at first, because that is where it mostly is.
         for bound in sorted({min(int(SOON * self.alone[robot]) + PATIENCE, latest), latest}):
@@ -218,11 +224,13 @@ class Replanning:
         left = straighten(roadmap, bodies, self.space, others, robot, reach, way)
         nodes, departs, arrives = way[:left].T
         stops = Stops(roadmap.nodes[nodes], np.array([0, left]), departs.astype(float), arrives.astype(float))
-        route = make_routes(self.problem, stops, [robot], cut)[0]
+        route = make_routes(self.problem, stops, [robot], cut * self.size)[0]
         # As soon as it can, or else by the clock of its way.
         for backs_up, hurrying in product(self.turns[robot], (True, False)):
             drive = drive_by_clock(self.problem, robot, route, stops, steps, hurrying=hurrying, backs_up=backs_up)
-            if self.fits(Others(driven.places, np.minimum(apart + TOUCH, others.need)), robot, drive, latest):
+            if self.fits(
+                Others(driven.places, np.minimum(apart + TOUCH * self.size, others.need)), robot, drive, latest
+            ):
                 driven.controls[:, robot], driven.places[:, robot], driven.arrivals[robot] = drive
                 if self.linger is not None:
                     driven.places[self.leaves(drive[2]) :, robot] = FAR
@@ -237,7 +245,7 @@ class Replanning:
         if self.space is None:
             return True
         room = self.problem.world.clearance(places[1 : arrival + 1, : self.problem.dimension])
-        return bool(room.min() > min(self.bodies.reach[robot] + TOUCH, self.own_room[robot]))
+        return bool(room.min() > min(self.bodies.reach[robot] + TOUCH * self.size, self.own_room[robot]))
 
 
 def is_compiled(problem: Problem) -> bool:

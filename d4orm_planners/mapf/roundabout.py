@@ -20,8 +20,8 @@ from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine.types import Engine
 from d4orm_planners.tracking.steering import track_velocities
 
-SLACK = 0.002
-"""Added to the distance that robots keep from each other in it [m]."""
+SLACK = 1 / 75
+"""Added to the distance that robots keep from each other in it, in radii of the largest robot."""
 PARALLEL = 1e-6
 """Ways are parallel whose directions differ by less, squared [rad^2]."""
 CORRECTION = 1.0
@@ -101,13 +101,13 @@ def _driven(time: float | Floats, speed: Floats, acceleration: Floats) -> Floats
 def _bends(problem: Problem, side: int) -> Bends | None:
     begin, end = problem.start[:, :2].astype(np.float64), problem.goal.astype(np.float64)
     along = end - begin
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), np.finfo(np.float64).tiny)
     across = side * np.stack([-along[:, 1], along[:, 0]], axis=1)
     middle = _nearest_to_all(begin, across)
     if middle is None:
         return None
     limits, radius = problem.team.limits.astype(np.float64), np.asarray(problem.team.radius, np.float64)
-    apart = 2 * radius.max() + problem.margin + SLACK
+    apart = 2 * radius.max() + problem.margin + SLACK * problem.team.largest_radius
     least = apart / (2 * float(sin(np.pi / problem.num_robots)))
     bend = np.maximum(limits[:, SPEED] ** 2 / limits[:, ACCELERATION], least)
     # Where robots cannot turn that sharply the arc reaches round the middle on the far side too.

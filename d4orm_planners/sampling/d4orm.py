@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.team import Team
 from d4orm_planners.base.settings import Positive, Samples, Share, ShareOrNone, Steps
 from d4orm_planners.base.solve import Search
 from d4orm_planners.engine.sampling_types import SamplingTask
@@ -68,16 +69,16 @@ class DeformingPlanner(DenoisingPlanner):
     def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
         """See :meth:`SamplingPlanner.initial`."""
         base = self.config.continued(search.current)
-        return base, self.start(search, base)
+        return base, self.start(search, base, search.problem.team)
 
-    def start(self, search: Search, base: FloatArray, number: int = 0) -> FloatArray:
-        """``U_N`` of a deformation of ``base``, as a mean to draw samples around, in the shape of ``base``.
+    def start(self, search: Search, base: FloatArray, team: Team, number: int = 0) -> FloatArray:
+        """``U_N`` of a deformation of ``base``, a team's controls, as a mean to draw samples around, in its shape.
 
         ``number`` tells the deformations of one iteration apart.
         """
         if not self.config.random_start:
             return np.zeros_like(base)
-        return self.first_mean(standard_normal(search, base.shape, number))
+        return self.first_mean(standard_normal(search, team, len(base), number))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,6 +15,7 @@ import numpy as np
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.seeds import Stream
+from d4orm_env.core.team import Team
 from d4orm_planners.base.conflict_groups import Groups, components, conflicts
 from d4orm_planners.base.planner import Iteration, Planner, State
 from d4orm_planners.base.solve import Search
@@ -103,7 +104,7 @@ class DenoisingPlanner(SamplingPlanner):
         return noise / np.float32(np.sqrt(final))
 
 
-def standard_normal(search: Search, shape: tuple[int, ...], number: int = 0) -> FloatArray:
-    """Standard normal numbers in this shape for the start of a run of this iteration."""
+def standard_normal(search: Search, team: Team, num_steps: int, number: int = 0) -> FloatArray:
+    """``(H, K, m)`` standard normal controls of a team, in its units, for the start of a run of this iteration."""
     generator = np.random.default_rng(search.iteration_seed(Stream.DEFORMATION_START, number))
-    return portable.standard_normal(generator, shape)
+    return portable.standard_normal(generator, (num_steps, *team.control_units.shape)) * team.control_units

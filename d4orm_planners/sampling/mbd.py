@@ -36,7 +36,7 @@ class MBD(DenoisingPlanner):
 
     def noisy_controls(self, search: Search) -> FloatArray:
         """``U_N`` of this iteration, ``(H, K, m)``."""
-        return standard_normal(search, search.current.controls.shape)
+        return standard_normal(search, search.problem.team, search.problem.horizon)
 
 
 @dataclass(frozen=True, kw_only=True)

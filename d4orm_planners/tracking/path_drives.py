@@ -30,8 +30,8 @@ BRAKING = 0.5
 """Share of its acceleration that a robot counts on before corners and in them."""
 RESERVE = 0.8
 """Share of the way to where it must stop that a robot plans to stop in."""
-BEYOND = 2.0
-"""How far beyond its goal a robot plans to drive that is stopped by arriving [m]."""
+BEYOND = 4.0
+"""How far beyond its goal a robot plans to drive that is stopped by arriving, in lengths of a stop from full speed."""
 SLOWEST = 0.1
 """Share of its speed at which a robot creeps round the sharpest corner."""
 
@@ -92,6 +92,7 @@ def direct(
     sights: Floats,
     dt: float,
     beyond: float,
+    size: float,
     positions: Floats,
     standing: BoolArray,
     progress: Progress,
@@ -104,6 +105,7 @@ def direct(
         sights: ``(K,)`` how far ahead robots look at least [m].
         dt: Time step [s].
         beyond: How far robots may plan to drive beyond their goals, which stop them [m].
+        size: The radius of the largest robot [m].
         positions: ``(K, 3)`` float64 where they are [m].
         standing: ``(K,)`` bool who has docked, and so is at the end of its route.
         progress: Changed in place.
@@ -111,7 +113,7 @@ def direct(
     points, arcs, num_robots = routes.points, routes.arcs, routes.first.shape[0] - 1
     for k in range(num_robots):
         first, last = routes.first[k], routes.first[k + 1] - 1
-        i = point_reached(points, arcs, first + progress.at[k], last, positions[k])
+        i = point_reached(points, arcs, first + progress.at[k], last, positions[k], size)
         progress.at[k] = (last if standing[k] else i) - first
     for k in range(num_robots):
         first, last = routes.first[k], routes.first[k + 1] - 1
@@ -121,7 +123,7 @@ def direct(
         progress.waits[k] = wait
         i, here = first + progress.at[k], positions[k]
         limit = last if wait == end else max(first + routes.wait_at[wait] - 1, i)
-        target = point_ahead(routes, paces, i, limit, np.inf, (sights[k], dt), here)
+        target = point_ahead(routes, paces, i, limit, np.inf, (sights[k], dt), here, size)
         progress.targets[k, 0], progress.targets[k, 1] = points[target, 0], points[target, 1]
         progress.targets[k, 2] = points[target, 2]
         room = RESERVE * (arcs[limit] - arcs[i])
@@ -205,11 +207,11 @@ def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[Floa
     progress = Progress.of(routes)
     places = np.zeros((most_steps + 1, num_robots, 3))
     arrivals = np.full(num_robots, most_steps + 1, np.int64)
-    parts, beyond = _parts(problem), BEYOND if problem.docks and problem.goal_speed is None else 0.0
+    parts, beyond, size = _parts(problem), beyond_goal(problem), problem.team.largest_radius
     ends, steps = np.diff(routes.first) - 1, 0
     while True:
         places[steps, :, :d] = states[:, :d]
-        direct(routes, paces, sights, problem.dt, beyond, places[steps], docked & problem.docks, progress)
+        direct(routes, paces, sights, problem.dt, beyond, size, places[steps], docked & problem.docks, progress)
         # Without docking a robot may come through its goal before it has made way for others.
         there = docked & (problem.docks | (progress.at == ends))
         arrivals[:] = np.where(there, np.minimum(arrivals, steps), most_steps + 1)
@@ -218,6 +220,14 @@ def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[Floa
         for drive, part in parts:
             drive(part, progress, states, docked, controls[steps])
         steps += 1
+
+
+def beyond_goal(problem: Problem) -> float:
+    """How far beyond their goals robots plan to drive, if these stop them [m]."""
+    if not problem.docks or problem.goal_speed is not None:
+        return 0.0
+    speed, acceleration = (problem.team.limits[:, column].astype(np.float64) for column in (SPEED, ACCELERATION))
+    return float((BEYOND * speed**2 / (2 * acceleration)).max())
 
 
 def _parts(problem: Problem) -> list[tuple[Drive, Part]]:

@@ -16,7 +16,7 @@ import numpy as np
 from d4orm_env.core.arrays import Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.models import MODELS
-from d4orm_env.dynamics.robot_model import Model, TimeStep
+from d4orm_env.dynamics.robot_model import SPEED, Model, TimeStep
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
 from d4orm_env.engine.elementary import OPS, cosine, sine
 from d4orm_env.engine.tile_layout import Row
@@ -29,16 +29,17 @@ Length: TypeAlias = Callable[[Row], np.float32]
 Steering: TypeAlias = Callable[[Row, Row, np.float32, np.float32, bool, Row, TimeStep], Row]
 Turning: TypeAlias = Callable[[Row, Row, Row, np.float32, bool, Row], tuple[Row, np.float32]]
 
-LOOKAHEAD = 0.05
-"""Of the point of its route that a robot heads for, beyond what it drives in a step and a half [m]."""
+LOOKAHEAD = 1 / 3
+"""Of the point of its route that a robot heads for, beyond what it drives in a step and a half, in radii of the largest
+robot, as all lengths below."""
 CIRCLES = 0.8
 """The same of one that drives in order to turn, in radii of its turning circle."""
-REACHED = 4e-4
-"""Square of the distance from which on a robot has come to a point [m^2]."""
+REACHED, COINCIDING = 2 / 15, 1 / 15
+"""Distance from which on a robot has come to a point, and up to which points of a route are taken for one."""
 FACING, CREEP = np.float32(0.8), np.float32(0.01)
 """Cosine of the angle between heading and way from which on a robot drives, and share of its speed before that."""
 UNDER_WAY = np.float32(0.05)
-"""Speed from which on a robot keeps its gear for longer, lest it change it all the time [m/s]."""
+"""Share of its speed from which on a robot keeps its gear for longer, lest it change it all the time."""
 BEHIND = np.float32(0.5)
 """Cosine of the angle behind it within which a point must lie that a robot under way changes gear for."""
 BESIDE = (np.float32(0.3), np.float32(0.954))
@@ -51,7 +52,7 @@ BACKING = np.float32(0.5)
 
 def lookaheads(problem: Problem) -> Floats:
     """``(K,)`` how far ahead of them robots look at least [m]."""
-    return np.maximum(LOOKAHEAD, CIRCLES * problem.team.turning_radius.astype(np.float64))
+    return np.maximum(LOOKAHEAD * problem.team.largest_radius, CIRCLES * problem.team.turning_radius.astype(np.float64))
 
 
 @compiled
@@ -62,15 +63,18 @@ def square_to(points: Floats, i: int, place: Floats) -> float:
 
 
 @compiled
-def point_reached(points: Floats, arcs: Floats, at: int, last: int, place: Floats) -> int:
-    """The point that a robot has come to that was at ``at``: as far on as each next one is nearer, or reached."""
-    following = at
+def point_reached(points: Floats, arcs: Floats, at: int, last: int, place: Floats, size: float) -> int:
+    """The point that a robot has come to that was at ``at``: as far on as each next one is nearer, or reached.
+
+    ``size`` is the radius of the largest robot [m].
+    """
+    following, reached = at, REACHED * size
     while following < last:
         following += 1
         # Where two arcs join, points coincide but for rounding.
-        if arcs[following] - arcs[at] > 0.01 or following == last:
+        if arcs[following] - arcs[at] > COINCIDING * size or following == last:
             gap = square_to(points, following, place)
-            if gap > square_to(points, at, place) and gap > REACHED:
+            if gap > square_to(points, at, place) and gap > reached * reached:
                 break
             at = following
     return at
@@ -78,7 +82,14 @@ def point_reached(points: Floats, arcs: Floats, at: int, last: int, place: Float
 
 @inlined
 def point_ahead(
-    route: Routes | Timed, paces: Floats, at: int, last: int, stop: float, sight: tuple[float, float], place: Floats
+    route: Routes | Timed,
+    paces: Floats,
+    at: int,
+    last: int,
+    stop: float,
+    sight: tuple[float, float],
+    place: Floats,
+    size: float,
 ) -> int:
     """The point that a robot at point ``at`` heads for.
 
@@ -93,14 +104,15 @@ def point_ahead(
         stop: Length of the route from which on it heads for no further point [m].
         sight: How far it looks at least [m], and the time step [s].
         place: ``(3,)`` where it really is [m].
+        size: The radius of the largest robot [m].
     """
-    target, slowest = min(at + 1, last), paces[at]
+    target, slowest, reached = min(at + 1, last), paces[at], REACHED * size
     while (
         target < last
         and route.arcs[target] < stop
         and (
             (route.arcs[target] - route.arcs[at] < sight[0] + 1.5 * sight[1] * slowest and route.bends[target] > 0.0)
-            or square_to(route.points, target, place) < REACHED
+            or square_to(route.points, target, place) < reached * reached
         )
     ):
         target += 1
@@ -197,7 +209,7 @@ def _turning(robot: Model, length: Length) -> Turning:
         x, y, distance = cosine(state[heading]), sine(state[heading]), length(gap)
         along, across = (x * gap[0] + y * gap[1]) / distance, (x * gap[1] - y * gap[0]) / distance
         own = velocity(state, at_rest, limits, OPS)
-        gear = gear_towards(along, across, x * own[0] + y * own[1], backs_up)
+        gear = gear_towards(along, across, (x * own[0] + y * own[1]) / limits[SPEED], backs_up)
         if backs_up and along * gear < ZERO:
             pace *= BACKING
         if along * gear < BESIDE[0]:
@@ -217,7 +229,7 @@ def gear_towards(along: np.float32, across: np.float32, speed: np.float32, backs
     Args:
         along: Cosine of the angle at which the point lies.
         across: Its sine.
-        speed: At which the robot drives [m/s], negative in reverse.
+        speed: At which the robot drives, as a share of its limit, negative in reverse.
         backs_up: Whether it drives away from a point that lies too far aside to drive there, and not past it.
     """
     rolls = ONE if speed > UNDER_WAY else (-ONE if speed < -UNDER_WAY else ZERO)

@@ -15,8 +15,8 @@ from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.dynamics.transition import TimeStep
 
-NEAR_VIA = np.float32(0.25)
-"""Square of how near to a point on its way a robot turns to its goal [m^2]."""
+NEAR_VIA = 10 / 3
+"""How near to a point on its way a robot turns to its goal, in radii of the largest robot."""
 
 
 def drive_to_goal(problem: Problem, states: FloatArray, goals: FloatArray) -> FloatArray:
@@ -148,7 +148,7 @@ def drives(
 ) -> Drives:
     """Follow the controls up to a time, and from there drive straight from point to point and on to the goal.
 
-    Half a metre before a point a robot turns to the next one.
+    At :data:`NEAR_VIA` from a point a robot turns to the next one.
 
     Args:
         problem: The robots.
@@ -168,7 +168,8 @@ def drives(
     x = np.zeros((*switch.shape, num_steps + 1, problem.state_size), np.float32)
     arrived = np.zeros(switch.shape, bool)
     docking = np.array([arrays.squared_goal_radius, arrays.squared_goal_speed])
-    rules = DriveRules(arrays.time_step, docking, arrays.docks, NEAR_VIA)
+    near = NEAR_VIA * problem.team.largest_radius
+    rules = DriveRules(arrays.time_step, docking, arrays.docks, np.float32(near * near))
     given_x, given_u = (np.ascontiguousarray(rows.swapaxes(0, 1), np.float32) for rows in (states, controls))
     ways = DrivenWays(arrays.limits, problem.goal, given_x, given_u, switch, np.ascontiguousarray(points))
     threads = Threads(available_cores())

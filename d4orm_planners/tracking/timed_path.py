@@ -15,7 +15,7 @@ from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS, ZERO, inlined, to_fixed_tuple
 from d4orm_env.engine.stepping import make_stepper, models_key
 from d4orm_planners.tracking import path_drives, pursuit
-from d4orm_planners.tracking.path_drives import BEYOND, RESERVE
+from d4orm_planners.tracking.path_drives import RESERVE
 from d4orm_planners.tracking.pursuit import point_ahead, point_reached, square_to, steering
 from d4orm_planners.tracking.routes import Route, Stops
 from d4orm_planners.tracking.straight_drives import LoneRobot
@@ -24,6 +24,8 @@ SOURCES = path_drives.SOURCES + fingerprint((path_drives,))
 
 HURRYING = 0.85
 """Share of its acceleration that a robot counts on that hurries: if it leaves its route so, it drives by the clock."""
+NEAR, SHORT = 2 / 15, 2 / 3
+"""How near to a corner or a stop a robot has come to it, and a way to a stop that it may drive all of, in radii."""
 
 
 class Timed(NamedTuple):
@@ -39,6 +41,7 @@ class Timed(NamedTuple):
         arrives: ``(C,)`` float64 step at which it should be there.
         sight: How far ahead the robot looks at least [m].
         beyond: How far it may plan to drive beyond its goal, which stops it [m].
+        size: The radius of the largest robot [m].
     """
 
     points: Floats
@@ -50,6 +53,7 @@ class Timed(NamedTuple):
     arrives: Floats
     sight: float
     beyond: np.float32
+    size: float
 
 
 @inlined
@@ -73,7 +77,7 @@ def pace_to(route: Timed, step: int, at: int, corner: int, stop: float, dt: np.f
     """How fast it should be, in order to come to the next corner at its time [m/s]."""
     pace, time = np.float32(route.paces[at]), route.arrives[corner] - step
     if time > 1.0 and stop >= route.corners[corner]:
-        pace = min(pace, np.float32((route.corners[corner] - route.arcs[at] + 0.02) / (time * dt)))
+        pace = min(pace, np.float32((route.corners[corner] - route.arcs[at] + NEAR * route.size) / (time * dt)))
     return pace
 
 
@@ -96,24 +100,24 @@ def timed_kernel(name: str) -> Kernel[[LoneRobot, Timed, bool, FloatArray, Float
         goal, x = to_fixed_tuple(robot.goal, d), to_fixed_tuple(robot.start, n)
         last, last_corner, steps = route.arcs.shape[0] - 1, route.corners.shape[0] - 1, controls.shape[0]
         target_place, end = np.zeros(d, np.float32), route.corners[last_corner]
-        at, corner, there, arrival = 0, min(1, last_corner), False, steps + 1
+        at, corner, there, arrival, near = 0, min(1, last_corner), False, steps + 1, NEAR * route.size
         places[:] = 0.0
         for i in range(d):
             places[0, i] = x[i]
         for step in range(steps):
             here = places[step]
-            at = point_reached(route.points, route.arcs, at, last, here)
-            while corner < last_corner and route.arcs[at] >= route.corners[corner] - 0.02:
+            at = point_reached(route.points, route.arcs, at, last, here, route.size)
+            while corner < last_corner and route.arcs[at] >= route.corners[corner] - near:
                 corner += 1
             stop = stop_before(route, step, at, corner, own[0] * dt[0])
             pace = pace_to(route, step, at, corner, stop, dt[0])
-            target = point_ahead(route, route.paces, at, last, stop, (route.sight, dt[0]), here)
-            if route.arcs[target] > stop + 0.02:
+            target = point_ahead(route, route.paces, at, last, stop, (route.sight, dt[0]), here, route.size)
+            if route.arcs[target] > stop + near:
                 target = at
             room = RESERVE * max(stop - route.arcs[at], 0.0)
             if stop == end:
                 room += route.beyond
-            elif room < 0.1:
+            elif room < SHORT * route.size:
                 room = np.sqrt(square_to(route.points, target, here))
             for i in range(d):
                 target_place[i] = route.points[target, i]
@@ -167,9 +171,12 @@ def drive_by_clock(
     paces = path_drives.paces_along(problem, robot, arcs, route.bends, share)
     controls = np.zeros((steps, problem.control_size), np.float32)
     places = np.empty((steps + 1, 3))
-    sight = pursuit.lookaheads(problem)[robot]
-    beyond = np.float32(BEYOND if problem.docks and problem.goal_speed is None else 0.0)
-    timed = Timed(route.points, arcs, paces, route.bends, arcs[at], departs, arrives, sight, beyond)
+    sight, beyond, size = (
+        pursuit.lookaheads(problem)[robot],
+        path_drives.beyond_goal(problem),
+        problem.team.largest_radius,
+    )
+    timed = Timed(route.points, arcs, paces, route.bends, arcs[at], departs, arrives, sight, np.float32(beyond), size)
     drive = timed_kernel(problem.team.models[robot])
     arrival = drive(LoneRobot.of(problem, robot), timed, backs_up, controls, places)
     return controls, places, int(arrival)

@@ -11,9 +11,6 @@ from d4orm_planners.base.conflict_groups import Graph, graph_of
 from d4orm_planners.base.solve import Search
 from d4orm_planners.tracking.steering import Drives
 
-ROUNDING = 1e-5
-"""Kept beyond the margin: the engine, in float32, must not find near what this has found clear [m]."""
-
 MISSING = 5
 """Robots that a robot may meet rather than never arrive, or touch an obstacle."""
 
@@ -41,7 +38,8 @@ class TeamPaths:
         self.search, self.problem = search, search.problem
         self.controls, self.states = trajectory.controls.copy(), trajectory.states.copy()
         self.arrived: BoolArray = trajectory.arrived[-1].copy()
-        margin = self.problem.margin + ROUNDING
+        # The engine, in float32, must not find near what this has found clear.
+        margin = self.problem.margin + self.problem.rounding
         self.index = PathIndex(trajectory.positions, self.problem.team.radius, margin)
         self._interval = search.check_interval
         # Who fails is looked for at some steps only, ways around others are at all of them.

@@ -278,7 +278,7 @@ def test_the_judge_integrates_what_it_has_equations_for_to_the_same_motion() -> 
     start = np.asarray(problem.start, np.float64)
     exact = TeamMotion(problem, controls)
     model, robots = get_model("differential_drive"), np.arange(3)
-    found = Integrated(model, robots, start, controls, problem.team.limits, problem.dt)
+    found = Integrated(model, robots, start, controls, problem.team, problem.dt)
     steps = slice(None)
     np.testing.assert_allclose(found.way(steps, 12), exact.way(steps, 12), atol=1e-6)
     np.testing.assert_allclose(found.pace, exact.pace, atol=1e-9)
@@ -296,7 +296,7 @@ def test_the_judge_integrates_all_steps_at_once_as_one_after_another(
 ) -> None:
     problem = make_problem("circle" if MODELS[name].dimension == 2 else "sphere", num_robots=3, model=name)
     controls = np.cumsum(scale * random_controls(problem, 2).astype(np.float64), axis=0)
-    arguments = np.arange(3), np.asarray(problem.start, np.float64), controls, problem.team.limits, problem.dt
+    arguments = np.arange(3), np.asarray(problem.start, np.float64), controls, problem.team, problem.dt
     at_once = Integrated(MODELS[name], *arguments)
     monkeypatch.setattr(integrated, "CORRECTIONS", 0)
     one_by_one = Integrated(MODELS[name], *arguments)

@@ -66,7 +66,7 @@ def seeds_of_an_episode(seed: int, monkeypatch: pytest.MonkeyPatch, **settings: 
 def test_control_loops_of_neighbouring_seeds_share_no_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     # A loop's seed was once the episode's plus a multiple of its step, and a coarse plan's the episode's plus its step.
     episodes = [
-        seeds_of_an_episode(seed, monkeypatch, refine="sync", refine_every=1, replan_distance=0.05, patience=2)
+        seeds_of_an_episode(seed, monkeypatch, refine="sync", refine_every=1, replan_distance=1 / 3, patience=2)
         for seed in (0, 1, 2, 7919)
     ]
     used = [seed for episode in episodes for seed in episode]
@@ -77,7 +77,7 @@ def test_control_loops_of_neighbouring_seeds_share_no_noise(monkeypatch: pytest.
 def test_repairs_of_one_iteration_start_apart() -> None:
     search = Search(make_planner("d4orm-d", engine="cpu", random_start=True), hop_problem(2), 0, None)
     base = np.zeros((30, 2, 2), np.float32)
-    starts = [search.planner.start(search, base, number) for number in range(3)]
+    starts = [search.planner.start(search, base, search.problem.team, number) for number in range(3)]
     assert not any(np.allclose(a, b) for a, b in ((starts[0], starts[1]), (starts[1], starts[2])))
 
 

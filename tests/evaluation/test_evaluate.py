@@ -209,10 +209,10 @@ def test_success_within_deadlines() -> None:
 TROUBLE = """
 import os, signal, time
 from d4orm_planners.evaluation import trials
-from d4orm_planners.base.policy import DriveToGoal
+from d4orm_planners.baselines.go_to_goal import GoToGoal
 
 
-class Trouble(DriveToGoal):
+class Trouble(GoToGoal):
     def _begin(self, env, seed):
         if seed == 1:
             raise RuntimeError("out of luck")

@@ -23,7 +23,7 @@ from typing import Any
 import pytest
 
 from d4orm_planners import make_policy
-from d4orm_planners.base.policy import DriveToGoal
+from d4orm_planners.baselines.go_to_goal import GoToGoal
 from d4orm_planners.evaluation import evaluate as evaluate_module
 from d4orm_planners.evaluation import pool as pool_module
 from d4orm_planners.evaluation import store as store_module
@@ -428,7 +428,7 @@ def test_resuming_runs_only_what_is_missing(tmp_path: Path, monkeypatch: pytest.
     assert len(ran) == 4
 
 
-class Unlucky(DriveToGoal):
+class Unlucky(GoToGoal):
     """Fails in the first episode."""
 
     def _begin(self, env: Any, seed: int) -> None:

@@ -103,7 +103,7 @@ def test_the_alternation_is_the_publications() -> None:
     expected = plainly(config, dt, bodies, limits, goal, begin, guess)
     motion = np.zeros((config.degree + 1, 2))
     motion[:3] = begin
-    violation = alternate(make_method(config, dt), bodies, 0, limits, goal, 3, motion, guess)
+    violation = alternate(make_method(config, dt, 1.0), bodies, 0, limits, goal, 3, motion, guess)
     np.testing.assert_allclose(motion, expected, atol=1e-7)
     # What it hands back is the motion's, and the violation what the samples say.
     basis = sample_basis(config.degree, 12, dt)

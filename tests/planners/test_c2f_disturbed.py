@@ -49,7 +49,7 @@ def joint(problem: Any, states: Any, **parts: Any) -> JointState:
 @given(late=st.integers(0, MOST), noise=st.floats(0, 0.3), seed=st.integers(0, 1000))
 @settings(max_examples=25, deadline=None)
 def test_how_late_commands_are_is_found_out(late: int, noise: float, seed: int) -> None:
-    random, lateness = np.random.default_rng(seed), Lateness(3, 2, None)
+    random, lateness = np.random.default_rng(seed), Lateness(Team(("holonomic2d",) * 3), None)
     sent = [np.zeros((3, 2), np.float32)] * (late + 1)
     for _ in range(60):
         executed = sent[-1 - late] + random.normal(0, noise, (3, 2)) * (len(sent) > late + 1)
@@ -63,7 +63,7 @@ def test_how_late_commands_are_is_found_out(late: int, noise: float, seed: int) 
 
 
 def test_a_lateness_that_is_known_stays() -> None:
-    lateness = Lateness(3, 2, 2)
+    lateness = Lateness(Team(("holonomic2d",) * 3), 2)
     for number in range(5):
         lateness.observe(np.full((3, 2), number - 1, np.float32), ALL)
         lateness.send(np.full((3, 2), number, np.float32))
@@ -344,7 +344,7 @@ def test_the_nearest_velocities_are_those_of_least_squares(seed: int, rows: int,
     target[-1] = 1
     left = system @ nnls(system, target)[0] - target
     found = wanted.copy()
-    if find_nearest(*barriers, found):
+    if find_nearest(*barriers, found, 1e-6):
         np.testing.assert_allclose(found - wanted, (-left[:-1] / left[-1]).reshape(4, d), atol=1e-3)
     else:
         assert barriers.missing(found).max() < 0.05
@@ -353,7 +353,7 @@ def test_the_nearest_velocities_are_those_of_least_squares(seed: int, rows: int,
 def test_between_walls_that_close_in_there_are_no_velocities() -> None:
     normals = np.array([[1.0, 0], [-1, 0]])
     barriers = Barriers(np.zeros(2, np.int64), np.full(2, -1), normals, np.array([0.1, 0.1]))
-    assert not find_nearest(*barriers, np.zeros((1, 2)))
+    assert not find_nearest(*barriers, np.zeros((1, 2)), 1e-6)
 
 
 def test_velocities_that_are_safe_are_left_alone() -> None:

@@ -99,7 +99,9 @@ def test_a_model_of_another_kind_is_refused(tmp_path: Path) -> None:
 
 
 def test_what_comes_with_the_package_is_small() -> None:
-    assert (Path(make_planner.__code__.co_filename).parents[1] / "baselines" / "mmd" / "weights.npz").stat().st_size < 5e6
+    assert (
+        Path(make_planner.__code__.co_filename).parents[1] / "baselines" / "mmd" / "weights.npz"
+    ).stat().st_size < 5e6
 
 
 @given(st.integers(1, 200))
@@ -219,6 +221,7 @@ def surroundings(problem: Problem, **changes: Any) -> Surroundings:
     nothing = Surroundings(
         world_space(problem),
         0.2,
+        problem.team.largest_radius,
         problem.dt,
         np.empty((0, 4)),
         np.empty((0, 2), np.int64),

@@ -223,7 +223,7 @@ def test_entry_points_are_found_and_loaded_when_asked_for(
     np.testing.assert_array_equal(controls("theirs"), controls("theirs-planner"))
     with pytest.raises(ValueError, match="policy 'broken': 'theirs_module:nothing' names nothing"):
         make_policy("broken")
-    with pytest.raises(ValueError, match=r"policy name 'goal' is claimed by .*DriveToGoal and theirs_module:Theirs"):
+    with pytest.raises(ValueError, match=r"policy name 'goal' is claimed by .*GoToGoal and theirs_module:Theirs"):
         make_policy("goal")
     with pytest.raises(SystemExit, match="0"):
         cli.main(["planners"])

@@ -577,7 +577,7 @@ CREDIT = pytest.mark.parametrize(("num_robots", "credit"), [(1, "team"), (2, "te
 def test_d4orm_is_algorithm_1_on_a_deformation(num_robots: int, credit: str) -> None:
     search = start_of("d4orm", tiny_problem(num_robots), credit=credit, late_samples=1.0, random_start=True)
     base = search.current.controls
-    noise = standard_normal(search, search.current.controls.shape)
+    noise = standard_normal(search, search.problem.team, search.problem.horizon)
     assert noise.std() == pytest.approx(1, abs=0.7)
     deformation = algorithm_1(
         noise, list(alpha_bar(STEPS, *BETAS)), draws_of(search), rewards_of(search, base), TEMPERATURE
@@ -645,7 +645,7 @@ def test_shares_of_late_steps_are_checked(setting: str, value: Any, message: str
 @pytest.mark.parametrize("name", ["mbd", "i-mbd"])
 def test_mbd_is_algorithm_1_on_the_controls_from_pure_noise(name: str) -> None:
     search = start_of(name, tiny_problem(1))
-    noise = standard_normal(search, search.current.controls.shape)
+    noise = standard_normal(search, search.problem.team, search.problem.horizon)
     expected = algorithm_1(
         noise, list(alpha_bar(STEPS, *BETAS)), draws_of(search), rewards_of(search, np.float32(0)), TEMPERATURE
     )
@@ -696,7 +696,7 @@ def test_controls_that_are_scaled_up_for_ever_stay_finite() -> None:
 def test_mbd_goes_on_from_noise_again() -> None:
     search = start_of("mbd", tiny_problem(1))
     search.advance()
-    noise = standard_normal(search, search.current.controls.shape)
+    noise = standard_normal(search, search.problem.team, search.problem.horizon)
     expected = algorithm_1(
         noise, list(alpha_bar(STEPS, *BETAS)), draws_of(search), rewards_of(search, np.float32(0)), TEMPERATURE
     )

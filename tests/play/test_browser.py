@@ -16,7 +16,7 @@ from browser_support import PATIENCE, Page, browser, missing
 
 from d4orm_env import Problem, World, load_problem, make_problem
 from d4orm_planners import make_planner, register_policy
-from d4orm_planners.base.policy import DriveToGoal
+from d4orm_planners.baselines.go_to_goal import GoToGoal
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(missing()), reason=missing())]
 
@@ -346,7 +346,7 @@ def test_a_slow_planner_does_not_freeze_the_page(page: Page) -> None:
         page.until("document.body.textContent.includes('circle, 3 robots, slow')")
 
 
-class Slow(DriveToGoal):
+class Slow(GoToGoal):
     """A policy that plans until it is told that it has found something, in compiled code as it were."""
 
     def __init__(self, ended: threading.Event) -> None:

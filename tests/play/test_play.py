@@ -22,7 +22,7 @@ from d4orm_env import World, make_problem
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance_registry import DISTURBANCES
 from d4orm_env.scenarios.problem_files import scenario_text
-from d4orm_planners.base.policy import DriveToGoal
+from d4orm_planners.baselines.go_to_goal import GoToGoal
 from d4orm_planners.play import edits
 from d4orm_planners.play.proxy import Gate
 from d4orm_planners.play.scene_frame import closest_approach
@@ -375,7 +375,7 @@ def test_a_level_that_makes_no_sense_is_left(session: Session) -> None:
 
 def test_a_slow_planner_holds_nobody_up(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on = threading.Event()
-    monkeypatch.setattr(DriveToGoal, "_begin", lambda *_: go_on.wait(PATIENCE))
+    monkeypatch.setattr(GoToGoal, "_begin", lambda *_: go_on.wait(PATIENCE))
     session.reset()
     until(lambda: session.frame.status.state == "planning")
     begin = time.monotonic()

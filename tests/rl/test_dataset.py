@@ -17,7 +17,7 @@ import pytest
 from d4orm_env import make_problem, navigation_v0
 from d4orm_env.disturbances import Delay, Push, StateNoise
 from d4orm_planners import make_policy
-from d4orm_planners.base.policy import DriveToGoal
+from d4orm_planners.baselines.go_to_goal import GoToGoal
 from d4orm_planners.rl.dataset import Demonstrations, RecordedEpisode, record_episode, write_dataset
 from d4orm_planners.rl.dataset import recording as recording_module
 
@@ -111,7 +111,7 @@ def test_actions_are_those_of_the_policy_whatever_disturbs_them() -> None:
     env = navigation_v0.parallel_env("circle", 2, disturbances=disturbances, max_cycles=30)
     actions: list[dict[str, np.ndarray]] = []
 
-    class Noted(DriveToGoal):
+    class Noted(GoToGoal):
         def act(self, observations: Any, state: Any) -> Any:
             actions.append(super().act(observations, state))
             return actions[-1]
@@ -235,7 +235,7 @@ def test_the_dataset_says_where_it_comes_from(tmp_path: Path) -> None:
         dataset.recover_environment()
 
 
-class Broken(DriveToGoal):
+class Broken(GoToGoal):
     """Fails in some episodes."""
 
     def _begin(self, env: Any, seed: int) -> None:

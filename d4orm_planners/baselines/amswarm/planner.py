@@ -21,7 +21,7 @@ Growth = Annotated[Number, Field(ge=1, le=10)]
 
 @dataclass(frozen=True, kw_only=True)
 class AMSwarmConfig(PlannerConfig):
-    """Settings of :class:`AMSwarm`.
+    """Settings of :class:`AMSwarm`; lengths are in steps of the fastest robot at full speed.
 
     Attributes:
         max_iterations: Runs from start to horizon after which :meth:`Planner.solve` gives up, each with other guesses.
@@ -31,13 +31,13 @@ class AMSwarmConfig(PlannerConfig):
         goal_weight: Weight of their squared distances from it.
         smoothness: Weight of the squared jerk.
         barrier: Share of its distance to a body's reach that a robot may use up in a step; 1 allows all of it.
-        lookout: Bodies are minded that are predicted to come this near to the reach [m]; ``None`` minds all.
-        clearance: Added to every distance to keep, for what is driven between the steps [m].
-        perturbation: What every guess is moved by at most, so that symmetric teams do not block themselves [m].
+        lookout: Bodies are minded that are predicted to come this near to the reach; ``None`` minds all.
+        clearance: Added to every distance to keep, for what is driven between the steps.
+        perturbation: What every guess is moved by at most, so that symmetric teams do not block themselves.
         penalty: First weight of the constraints.
         growth: Factor by which it grows from one alternation to the next.
         alternations: Of a replanning, at most.
-        tolerance: Largest violation, and change of a place, at which a replanning ends, in SI units.
+        tolerance: Largest violation, and change of a place, at which a replanning ends.
 
     Raises:
         ValueError: If a value makes no sense; the message names it.
@@ -50,13 +50,13 @@ class AMSwarmConfig(PlannerConfig):
     goal_weight: Positive = 1.0
     smoothness: NotNegative = 1e-4
     barrier: Share = 0.25
-    lookout: NotNegative | None = 1.0
-    clearance: NotNegative = 0.03
-    perturbation: NotNegative = 0.05
+    lookout: NotNegative | None = 10.0
+    clearance: NotNegative = 0.3
+    perturbation: NotNegative = 0.5
     penalty: Positive = 2.0
     growth: Growth = 1.05
     alternations: Steps = 100
-    tolerance: Positive = 5e-3
+    tolerance: Positive = 0.05
 
 
 class AMSwarm(Planner):
@@ -76,12 +76,12 @@ class AMSwarm(Planner):
             "goal_weight": 7000.0,
             "smoothness": 0.7,
             "barrier": 1.0,
-            "lookout": 0.2,
-            "clearance": 0.06,
+            "lookout": 2.0,
+            "clearance": 0.6,
             "penalty": 1.0,
             "growth": 1.3,
             "alternations": 3000,
-            "tolerance": 0.01,
+            "tolerance": 0.1,
         }
     }
     config: AMSwarmConfig

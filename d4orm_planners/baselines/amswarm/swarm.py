@@ -33,12 +33,14 @@ class Swarm:
 
     def __init__(self, problem: Problem, config: AMSwarmConfig, random: np.random.Generator) -> None:
         self._problem, self._config, self._random = problem, config, random
-        self._method = make_method(config, problem.dt)
+        stride = problem.dt * float(problem.team.max_speed.max())
+        self._method = make_method(config, problem.dt, stride)
+        self._clearance, self._perturbation = config.clearance * stride, config.perturbation * stride
         d, team = problem.dimension, problem.team
         self._goals = problem.goal.astype(np.float64)
         self._radius = np.asarray(team.radius, np.float64)
         self._boxes = problem.world.shapes.boxes.astype(np.float64)
-        self._bounds = problem.world.bounds.astype(np.float64) + config.clearance * np.array([[1.0], [-1.0]])
+        self._bounds = problem.world.bounds.astype(np.float64) + self._clearance * np.array([[1.0], [-1.0]])
         # A first-order robot takes any velocity at once; of the others the motion continues velocity and acceleration.
         inertia = np.array([bool(model.speed_indices) for model in team.robot_models])
         self._fixed = np.where(inertia, 3, 1)
@@ -76,9 +78,9 @@ class Swarm:
         """Every robot's motion from here, around where the others are predicted to be; whether time sufficed."""
         config, problem, method = self._config, self._problem, self._method
         places, duration = states[:, : problem.dimension].astype(np.float64), config.lookahead * problem.dt
-        moved = self._random.uniform(-config.perturbation, config.perturbation, self._guesses.place.shape)
+        moved = self._random.uniform(-self._perturbation, self._perturbation, self._guesses.place.shape)
         predicted = np.where(stands[:, None, None], places[:, None], self._guesses.place)
-        bodies = Surroundings(predicted, self._radius, problem.margin + config.clearance, self._boxes, self._bounds)
+        bodies = Surroundings(predicted, self._radius, problem.margin + self._clearance, self._boxes, self._bounds)
         begins = first_coefficients(config.degree, duration, places, velocities, self._accelerations)
         guesses = Guess(predicted + moved, self._guesses.velocity.copy(), self._guesses.acceleration.copy())
         for robot in np.flatnonzero(~stands):
@@ -112,8 +114,8 @@ class Swarm:
         return Guess(places + share * ahead, still, still)
 
 
-def make_method(config: AMSwarmConfig, dt: float) -> Method:
-    """The settings as the kernel takes them, for steps of ``dt`` [s]."""
+def make_method(config: AMSwarmConfig, dt: float, stride: float) -> Method:
+    """The settings as the kernel takes them, for steps of ``dt`` [s] in which robots drive ``stride`` [m] at most."""
     basis = sample_basis(config.degree, config.lookahead, dt)
     late = basis.place[-min(config.goal_steps, config.lookahead) :]
     squares = [_squares(samples) for samples in basis[:3]]
@@ -123,11 +125,11 @@ def make_method(config: AMSwarmConfig, dt: float) -> Method:
         squares=np.stack(squares),
         goal=config.goal_weight * late.sum(axis=0),
         barrier=config.barrier,
-        lookout=np.inf if config.lookout is None else config.lookout,
+        lookout=np.inf if config.lookout is None else config.lookout * stride,
         penalty=config.penalty,
         growth=config.growth,
         alternations=config.alternations,
-        tolerance=config.tolerance,
+        tolerance=config.tolerance * stride,
     )
 
 

@@ -20,8 +20,8 @@ from d4orm_planners.baselines.mmd.way_frame import WayFrame
 if TYPE_CHECKING:
     from d4orm_planners.baselines.mmd.planner import MMDConfig
 
-SPARE = 2e-3
-"""Added to distances when conflicts are sought, for rounding [m]."""
+SPARE = 1 / 75
+"""Added to distances when conflicts are sought, for rounding, in radii of the largest robot."""
 PADDING = 2
 """Of the 64 points of a motion, how many a constraint lasts before and after its conflict, as in the publication."""
 
@@ -128,8 +128,8 @@ class Planning:
     ) -> None:
         self._problem, self._config, self._denoiser = problem, config, denoiser
         self._frames, self._space = frames, space
-        radius = np.asarray(problem.team.radius, np.float64)
-        self._distances: Floats = radius[:, None] + radius + problem.margin + SPARE
+        radius, self._spare = np.asarray(problem.team.radius, np.float64), SPARE * problem.team.largest_radius
+        self._distances: Floats = radius[:, None] + radius + problem.margin + self._spare
         self.steps = 0
 
     def root(self, seeds: list[int]) -> Node:
@@ -197,7 +197,8 @@ class Planning:
         distances = self._distances[robot, others]
         surroundings = Surroundings(
             space=self._space,
-            clearance=frame.reach + config.clearance,
+            clearance=frame.reach + config.clearance * self._problem.team.largest_radius,
+            size=self._problem.team.largest_radius,
             dt=self._problem.dt,
             spheres=np.array([constraint.sphere for constraint in constraints]).reshape(-1, 4),
             spans=np.array([constraint.span for constraint in constraints], np.int64).reshape(-1, 2),
@@ -214,7 +215,7 @@ class Planning:
         counts: NDArray[np.int64] = np.zeros((len(batch.motions), 2), np.int64)
         if len(ways):
             count_conflicts(driven.places, ways, distances, counts)
-        fails = (driven.arrivals > self._problem.horizon) | (driven.clearances < reach + SPARE)
+        fails = (driven.arrivals > self._problem.horizon) | (driven.clearances < reach + self._spare)
         best = int(np.lexsort((driven.arrivals, counts[:, 1], counts[:, 0], fails))[0])
         controls, places = driven.controls[best].copy(), driven.places[best].copy()
         return Motion(batch.motions, controls, places, int(driven.arrivals[best]), bool(fails[best]))

@@ -22,8 +22,9 @@ from d4orm_planners.baselines.mmd import clock, way_frame
 from d4orm_planners.baselines.mmd.clock import fill_clock
 from d4orm_planners.baselines.mmd.way_frame import WayFrame, locate, trace
 
-_PROBE = 1e-3
-"""Distance over which the slope of the clearance is measured [m]."""
+_PROBE, _WITHIN = 1 / 150, 2.0**-27
+"""Distance over which the slope of the clearance is measured, in radii of the largest robot, and share of a sphere's
+radius within which no direction leads out of it."""
 _BACKING = 0.02
 """Added to a point's variance, as a share of the largest, so that points near the ends, which cannot move, do not move
 the rest."""
@@ -35,6 +36,7 @@ class Surroundings(NamedTuple):
     Attributes:
         space: The world.
         clearance: Distance from obstacles to keep with the robot's centre [m].
+        size: Radius of the largest robot [m].
         dt: Of the steps [s].
         spheres: ``(C, 4)`` centre and radius of hard constraints [m].
         spans: ``(C, 2)`` int64 first and last step of each.
@@ -45,6 +47,7 @@ class Surroundings(NamedTuple):
 
     space: Space
     clearance: float
+    size: float
     dt: float
     spheres: Floats
     spans: IntArray
@@ -130,19 +133,19 @@ def _violation(surroundings: Surroundings, step: Whole, spot: Floats, push: Floa
     for other in range(surroundings.others.shape[0]):
         centre = surroundings.others[other, at]
         violated |= _push_out(centre, surroundings.radii[other], surroundings.pull, aside, place, push)
-    return _push_clear(surroundings.space, surroundings.clearance, spot, push) or violated
+    return _push_clear(surroundings.space, surroundings.clearance, _PROBE * surroundings.size, spot, push) or violated
 
 
 @compiled
-def _push_clear(space: Space, clearance: float, spot: Floats, push: Floats) -> bool:
+def _push_clear(space: Space, clearance: float, probe: float, spot: Floats, push: Floats) -> bool:
     """Add to ``push`` what brings a place out of obstacles, on the side where the way is; whether it is too near."""
     x, y, z = spot[0, 0], spot[0, 1], spot[0, 2]
     missing = clearance - clearance_at(space, x, y, z)
     if not missing > 0.0:
         return False
-    gx = clearance_at(space, x + _PROBE, y, z) - clearance_at(space, x - _PROBE, y, z)
-    gy = clearance_at(space, x, y + _PROBE, z) - clearance_at(space, x, y - _PROBE, z)
-    gz = clearance_at(space, x, y, z + _PROBE) - clearance_at(space, x, y, z - _PROBE)
+    gx = clearance_at(space, x + probe, y, z) - clearance_at(space, x - probe, y, z)
+    gy = clearance_at(space, x, y + probe, z) - clearance_at(space, x, y - probe, z)
+    gz = clearance_at(space, x, y, z + probe) - clearance_at(space, x, y, z - probe)
     norm = np.sqrt(gx * gx + gy * gy + gz * gz)
     hx, hy, hz = spot[3, 0] - x, spot[3, 1] - y, spot[3, 2] - z
     if gx * hx + gy * hy + gz * hz < 0.0:
@@ -165,7 +168,7 @@ def _push_out(centre: Floats, radius: float, share: float, aside: Floats, place:
     if not square < radius * radius or share == 0.0:
         return False
     distance = np.sqrt(square)
-    if distance < 1e-9:
+    if distance < _WITHIN * radius:
         dx, dy, dz, distance = aside[0], aside[1], aside[2], 1.0
         missing = share * radius
     else:

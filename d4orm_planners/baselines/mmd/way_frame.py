@@ -34,7 +34,7 @@ FEATURES = 5 * LOOKS + 2
 _ROUNDING = 2
 """Points before and after one over which a way's direction is averaged."""
 _ANY = 1e6
-"""Acceleration of robots that take any velocity at once [m/s^2]."""
+"""How often robots that take any velocity at once could reach their full speed in a second [1/s]."""
 _FAR = 4.0
 """Of room the model is told up to so many times the robot's reach."""
 
@@ -116,10 +116,10 @@ def make_frame(problem: Problem, robot: int, space: Space, turn: Floats) -> WayF
     length = max(resample(way, reference), problem.goal_radius)
     limits, reach = problem.team.limits[robot].astype(np.float64), float(problem.team.radius[robot]) + problem.margin
     speed = float(limits[SPEED])
-    acceleration = float(limits[ACCELERATION]) if problem.team.robot_models[robot].speed_indices else _ANY
+    acceleration = float(limits[ACCELERATION]) if problem.team.robot_models[robot].speed_indices else _ANY * speed
     tangents = np.empty_like(reference)
     round_tangents(reference, tangents)
-    along = _unit(reference[-1] - reference[0], np.array([1.0, 0.0, 0.0]))
+    along = _unit(reference[-1] - reference[0], np.array([1.0, 0.0, 0.0]), length)
     axes = _axes(along, turn, problem.dimension)
     features = np.empty((len(axes), FEATURES), np.float32)
     for own, axis in zip(features, axes, strict=True):
@@ -150,9 +150,9 @@ def _cross(a: Floats, b: Floats) -> Floats:
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-def _unit(vector: Floats, otherwise: Floats) -> Floats:
+def _unit(vector: Floats, otherwise: Floats, scale: float = 1.0) -> Floats:
     length = np.sqrt(_dot(vector, vector))
-    return vector / length if length > 1e-6 else otherwise
+    return vector / length if length > 1e-6 * scale else otherwise
 
 
 @cached_kernel(SOURCES, variant="resample", **OPTIONS)

@@ -1,0 +1,100 @@
+"""Nothing is measured in metres: a problem in other units of length has the same plan, in those units."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from planner_support import cheap_planner
+from scale_support import control_units, scaled, state_units
+
+from d4orm_env import navigation_v0
+from d4orm_env.core.problem import Problem
+from d4orm_env.scenarios import make_problem
+from d4orm_env.verify import verify
+from d4orm_planners import list_planners, make_planner, make_policy, run_episode
+
+PROBLEMS: dict[str, tuple[str, dict[str, Any]]] = {
+    "open": ("heterogeneous", {"num_robots": 4, "max_acceleration": [0.5, 1, 2, 1]}),
+    "walls": ("rooms", {"num_robots": 3, "radius": [0.15, 0.12, 0.15], "goal_speed": 0.3}),
+    "space": ("random", {"num_robots": 3, "model": "holonomic3d", "num_obstacles": 4}),
+    "wheels": ("random", {"num_robots": 4, "model": ("car", "unicycle", "velocity2d", "differential_drive")}),
+}
+FACTORS = st.integers(-6, 6).map(lambda exponent: 2.0**exponent)
+
+
+def problem(name: str) -> Problem:
+    scenario, arguments = PROBLEMS[name]
+    return make_problem(scenario, seed=0, **arguments)
+
+
+def assert_scaled(before: Any, after: Any, original: Problem, factor: float) -> None:
+    """Controls and states of a plan or an episode are those of another, multiplied."""
+    np.testing.assert_array_equal(after.controls, before.controls * control_units(original, factor))
+    np.testing.assert_array_equal(
+        after.trajectory.states, before.trajectory.states * state_units(original.team, factor)
+    )
+    np.testing.assert_array_equal(after.trajectory.rewards, before.trajectory.rewards)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list_planners())
+@pytest.mark.parametrize("where", PROBLEMS)
+@given(factor=FACTORS)
+@settings(max_examples=3, deadline=None)
+def test_plans_are_the_same_in_other_units(name: str, where: str, factor: float) -> None:
+    original, planner = problem(where), cheap_planner(name)
+    before, after = (planner.solve(each, seed=1) for each in (original, scaled(original, factor)))
+    assert_scaled(before, after, original, factor)
+    assert (before.solved, before.failures.keys()) == (after.solved, after.failures.keys())
+
+
+POLICIES: dict[str, dict[str, Any]] = {
+    "goal": {},
+    "random": {},
+    "orca": {},
+    "d4orm-c2f": {"engine": "cpu", "refine": "sync", "num_samples": 32, "num_steps": 5, "coarse_iterations": 2},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", POLICIES)
+@pytest.mark.parametrize("where", PROBLEMS)
+@given(factor=FACTORS)
+@settings(max_examples=2, deadline=None)
+def test_episodes_are_the_same_in_other_units(name: str, where: str, factor: float) -> None:
+    if name == "orca" and where == "space":
+        pytest.skip("works in the plane")
+    original = problem(where)
+    before, after = (
+        run_episode(navigation_v0.parallel_env(problem=each), make_policy(name, **POLICIES[name]), seed=1)
+        for each in (original, scaled(original, factor))
+    )
+    assert_scaled(before, after, original, factor)
+
+
+@pytest.mark.parametrize("where", PROBLEMS)
+@given(factor=FACTORS, seed=st.integers(0, 100))
+@settings(max_examples=5, deadline=None)
+def test_the_judge_says_the_same_in_other_units(where: str, factor: float, seed: int) -> None:
+    original = problem(where)
+    other, units = scaled(original, factor), control_units(original, factor)
+    limit, shape = original.team.control_limits, (original.horizon, *original.team.control_limits.shape)
+    controls = np.random.default_rng(seed).uniform(-1.2, 1.2, shape) * limit
+    before, after = verify(original, controls), verify(other, controls * units)
+    assert after.min_separation == before.min_separation * factor
+    assert after.min_clearance == before.min_clearance * factor
+    np.testing.assert_array_equal(after.arrival_times, before.arrival_times)
+    kinds = [[(each.kind, each.robots, each.time) for each in report.violations] for report in (before, after)]
+    assert kinds[0] == kinds[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", ["rooms", "maze", "warehouse"])
+@pytest.mark.parametrize("factor", [0.02, 0.1, 3.0])
+def test_robots_of_any_size_get_by_among_walls(scenario: str, factor: float) -> None:
+    other = scaled(make_problem(scenario, num_robots=5, seed=0), factor)
+    assert make_planner().solve(other, seed=0, max_iterations=10).solved
