@@ -50,9 +50,18 @@ def hop_problem(num_robots: int = 3, **changes: Any) -> Problem:
 
 
 def walled_in_problem() -> Problem:
-    """One robot whose goal stands inside a closed ring of circles."""
-    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
-    ring = np.column_stack([3 + 0.8 * np.cos(angle), 0.8 * np.sin(angle), np.full(12, 0.25)])
+    """One robot whose goal stands inside a ring of circles with gaps so little too narrow that no proof sees it."""
+    return _ringed(6, 0.88)
+
+
+def sealed_problem() -> Problem:
+    """The same inside a ring of circles that overlap."""
+    return _ringed(12, 0.8)
+
+
+def _ringed(number: int, distance: float) -> Problem:
+    angle = np.linspace(0, 2 * np.pi, number, endpoint=False)
+    ring = np.column_stack([3 + distance * np.cos(angle), distance * np.sin(angle), np.full(number, 0.25)])
     return Problem(Team(("holonomic2d",)), [[0, 0, 0, 0]], [[3, 0]], World(circles=ring), horizon=60)
 
 

@@ -10,7 +10,7 @@ from d4orm_env.core.arrays import LARGEST, LARGEST_NUMBER, BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.types import Engine
-from d4orm_env.verify import verify
+from d4orm_env.verify import VerificationReport, verify
 from d4orm_planners.base.plan import failed_robots
 
 PLAN_REACH = LARGEST_NUMBER / LARGEST
@@ -25,15 +25,28 @@ class Candidate:
         planned: ``(H, K, m)`` as the method left them, at most :data:`PLAN_REACH` times the limits; zero once docked.
         controls: ``(H, K, m)`` as executed: inside the limits, zero once docked.
         trajectory: Their rollout.
-        solved: Whether everyone arrives, the margin is kept at every step, and :func:`d4orm_env.verify` agrees.
         failed: ``(K,)`` robots that do not arrive, or violate the margin at some step that was checked.
+        report: What :func:`d4orm_env.verify` says; ``None`` where somebody fails at any step, and it was not asked.
     """
 
     planned: FloatArray
     controls: FloatArray
     trajectory: Trajectory
-    solved: bool
     failed: BoolArray
+    report: VerificationReport | None
+
+    @property
+    def solved(self) -> bool:
+        """Whether everyone arrives, the margin is kept at every step, and :func:`d4orm_env.verify` agrees."""
+        return self.report is not None and self.report.ok
+
+    @property
+    def unsolved(self) -> BoolArray:
+        """``(K,)`` robots that fail, or that the report names."""
+        unsolved = self.failed.copy()
+        for violation in () if self.report is None else self.report.violations:
+            unsolved[list(violation.robots)] = True
+        return unsolved
 
     @property
     def reward(self) -> float:
@@ -42,8 +55,8 @@ class Candidate:
 
     @property
     def rank(self) -> tuple[bool, int, float]:
-        """Larger is better: solved before unsolved, then fewer failed robots, then more reward."""
-        return (True, 0, self.reward) if self.solved else (False, -int(self.failed.sum()), self.reward)
+        """Larger is better: solved before unsolved, then fewer unsolved robots, then more reward."""
+        return (True, 0, self.reward) if self.solved else (False, -int(self.unsolved.sum()), self.reward)
 
 
 def evaluate_controls(engine: Engine, problem: Problem, controls: FloatArray, check_interval: int = 1) -> Candidate:
@@ -54,5 +67,5 @@ def evaluate_controls(engine: Engine, problem: Problem, controls: FloatArray, ch
     docked = trajectory.arrived[:-1, :, None] & problem.docks
     planned = np.where(docked, np.float32(0), bounded)
     failed = failed_robots(trajectory, check_interval)
-    solved = not failed_robots(trajectory).any() and verify(problem, trajectory.controls).ok
-    return Candidate(planned, trajectory.controls, trajectory, solved, failed)
+    report = None if failed_robots(trajectory).any() else verify(problem, trajectory.controls)
+    return Candidate(planned, trajectory.controls, trajectory, failed, report)

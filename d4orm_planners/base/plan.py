@@ -23,12 +23,13 @@ from d4orm_env.core.team import DEFAULT_RADIUS
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.rollout import rollout
 from d4orm_env.scenarios.schema import describe, parse
-from d4orm_env.verify import verify
+from d4orm_env.verify import VerificationReport, verify
 from d4orm_planners.base.conflict_groups import conflicts
 from d4orm_planners.base.display import Shown
+from d4orm_planners.base.infeasibility import prove_infeasible
 from d4orm_planners.base.provenance import Provenance
 
-Status = Literal["solved", "iteration_limit", "time_limit", "stopped", "interrupted", "refuted"]
+Status = Literal["solved", "iteration_limit", "time_limit", "stopped", "interrupted", "infeasible", "refuted"]
 """How a search ended; see :class:`Plan`."""
 
 FORMAT = "d4orm-plan-1"
@@ -58,7 +59,8 @@ class IterationRecord:
         best_solved: Whether that one is a solution.
         excluded: Samples of this iteration that were left out because their reward was not finite.
         note: What the method itself says of how the iteration ended; ``ipopt`` has IPOPT's return status here,
-            ``d-d4orm`` the nodes that were lost and the messages that were dropped.
+            ``d-d4orm`` the nodes that were lost and the messages that were dropped, and path finding why it found none.
+        unreachable: Robots for which path finding found no way to their goals.
         controls: ``(H, K, m)`` of this iteration's candidate, for callbacks; ``None`` in a plan's history.
         trajectory: Where they lead, likewise.
     """
@@ -75,6 +77,7 @@ class IterationRecord:
     best_solved: bool
     excluded: int = 0
     note: str = ""
+    unreachable: tuple[int, ...] = ()
     controls: FloatArray | None = field(default=None, repr=False, compare=False)
     trajectory: Trajectory | None = field(default=None, repr=False, compare=False)
 
@@ -91,7 +94,9 @@ class Plan(Shown):
         solved: Whether everyone arrives, the margin is kept at every step, and :func:`d4orm_env.verify` found no fault.
         status: How the search ended. ``"solved"``: with a solution. ``"iteration_limit"`` or ``"time_limit"``: with the
             budget, so without a solution unless it was to be improved. ``"stopped"`` (by the callback) or
-            ``"interrupted"``: with whatever it had. ``"refuted"``: a file says ``"solved"``, and it is not.
+            ``"interrupted"``: with whatever it had. ``"infeasible"``: at once, for there is a proof that nothing solves
+            the problem, see :func:`d4orm_planners.base.infeasibility.prove_infeasible`. ``"refuted"``: a file says
+            ``"solved"`` or ``"infeasible"``, and that is not so.
         iterations: Iterations done.
         denoising_steps: Sample-score-update steps done.
         wall_time: Seconds, first-call compilation excluded.
@@ -103,7 +108,8 @@ class Plan(Shown):
         provenance: Preset, settings, version and machine; ``None`` for a plan of an older file.
 
     Raises:
-        ValueError: If the status is none of these, or ``"solved"`` and the plan is not, or ``"refuted"`` and it is.
+        ValueError: If the status is none of these, or ``"solved"`` and the plan is not, or ``"refuted"`` or
+            ``"infeasible"`` and it is.
     """
 
     planner: str
@@ -123,13 +129,17 @@ class Plan(Shown):
     def __post_init__(self) -> None:
         if self.status not in get_args(Status):
             raise ValueError(f"status {self.status!r} is unknown; it must be one of {', '.join(get_args(Status))}")
-        if self.solved != {"solved": True, "refuted": False}.get(self.status, self.solved):
+        if self.solved != {"solved": True, "refuted": False, "infeasible": False}.get(self.status, self.solved):
             raise ValueError(f"status is {self.status!r} and solved is {self.solved}; one of them must be wrong")
 
     @cached_property
     def verified(self) -> bool:
         """Whether :func:`d4orm_env.verify` finds no fault with the controls; judged when it is first asked for."""
-        return verify(self.problem, self.controls).ok
+        return self._report.ok
+
+    @cached_property
+    def _report(self) -> VerificationReport:
+        return verify(self.problem, self.controls)
 
     @cached_property
     def stretch(self) -> float:
@@ -140,23 +150,44 @@ class Plan(Shown):
 
     @property
     def failures(self) -> dict[str, str]:
-        """Which robots the plan leaves unsolved, and why: a sentence for each, by agent name; empty if it is solved."""
+        """Which robots the plan leaves unsolved, and why: a sentence for each, by agent name; empty if it is solved.
+
+        It is the proof where there is one; else what each does wrong at the steps, or if nobody does anything, what
+        :func:`d4orm_env.verify` found.
+        """
+        if self.solved:
+            return {}
+        if self.status == "infeasible":
+            reasons = {robot: [proof] for robot, proof in prove_infeasible(self.problem).items()}
+        else:
+            reasons = self._faults()
+        if not reasons:
+            for violation in self._report.violations:
+                for robot in violation.robots:
+                    reasons.setdefault(robot, []).append(str(violation))
+        return {f"robot_{robot}": "; ".join(reasons[robot]) for robot in sorted(reasons)}
+
+    def _faults(self) -> dict[int, list[str]]:
+        """What robots do wrong at the steps."""
         problem, trajectory = self.problem, self.trajectory
+        reach = np.asarray(problem.team.radius) + problem.margin
         near = conflicts(trajectory.positions, problem.team.radius, problem.margin)
-        reasons = {}
-        for robot in range(problem.num_robots):
-            faults = []
+        unreachable = {robot for record in self.history for robot in record.unreachable}
+        reasons: dict[int, list[str]] = {}
+        for robot in np.flatnonzero(failed_robots(trajectory)).tolist():
+            faults = reasons[robot] = []
             if not trajectory.arrived[-1, robot]:
                 gap = np.linalg.norm(trajectory.positions[-1, robot] - problem.goal[robot])
                 faults.append(f"ends {gap:.2g} m from its goal")
+            if robot in unreachable:
+                faults.append(f"has no way from start to goal that is {reach[robot]:.4g} m clear of obstacles")
             others = [f"robot_{other}" for other in sorted(near[robot])]
             if others:
                 faults.append(f"comes within the margin of {', '.join(others)}")
-            clearance = problem.world.clearance(trajectory.positions[1:, robot]).min()
-            if clearance <= np.asarray(problem.team.radius)[robot] + problem.margin:
+            if problem.world.clearance(trajectory.positions[1:, robot]).min() <= reach[robot]:
                 faults.append("comes within the margin of an obstacle or the bounds")
-            if faults:
-                reasons[f"robot_{robot}"] = "; ".join(faults)
+            if not faults:
+                faults.append("comes so near to the margin of something that rounding decides")
         return reasons
 
     @property
@@ -228,8 +259,9 @@ class Plan(Shown):
         actual = rollout(problem, claimed.controls, engine="cpu")
         trajectory = claimed if _agree(problem, claimed, actual) else actual
         solved = not failed_robots(trajectory).any() and verify(problem, trajectory.controls).ok
-        if scalars["status"] in ("solved", "refuted"):
-            scalars["status"] = "solved" if solved else "refuted"
+        if scalars["status"] in ("solved", "infeasible", "refuted"):
+            proved = not solved and scalars["status"] == "infeasible" and prove_infeasible(problem)
+            scalars["status"] = "solved" if solved else "infeasible" if proved else "refuted"
         scalars |= {"solved": solved, "metrics": scalars["metrics"] | trajectory_metrics(problem, trajectory)}
         return cls(problem=problem, history=history, trajectory=trajectory, controls=trajectory.controls, **scalars)
 
@@ -265,7 +297,7 @@ def _npz_path(path: str | os.PathLike[str]) -> Path:
 def _read_record(record: dict[str, Any]) -> IterationRecord:
     if not record.keys() <= set(_RECORDED):
         raise ValueError(f"its history has {', '.join(sorted(record.keys() - set(_RECORDED)))}")
-    return IterationRecord(**record)
+    return IterationRecord(**record | {"unreachable": tuple(record.get("unreachable", ()))})
 
 
 def _checked(header: dict[str, Any]) -> dict[str, object]:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.arrays import FloatArray, duration, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_planners.base.candidate import Candidate
+from d4orm_planners.base.infeasibility import prove_infeasible
 from d4orm_planners.base.plan import IterationRecord, Plan, Status
 from d4orm_planners.base.settings import CheckedSettings, Count, EngineName
 from d4orm_planners.base.solve import Search
@@ -50,6 +51,7 @@ class Iteration:
         note: What the method itself says of how the iteration ended, where it has a word for it.
         judged: What :func:`~d4orm_planners.base.candidate.evaluate_controls` made of these controls, if the iteration asked;
             else the loop does.
+        unreachable: Robots for which path finding found no way to their goals.
     """
 
     controls: FloatArray
@@ -57,6 +59,7 @@ class Iteration:
     excluded: int = 0
     note: str = ""
     judged: Candidate | None = None
+    unreachable: tuple[int, ...] = ()
 
 
 class Planner(ABC):
@@ -108,6 +111,8 @@ class Planner(ABC):
     ) -> Plan:
         """Plan until a solution is found (or on, with ``improve``), the budget is used up, or Ctrl-C is pressed.
 
+        A problem that :func:`~d4orm_planners.base.infeasibility.prove_infeasible` proves to have no solution ends at once.
+
         Args:
             problem: What to solve.
             seed: Non-negative seed; the same seed gives the same plan.
@@ -135,7 +140,8 @@ class Planner(ABC):
         search.time_limit = limit
         search.watcher = watcher
         try:
-            status = _run(search, most, callback)
+            proved = not search.best.solved and prove_infeasible(problem)
+            status = "infeasible" if proved else _run(search, most, callback)
         except KeyboardInterrupt:
             status = "interrupted"
         finally:

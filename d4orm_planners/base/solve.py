@@ -17,6 +17,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.engine.types import checked_controls
 from d4orm_planners.base.candidate import Candidate, evaluate_controls
+from d4orm_planners.base.final_approach import drive_further_in
 from d4orm_planners.base.plan import IterationRecord, Plan, Status
 from d4orm_planners.base.provenance import Provenance
 from d4orm_planners.base.stopwatch import Stopwatch
@@ -147,7 +148,7 @@ class Search:
         if not self._began:
             self.state, self._began = self.planner.init(self), True
         self.state, iteration = self.planner.iterate(self, self.state)
-        self.current = iteration.judged or self._judge(iteration.controls)
+        self.current = drive_further_in(self, iteration.judged or self._judge(iteration.controls), self._judge)
         self.iteration += 1
         self.denoising_steps += iteration.denoising_steps
         if self.current.rank > self.best.rank:
@@ -159,13 +160,14 @@ class Search:
             denoising_steps=self.denoising_steps,
             reward=self.current.reward,
             solved=self.current.solved,
-            num_failed=int(self.current.failed.sum()),
+            num_failed=int(self.current.unsolved.sum()),
             num_margin_violated=int(trajectory.margin_violated[1:].any(axis=0).sum()),
             num_not_arrived=int((~trajectory.arrived[-1]).sum()),
             best_reward=self.best.reward,
             best_solved=self.best.solved,
             excluded=iteration.excluded,
             note=iteration.note,
+            unreachable=iteration.unreachable,
         )
         self.history.append(record)
         return replace(record, controls=self.current.controls, trajectory=trajectory)

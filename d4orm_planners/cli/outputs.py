@@ -56,7 +56,8 @@ def print_table(title: str, rows: list[tuple[str, str]]) -> None:
 def require_solved(plan: Plan) -> None:
     """Say why, and end with status 1, if a plan is no solution."""
     if not plan.solved:
-        typer.echo(f"no solution found ({plan.status.replace('_', ' ')} after {plan.iterations} iterations)", err=True)
+        ended = f"no solution found ({plan.status.replace('_', ' ')} after {plan.iterations} iterations)"
+        typer.echo("there is no solution" if plan.status == "infeasible" else ended, err=True)
         for robot, reason in plan.failures.items():
             typer.echo(f"  {robot} {reason}", err=True)
         raise typer.Exit(1)

@@ -11,11 +11,12 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
 from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.verify import VerificationReport
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import Search
+from d4orm_planners.base.working_plan import TeamPaths
 from d4orm_planners.engine.sampling_types import MovingObstacles, SamplingTask
 from d4orm_planners.sampling.d4orm import DeformingPlanner
-from d4orm_planners.tracking.working_plan import TeamPaths
 
 
 class DeformedTeam(TeamPaths):
@@ -25,10 +26,17 @@ class DeformedTeam(TeamPaths):
         planner: Whose rules deformations go by.
         search: The search.
         trajectory: What the team does at first.
+        report: What :func:`~d4orm_env.verify` says of that, if it was asked.
     """
 
-    def __init__(self, planner: DeformingPlanner, search: Search, trajectory: Trajectory) -> None:
-        super().__init__(search, trajectory)
+    def __init__(
+        self,
+        planner: DeformingPlanner,
+        search: Search,
+        trajectory: Trajectory,
+        report: VerificationReport | None = None,
+    ) -> None:
+        super().__init__(search, trajectory, report)
         self.planner = planner
         self._denoising_steps = self._excluded = self._runs = 0
 

@@ -24,7 +24,7 @@ class Groups:
         checked = search.current.trajectory.positions[:: search.check_interval]
         graph = conflicts(checked, problem.team.radius, problem.margin)
         team.controls = planner.config.continued(search.current).copy()
-        for group in failure_groups(search.current.failed, reconnected(graph, self.graph)):
+        for group in failure_groups(search.current.unsolved, reconnected(graph, self.graph)):
             if search.should_stop():
                 break
             robots = list(group)

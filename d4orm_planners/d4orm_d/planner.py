@@ -53,9 +53,9 @@ class D4ormD(DeformingPlanner):
         if search.iteration == 0 and not search.current.controls.any():
             drives = self.straight_start(search.problem)
             return self.whole_team(search, state) if drives is None else (state, Iteration(drives))
-        if not search.current.failed.any() or (isinstance(state, Groups) and search.best.solved):
+        if not search.current.unsolved.any() or (isinstance(state, Groups) and search.best.solved):
             return self.whole_team(search, state)
-        team = DeformedTeam(self, search, search.current.trajectory)
+        team = DeformedTeam(self, search, search.current.trajectory, search.current.report)
         state = state.replan(team) if isinstance(state, Groups) else state.repair(team, self.config)
         return state, team.iteration()
 

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 
 from d4orm_planners.base.candidate import Candidate
+from d4orm_planners.base.plan import IterationRecord
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import Search
 from d4orm_planners.d_d4orm.evaluator import Judge, Stopped
@@ -203,19 +204,24 @@ class Crew(ABC):
             faults += node.inbox.dropped
             faults["false claim"] += node.inbox.false_claims
         new = faults - self._reported
-        notes = self._notes + self._node_notes() + [f"received {count} x {kind}" for kind, count in sorted(new.items())]
-        iteration = Iteration(best.controls, steps - self._spent, excluded - self._excluded, "; ".join(notes), best)
+        records = self._new_records()
+        notes = self._notes + [record.note for record in records if record.note]
+        notes += [f"received {count} x {kind}" for kind, count in sorted(new.items())]
+        unreachable = tuple(sorted({robot for record in records for robot in record.unreachable}))
+        iteration = Iteration(
+            best.controls, steps - self._spent, excluded - self._excluded, "; ".join(notes), best, unreachable
+        )
         self._spent, self._excluded, self._reported, self._notes = steps, excluded, faults, []
         return iteration
 
-    def _node_notes(self) -> list[str]:
-        """What the nodes' planners noted since the last time."""
-        notes = []
+    def _new_records(self) -> list[IterationRecord]:
+        """What the nodes did since the last time."""
+        new = []
         for node in self._nodes:
             records = node.search.history[self._read[node] :]
             self._read[node] += len(records)
-            notes += [record.note for record in records if record.note]
-        return notes
+            new += records
+        return new
 
 
 class SyncCrew(Crew):

@@ -9,6 +9,7 @@ import numpy as np
 
 from d4orm_planners.base.planner import Iteration, Planner
 from d4orm_planners.base.solve import Search
+from d4orm_planners.base.working_plan import TeamPaths
 from d4orm_planners.d4orm_d.deformed_plan import DeformedTeam
 from d4orm_planners.d4orm_d.groups import Groups
 from d4orm_planners.d4orm_d.planner import D4ormD
@@ -25,7 +26,6 @@ from d4orm_planners.mapf.planner import (
     guided_iteration,
     leads_round,
 )
-from d4orm_planners.tracking.working_plan import TeamPaths
 
 State = Groups | Repairs | Guide
 """What is kept between iterations: the repairer's state, or the roadmap solution once there is one."""
@@ -73,14 +73,20 @@ class Hybrid(Planner):
             solution = first_ways(search)
             if isinstance(solution, Guide):
                 return solution, self.follow(search, solution)
+            state, iteration = self.without_paths(search, state)
+            return state, solution.explained(iteration)
+        return self.without_paths(search, state)
+
+    def without_paths(self, search: Search, state: Groups | Repairs) -> tuple[State, Iteration]:
+        """Start straight or with the whole team, repair who fails, then improve."""
         if search.iteration == 0 and not search.current.controls.any():
             drives = self.denoiser.straight_start(search.problem)
             return self.whole_team(search, state) if drives is None else (state, Iteration(drives))
         if self.improves_by_lns and search.best.solved:
             return state, refined_iteration(search)
-        if not search.current.failed.any() or (isinstance(state, Groups) and search.best.solved):
+        if not search.current.unsolved.any() or (isinstance(state, Groups) and search.best.solved):
             return self.whole_team(search, state)
-        team = DeformedTeam(self.denoiser, search, search.current.trajectory)
+        team = DeformedTeam(self.denoiser, search, search.current.trajectory, search.current.report)
         if isinstance(state, Groups):
             return state.replan(team), team.iteration()
         return self.repair(team, state), team.iteration()
@@ -96,9 +102,8 @@ class Hybrid(Planner):
         self.improve_first(team)
         return state
 
-    def whole_team(self, search: Search, state: State) -> tuple[State, Iteration]:
+    def whole_team(self, search: Search, state: Groups | Repairs) -> tuple[State, Iteration]:
         """Deform everybody's controls at once, as D4orm-D does, and improve them if nobody fails."""
-        assert not isinstance(state, Guide)
         state, iteration = self.denoiser.whole_team(search, state)
         if not isinstance(state, Repairs):
             return state, iteration

@@ -8,12 +8,12 @@ from d4orm_env.core import portable
 from d4orm_env.core.arrays import IntArray
 from d4orm_env.core.seeds import Stream
 from d4orm_planners.base.conflict_groups import components
+from d4orm_planners.base.working_plan import TeamPaths
 from d4orm_planners.engine.path_index import BLOCK
 from d4orm_planners.hybrid.settings import REROUTE_RULES
 from d4orm_planners.mapf.beam_search import BeamRules
 from d4orm_planners.mapf.beams import Company, Manner, find_ways
 from d4orm_planners.tracking.steering import drives, standing
-from d4orm_planners.tracking.working_plan import TeamPaths
 
 AWAY = np.float32(1e6)
 """Where a robot is that is in nobody's way [m]."""

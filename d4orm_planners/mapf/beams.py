@@ -12,10 +12,10 @@ from d4orm_env.core import portable
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.engine.threads import Threads, available_cores
+from d4orm_planners.base.working_plan import TeamPaths
 from d4orm_planners.engine.path_index import BLOCK
 from d4orm_planners.mapf.beam_search import BeamRules, Moves, Seekers, search_kernel
 from d4orm_planners.tracking.steering import Drives, by_model
-from d4orm_planners.tracking.working_plan import TeamPaths
 
 
 @dataclass(frozen=True)

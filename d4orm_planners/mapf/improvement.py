@@ -7,8 +7,8 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_planners.base.candidate import evaluate_controls
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import Search
+from d4orm_planners.base.working_plan import TeamPaths
 from d4orm_planners.mapf.roundabout import drive_roundabout
-from d4orm_planners.tracking.working_plan import TeamPaths
 
 ROUNDS = 96
 """Rounds of the search in an iteration: one annealing."""

@@ -13,11 +13,11 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 from d4orm_env.core.metrics import arrival_steps
 from d4orm_env.core.portable import log
+from d4orm_planners.base.working_plan import TeamPaths
 from d4orm_planners.engine.path_index import BLOCK
 from d4orm_planners.mapf.beam_search import BeamRules
 from d4orm_planners.mapf.beams import Company, Manner, find_ways
 from d4orm_planners.tracking.steering import straight_drives
-from d4orm_planners.tracking.working_plan import TeamPaths
 
 
 @dataclass(frozen=True)

@@ -64,9 +64,24 @@ class NoWays:
 
     Attributes:
         why: For the record of the iterations.
+        unreachable: Robots that have no way to their goals, if that is why.
     """
 
     why: str
+    unreachable: tuple[int, ...] = ()
+
+    @classmethod
+    def unless_reachable(cls, problem: Problem) -> NoWays | None:
+        """Why there are no ways, if :meth:`Problem.check_reachable` knows."""
+        try:
+            problem.check_reachable()
+        except ValueError as error:
+            return cls(str(error), tuple(np.flatnonzero(np.isinf(problem.ways.length)).tolist()))
+        return None
+
+    def explained(self, iteration: Iteration) -> Iteration:
+        """The iteration, in whose record it says why."""
+        return replace(iteration, note=self.why, unreachable=self.unreachable)
 
 
 class MAPF(Planner):
@@ -85,7 +100,7 @@ class MAPF(Planner):
         elif state is None:
             state = first_ways(search)
         if isinstance(state, NoWays):
-            return state, Iteration(search.current.controls, note=state.why)
+            return state, state.explained(Iteration(search.current.controls))
         return state, guided_iteration(search, state)
 
 
@@ -129,11 +144,9 @@ def first_ways(search: Search) -> Guide | NoWays:
         roadmap = lay_roadmap(problem, fineness)
         replanning = Replanning(problem, roadmap)
         if not np.isfinite(replanning.alone).all():
-            if number == 0:
-                try:
-                    problem.check_reachable()
-                except ValueError as error:
-                    return NoWays(str(error))
+            reason = NoWays.unless_reachable(problem) if number == 0 else None
+            if reason is not None:
+                return reason
             continue
         driven = replanning.one_by_one(random, search.should_stop, TURNS * problem.num_robots)
         if driven is not None:

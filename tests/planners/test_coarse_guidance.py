@@ -14,6 +14,7 @@ from d4orm_env.core.world import World
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.base.plan import failed_robots
 from d4orm_planners.base.solve import Search
+from d4orm_planners.base.working_plan import TeamPaths
 from d4orm_planners.d4orm_c2f.coarse_plan import (
     Guidance,
     coarse_problem,
@@ -27,7 +28,6 @@ from d4orm_planners.d4orm_c2f.lookahead import LEAST, within_sight
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
 from d4orm_planners.engine.select import get_sampling_engine
-from d4orm_planners.tracking.working_plan import TeamPaths
 
 
 @pytest.mark.parametrize(

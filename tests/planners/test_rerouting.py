@@ -18,10 +18,10 @@ from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import make_planner
 from d4orm_planners.base.solve import Search
+from d4orm_planners.base.working_plan import TeamPaths
 from d4orm_planners.engine import path_index
 from d4orm_planners.mapf import beams
 from d4orm_planners.tracking.steering import straight_drives
-from d4orm_planners.tracking.working_plan import TeamPaths
 
 
 def rerouted(problem: Problem, seed: int = 0) -> TeamPaths:

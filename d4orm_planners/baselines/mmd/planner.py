@@ -88,14 +88,14 @@ class MMD(Planner):
                 compile_mmd(search.problem)
             state = _begin(search)
         if isinstance(state, NoWays):
-            return state, Iteration(search.current.controls, note=state.why)
+            return state, state.explained(Iteration(search.current.controls))
         problem = search.problem
         denoiser = Denoiser(problem, self.config, search.should_stop)
         planning = Planning(problem, self.config, denoiser, state.frames, state.space)
         if not state.nodes:
             added = [planning.root(_seeds(search, problem.num_robots))]
         else:
-            failed = np.flatnonzero(search.current.failed)
+            failed = np.flatnonzero(search.current.unsolved)
             unlucky = int(failed[0]) if len(failed) else search.iteration % problem.num_robots
             added = planning.children(state.nodes[0], state.made, _seeds(search, 2), unlucky)
         best = min(added)
@@ -109,10 +109,9 @@ def _begin(search: Search) -> Tree | NoWays:
     from d4orm_planners.baselines.mmd.way_frame import make_frame, world_space
 
     problem, space = search.problem, world_space(search.problem)
-    try:
-        problem.check_reachable()
-    except ValueError as error:
-        return NoWays(str(error))
+    reason = NoWays.unless_reachable(problem)
+    if reason is not None:
+        return reason
     # The first numbers are the robots'.
     turns = generator(search.seed, Stream.SAMPLES, 0, problem.num_robots).uniform(-1, 1, (problem.num_robots, 3))
     frames = [make_frame(problem, robot, space, turn) for robot, turn in enumerate(turns)]

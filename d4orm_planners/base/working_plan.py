@@ -6,7 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.core.metrics import arrival_steps
 from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.verify import VerificationReport
 from d4orm_planners.base.conflict_groups import Graph, graph_of
 from d4orm_planners.base.solve import Search
 from d4orm_planners.tracking.steering import Drives
@@ -23,21 +25,30 @@ class TeamPaths:
     Args:
         search: The search.
         trajectory: What the team does at first.
+        report: What :func:`~d4orm_env.verify` says of that, if it was asked.
 
     Attributes:
         controls: ``(H, K, m)``.
         states: ``(H+1, K, n)``.
         arrived: ``(K,)`` whether each ends at its goal.
+        refused: ``(K,)`` step of the fault that the report finds with each; ``H + 1`` for none, or once it moves.
         index: Where everybody is.
     """
 
-    def __init__(self, search: Search, trajectory: Trajectory) -> None:
+    def __init__(self, search: Search, trajectory: Trajectory, report: VerificationReport | None = None) -> None:
         # Here, because importing numba takes long.
         from d4orm_planners.engine.path_index import PathIndex
 
         self.search, self.problem = search, search.problem
         self.controls, self.states = trajectory.controls.copy(), trajectory.states.copy()
         self.arrived: BoolArray = trajectory.arrived[-1].copy()
+        self.refused = np.full(self.problem.num_robots, self.problem.horizon + 1)
+        arrivals = arrival_steps(trajectory.arrived)
+        for violation in () if report is None else report.violations:
+            robots = list(violation.robots)
+            # Who has not arrived may stop where it seems to.
+            step = np.minimum(int(violation.time / self.problem.dt) + 1, arrivals[robots])
+            self.refused[robots] = np.minimum(self.refused[robots], step)
         # The engine, in float32, must not find near what this has found clear.
         margin = self.problem.margin + self.problem.rounding
         self.index = PathIndex(trajectory.positions, self.problem.team.radius, margin)
@@ -64,6 +75,7 @@ class TeamPaths:
         self.states[:, index] = 0
         self.states[:, index, : states.shape[2]] = states
         self.arrived[index] = arrived
+        self.refused[index] = self.problem.horizon + 1
         self.index.move(index, states[..., : self.problem.dimension])
         if self._checked is not self.index:
             self._checked.move(index, states[:: self._interval, :, : self.problem.dimension])
@@ -77,7 +89,8 @@ class TeamPaths:
         """
         index = np.asarray(robots)
         costs, first = self._judged(index, self.states[:, index, None], self.arrived[index, None])
-        return np.floor(costs[:, 0]), first[:, 0]
+        refused = self.refused[index]
+        return np.floor(costs[:, 0]) + (refused <= self.problem.horizon), np.minimum(first[:, 0], refused)
 
     def take_best(self, robots: ArrayLike, ways: Drives, *, or_longer: bool = False) -> None:
         """Let one robot after the other take the best of its ways, if that is better than what it does.
@@ -90,6 +103,9 @@ class TeamPaths:
         for i, robot in enumerate(np.asarray(robots).tolist()):
             costs, _ = self._judged([robot], ways.states[:, [i]], ways.arrived[[i]])
             present, _ = self._judged([robot], self.states[:, [robot], None], self.arrived[[robot], None])
+            if self.refused[robot] <= self.problem.horizon:
+                present += 1
+                costs[0] += (ways.states[:, i] == self.states[:, robot, None, : ways.states.shape[3]]).all(axis=(0, 2))
             best = int(costs[0].argmin())
             before = np.floor(present[0, 0]) + 1 if or_longer else present[0, 0]
             if costs[0, best] < before:

@@ -1,0 +1,157 @@
+"""Proofs that a problem has no solution, whatever the planner.
+
+A solution keeps the margin at the end of every step, and touches nothing in between. So its robots are nowhere nearer
+to an obstacle than their radius; and on straight lines from step to step nowhere nearer than radius and margin, less
+half of what they travel in a step. Space is cut into cells. One whose middle is not even so clear less half a diagonal
+has no place that is so clear, and what the other cells do not connect is not connected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.core.arrays import Floats, IntArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.dynamics.models import MODEL_CODES, NUM_BUILT_IN
+from d4orm_env.dynamics.robot_model import ACCELERATION
+from d4orm_env.verify import CHORD_ERROR
+
+ROUNDING = 64 * 2.0**-23
+"""What float32 may be off by, as a share of the largest coordinate or of radius and margin."""
+MAX_CELLS = 2**18
+"""Most cells; coarser ones prove less."""
+HALVINGS = 3
+"""How many times cells are halved that are as large as the smallest radius and margin."""
+SIMILAR = 1.1
+"""Robots whose radii differ by less are judged by the smallest of them."""
+
+
+def prove_infeasible(problem: Problem) -> dict[int, str]:
+    """Return why a problem has no solution, by robot; empty where that is not proved.
+
+    Proved are starts within the margin that cannot be left in one step, goals within it or so near to each other that
+    robots at rest there are within it, and walls between start and goal. Gaps that are only a little too narrow are
+    taken for wide enough, and so are those of a world many times larger than its robots. For models of users only
+    goals and walls count, because nothing says how far their robots get in a step.
+
+    Args:
+        problem: The problem.
+    """
+    d, reach = problem.dimension, problem.team.radius.astype(np.float64) + problem.margin
+    starts, goals = problem.start[:, :d].astype(np.float64), problem.goal.astype(np.float64)
+    doubt = CHORD_ERROR + ROUNDING * max(np.abs(starts).max(), np.abs(goals).max(), reach.max())
+    proofs = dict(_crowded(problem, "starts", starts, _travel(problem, _start_speed(problem)) + doubt, "one step"))
+    at_rest = np.full(problem.num_robots, problem.goal_radius + doubt)
+    proofs |= dict(_crowded(problem, "has a goal", goals, at_rest, "the goal radius"))
+    if not proofs and problem.world.num_obstacles:
+        robots = _walled_off(problem, starts, goals, float(doubt))
+        proofs = dict.fromkeys(robots, "has no free way to its goal: walls are closed all round the one or the other")
+    return proofs
+
+
+def _start_speed(problem: Problem) -> Floats:
+    """``(K,)`` of those whose speed is part of their state; that of all others is their limit [m/s]."""
+    speeds = problem.team.max_speed.astype(np.float64)
+    for robot, model in enumerate(problem.team.robot_models):
+        if model.speed_indices:
+            own = problem.start[robot, list(model.speed_indices)].astype(np.float64)
+            speeds[robot] = np.sqrt((own * own).sum())
+    return speeds
+
+
+def _travel(problem: Problem, speed: Floats) -> Floats:
+    """``(K,)`` how far each robot gets in a step that it begins at this speed ``(K,)`` at most [m]."""
+    limits, travel = problem.team.limits.astype(np.float64), np.full(problem.num_robots, np.inf)
+    for robot, model in enumerate(problem.team.robot_models):
+        if MODEL_CODES[model.name] < NUM_BUILT_IN:
+            gained = limits[robot, ACCELERATION] * problem.dt / 2 if ACCELERATION in model.control_limits else 0.0
+            travel[robot] = problem.dt * (speed[robot] + gained)
+    return travel
+
+
+def _crowded(problem: Problem, what: str, places: Floats, freedom: Floats, within: str) -> Iterator[tuple[int, str]]:
+    """Robots within the margin of something wherever they get from their places ``(K, d)`` by ``freedom`` ``(K,)``."""
+    radius, margin = problem.team.radius.astype(np.float64), problem.margin
+    clearance, needed = problem.world.clearance(places) - radius, f"the margin of {margin:g} m within {within}"
+    for robot in np.flatnonzero(clearance + freedom < margin).tolist():
+        gap = f"{what} {clearance[robot]:.3g} m from an obstacle or the bounds"
+        yield robot, f"{gap}, and cannot come clear of them by {needed}"
+    for later in range(1, len(places)):
+        offset = places[:later] - places[later]
+        gaps = np.sqrt((offset * offset).sum(axis=1)) - radius[:later] - radius[later]
+        for other in np.flatnonzero(gaps + freedom[:later] + freedom[later] < margin).tolist():
+            for robot, neighbour in ((later, other), (other, later)):
+                gap = f"{what} {gaps[other]:.3g} m from robot_{neighbour}'s"
+                yield robot, f"{gap}, and the two cannot come clear of each other by {needed}"
+
+
+def _walled_off(problem: Problem, starts: Floats, goals: Floats, doubt: float) -> list[int]:
+    """Robots whose goals are not connected with their starts."""
+    from scipy.ndimage import label
+
+    d, reach = problem.dimension, problem.team.radius.astype(np.float64) + problem.margin
+    travel = _travel(problem, problem.team.max_speed.astype(np.float64))
+    for halving in range(1 + HALVINGS):
+        low, cell, clearance = _cells(problem, np.concatenate([starts, goals]), float(reach.min()) / 2**halving)
+        half, are_open = cell * np.sqrt(d) / 2, True
+        robots: list[int] = []
+        for group in _similar(reach):
+            body, least = float(reach[group].min()) - problem.margin, float(reach[group].min())
+            by_steps = least - travel[group].max() / 2
+            kept, away = (by_steps, travel[group].max()) if by_steps > body else (body, 0.0)
+            # Beyond the cells everything is connected.
+            free = np.pad(clearance > kept - half - doubt, 1, constant_values=True)
+            regions, _ = label(free, np.ones((3,) * d))
+            rooms, _ = label(clearance > np.sqrt(reach[group].max() ** 2 + cell * cell / 4))
+            for robot in group.tolist():
+                begin = _near(regions, low - cell, cell, starts[robot], away + half + doubt)
+                end = _near(regions, low - cell, cell, goals[robot], problem.goal_radius + half + doubt)
+                if not begin & end:
+                    robots.append(robot)
+                begin, end = (_near(rooms, low, cell, place[robot], 2 * half) for place in (starts, goals))
+                are_open &= bool(begin & end)
+        if robots or are_open:
+            return sorted(robots)
+        if clearance.size * 2**d > MAX_CELLS:
+            break
+    return []
+
+
+def _cells(problem: Problem, places: Floats, cell: float) -> tuple[Floats, float, Floats]:
+    """The lowest corner of all cells, their size, larger where there would be too many, and the clearance of each.
+
+    They reach beyond the bounds, or in an open world all round obstacles and places ``(P, d)``.
+    """
+    lower, upper = problem.world.bounds.astype(np.float64)
+    if problem.world.lower is None:
+        lower, upper = problem.world.shapes.extent()
+        lower, upper = np.minimum(lower, places.min(axis=0)), np.maximum(upper, places.max(axis=0))
+    while True:
+        low, high = lower - 2 * cell, upper + 2 * cell
+        size = np.ceil((high - low) / cell)
+        if size.prod() <= MAX_CELLS:
+            break
+        cell *= 1.1
+    centres = low + cell * (np.moveaxis(np.indices(size.astype(int)), 0, -1) + 0.5)
+    return low, cell, problem.world.clearance(centres)
+
+
+def _similar(reach: Floats) -> Iterator[IntArray]:
+    """Robots in groups of about the same reach ``(K,)``."""
+    left = np.argsort(reach, kind="stable")
+    while len(left):
+        alike = reach[left] <= SIMILAR * reach[left[0]]
+        yield left[alike]
+        left = left[~alike]
+
+
+def _near(labels: NDArray[np.int32], low: Floats, cell: float, place: Floats, distance: float) -> set[int]:
+    """Labels, but for zero, of the cells whose middle is so near to a place."""
+    first = np.clip(np.floor((place - distance - low) / cell).astype(int), 0, labels.shape)
+    last = np.clip(np.ceil((place + distance - low) / cell).astype(int), 0, labels.shape)
+    part = labels[tuple(map(slice, first, last))]
+    offset = cell * (np.moveaxis(np.indices(part.shape), 0, -1) + first + 0.5) + low - place
+    return set(part[(offset * offset).sum(axis=-1) <= distance * distance].tolist()) - {0}
