@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.observation_layout import ObservationLayout
+from d4orm_env.core.portable import root
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.world import World
 
 if TYPE_CHECKING:
     from d4orm_env.paths.wavefront import Fields, Front, Lattice, Space
@@ -20,9 +22,13 @@ if TYPE_CHECKING:
 
 MAX_NODES, MAX_NODES_IN_ALL = 2**21, 2**24
 """Most nodes of a grid, and of the grids of all robots together; coarser ones where there would be more."""
+MAX_POINTS = 2**24
+"""Most points of a grid, blocked ones included."""
 
 STEP = 0.5
 """Distance of neighbouring nodes, as a share of the robot's radius and margin."""
+STRETCH = 1.05
+"""By how much coarser the next grid is that is tried where one has too many points, at least."""
 REFINEMENTS = 2
 """How often a robot that seems to have no way is tried again on a grid that is twice as fine."""
 
@@ -133,8 +139,9 @@ def shortest_ways(problem: Problem) -> Ways:
     for reach, goal, place in zip(reaches.tolist(), in_space(problem.goal.astype(np.float64)), starts):
         for refinement in range(1 + REFINEMENTS):
             if (reach, refinement) not in lattices:
-                step, most = STEP * reach / 2**refinement, min(MAX_NODES, MAX_NODES_IN_ALL // problem.num_robots)
-                lattices[reach, refinement] = lay_lattice(problem, space, reach, step, most)
+                lattices[reach, refinement] = _first_or_finer(
+                    problem, space, reach, lattices.get((reach, refinement - 1))
+                )
             lattice = lattices[reach, refinement]
             front = spread(space, lattice, reach, goal)
             own = gather(np.array([reach]), [lattice], np.array([0]), [front])
@@ -189,8 +196,22 @@ def observe_ways(observations: FloatArray, layout: ObservationLayout, direction:
     seen[..., parts.length] = np.minimum(length, layout.high[-1])[..., None]
 
 
+def _first_or_finer(problem: Problem, space: Space, reach: float, before: Lattice | None) -> Lattice:
+    """The lattice that ways are looked for on at first, or one that is twice as fine as the one before."""
+    most = min(MAX_NODES, MAX_NODES_IN_ALL // problem.num_robots)
+    if before is None:
+        return lay_lattice(problem, space, reach, STEP * reach, most, MAX_NODES)
+    return lay_lattice(problem, space, reach, before.step / 2, most, MAX_POINTS)
+
+
 def lay_lattice(
-    problem: Problem, space: Space | None, reach: float, step: float, most: int, pad: float = 0.0
+    problem: Problem,
+    space: Space | None,
+    reach: float,
+    step: float,
+    most: int,
+    most_points: int = MAX_POINTS,
+    pad: float = 0.0,
 ) -> Lattice:
     """Nodes so far apart wherever ways may lead; farther apart where there would be too many.
 
@@ -198,38 +219,67 @@ def lay_lattice(
         problem: The starts, goals and bounds.
         space: Its obstacles; ``None`` where there are none.
         reach: What must fit at a node [m].
-        step: Distance of neighbouring nodes [m].
+        step: Distance of neighbouring nodes [m], at least: that of the lattice is said by its ``step``.
         most: Most nodes.
+        most_points: Most points, blocked ones included.
         pad: How far beyond starts, goals and obstacles ways may lead, at least twice the reach [m].
     """
-    from d4orm_env.paths.wavefront import Lattice, settle_nodes
+    low, high = _where_ways_lead(problem, space, max(pad, 2 * reach))
+    most_points = most if space is None else most_points
+    while True:
+        while np.floor((high - low) / step + 1).prod() > most_points:
+            step *= STRETCH
+        lattice = _empty_lattice(low, high, step, most)
+        count = _fill(lattice, problem.world, space, reach)
+        if count <= most:
+            return lattice._replace(points=lattice.points[:count].copy(), places=lattice.places[:count].copy())
+        step *= STRETCH * root(count / most, problem.dimension)
 
-    d, bounds, pad = problem.dimension, problem.world.bounds.astype(np.float64), max(pad, 2 * reach)
+
+def _where_ways_lead(problem: Problem, space: Space | None, pad: float) -> tuple[Floats, Floats]:
+    """Lowest and highest corner of where ways may lead [m]."""
+    d, bounds = problem.dimension, problem.world.bounds.astype(np.float64)
     places = np.concatenate([problem.start[:, :d], problem.goal]).astype(np.float64)
     if space is not None:
         obstacles = space.extent[:, :d]
         places = np.concatenate([places, np.where(np.isinf(obstacles), problem.goal[0], obstacles)])
-    low = np.maximum(places.min(axis=0) - pad, bounds[0])
-    high = np.minimum(places.max(axis=0) + pad, bounds[1])
-    while np.floor((high - low) / step + 1).prod() > most:
-        step *= 1.05
-    size = np.floor((high - low) / step).astype(np.int64) + 1
-    flat = [0] * (3 - d)
-    lattice = Lattice(
+    return np.maximum(places.min(axis=0) - pad, bounds[0]), np.minimum(places.max(axis=0) + pad, bounds[1])
+
+
+def _empty_lattice(low: Floats, high: Floats, step: float, most: int) -> Lattice:
+    """The points of a lattice in the middle between two corners, and room for so many nodes."""
+    # Here, because importing the compiler takes longer than importing all the rest of the package.
+    from d4orm_env.paths.wavefront import Lattice
+
+    d = len(low)
+    size, flat = np.floor((high - low) / step).astype(np.int64) + 1, [0] * (3 - d)
+    count = min(int(size.prod()), most)
+    return Lattice(
         low=np.append((low + high - (size - 1) * step) / 2, flat).astype(np.float64),
         step=step,
         size=np.append(size, [1] * (3 - d)).astype(np.int64),
         moves=np.array([(*move, *flat) for move in product((-1, 0, 1), repeat=d) if any(move)]),
-        places=np.empty((size.prod(), 3)),
-        free=np.empty(size.prod(), np.bool_),
+        nodes=np.empty(size.prod(), np.int32),
+        points=np.empty(count, np.int32),
+        places=np.empty((count, 3)),
     )
-    if space is None:
-        lattice.places[:] = lattice.low + np.indices(tuple(lattice.size)).reshape(3, -1).T * step
-        inside = (lattice.places[:, :d] >= bounds[0] + reach) & (lattice.places[:, :d] <= bounds[1] - reach)
-        lattice.free[:] = inside.all(axis=1)
-    else:
-        settle_nodes(space, lattice, reach)
-    return lattice
+
+
+def _fill(lattice: Lattice, world: World, space: Space | None, reach: float) -> int:
+    """Find the nodes of a lattice, and write as many as there is room for; how many there are."""
+    from d4orm_env.paths.wavefront import settle_nodes
+
+    if space is not None:
+        return settle_nodes(space, lattice, reach)
+    bounds, d = world.bounds.astype(np.float64), world.dimension
+    lattice.places[:] = lattice.low + np.indices(tuple(lattice.size)).reshape(3, -1).T * lattice.step
+    free = ((lattice.places[:, :d] >= bounds[0] + reach) & (lattice.places[:, :d] <= bounds[1] - reach)).all(axis=1)
+    inside = np.flatnonzero(free)
+    count = len(inside)
+    lattice.nodes[:] = -1
+    lattice.nodes[inside] = np.arange(count)
+    lattice.points[:count], lattice.places[:count] = inside, lattice.places[inside]
+    return count
 
 
 def in_space(places: Floats) -> Floats:

@@ -75,23 +75,25 @@ class Space(NamedTuple):
 
 
 class Lattice(NamedTuple):
-    """The nodes of a wavefront, numbered with the last axis fastest.
+    """A grid whose free points are the nodes of a wavefront, both numbered with the last axis fastest.
 
     Attributes:
-        low: ``(3,)`` the first node [m].
+        low: ``(3,)`` the first point [m].
         step: Between neighbours along an axis [m].
-        size: ``(3,)`` int64 nodes along each axis.
-        moves: ``(M, 3)`` int64 to the neighbours of a node.
-        places: ``(N, 3)`` where each is [m].
-        free: ``(N,)`` bool.
+        size: ``(3,)`` int64 points along each axis.
+        moves: ``(M, 3)`` int64 to the neighbours of a point.
+        nodes: ``(G,)`` int32 the node of each point; -1 where it is not free.
+        points: ``(N,)`` int32 the point of each node.
+        places: ``(N, 3)`` where each node is [m].
     """
 
     low: Floats
     step: float
     size: IntArray
     moves: IntArray
+    nodes: Ints
+    points: Ints
     places: Floats
-    free: BoolArray
 
 
 class Front(NamedTuple):
@@ -121,7 +123,9 @@ class Fields(NamedTuple):
         lattice: ``(K,)`` int64 number of its lattice.
         low: ``(L, 3)`` the first nodes of the lattices [m].
         step: ``(L,)`` between neighbours along an axis [m].
-        size: ``(L, 3)`` int64 nodes along each axis.
+        size: ``(L, 3)`` int64 points along each axis.
+        first_node: ``(L + 1,)`` int64 where the part of ``nodes`` of each lattice begins, and the end.
+        nodes: int32 the node of each point; -1 where it is not free.
         first_place: ``(L + 1,)`` int64 where the part of ``places`` of each lattice begins, and the end.
         places: ``(., 3)`` where the nodes are [m].
         first_anchor: ``(K + 1,)`` int64 where the part of ``anchor`` of each robot begins, and the end.
@@ -138,6 +142,8 @@ class Fields(NamedTuple):
     low: Floats
     step: Floats
     size: IntArray
+    first_node: IntArray
+    nodes: Ints
     first_place: IntArray
     places: Floats
     first_anchor: IntArray
@@ -300,9 +306,8 @@ def _sees(space: Space, reach: float, a: Place, own_a: float, b: Place, own_b: f
 
 
 @inlined
-def _indices(lattice: Lattice, n: Whole) -> tuple[int, int, int]:
-    """Steps to a node along each axis."""
-    size = lattice.size
+def _indices(size: IntArray, n: Whole) -> tuple[int, int, int]:
+    """Steps to a point along each axis."""
     return n // (size[2] * size[1]), n // size[2] % size[1], n % size[2]
 
 
@@ -313,7 +318,7 @@ def _place(rows: Floats, n: Whole) -> Place:
 
 @inlined
 def _corner(low: Floats, step: float, size: IntArray, q: Place) -> tuple[int, int, int]:
-    """Steps along each axis to the node below a place, or to the outermost one."""
+    """Steps along each axis to the point below a place, or to the outermost one."""
     i = min(max(np.int64((q[0] - low[0]) / step), 0), size[0] - 1)
     j = min(max(np.int64((q[1] - low[1]) / step), 0), size[1] - 1)
     return i, j, min(max(np.int64((q[2] - low[2]) / step), 0), size[2] - 1)
@@ -321,12 +326,12 @@ def _corner(low: Floats, step: float, size: IntArray, q: Place) -> tuple[int, in
 
 @inlined
 def _neighbour(lattice: Lattice, move: int, i: int, j: int, k: int) -> np.int64:
-    """The number of a neighbour; -1 beyond the lattice."""
+    """The node next to a point; -1 where none is."""
     ni, nj, nk = i + lattice.moves[move, 0], j + lattice.moves[move, 1], k + lattice.moves[move, 2]
     size = lattice.size
     if ni < 0 or nj < 0 or nk < 0 or ni >= size[0] or nj >= size[1] or nk >= size[2]:
         return np.int64(-1)
-    return (ni * size[1] + nj) * size[2] + nk
+    return np.int64(lattice.nodes[(ni * size[1] + nj) * size[2] + nk])
 
 
 @inlined
@@ -387,21 +392,30 @@ def _settled(space: Space, lattice: Lattice, reach: float, place: Place) -> tupl
 
 
 @cached_kernel(SOURCES, variant="settle", **OPTIONS)
-def settle_nodes(space: Space, lattice: Lattice, reach: float) -> None:
-    """Put the nodes of a lattice where a body of this reach fits, if that is less than half a step away."""
-    low, step = lattice.low, lattice.step
-    for n in range(lattice.free.shape[0]):
-        i, j, k = _indices(lattice, n)
+def settle_nodes(space: Space, lattice: Lattice, reach: float) -> int:
+    """Find the points of a lattice where a body of this reach fits, if that is less than half a step away.
+
+    Returns:
+        How many there are; as many as there is room for are written as nodes.
+    """
+    low, step, count = lattice.low, lattice.step, 0
+    for n in range(lattice.nodes.shape[0]):
+        i, j, k = _indices(lattice.size, n)
         place = (low[0] + i * step, low[1] + j * step, low[2] + k * step)
-        if (
+        fits = (
             _about_to_obstacles(space, place[0], place[1], place[2])
             > reach
             < _to_bounds(space, place[0], place[1], place[2])
-        ):
-            lattice.free[n] = True
-        else:
-            place, lattice.free[n] = _settled(space, lattice, reach, place)
-        lattice.places[n, 0], lattice.places[n, 1], lattice.places[n, 2] = place
+        )
+        if not fits:
+            place, fits = _settled(space, lattice, reach, place)
+        lattice.nodes[n] = count if fits else -1
+        if fits:
+            if count < lattice.points.shape[0]:
+                lattice.points[count] = n
+                lattice.places[count, 0], lattice.places[count, 1], lattice.places[count, 2] = place
+            count += 1
+    return count
 
 
 class _Nodes(NamedTuple):
@@ -442,7 +456,7 @@ def _seen_anchor(
     n: Whole,
 ) -> tuple[np.int32, float]:
     """The best anchor of the neighbours of a node that it sees, and the way by it; -1 for none."""
-    (i, j, k), q, tried = _indices(lattice, n), _place(lattice.places, n), nodes.tried
+    (i, j, k), q, tried = _indices(lattice.size, lattice.points[n]), _place(lattice.places, n), nodes.tried
     best, chosen, count = np.inf, _NOBODY, 0
     for move in range(lattice.moves.shape[0]):
         p = _neighbour(lattice, move, i, j, k)
@@ -471,7 +485,7 @@ def _way_round(
 
     In a narrow gap neighbours may see each other by way of a place between them only; elsewhere it is ``q``.
     """
-    i, j, k = _indices(lattice, n)
+    i, j, k = _indices(lattice.size, lattice.points[n])
     best, through, bend = np.inf, np.int64(-1), q
     for straight in (True, False):
         for move in range(lattice.moves.shape[0]):
@@ -503,7 +517,7 @@ def _spread(
     space: Space, lattice: Lattice, reach: float, goal: Floats, nodes: _Nodes
 ) -> tuple[Floats, Floats, Ints, float]:
     """See :func:`spread`; anchors, their values and their parents, and the clearance at the goal."""
-    count, size = lattice.free.shape[0], lattice.size
+    count, size = lattice.places.shape[0], lattice.size
     value, anchor, hidden = nodes.value, nodes.anchor, nodes.hidden
     points, values, parents = np.empty((256, 3)), np.empty(256), np.empty(256, np.int32)
     points[0, 0], points[0, 1], points[0, 2] = goal[0], goal[1], goal[2]
@@ -516,8 +530,8 @@ def _spread(
     for i in range(max(0, low_i - around), min(size[0], low_i + around + 1)):
         for j in range(max(0, low_j - around), min(size[1], low_j + around + 1)):
             for k in range(max(0, low_k - around), min(size[2], low_k + around + 1)):
-                n = (i * size[1] + j) * size[2] + k
-                if lattice.free[n]:
+                n = np.int64(lattice.nodes[(i * size[1] + j) * size[2] + k])
+                if n >= 0:
                     value[n], anchor[n] = _distance(at, _place(lattice.places, n)), 0
                     heapq.heappush(heap, (value[n], n))
     while len(heap) > 0:
@@ -550,10 +564,10 @@ def _spread(
                 continue
         nodes.done[n] = True
         at, own = _place(points, a), _kept(a, own_goal, reach)
-        i, j, k = _indices(lattice, n)
+        i, j, k = _indices(lattice.size, lattice.points[n])
         for move in range(lattice.moves.shape[0]):
             p = _neighbour(lattice, move, i, j, k)
-            if p < 0 or nodes.done[p] or not lattice.free[p]:
+            if p < 0 or nodes.done[p]:
                 continue
             place = _place(lattice.places, p)
             length = values[a] + _distance(at, place)
@@ -573,7 +587,7 @@ def _spread(
 
 def spread(space: Space, lattice: Lattice, reach: float, goal: Floats) -> Front:
     """The wavefront of a body of this reach from its goal ``(3,)``."""
-    count = len(lattice.free)
+    count = len(lattice.places)
     nodes = _Nodes(
         value=np.full(count, np.inf),
         anchor=np.full(count, _NOBODY),
@@ -594,6 +608,8 @@ def gather(reach: Floats, lattices: Sequence[Lattice], number: IntArray, fronts:
         low=np.stack([lattice.low for lattice in lattices]),
         step=np.array([lattice.step for lattice in lattices]),
         size=np.stack([lattice.size for lattice in lattices]),
+        first_node=_beginnings([lattice.nodes for lattice in lattices]),
+        nodes=_joined([lattice.nodes for lattice in lattices]),
         first_place=_beginnings([lattice.places for lattice in lattices]),
         places=_joined([lattice.places for lattice in lattices]),
         first_anchor=_beginnings([front.anchor for front in fronts]),
@@ -620,7 +636,7 @@ def _look_from(space: Space, fields: Fields, robot: int, q: Place) -> tuple[Plac
     """Where a robot at ``q`` goes first, the length of the whole way, and the anchor."""
     reach, lattice, first = fields.reach[robot], fields.lattice[robot], fields.first_point[robot]
     step, size, first_place = fields.step[lattice], fields.size[lattice], fields.first_place[lattice]
-    first_anchor = fields.first_anchor[robot]
+    first_node, first_anchor = fields.first_node[lattice], fields.first_anchor[robot]
     goal, own_goal, own = _place(fields.points, first), fields.room[robot], clearance_at(space, q[0], q[1], q[2])
     if _sees(space, reach, goal, own_goal, q, own):
         return goal, _distance(goal, q), np.int32(0)
@@ -633,7 +649,9 @@ def _look_from(space: Space, fields: Fields, robot: int, q: Place) -> tuple[Plac
         for ni in range(max(0, i - ring), min(size[0], i + ring + 2)):
             for nj in range(max(0, j - ring), min(size[1], j + ring + 2)):
                 for nk in range(max(0, k - ring), min(size[2], k + ring + 2)):
-                    n = (ni * size[1] + nj) * size[2] + nk
+                    n = np.int64(fields.nodes[first_node + (ni * size[1] + nj) * size[2] + nk])
+                    if n < 0:
+                        continue
                     a = fields.anchor[first_anchor + n]
                     if a < 0:
                         continue

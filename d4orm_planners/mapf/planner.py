@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from d4orm_env.core.problem import Problem
+from d4orm_env.core.arrays import LARGEST
+from d4orm_env.core.problem import MAX_HORIZON, Problem
 from d4orm_env.core.seeds import Stream
+from d4orm_env.core.world import World
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
 from d4orm_planners.base.settings import Count
 from d4orm_planners.base.solve import Search
@@ -25,6 +27,8 @@ MAX_ROBOT_STEPS = 4_000_000
 """Most steps of all robots together, whose drives are kept several times over."""
 ROUND = 1.25
 """How many times as long as straight a way is that leads far round; on a lattice any may be 1.1 times as long."""
+LEISURELY = 10
+"""Times that a straight drive at full speed takes that the robots have for which kernels are compiled."""
 STEPS = 3000
 """Steps of path finding for all at once after which the next roadmap is tried."""
 
@@ -169,7 +173,7 @@ def compile_roadmap(problem: Problem) -> None:
     from d4orm_planners.mapf.pibt import fill_costs
 
     if not fill_costs.signatures:
-        leads_round(problem.select([0]))
+        leads_round(_small_problem(problem, 0))
 
 
 def leads_round(problem: Problem) -> bool:
@@ -194,9 +198,20 @@ def compile_guidance(problem: Problem) -> None:
     if is_compiled(problem):
         return
     for robot in {model: number for number, model in enumerate(problem.team.models)}.values():
-        alone = problem.select([robot])
+        alone = _small_problem(problem, robot)
         roadmap = lay_roadmap(alone)
         found = find_moves(alone, roadmap, 0, lambda: False, STEPS)
         if found is not None:
-            driven = drive_moves(alone, roadmap, found.moves)
-            Replanning(alone, roadmap).better(driven, np.zeros(1, np.int64), np.random.default_rng(0), lambda: False)
+            drive_moves(alone, roadmap, found.moves)
+            Replanning(alone, roadmap).one_by_one(np.random.default_rng(0), lambda: False, TURNS)
+
+
+def _small_problem(problem: Problem, robot: int) -> Problem:
+    """A short way of one robot, in a world with an obstacle if the problem's has any: quickly planned, in any world."""
+    alone, d = problem.select([robot]), problem.dimension
+    far = min(8 * (float(alone.team.radius[0]) + alone.margin), LARGEST / 2)
+    start, aside = alone.start.copy(), np.eye(d)[1] * far
+    start[:, :d] = 0
+    boxes = [[*aside, *(2 * aside + far)]] if problem.world.num_obstacles else ()
+    steps = min(LEISURELY * far / (alone.dt * float(alone.team.max_speed[0])), MAX_HORIZON - 100)
+    return alone.replace(start=start, goal=[np.eye(d)[0] * far], world=World(d, boxes=boxes), horizon=100 + int(steps))

@@ -8,33 +8,21 @@ from typing import NamedTuple
 import numpy as np
 from numba.extending import register_jitable
 
-from d4orm_env.core.arrays import Floats, IntArray, Ints, Whole
+from d4orm_env.core.arrays import Floats, IntArray, Whole
 from d4orm_env.engine.caching import cached_kernel, fingerprint
 from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_env.paths import wavefront
 from d4orm_env.paths.wavefront import Space, is_free_line
-from d4orm_planners.mapf import near_neighbours, pibt
-from d4orm_planners.mapf.near_neighbours import Cells, cells_about
+from d4orm_planners.mapf import near_neighbours, pibt, safe_intervals
+from d4orm_planners.mapf.near_neighbours import Cells
 from d4orm_planners.mapf.pibt import Footprints
 from d4orm_planners.mapf.roadmap import Roadmap
+from d4orm_planners.mapf.safe_intervals import Others, find_visits, free_intervals, interval_at
 
-SOURCES = fingerprint((near_neighbours, pibt, wavefront))
-
+SOURCES = fingerprint((near_neighbours, pibt, safe_intervals, wavefront))
 
 BLOCK = 16
 """Steps for which it is known at once whether somebody is about."""
-
-
-class Others(NamedTuple):
-    """Where everybody is at every step.
-
-    Attributes:
-        positions: ``(T + 1, K, 3)`` float64; afterwards they stay where they are [m].
-        need: ``(K,)`` how far the robot that is replanned keeps from each [m].
-    """
-
-    positions: Floats
-    need: Floats
 
 
 @compiled
@@ -151,56 +139,6 @@ def touches(others: Others, k: Whole, places: Floats) -> bool:
     return False
 
 
-@compiled
-def _close_nodes(cells: Cells, others: Others, k: Whole, begins: Ints) -> None:
-    """Mark with -1 in ``begins`` ``(N, T + 1)`` when somebody is near each node."""
-    nodes, steps, rows = cells.points, begins.shape[1], others.positions.shape[0]
-    for i in range(others.positions.shape[1]):
-        need, step = others.need[i], 0
-        while i != k and step < steps:
-            place = others.positions[min(step, rows - 1), i]
-            # Who stands still is looked at once.
-            end = step + 1
-            while end < steps:
-                after = others.positions[min(end, rows - 1), i]
-                if after[0] != place[0] or after[1] != place[1] or after[2] != place[2]:
-                    break
-                end += 1
-            (low_i, high_i), (low_j, high_j), (low_k, high_k) = cells_about(cells, place, place, need)
-            for ci in range(low_i, high_i):
-                for cj in range(low_j, high_j):
-                    for ck in range(low_k, high_k):
-                        cell = (ci * cells.size[1] + cj) * cells.size[2] + ck
-                        for number in range(cells.first[cell], cells.first[cell + 1]):
-                            n = cells.items[number]
-                            dx, dy, dz = nodes[n, 0] - place[0], nodes[n, 1] - place[1], nodes[n, 2] - place[2]
-                            if dx * dx + dy * dy + dz * dz < need * need:
-                                begins[n, step:end] = -1
-            step = end
-
-
-@compiled
-def _fill_begins(begins: Ints, ends: Ints) -> None:
-    """Say of every node and step when the free interval around it begins, and of every beginning when it ends.
-
-    Steps at which a node is not free know the next one at which it is, as its complement.
-    """
-    for n in range(begins.shape[0]):
-        begin, end = -1, begins.shape[1]
-        for step in range(begins.shape[1]):
-            if begins[n, step] < 0:
-                begin = -1
-            else:
-                begin = step if begin < 0 else begin
-                begins[n, step] = begin
-                ends[n, begin] = step + 1
-        for step in range(begins.shape[1] - 1, -1, -1):
-            if begins[n, step] < 0:
-                begins[n, step] = ~end
-            else:
-                end = step
-
-
 class Trip(NamedTuple):
     """How a robot is taken to drive when its way is planned.
 
@@ -256,26 +194,20 @@ def find_way(roadmap: Roadmap, cells: Cells, bodies: Footprints, others: Others,
         dock -= 1
     boxes = np.empty((latest // BLOCK + 2, others.positions.shape[1], 6))
     _fill_boxes(others, boxes)
-    begins = np.zeros((nodes.shape[0], latest + 1), np.int32)
-    _close_nodes(cells, others, k, begins)
-    ends = np.empty((nodes.shape[0], latest + 1), np.int32)
-    _fill_begins(begins, ends)
-    # The entry of ``path`` that comes first to each interval, kept at its beginning.
-    came = np.full((nodes.shape[0], latest + 1), -1, np.int32)
+    visits, last = find_visits(cells, others, k, latest + 1)
+    safe = free_intervals(visits, last, start, latest + 1)
+    # The entry of ``path`` that comes first to each interval.
+    came = np.full(safe.begins.shape[0], -1, np.int32)
     aside = (bodies.docked + bodies.slack / 2) ** 2
-    path = np.empty((1024, 4), np.int64)
-    path[0, 0], path[0, 1], path[0, 2], path[0, 3] = start, 0, 0, -1
+    path = np.empty((1024, 5), np.int64)
+    path[0, 0], path[0, 1], path[0, 2], path[0, 3], path[0, 4] = start, 0, 0, -1, safe.first[start]
     used = 1
-    # Where it starts others may be near as well.
-    if begins[start, 0] < 0:
-        begins[start, 0], ends[start, 0] = 0, 1
-    came[start, 0] = 0
+    came[safe.first[start]] = 0
     heap = [(np.float64(costs[start]) / stride, np.int64(0))]
     while len(heap) > 0:
         _, entry = heapq.heappop(heap)
-        node, arrived = path[entry, 0], path[entry, 2]
-        begin = begins[node, arrived]
-        if came[node, begin] != entry:
+        node, arrived, interval = path[entry, 0], path[entry, 2], path[entry, 4]
+        if came[interval] != entry:
             continue
         if node == goal and arrived > dock:
             return _followed_back(path, entry)
@@ -294,24 +226,26 @@ def find_way(roadmap: Roadmap, cells: Cells, bodies: Footprints, others: Others,
             ):
                 continue
             steps, depart, failures = np.int64(np.ceil(roadmap.lengths[e] / stride)), arrived, 0
-            while depart < ends[node, begin]:
+            while depart < safe.ends[interval]:
                 lost = trip.launch if depart > arrived or path[entry, 3] < 0 else 0
                 until = depart + steps + lost
                 if until + left > latest:
                     break
-                safe = begins[head, until]
-                if safe < 0:
-                    depart += ~safe - until
+                there = interval_at(safe, head, until)
+                if there == safe.first[head + 1]:
+                    break
+                if safe.begins[there] > until:
+                    depart += safe.begins[there] - until
                     continue
-                before = came[head, safe]
+                before = came[there]
                 if before >= 0 and path[before, 2] <= until:
-                    depart += ends[head, safe] - until
+                    depart += safe.ends[there] - until
                     continue
                 depart += 1
                 if head == goal and bodies.docks and until <= dock:
                     continue
-                if head == goal and ends[head, safe] < min(until + trip.linger, latest):
-                    depart += ends[head, safe] - until
+                if head == goal and safe.ends[there] < min(until + trip.linger, latest):
+                    depart += safe.ends[there] - until
                     continue
                 if not _is_line_free(others, boxes, k, tail, nodes[head], depart - 1, until):
                     # Whoever stands in the way often does so for long.
@@ -319,9 +253,9 @@ def find_way(roadmap: Roadmap, cells: Cells, bodies: Footprints, others: Others,
                     depart += failures // 4
                     continue
                 if used == path.shape[0]:
-                    path = np.concatenate((path, np.empty((used, 4), np.int64)))
-                path[used, 0], path[used, 1], path[used, 2], path[used, 3] = head, until - steps - lost, until, entry
-                came[head, safe] = used
+                    path = np.concatenate((path, np.empty((used, 5), np.int64)))
+                path[used, 0], path[used, 1], path[used, 2] = head, until - steps - lost, until
+                path[used, 3], path[used, 4], came[there] = entry, there, used
                 heapq.heappush(heap, (until + left, np.int64(used)))
                 used += 1
     return np.empty((0, 3), np.int64)

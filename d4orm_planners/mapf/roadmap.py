@@ -23,8 +23,8 @@ WALL_SLACK = 0.15
 """The same for obstacles, as a share of radius and margin."""
 REPLACED = 0.35
 """Share of the step within which a start or goal takes the place of a node of the lattice."""
-MAX_NODES, MAX_CELLS = 200_000, 2**25
-"""Most nodes, and most of them times robots, or times steps; lattices are coarser where there would be more."""
+MAX_NODES, MAX_COSTS = 200_000, 2**25
+"""Most nodes, and most of them times robots; lattices are coarser where there would be more."""
 PAD = 3
 """Steps beyond starts, goals and obstacles that nodes reach."""
 
@@ -64,15 +64,16 @@ def lay_roadmap(problem: Problem, fineness: float = 1.0) -> Roadmap:
 
     Args:
         problem: The team, its starts and goals, and the world.
-        fineness: By how much nearer to each other nodes are than that.
+        fineness: By how much nearer to each other nodes are than that, at most: in large worlds they are farther apart.
     """
     d, radius = problem.dimension, np.asarray(problem.team.radius, np.float64)
     spread = 2 * radius.max() + problem.margin + PAIR_SLACK * problem.team.largest_radius
-    step = float(np.sqrt(2.0) * spread / fineness)
     reaches = np.unique(radius + problem.margin)
     space = make_space(problem) if problem.world.num_obstacles else None
     ends = np.unique(in_space(np.concatenate([problem.start[:, :d], problem.goal]).astype(np.float64)), axis=0)
-    places = _lattice_nodes(problem, space, float(reaches[-1]) * (1 + WALL_SLACK), step)
+    asked, most = float(np.sqrt(2.0) * spread / fineness), min(MAX_NODES, MAX_COSTS // problem.num_robots)
+    lattice = lay_lattice(problem, space, float(reaches[-1]) * (1 + WALL_SLACK), asked, most, pad=PAD * asked)
+    places, step = lattice.places, lattice.step
     near_end = np.diff(find_near(sort_into_cells(ends, step), places, places, REPLACED * step)[0]) > 0
     nodes = np.concatenate([places[~near_end], ends])
     far = step * (1.5 if d == 2 else 1.8)
@@ -111,13 +112,6 @@ def _numbers(nodes: Floats, places: FloatArray) -> IntArray:
     """``(K,)`` the nodes that are at places ``(K, d)``."""
     wanted = in_space(places.astype(np.float64))
     return np.array([int(np.flatnonzero((nodes == place).all(axis=1))[-1]) for place in wanted], np.int64)
-
-
-def _lattice_nodes(problem: Problem, space: Space | None, reach: float, step: float) -> Floats:
-    """``(N, 3)`` free places of a lattice wherever ways may lead."""
-    most = min(MAX_NODES, MAX_CELLS // max(problem.num_robots, problem.horizon))
-    lattice = lay_lattice(problem, space, reach, step, most, pad=PAD * step)
-    return lattice.places[lattice.free]
 
 
 def _room(problem: Problem, space: Space | None, reaches: Floats, tails: Floats, heads: Floats) -> Floats:
