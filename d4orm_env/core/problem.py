@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,6 +16,7 @@ from d4orm_env.core.arrays import (
     LARGEST,
     SMALLEST,
     FloatArray,
+    Floats,
     Frozen,
     frozen_array,
     positive_number,
@@ -84,6 +86,10 @@ class Problem(Frozen):
         ValueError: If a value is not finite or out of range, a shape is wrong, a number is not positive, a start or
             goal is out of bounds or in contact with another robot or an obstacle, or float32 or RK4 does not hold the
             problem. The message names the robot, the value and the remedy.
+
+    Warns:
+        UserWarning: If a start or goal is within the margin of something, where plans cannot keep it. Scenarios refuse
+            that.
     """
 
     team: Team
@@ -145,8 +151,12 @@ class Problem(Frozen):
         check_states(team, self.start)
         check_resolution(team, np.concatenate([places, self.goal], axis=1), self.dt, self.goal_radius)
         check_turning(team, self.dt, self.goal_radius)
-        check_places(team, self.world, "start", places)
-        check_places(team, self.world, "goal", self.goal)
+        for what, positions in (("start", places), ("goal", self.goal)):
+            fault = check_places(team, self.world, what, positions, self.margin)
+            if fault:
+                warnings.warn(
+                    f"problem {self.name!r}: {fault}; move it, or use a smaller radius or margin", stacklevel=3
+                )
 
     @property
     def num_robots(self) -> int:
@@ -157,6 +167,11 @@ class Problem(Frozen):
     def dimension(self) -> int:
         """Position dimensions ``d``."""
         return self.team.dimension
+
+    @property
+    def origin(self) -> Floats:
+        """``(d,)`` float64, where the zero of all positions lies in the coordinates that the world comes from [m]."""
+        return self.world.origin
 
     @property
     def state_size(self) -> int:
@@ -263,6 +278,8 @@ class Problem(Frozen):
             array: np.ndarray = np.ascontiguousarray(value)
             sha.update(f"{array.shape}{array.dtype}".encode())
             sha.update(array.tobytes())
+        if world.origin.any():
+            sha.update(b"origin" + world.origin.tobytes())
         sha.update(f"{self.dt!r} {self.horizon} {self.margin!r} {self.goal_radius!r} {self.goal_speed!r}".encode())
         if not self.docks:
             sha.update(self.arrival.encode())

@@ -84,24 +84,34 @@ def check_turning(team: Team, dt: float, goal_radius: float) -> None:
             )
 
 
-def check_places(team: Team, world: World, what: str, places: FloatArray) -> None:
-    """Refuse starts or goals (``what``) ``(K, d)`` outside the world, or that touch something."""
+def check_places(team: Team, world: World, what: str, places: FloatArray, margin: float) -> str:
+    """Refuse starts or goals (``what``) ``(K, d)`` outside the world, or that touch something.
+
+    Returns:
+        What is nearest within the margin, for an error or a warning: the empty string if nothing is.
+    """
     radius = team.radius.astype(np.float64)
-    clearance = world.clearance(places) - radius
-    for robot in np.flatnonzero(clearance <= 0):
+    gaps = world.clearance(places) - radius
+    for robot in np.flatnonzero(gaps <= 0):
         raise ValueError(
-            f"{what} of robot_{robot} at {_point(places[robot])} is {0 - clearance[robot]:.3g} m inside an "
+            f"{what} of robot_{robot} at {_point(places[robot])} is {0 - gaps[robot]:.3g} m inside an "
             f"obstacle or outside the bounds (robot radius {radius[robot]:g} m); move it, or change the world"
         )
-    points = places.astype(np.float64)
+    points, nearest = places.astype(np.float64), ["an obstacle or the bounds"] * len(places)
     for later in range(1, len(points)):
-        gaps = np.linalg.norm(points[:later] - points[later], axis=1) - radius[:later] - radius[later]
-        other = int(np.argmin(gaps))
-        if gaps[other] <= 0:
+        between = np.linalg.norm(points[:later] - points[later], axis=1) - radius[:later] - radius[later]
+        other = int(np.argmin(between))
+        if between[other] <= 0:
             raise ValueError(
                 f"{what}s of robot_{other} at {_point(points[other])} and robot_{later} at {_point(points[later])} "
-                f"overlap by {0 - gaps[other]:.3g} m; move them more than {radius[later] + radius[other]:g} m apart"
+                f"overlap by {0 - between[other]:.3g} m; move them more than {radius[later] + radius[other]:g} m apart"
             )
+        if between[other] < gaps[later]:
+            gaps[later], nearest[later] = between[other], f"robot_{other}"
+    robot = int(np.argmin(gaps))
+    if gaps[robot] > margin:
+        return ""
+    return f"the {what} of robot_{robot} is {gaps[robot]:.3g} m from {nearest[robot]}, and the margin is {margin:g} m"
 
 
 def _turning_limits(model: Model) -> str:

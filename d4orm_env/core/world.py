@@ -10,10 +10,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import LARGEST, SMALLEST, FloatArray, Frozen, frozen_array
-from d4orm_env.geometry.polygon import check_polygon, triangulate
+from d4orm_env.core.arrays import LARGEST, SMALLEST, FloatArray, Floats, Frozen, frozen_array
+from d4orm_env.geometry.polygon import MAX_ALL_CORNERS, check_polygon, triangulate
 from d4orm_env.geometry.shapes import Shapes
 from d4orm_env.geometry.world_index import WorldIndex, build_index, nearest_distance
+
+LARGEST_ORIGIN = 1e9
+"""Of a world [m]: float64 resolves it to 1e-7."""
 
 _LEVELS, _FEW = 3, 2048
 """Grids of an index that finds obstacles for robots wherever they drive, the last 16 times as wide as the first, where
@@ -31,9 +34,12 @@ class World(Frozen):
         spheres: ``(., 4)`` centre x, y, z and radius [m]; spatial worlds only.
         cylinders: ``(., 3)`` axis x, y and radius [m], vertical and unbounded in z; spatial worlds only.
         boxes: ``(., 2 * dimension)`` lower corner, then upper corner [m], axis-aligned.
-        polygons: Each ``(v, 2)`` corners in order, either way round [m]; simple, convex or not; planar worlds only.
+        polygons: Each ``(v, 2)`` corners in order, either way round [m]; simple, convex or not; planar worlds only. One
+            has at most 2,000 corners, and all 30,000.
         lower: ``(dimension,)`` lower bounds of the world [m], or ``None`` for an open world.
         upper: ``(dimension,)`` upper bounds, given together with ``lower``.
+        origin: ``(dimension,)`` float64, where zero lies in the coordinates that the world comes from, such as UTM [m].
+            Everything here, and of a problem in this world, is relative to it; add it to what goes back there.
 
     Raises:
         ValueError: For a shape, radius, corner or bound that makes no sense; the message names it.
@@ -47,6 +53,7 @@ class World(Frozen):
     polygons: tuple[FloatArray, ...]
     lower: FloatArray | None
     upper: FloatArray | None
+    origin: Floats
 
     def __init__(
         self,
@@ -58,6 +65,7 @@ class World(Frozen):
         polygons: Sequence[ArrayLike] = (),
         lower: ArrayLike | None = None,
         upper: ArrayLike | None = None,
+        origin: ArrayLike | None = None,
     ) -> None:
         if dimension not in (2, 3):
             raise ValueError(f"dimension of the world is {dimension!r}; it must be 2 or 3")
@@ -80,7 +88,11 @@ class World(Frozen):
             frozen_array(given, f"polygons[{index}]", (None, 2), largest=LARGEST)
             for index, given in enumerate(polygons)
         )
-        self._set(dimension=dimension, polygons=corners, **tables, **bounds)
+        origin = np.zeros(dimension) if origin is None else origin
+        frozen_array(origin, "origin", (dimension,), largest=LARGEST_ORIGIN)
+        # Adding zero makes -0.0 a plain zero.
+        offset = np.array(origin, np.float64) + 0.0
+        self._set(dimension=dimension, polygons=corners, origin=offset, **tables, **bounds)
         self._check()
 
     def _check(self) -> None:
@@ -96,6 +108,9 @@ class World(Frozen):
                 raise ValueError(f"boxes[{index}] is {box.tolist()}; its lower corner must lie below its upper corner")
         if len(self.polygons) and self.dimension != 2:
             raise ValueError(f"polygons need a world of dimension 2, and this one has {self.dimension}")
+        count = sum(map(len, self.polygons))
+        if count > MAX_ALL_CORNERS:
+            raise ValueError(f"polygons have {count} corners in all, and a world at most {MAX_ALL_CORNERS}; give fewer")
         for index, corners in enumerate(self.polygons):
             check_polygon(corners, f"polygons[{index}]")
         if self.lower is not None and self.upper is not None and (self.lower >= self.upper).any():

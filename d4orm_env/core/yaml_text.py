@@ -14,6 +14,7 @@ from typing import Any
 
 import yaml
 
+SUFFIXES = (".yaml", ".yml")
 MAX_BYTES = 10_000_000
 MAX_DEPTH = 16
 MAX_ITEMS = 10_000
@@ -28,6 +29,11 @@ _SPECIAL_FLOAT = re.compile(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
 _WORDS = {"": None, "~": None, "null": None, "Null": None, "NULL": None} | {
     word: word.lower() == "true" for word in ("true", "True", "TRUE", "false", "False", "FALSE")
 }
+
+
+def is_yaml_path(path: str | os.PathLike[str]) -> bool:
+    """Whether a path ends as those of YAML files do, in letters of either case."""
+    return Path(path).suffix.lower() in SUFFIXES
 
 
 def read_yaml(path: str | os.PathLike[str]) -> object:

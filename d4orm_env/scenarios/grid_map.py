@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from d4orm_env.core.arrays import LARGEST, SMALLEST
+from d4orm_env.core.problem_checks import RESOLUTION
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.free_space import Mask
 from d4orm_env.scenarios.placement import Points
@@ -30,25 +31,39 @@ class GridMap:
         blocked: ``(rows, columns)``, the first row at the top.
         cell: Side of a cell [m].
         low: x and y of the lower left corner [m].
+        origin: Of the world, where the map was elsewhere before [m].
+        world: The blocked cells as boxes, and bounds around the map; y goes up.
+
+    Raises:
+        ValueError: If no cell is free, or float32 does not resolve the cells.
     """
 
     blocked: Mask
     cell: float
     low: tuple[float, float] = (0.0, 0.0)
+    origin: tuple[float, float] = (0.0, 0.0)
+    world: World = field(init=False)
 
     def __post_init__(self) -> None:
         if self.blocked.all():
             raise ValueError("has no free cell; open some")
+        rows, columns = self.blocked.shape
+        side = self.cell * max(rows, columns)
+        if not SMALLEST <= self.cell <= side <= LARGEST or not float32_resolves(side, self.cell):
+            raise ValueError(
+                f"has {rows} x {columns} cells of {self.cell:g} m (resolution or cell); they must have {SMALLEST:g} m "
+                f"or more, the sides of the map at most {LARGEST:g} m, and float32 must hold a cell to 1/{RESOLUTION}"
+            )
+        object.__setattr__(self, "world", self._world())
 
-    @cached_property
-    def world(self) -> World:
-        """The blocked cells as boxes, and bounds around the map; y goes up."""
+    def _world(self) -> World:
         rows, columns = self.blocked.shape
         top, left, bottom, right = merge_cells(self.blocked).T
         cells = np.column_stack([left, rows - bottom, right, rows - top])
         corner = np.array(self.low)
         boxes = cells * self.cell + np.tile(corner, 2)
-        return World(2, boxes=boxes, lower=corner, upper=corner + self.cell * np.array([columns, rows]))
+        upper = corner + self.cell * np.array([columns, rows])
+        return World(2, boxes=boxes, lower=corner, upper=upper, origin=self.origin)
 
     def centres(self, cells: Points) -> Points:
         """``(., 2)`` centres of the cells of these columns and rows ``(., 2)`` [m]."""
@@ -64,6 +79,11 @@ class GridMap:
         room = 2 * math.sqrt(half * half - reach * reach) * (1 - ROUNDING)
         parts = int(half / room) + 1
         return half / min(parts, MOST_PARTS)
+
+
+def float32_resolves(coordinate: float, cell: float) -> bool:
+    """Whether float32 holds so large a coordinate to a hundredth of a cell [m], as starts to one of the goal radius."""
+    return coordinate <= LARGEST and bool(RESOLUTION * np.spacing(np.float32(coordinate)) <= cell)
 
 
 def merge_cells(blocked: Mask) -> np.ndarray:

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from d4orm_env.core.arrays import as_float32
 from d4orm_env.core.portable import arctan2
 from d4orm_env.core.problem import MAX_HORIZON, Problem
+from d4orm_env.core.problem_checks import check_places
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.bounding import require_inside, with_bounds
@@ -54,7 +56,8 @@ def build(settings: Settings, layout: Layout) -> Problem:
     require_inside(settings, world, layout.starts, layout.goals)
     if layout.area is not None:
         world = with_random_obstacles(settings, world, places, layout.area)
-    problem = Problem(
+    require_margin(settings, world, layout.starts, layout.goals)
+    return Problem(
         team=team,
         start=start_states(team, layout.starts, layout.goals),
         goal=layout.goals,
@@ -67,8 +70,6 @@ def build(settings: Settings, layout: Layout) -> Problem:
         name=settings.scenario,
         arrival=settings.arrival,
     )
-    require_margin(problem)
-    return problem
 
 
 def default_horizon(team: Team, dt: float, distance: float) -> int:
@@ -116,24 +117,15 @@ def in_space(points: ArrayLike, dimension: int) -> Points:
     return planar if dimension == 2 else np.hstack([planar, np.zeros((len(planar), 1))])
 
 
-def require_margin(problem: Problem) -> None:
+def require_margin(settings: Settings, world: World, starts: Points, goals: Points) -> None:
     """Check that the surfaces of robots and obstacles are more than the margin apart, at the start and at the goal.
 
     Raises:
         ValueError: If not: the problem would have no solution that keeps the margin.
     """
-    radius = np.asarray(problem.team.radius, np.float64)
-    for what, places in (("start", problem.start[:, : problem.dimension]), ("goal", problem.goal)):
-        points = places.astype(np.float64)
-        gaps = problem.world.clearance(points) - radius
-        nearest = ["an obstacle or the bounds"] * len(points)
-        for robot in range(1, len(points)):
-            gap = np.linalg.norm(points[:robot] - points[robot], axis=1) - radius[:robot] - radius[robot]
-            if gap.min() < gaps[robot]:
-                gaps[robot], nearest[robot] = gap.min(), f"robot_{np.argmin(gap)}"
-        robot = int(np.argmin(gaps))
-        if gaps[robot] <= problem.margin:
+    for what, places in (("start", starts), ("goal", goals)):
+        fault = check_places(settings.team, world, what, as_float32(places), settings.margin)
+        if fault:
             raise ValueError(
-                f"scenario {problem.name!r}: the {what} of robot_{robot} is {gaps[robot]:.3g} m from {nearest[robot]}, "
-                f"and the margin is {problem.margin:g} m; make the scenario larger, or the radius or margin smaller"
+                f"scenario {settings.scenario!r}: {fault}; make the scenario larger, or the radius or margin smaller"
             )

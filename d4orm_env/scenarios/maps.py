@@ -14,6 +14,7 @@ import numpy as np
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
+from d4orm_env.core.yaml_text import is_yaml_path
 from d4orm_env.scenarios.free_space import FreeSpace, free_space
 from d4orm_env.scenarios.grid_map import MAX_CELLS, GridMap
 from d4orm_env.scenarios.layout import Layout, build
@@ -32,8 +33,10 @@ def load_map(path: PathLike, cell: float = 0.6) -> World:
 
     Args:
         path: A ``.map`` file in the format of the Moving AI Lab, whose lower left corner is at the origin: ``.``, ``G``
-            and ``S`` are free, ``@``, ``O``, ``T`` and ``W`` are blocked. Or the YAML file of ROS's map_server, with
-            its ``.png`` or ``.pgm`` image beside it: what is not known to be free is blocked.
+            ``S`` and ``E`` are free, ``@``, ``O``, ``T`` and ``W`` are blocked. Or the YAML file of ROS's map_server,
+            with its ``.png`` or ``.pgm`` image beside it: what is not known to be free is blocked, transparent pixels
+            too. Where its origin is so far out that float32 does not resolve the cells, as UTM coordinates are, the
+            world begins at zero and has the origin as its :attr:`~d4orm_env.World.origin`.
         cell: Side of a cell of a ``.map`` file [m]; a map_server file has a resolution of its own.
 
     Raises:
@@ -49,7 +52,7 @@ def read_map(path: PathLike, cell: float = 0.6) -> GridMap:
         raise ValueError(f"the path of a map must be text or a path, not {shown(path)}")
     file = Path(path)
     with _named(file):
-        if file.suffix in (".yaml", ".yml"):
+        if is_yaml_path(file):
             from d4orm_env.scenarios.occupancy_image import read_occupancy_image
 
             return read_occupancy_image(file)
@@ -85,7 +88,8 @@ def map(
         return populate(settings, grid.world, step, space.longest_way, remedy)
     starts, goals, travel = _listed_places(settings, grid, space, Path(scenario_file))
     world = with_obstacles(settings, grid.world, np.vstack([starts, goals]))
-    return build(settings, Layout(starts, goals, world, travel))
+    with _named(Path(scenario_file)):  # whose rows may start or end in one place
+        return build(settings, Layout(starts, goals, world, travel))
 
 
 def _listed_places(settings: Settings, grid: GridMap, space: FreeSpace, path: Path) -> tuple[Points, Points, float]:

@@ -1,4 +1,7 @@
-"""Maps and scenarios in the formats of the Moving AI Lab, https://movingai.com/benchmarks/formats.html."""
+"""Maps and scenarios in the formats of the Moving AI Lab, https://movingai.com/benchmarks/formats.html.
+
+The League of Robot Runners has maps of its own in that format, with emitter and service points, both free.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,10 @@ import numpy as np
 
 from d4orm_env.scenarios.grid_map import MAX_CELLS, GridMap
 
-PASSABLE, BLOCKED = b".GS", b"@OTW"
-"""Ground and swamp; out of bounds, trees and water."""
+PASSABLE, BLOCKED = b".GSE", b"@OTW"
+"""Ground, swamp or service points, emitters; out of bounds, trees and water."""
+BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+"""What some editors put before UTF-8 text."""
 
 
 def parse_map(content: bytes, cell: float) -> GridMap:
@@ -23,7 +28,7 @@ def parse_map(content: bytes, cell: float) -> GridMap:
     Raises:
         ValueError: If it is none; one line without the file's name.
     """
-    lines = content.splitlines()
+    lines = content.removeprefix(BYTE_ORDER_MARK).splitlines()
     height, width = _size(lines)
     rows = [row.rstrip() for row in lines[4:]]
     while rows and not rows[-1]:
@@ -49,7 +54,7 @@ def _size(lines: list[bytes]) -> tuple[int, int]:
     """Rows and columns that the first lines of a map tell."""
     header: dict[bytes, bytes] = {}
     while len(header) < len(lines) and lines[len(header)].strip() != b"map":
-        name, _, value = lines[len(header)].partition(b" ")
+        name, value = (*lines[len(header)].split(None, 1), b"", b"")[:2]
         if name not in (b"type", b"height", b"width") or name in header:
             break
         header[name] = value.strip()
@@ -83,7 +88,8 @@ def parse_scenario(content: bytes, shape: tuple[int, int], count: int) -> list[T
     Raises:
         ValueError: If it is no such file, is of another map, or has fewer rows; one line without the file's name.
     """
-    lines = content.decode("latin-1").splitlines()
+    # Split as bytes: of text more would end a line, such as the ellipsis of a map's name.
+    lines = [line.decode("latin-1") for line in content.removeprefix(BYTE_ORDER_MARK).splitlines()]
     if not lines or lines[0].split()[:1] != ["version"]:
         raise ValueError("is not a Moving AI scenario; it must begin with a line 'version 1'")
     tasks: list[Task] = []

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import io
+import math
 import warnings
 from functools import lru_cache
 from pathlib import Path
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
-from d4orm_env.core.arrays import positive_number
+from d4orm_env.core.arrays import LARGEST, SMALLEST, Floats, positive_number, shown
 from d4orm_env.core.yaml_text import read_yaml
 from d4orm_env.scenarios.free_space import Mask
-from d4orm_env.scenarios.grid_map import MAX_CELLS, GridMap
+from d4orm_env.scenarios.grid_map import MAX_CELLS, GridMap, float32_resolves
+
+Mode: TypeAlias = Literal["trinary", "scale", "raw"]
+
+LEAST_TURN = 0.01
+"""Share of a cell by which a yaw may move a corner of a map and still count as none."""
 
 
 def read_occupancy_image(path: Path) -> GridMap:
@@ -30,27 +37,53 @@ def read_occupancy_image(path: Path) -> GridMap:
         raise ValueError(f"has no field {missing[0]!r}; a map_server file needs image, resolution and origin")
     image, negate = fields["image"], fields.get("negate", 0)
     if not isinstance(image, str) or not image:
-        raise ValueError(f"image is {image!r}; it must be the path of a .png or .pgm file")
+        raise ValueError(f"image is {shown(image)}; it must be the path of a .png or .pgm file")
     if not isinstance(negate, bool | int) or negate not in (0, 1):
-        raise ValueError(f"negate is {negate!r}; it must be 0 or 1")
-    if fields.get("mode", "trinary") not in ("trinary", "scale"):
-        raise ValueError(f"mode is {fields['mode']!r}; only trinary and scale can be read")
-    resolution = positive_number(fields["resolution"], "resolution")
+        raise ValueError(f"negate is {shown(negate)}; it must be 0 or 1")
+    mode = _mode(fields.get("mode", "trinary"))
+    if mode == "raw" and negate:
+        raise ValueError("negate is 1 and mode is raw, which map_server and nav2 read differently; save it with 0")
+    resolution = positive_number(fields["resolution"], "resolution", least=SMALLEST, most=LARGEST)
     free = _share(fields.get("free_thresh", 0.196), "free_thresh")
     occupied = _share(fields.get("occupied_thresh", 0.65), "occupied_thresh")
     if free > occupied:
         raise ValueError(f"free_thresh is {free:g}; it must be at most occupied_thresh, which is {occupied:g}")
     low = _corner(fields["origin"])
-    blocked = _blocked_cells((path.parent / image).read_bytes(), bool(negate), free)
+    blocked = ~(_occupancy((path.parent / image).read_bytes(), mode, bool(negate)) < free)
+    _require_no_turn(fields["origin"], blocked.shape)
     return _grid_map(blocked.tobytes(), blocked.shape, resolution, low)
 
 
 @lru_cache(maxsize=4)
 def _grid_map(blocked: bytes, shape: tuple[int, int], resolution: float, low: tuple[float, float]) -> GridMap:
-    return GridMap(np.frombuffer(blocked, np.bool_).reshape(shape), resolution, low)
+    cells: Mask = np.frombuffer(blocked, np.bool_).reshape(shape)
+    far = max(max(abs(low[axis]), abs(low[axis] + resolution * shape[1 - axis])) for axis in (0, 1))
+    if float32_resolves(far, resolution):
+        return GridMap(cells, resolution, low)
+    return GridMap(cells, resolution, origin=low)
 
 
-def _blocked_cells(content: bytes, negate: bool, free_thresh: float) -> Mask:
+def _occupancy(content: bytes, mode: Mode, negate: bool) -> Floats:
+    """How occupied each cell is, from 0 to 1, and infinite where that is unknown, ``(rows, columns)``.
+
+    Colours and ``negate`` count as in map_server and nav2 (loadMapFromFile), and alpha so that it never makes a cell
+    free. Trinary: averaged in with the colours, as they do, but for an opaque pixel, which is as in an image without
+    alpha, and one of no opacity, which is unknown even if negated. Scale: what is not opaque is unknown, as in nav2;
+    and so in raw, where neither looks. Raw: the brightness from 0 to 100 is the occupancy in per cent, and unknown
+    above.
+    """
+    shade, alpha = _pixels(content)
+    if mode == "raw":
+        value = np.round(shade * 255)
+        return np.where((alpha == 1) & (value <= 100), value / 100, np.inf)
+    occupancy = shade if negate else 1 - shade
+    if mode == "scale":
+        return np.where(alpha == 1, occupancy, np.inf)
+    return np.where(alpha > 0, np.maximum(occupancy, (3 * occupancy + 1 - alpha) / 4), np.inf)
+
+
+def _pixels(content: bytes) -> tuple[Floats, Floats]:
+    """Brightness and opacity of each pixel, from 0 to 1, ``(rows, columns)`` each."""
     from PIL import Image, UnidentifiedImageError
 
     try:
@@ -60,30 +93,60 @@ def _blocked_cells(content: bytes, negate: bool, free_thresh: float) -> Mask:
                 columns, rows = image.size
                 if columns * rows > MAX_CELLS:
                     raise ValueError(f"its image has {rows} x {columns} cells; at most {MAX_CELLS} are read")
-                deep = image.mode.startswith("I")
-                shades = np.asarray(image if deep else image.convert("RGB"), np.float64)
+                key = image.info.get("transparency")
+                if image.mode.startswith("I"):  # 16 bits deep, where at most one shade is transparent
+                    deep = np.asarray(image)
+                    return deep / 65535, np.where(deep == key, 0.0, 1.0)
+                if key is None and not image.mode.upper().endswith("A"):
+                    return _brightness(np.asarray(image.convert("RGB"))), np.ones((rows, columns))
+                pixels = np.asarray(image.convert("RGBA"))
     except (Image.DecompressionBombWarning, Image.DecompressionBombError):
         raise ValueError(f"its image is too large; at most {MAX_CELLS} cells are read") from None
     except UnidentifiedImageError:
         raise ValueError("its image is no image that can be read; save it as .png or .pgm") from None
     except (OSError, SyntaxError) as error:
         raise ValueError(f"its image is broken ({error}); save it again") from None
-    share = shades / 65535 if deep else shades.mean(axis=-1) / 255
-    occupancy = share if negate else 1 - share
-    blocked: Mask = ~(occupancy < free_thresh)
-    return blocked
+    return _brightness(pixels[..., :3]), pixels[..., 3] / 255
+
+
+def _brightness(colours: np.ndarray) -> Floats:
+    shade: Floats = colours.sum(axis=-1, dtype=np.uint16) / 3 / 255
+    return shade
+
+
+def _mode(value: object) -> Mode:
+    """As nav2 reads it: in letters of either case."""
+    for mode in get_args(Mode):
+        if isinstance(value, str) and value.lower() == mode:
+            return mode  # type: ignore[no-any-return] # of its own values
+    raise ValueError(f"mode is {shown(value)}; it must be one of {', '.join(get_args(Mode))}")
 
 
 def _share(value: object, name: str) -> float:
     return positive_number(value, name, zero_allowed=True, most=1.0)
 
 
+def _numbers(origin: object) -> list[float]:
+    """x, y and yaw.
+
+    Some saved maps have ``-nan`` as their yaw, where a mapper sent no valid orientation. Nothing in ROS's navigation
+    uses a yaw, and its maintainers advise to write zero there (ros-planning/navigation, issue 993): it is read as zero.
+    """
+    numbers = origin if isinstance(origin, list) and len(origin) == 3 else [None]
+    if str(numbers[-1]).lower().lstrip("+-.") == "nan":
+        numbers = [*numbers[:2], 0.0]
+    if not all(isinstance(value, int | float) and math.isfinite(value) for value in numbers):
+        raise ValueError(f"origin is {shown(origin)}; it must be three numbers, x, y and yaw")
+    return [float(value) for value in numbers]
+
+
 def _corner(origin: object) -> tuple[float, float]:
-    numbers = origin if isinstance(origin, list) and all(isinstance(value, int | float) for value in origin) else []
-    if len(numbers) != 3 or not np.isfinite(numbers).all():
-        raise ValueError(f"origin is {origin!r}; it must be three numbers, x, y and yaw")
-    if numbers[2] != 0:
-        raise ValueError(
-            f"origin has a yaw of {numbers[2]:g} rad; only maps with a yaw of 0 can be read, so turn the image"
-        )
-    return float(numbers[0]), float(numbers[1])
+    x, y, _ = _numbers(origin)
+    return x, y
+
+
+def _require_no_turn(origin: object, shape: tuple[int, ...]) -> None:
+    """Refuse a yaw that moves a cell of a map of that many rows and columns."""
+    yaw = _numbers(origin)[2]
+    if abs(math.remainder(yaw, math.tau)) * math.hypot(*shape) > LEAST_TURN:
+        raise ValueError(f"origin has a yaw of {yaw:g} rad; only maps with a yaw of 0 can be read, so turn the image")

@@ -62,8 +62,8 @@ def scenario_text(problem: Problem) -> str:
         elif isinstance(value, dict):
             lines += [f"{key}:" if value else f"{key}: {{}}"]
             for part, entries in value.items():
-                if part == "bounds":
-                    lines += [f"  bounds: {_flow(entries)}"]
+                if part in ("bounds", "origin"):
+                    lines += [f"  {part}: {_flow(entries)}"]
                 else:
                     lines += [f"  {part}:", *(f"    - {_flow(entry)}" for entry in entries)]
         else:

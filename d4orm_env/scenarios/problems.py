@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TypeAlias, TypeGuard
 
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.yaml_text import is_yaml_path
 from d4orm_env.scenarios.scenario import Scenario, complain
-from d4orm_env.scenarios.scenario_registry import FILE_SUFFIXES, SCENARIOS
+from d4orm_env.scenarios.scenario_registry import SCENARIOS
 
 ScenarioLike: TypeAlias = str | os.PathLike[str] | Callable[..., Problem] | Scenario
 """A name, a YAML file, a callable, or where one is, ``"package.module:function"`` or ``"folder/file.py:function"``."""
@@ -30,7 +31,7 @@ class _File:
 def is_scenario_file(scenario: object) -> TypeGuard[str | os.PathLike[str]]:
     """Whether what is given as a scenario is the path of a file."""
     if isinstance(scenario, str):
-        return Path(scenario).suffix in FILE_SUFFIXES
+        return is_yaml_path(scenario)
     return isinstance(scenario, os.PathLike)
 
 

@@ -8,10 +8,9 @@ from functools import partial
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.registry import Registry
+from d4orm_env.core.yaml_text import is_yaml_path
 from d4orm_env.scenarios import corridors, forest, generators, maps, maze, mmd_maps, paper, rooms, warehouse
 from d4orm_env.scenarios.scenario import BuiltIn, Scenario
-
-FILE_SUFFIXES = (".yaml", ".yml")
 
 SCENARIOS = Registry(
     "scenario", "d4orm.scenarios", lambda name, generator: Scenario(name.rpartition(":")[2], generator)
@@ -31,7 +30,7 @@ def register_scenario(name: str, generator: Callable[..., Problem]) -> None:
     Raises:
         ValueError: If the name is taken or no name, or the generator cannot be called like that.
     """
-    if isinstance(name, str) and name.endswith(FILE_SUFFIXES):
+    if isinstance(name, str) and is_yaml_path(name):
         raise ValueError(f"scenario name {shown(name)} is that of a file; give one that does not end in .yaml")
     SCENARIOS.add(name, generator)
 

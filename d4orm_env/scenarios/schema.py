@@ -136,6 +136,7 @@ class WorldEntry(Entry):
     """Obstacles and bounds; an open world without bounds."""
 
     bounds: BoxEntry | None = None
+    origin: Place | None = None
     circles: list[RoundEntry] = []
     spheres: list[SphereEntry] = []
     cylinders: list[RoundEntry] = []
@@ -148,7 +149,7 @@ class WorldEntry(Entry):
         }
         lower, upper = (self.bounds.lower, self.bounds.upper) if self.bounds else (None, None)
         polygons = [entry.corners for entry in self.polygons]
-        return World(dimension, **rows, polygons=polygons, lower=lower, upper=upper)
+        return World(dimension, **rows, polygons=polygons, lower=lower, upper=upper, origin=self.origin)
 
 
 class ProblemFile(Entry):
@@ -307,6 +308,8 @@ def _describe_world(problem: Problem) -> dict[str, object]:
     if world.lower is not None:
         lower, upper = map(_decimals, world.bounds)
         content["bounds"] = {"lower": lower, "upper": upper}
+    if world.origin.any():
+        content["origin"] = world.origin.tolist()
     for kind in ("circles", "spheres", "cylinders"):
         rows = [_decimals(row) for row in getattr(world, kind)]
         content[kind] = [{"center": row[:-1], "radius": row[-1]} for row in rows]

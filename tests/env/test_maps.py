@@ -14,7 +14,7 @@ from PIL import Image
 from scenario_support import MAP
 
 from d4orm_env import load_map, make_problem
-from d4orm_env.scenarios import load_problem
+from d4orm_env.scenarios import load_problem, save_problem
 from d4orm_env.scenarios.grid_map import GridMap, merge_cells
 
 BLOCKED = arrays(bool, array_shapes(min_dims=2, max_dims=2, max_side=12))
@@ -63,7 +63,7 @@ def test_few_boxes() -> None:
     assert len(merge_cells(stripes)) == len(merge_cells(stripes.T)) == 20
 
 
-@pytest.mark.parametrize(("free", "closed"), [(".", "@"), ("G", "O"), ("S", "T"), (".", "W")])
+@pytest.mark.parametrize(("free", "closed"), [(".", "@"), ("G", "O"), ("S", "T"), (".", "W"), ("E", "@")])
 def test_moving_ai_characters(tmp_path: Path, free: str, closed: str) -> None:
     path = written(tmp_path, text_of([[1, 0, 0], [0, 0, 0]], free, closed))
     world = load_map(path, cell=2.0)
@@ -75,8 +75,9 @@ def test_line_ends_and_the_order_of_the_header_do_not_matter(tmp_path: Path) -> 
     plain = text_of([[1, 0], [0, 0]])
     first = load_map(written(tmp_path, plain))
     dos = load_map(written(tmp_path, plain.replace("\n", "\r\n"), "dos.map"))
-    other = load_map(written(tmp_path, "width 2\nheight 2\ntype tile\nmap\n@.\n..\n\n\n", "other.map"))
-    for world in (dos, other):
+    other = load_map(written(tmp_path, "width 2\nheight\t2\ntype tile\nmap\n@.\n..\n\n\n", "other.map"))
+    marked = load_map(written(tmp_path, b"\xef\xbb\xbf" + plain.encode(), "marked.map"))
+    for world in (dos, other, marked):
         assert world.boxes.tolist() == first.boxes.tolist()
 
 
@@ -100,9 +101,10 @@ def test_a_free_cell_is_a_world(tmp_path: Path) -> None:
         ("type octile\nheight 99999\nwidth 99999\nmap\n", "has 99999 x 99999 cells; at most 16777216 are read"),
         ("type octile\nheight 3\nwidth 2\nmap\n..\n..\n", "has 2 rows of cells where its height is 3"),
         ("type octile\nheight 2\nwidth 2\nmap\n..\n...\n", "has 3 cells in line 6 where its width is 2"),
-        ("type octile\nheight 2\nwidth 2\nmap\n..\n.x\n", "has 'x' in line 6, column 2; cells are . G S \\(free\\)"),
+        ("type octile\nheight 2\nwidth 2\nmap\n..\n.x\n", "has 'x' in line 6, column 2; cells are . G S E \\(free\\)"),
         (text_of([[1]]), "has no free cell"),
         (text_of([[1, 1], [1, 1]]), "has no free cell; open some"),
+        (text_of([[0] * 200_000]), r"has 1 x 200000 cells of 0.6 m \(resolution or cell\)"),
     ],
 )
 def test_bad_maps_are_refused_in_one_line(tmp_path: Path, content: str | bytes, message: str) -> None:
@@ -134,6 +136,17 @@ def test_a_million_cells(tmp_path: Path) -> None:
 
 
 SHADES = np.array([[0, 205, 254], [254, 254, 254]], np.uint8)
+KEYED = np.array([[250, 254]], np.uint8)
+TRANSPARENT: dict[str, tuple[Image.Image, Any]] = {
+    "LA": (Image.fromarray(np.array([[[255, 0], [255, 255]]], np.uint8)), None),
+    "RGBA": (Image.fromarray(np.array([[[255, 255, 255, 0], [255, 255, 255, 255]]], np.uint8)), None),
+    "shade": (Image.fromarray(KEYED), 250),
+    "deep shade": (Image.fromarray(KEYED.astype(np.uint16) * 257), 250 * 257),
+    "colour": (Image.fromarray(np.repeat(KEYED[..., None], 3, axis=2)), (250, 250, 250)),
+    "palette": (Image.fromarray(KEYED).convert("P"), 250),
+    "palette with a table": (Image.fromarray(KEYED).convert("P"), bytes([255] * 250 + [0, 255, 255, 255, 255, 255])),
+}
+"""Images of two pixels of the colour of free ground, the left one transparent, and the PNG chunk that says so."""
 FIELDS = "image: {}\nresolution: 0.5\norigin: [-1, 2, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
 
 
@@ -161,10 +174,19 @@ class TestOccupancyImage:
             (("origin: [-1, 2, 0]", "origin: [-1, 2, 0.3]"), "has a yaw of 0.3 rad; only maps with a yaw of 0"),
             (("origin: [-1, 2, 0]", "origin: [-1, 2]"), "it must be three numbers, x, y and yaw"),
             (("origin: [-1, 2, 0]", ""), "has no field 'origin'"),
+            (("origin: [-1, 2, 0]", "origin: [-1, -nan, 0]"), "it must be three numbers, x, y and yaw"),
+            (
+                ("origin: [-1, 2, 0]", "origin: [-1, 2e9, 0]"),
+                r"origin\[1\] is 2e\+09; magnitudes must be at most 1e\+09",
+            ),
+            (("resolution: 0.5", "resolution: 0.00000001"), "resolution is 1e-08; it must be at least 1e-07"),
+            (("resolution: 0.5", "resolution: 20000"), "has 80 x 120 cells of 20000 m"),
             (("resolution: 0.5", "resolution: 0"), "resolution is 0"),
             (("resolution: 0.5", "resolution: fine"), "resolution must be a number"),
             (("negate: 0", "negate: 2"), "negate is 2; it must be 0 or 1"),
-            (("negate: 0", "mode: raw"), "mode is 'raw'; only trinary and scale"),
+            (("negate: 0", "mode: rough"), "mode is 'rough'; it must be one of trinary, scale, raw"),
+            (("negate: 0", "mode: 3"), "mode is 3; it must be one of trinary, scale, raw"),
+            (("negate: 0", "negate: 1\nmode: raw"), "negate is 1 and mode is raw"),
             (("free_thresh: 0.196", "free_thresh: 0.9"), "free_thresh is 0.9; it must be at most occupied_thresh"),
             (("free_thresh: 0.196", "free_thresh: 0"), "has no free cell"),
             (("image: map.png", "image: 3"), "image is 3; it must be the path"),
@@ -182,6 +204,71 @@ class TestOccupancyImage:
             load_map(path)
         assert "\n" not in str(error.value)
         assert str(tmp_path) in str(error.value)
+
+    @pytest.mark.parametrize("mode", ["trinary", "scale"])
+    @pytest.mark.parametrize("kind", TRANSPARENT)
+    def test_transparent_pixels_are_blocked(self, tmp_path: Path, kind: str, mode: str) -> None:
+        image, key = TRANSPARENT[kind]
+        image.save(tmp_path / "map.png", transparency=key)
+        fields = FIELDS.format("map.png") + f"mode: {mode}\n"
+        assert load_map(written(tmp_path, fields, "map.yaml")).boxes.tolist() == [[-1, 2, -0.5, 2.5]]
+
+    def test_transparency_frees_nothing(self, tmp_path: Path) -> None:
+        Image.fromarray(np.array([[[0, 0], [0, 255]]], np.uint8)).save(tmp_path / "map.png")  # LA
+        for mode in ("trinary", "scale"):  # black is free, and transparent black is not
+            fields = FIELDS.format("map.png").replace("negate: 0", f"negate: 1\nmode: {mode}")
+            assert load_map(written(tmp_path, fields, "map.yaml")).boxes.tolist() == [[-1, 2, -0.5, 2.5]]
+        Image.new("1", (2, 2), 1).save(tmp_path / "map.png", transparency=255)
+        with pytest.raises(ValueError, match="has no free cell"):
+            load_map(written(tmp_path, FIELDS.format("map.png"), "map.yaml"))
+
+    @pytest.mark.parametrize(
+        ("mode", "shades", "free"),
+        [
+            # As map_server: (3 * shade + alpha) / 4 of 255 leaves less than 0.196 to one.
+            ("trinary", [(255, 55), (255, 56), (220, 160), (220, 161)], [0, 1, 0, 1]),
+            # An unknown grey stays unknown in an image that has an alpha channel.
+            ("trinary", [(205, 255), (206, 255), (254, 255), (255, 0)], [0, 1, 1, 0]),
+            ("scale", [(255, 254), (255, 255), (205, 255), (0, 255)], [0, 1, 0, 0]),
+            ("raw", [(0, 255), (19, 255), (20, 255), (255, 255)], [1, 1, 0, 0]),
+            ("raw", [(0, 254), (0, 0), (100, 255), (1, 255)], [0, 0, 0, 1]),
+        ],
+    )
+    def test_each_mode_reads_alpha_as_map_server_does(
+        self, tmp_path: Path, mode: str, shades: list[tuple[int, int]], free: list[int]
+    ) -> None:
+        Image.fromarray(np.array([shades], np.uint8)).save(tmp_path / "map.png")
+        world = load_map(written(tmp_path, FIELDS.format("map.png") + f"mode: {mode}\n", "map.yaml"))
+        centres = [[-1 + 0.5 * column + 0.25, 2.25] for column in range(4)]
+        assert (world.clearance(centres) > 0).tolist() == [bool(value) for value in free]
+
+    @pytest.mark.parametrize("name", ["map.YAML", "map.Yml", "map.yaml"])
+    @pytest.mark.parametrize("mode", ["Trinary", "SCALE", "trinary"])
+    def test_names_in_letters_of_either_case(self, tmp_path: Path, name: str, mode: str) -> None:
+        Image.fromarray(SHADES).save(tmp_path / "map.png")
+        path = written(tmp_path, FIELDS.format("map.png") + f"mode: {mode}\n", name)
+        assert load_map(path).boxes.tolist() == [[-1, 2.5, 0, 3]]
+
+    @pytest.mark.parametrize("yaw", ["1e-9", "-1e-9", "6.283185307", "0.0", "-nan", "nan", ".nan", "-.NaN"])
+    def test_a_yaw_that_turns_nothing_is_none(self, tmp_path: Path, yaw: str) -> None:
+        Image.fromarray(SHADES).save(tmp_path / "map.png")
+        path = written(tmp_path, FIELDS.format("map.png").replace("2, 0]", f"2, {yaw}]"), "map.yaml")
+        assert load_map(path).boxes.tolist() == [[-1, 2.5, 0, 3]]
+
+    def test_an_origin_far_out_is_kept_beside_the_world(self, tmp_path: Path) -> None:
+        Image.fromarray(np.pad(np.full((30, 40), 254, np.uint8), 1)).save(tmp_path / "map.png")
+        fields = FIELDS.format("map.png").replace("0.5", "0.1").replace("[-1, 2, 0]", "[500000.25, 5410000.125, 0]")
+        path = written(tmp_path, fields, "map.yaml")
+        near = load_map(written(tmp_path, fields.replace("[500000.25, 5410000.125, 0]", "[0, 0, 0]"), "near.yaml"))
+        assert load_map(path).origin.tolist() == [500000.25, 5410000.125]
+        assert near.origin.tolist() == [0, 0]
+        np.testing.assert_array_equal(load_map(path).boxes, near.boxes)
+        problem = make_problem("map", 2, map=path)
+        assert problem.origin.tolist() == [500000.25, 5410000.125]
+        assert problem != make_problem("map", 2, map=tmp_path / "near.yaml")
+        save_problem(problem, tmp_path / "saved.yaml")
+        assert load_problem(tmp_path / "saved.yaml") == problem
+        assert load_problem(tmp_path / "saved.yaml").origin.tolist() == [500000.25, 5410000.125]
 
     def test_other_yaml_is_refused(self, tmp_path: Path) -> None:
         for content in ("- 1\n", "hello\n", "version: 1\nscenario: circle\n"):
@@ -284,6 +371,10 @@ class TestMovingAiScenario:
             ("version 1\n" + ROW.format(0, 0, -1, 0), "which is not on the map"),
             ("version 1\n" + ROW.format(0, 0, "x", 0), "has a line 2 that is not bucket, map, width, height"),
             ("version 1\n1 2 3\n", "has a line 2 that is not bucket"),
+            (
+                "version 1\n" + ROW.format(0, 0, 1, 0) + ROW.format(0, 0, 2, 0),
+                "starts of robot_0 .* and robot_1 .* overlap",
+            ),
             ("version 1\n" + ROW.format(0, 0, 1, 0).replace("3.5", "nan"), "gives a length of nan in line 2"),
             (
                 "version 1\n" + ROW.format(0, 0, 1, 0).replace("\t4\t3", "\t8\t3"),
@@ -294,7 +385,7 @@ class TestMovingAiScenario:
     def test_bad_files_are_refused_in_one_line(self, tmp_path: Path, grid: Path, content: str, message: str) -> None:
         path = written(tmp_path, content, "grid.scen")
         with pytest.raises(ValueError, match=message) as error:
-            make_problem("map", 1, map=grid, scenario_file=path)
+            make_problem("map", max(content.count("grid.map"), 1), map=grid, scenario_file=path)
         assert str(error.value).startswith(f"{path}: ")
         assert "\n" not in str(error.value)
 

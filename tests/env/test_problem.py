@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import pickle
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.rollout import rollout
+from d4orm_env.scenarios import load_problem, save_problem
 
 NAN, INF = float("nan"), float("inf")
 
@@ -239,8 +241,25 @@ def test_what_is_under_way_is_not_checked() -> None:
     assert (coarse.dt, coarse.horizon) == (2.0, 5)
 
 
-def test_the_margin_may_be_violated_at_the_start() -> None:
-    assert two_robots(margin=5.0).margin == 5.0
+def test_within_the_margin_is_said_but_not_refused(tmp_path: Path) -> None:
+    with pytest.warns(
+        UserWarning,
+        match=r"the start of robot_1 is 0.864 m from an obstacle or the bounds, and the margin is 5 m; move it",
+    ):
+        problem = two_robots(margin=5.0)
+    save_problem(problem, tmp_path / "near.yaml")
+    with pytest.warns(UserWarning, match=r"problem 'custom': the goal of robot_1 is 0.864 m from an obstacle"):
+        assert load_problem(tmp_path / "near.yaml") == problem
+    near = [[0, 0], [0.54, 0]]
+    with pytest.warns(UserWarning, match=r"the goal of robot_1 is 0.04 m from robot_0, and the margin is 0.05 m"):
+        two_robots(goal=near)
+    with pytest.warns(UserWarning, match=r"the goal of robot_0 is 0.0\d+ m from an obstacle or the bounds"):
+        two_robots(goal=[[0, 0], [1, 0]], world=World(circles=[[0, 0.42, 0.2]]))
+
+
+def test_what_keeps_the_margin_warns_of_nothing(recwarn: pytest.WarningsRecorder) -> None:
+    two_robots(goal=[[0, 0], [0.56, 0]])
+    assert not recwarn.list
 
 
 def test_a_start_speed_at_the_limit_is_allowed() -> None:
@@ -401,7 +420,7 @@ def test_copies_are_equal_and_as_read_only_as_the_original(duplicate: Any) -> No
     problem = two_robots()
     assert problem.arrays is problem.arrays
     twin = duplicate(problem)
-    assert len(all_arrays(twin)) == 12
+    assert len(all_arrays(twin)) == 13
     for array in all_arrays(twin):
         with pytest.raises(ValueError, match="read-only"):
             array[...] = 0

@@ -15,9 +15,10 @@ import yaml
 from fuzzing import PLAIN, SCALAR, all_finite, damaged, few, refused, spoiled
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 from planner_support import hop_problem
 
-from d4orm_env import load_problem, verify
+from d4orm_env import load_map, load_problem, make_problem, verify
 from d4orm_env.core.problem import Problem
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.cli.node_file import load_node
@@ -41,6 +42,12 @@ NODE = {
     "node": 0, "nodes": 2, "problem": {"scenario": "circle", "num_robots": 2}, "time_limit": 5, "out": "plan.npz",
     "seed": 3, "settings": {"num_samples": 64}, "zenoh": {"listen": ["tcp/127.0.0.1:0"]},
 }  # fmt: skip
+MAP = {
+    "image": "map.png", "resolution": 0.5, "origin": [-1, 2, 0], "negate": 0, "mode": "trinary",
+    "occupied_thresh": 0.65, "free_thresh": 0.196,
+}  # fmt: skip
+GRID = b"type octile\nheight 3\nwidth 4\nmap\n....\n.@ES\nG..T\n"
+ROWS = b"version 1\n0\tgrid.map\t4\t3\t0\t0\t3\t0\t3.5\n1\tgrid.map\t4\t3\t0\t2\t3\t1\t4\n"
 LONG = 1_000
 
 
@@ -72,6 +79,34 @@ def test_bytes_that_may_be_a_scenario_file_likewise(tmp_path: Path, content: byt
     path = tmp_path / "scenario.yaml"
     path.write_bytes(content)
     problem, _ = refused(lambda: load_problem(path), path.name)
+    if problem is not None:
+        check_problem(problem)
+
+
+@few(60)
+@given(document=spoiled(MAP), kind=st.sampled_from(["L", "LA", "RGB", "RGBA"]), seed=st.integers(0, 2**32 - 1))
+def test_a_map_server_file_makes_a_world_or_is_refused(tmp_path: Path, document: Any, kind: str, seed: int) -> None:
+    pixels = np.random.default_rng(seed).choice(np.array([0, 205, 254, 255], np.uint8), (4, 5, len(kind)))
+    Image.fromarray(pixels[..., 0] if kind == "L" else pixels).save(tmp_path / "map.png")
+    path = tmp_path / "map.yaml"
+    path.write_text(yaml.safe_dump(document, allow_unicode=True), encoding="utf-8")
+    world, _ = refused(lambda: load_map(path), str(tmp_path))
+    if world is not None:
+        rows, columns = np.nonzero(pixels[..., -1] == 0 if kind[-1] == "A" else np.zeros((4, 5), bool))
+        lower, upper = world.bounds.astype(np.float64)
+        transparent = lower + (upper - lower) * np.stack([(columns + 0.5) / 5, (3.5 - rows) / 4], axis=-1)
+        assert (world.clearance(transparent) < 0).all()
+
+
+@few(100)
+@given(grid=st.one_of(st.just(GRID), damaged(GRID)), rows=st.one_of(st.just(ROWS), damaged(ROWS)))
+def test_a_moving_ai_map_and_its_scenario_likewise(tmp_path: Path, grid: bytes, rows: bytes) -> None:
+    names = tmp_path / "grid.map", tmp_path / "grid.scen"
+    for path, content in zip(names, (grid, rows), strict=True):
+        path.write_bytes(content)
+    problem, _ = refused(
+        lambda: make_problem("map", 2, map=names[0], scenario_file=names[1]), "grid.", "scenario 'map'"
+    )
     if problem is not None:
         check_problem(problem)
 
