@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray, Floats
-from d4orm_env.core.simple_polygon import first_crossing
+from d4orm_env.geometry.simple_polygon import first_crossing
 
 MAX_CORNERS, MAX_ALL_CORNERS = 2_000, 30_000
 """Of one polygon, as of a way of OpenStreetMap, for cutting one into triangles may take quadratic time; and of all."""

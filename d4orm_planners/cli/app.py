@@ -28,6 +28,7 @@ from d4orm_planners.cli.reproduce import reproduce
 from d4orm_planners.cli.robustness_command import robustness
 from d4orm_planners.cli.run import run
 from d4orm_planners.cli.train import train
+from d4orm_planners.escaping import one_line
 
 # Typer carries its own copy of click, whose base class it does not export.
 ClickException: Any = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
@@ -135,7 +136,7 @@ def _message(error: Exception) -> str:
 
 
 def _complain(message: str) -> int:
-    line = " ".join(message.split())
+    line = one_line(" ".join(message.split()))
     sys.stderr.write(f"d4orm: {line}{os.linesep}")
     return 2
 

@@ -20,6 +20,7 @@ from d4orm_planners.cli.arguments import (
 )
 from d4orm_planners.cli.common_options import Physics, Quiet, ScenarioSettings, TimeLimit
 from d4orm_planners.cli.dataclass_options import takes
+from d4orm_planners.escaping import one_line
 
 if TYPE_CHECKING:
     from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup
@@ -148,7 +149,7 @@ def require_trials(rates: list[SuccessRate]) -> None:
     """Say so, and end with status 1, if every trial ended with an error."""
     if all(rate.errors == rate.trials for rate in rates):
         trials = sum(rate.trials for rate in rates)
-        typer.echo(f"every trial ({trials}) ended with an error; the first: {rates[0].error}", err=True)
+        typer.echo(f"every trial ({trials}) ended with an error; the first: {one_line(rates[0].error)}", err=True)
         raise typer.Exit(1)
 
 

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from d4orm_planners.escaping import one_line
+
 if TYPE_CHECKING:
     from d4orm_planners.base.episode import Episode
     from d4orm_planners.base.plan import Plan
@@ -46,10 +48,11 @@ def print_table(title: str, rows: list[tuple[str, str]]) -> None:
     """Rows without a header."""
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
-    table = Table(title=title, title_justify="left", show_header=False)
+    table = Table(title=Text(one_line(title)), title_justify="left", show_header=False)
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*(Text(one_line(cell)) for cell in row))
     Console().print(table)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 import webbrowser
 from dataclasses import dataclass
 from typing import Annotated
@@ -13,6 +14,9 @@ import typer
 from d4orm_planners.cli.arguments import names
 from d4orm_planners.cli.common_options import ProblemOptions
 from d4orm_planners.cli.dataclass_options import takes
+
+LAST_WAIT = 2.0
+"""Seconds from Ctrl-C to the end of the process."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +41,7 @@ def play(options: PlayOptions) -> None:
     except ImportError as error:
         raise ImportError('d4orm play needs viser; install it with pip install "d4orm-env[viz]"') from error
 
+    quieten_viser()
     typer.echo("getting ready; the first time this compiles for a while ...")
     policies = names(options.policy) or ()
     playground = Playground(options.problem(), *policies, seed=options.seed, host=options.host, port=options.port)
@@ -45,8 +50,21 @@ def play(options: PlayOptions) -> None:
         if options.open_browser and has_display():
             webbrowser.open(playground.address)
         playground.run()
+    except KeyboardInterrupt:
+        # Python waits for threads of planners, which may be in the middle of a plan.
+        watchdog = threading.Timer(LAST_WAIT, os._exit, (130,))
+        watchdog.daemon = True
+        watchdog.start()
+        raise
     finally:
         playground.close()
+
+
+def quieten_viser() -> None:
+    """Keep viser from printing, by rich, a line whenever anybody knocks with another version."""
+    import rich
+
+    rich.get_console().quiet = True
 
 
 def has_display() -> bool:

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeAlias
 
+from d4orm_planners.escaping import markdown_text
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_by, success_rates
 from d4orm_planners.evaluation.tables import deadline_table, errors, in_physics, panels, rate_table, share, table
@@ -130,12 +131,12 @@ def _deadlines(groups: Mapping[Key, Sequence[Trial]], deadlines: Sequence[float]
 def origin(trials: Sequence[Trial]) -> str:
     """Where the numbers come from: dates, machines and versions of at least one trial, under a heading."""
     dates = sorted(trial.date for trial in trials)
-    lines = ["## Where the numbers come from", "", f"- {len(trials)} trials, {dates[0][:10]} to {dates[-1][:10]}"]
+    lines = ["## Where the numbers come from", "", f"{len(trials)} trials, {dates[0][:10]} to {dates[-1][:10]}"]
     for machine in sorted({trial.machine for trial in trials}):
         if known := json.loads(machine):
             used, cores = known["cores_used"], known["cores"]
-            lines.append(f"- {known['processor']}, {used} of {cores} cores per trial, Python {known['python']}")
+            lines.append(f"{known['processor']}, {used} of {cores} cores per trial, Python {known['python']}")
     for versions in sorted({trial.versions for trial in trials}):
         if installed := json.loads(versions):
-            lines.append("- " + ", ".join(f"{name} {version}" for name, version in installed.items()))
-    return "\n".join(lines)
+            lines.append(", ".join(f"{name} {version}" for name, version in installed.items()))
+    return "\n".join([*lines[:2], *(f"- {markdown_text(line)}" for line in lines[2:])])

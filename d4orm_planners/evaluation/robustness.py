@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,7 +42,7 @@ def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate
         path.write_text(markdown(rates), encoding="utf-8")
     if any(rate.disturbance for rate in rates):
         return paths[:2]
-    with target(paths[2]) as path:
+    with _picture(paths[2]) as path:
         _draw_noise(path, rates)
     return paths
 
@@ -65,7 +66,7 @@ def write_disturbances(folder: str | os.PathLike[str], groups: Sequence[TrialGro
     with target(paths[0]) as path:
         path.write_text(_page(rates, stood, pairs), encoding="utf-8")
     write_csv(paths[1], [vars(one) for one in stood])
-    with target(paths[2]) as path:
+    with _picture(paths[2]) as path:
         _draw_map(path, rates)
     if pairs:
         paths.append(Path(folder, "pairs.csv"))
@@ -73,9 +74,18 @@ def write_disturbances(folder: str | os.PathLike[str], groups: Sequence[TrialGro
     for name in dict.fromkeys(one.disturbance for one in stood):
         file = re.sub(r"[^\w.-]", "_", name)
         paths.append(Path(folder, f"disturbance-{file}.png"))
-        with target(paths[-1]) as path:
+        with _picture(paths[-1]) as path:
             _draw_disturbance(path, name, [rate for rate in rates if rate.disturbance == name])
     return paths
+
+
+@contextmanager
+def _picture(path: Path) -> Iterator[Path]:
+    """A :func:`target` for a picture, in which no name is a formula."""
+    from matplotlib import rc_context
+
+    with target(path) as temporary, rc_context({"text.parse_math": False}):
+        yield temporary
 
 
 def _page(rates: Sequence[SuccessRate], stood: Sequence[Tolerance], pairs: Sequence[PairedPolicies]) -> str:

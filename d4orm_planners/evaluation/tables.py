@@ -10,6 +10,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from d4orm_env.core.files import replaced_when_done
+from d4orm_planners.escaping import markdown_text, one_line, spreadsheet_cell
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore, config_now
 from d4orm_planners.evaluation.summary import SuccessRate, SuccessWithin
 
@@ -47,7 +48,7 @@ def write_rates(path: Path, rates: Sequence[SuccessRate]) -> None:
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
-    """Write at least one row, all with the same columns, as CSV; what is ``None`` is empty.
+    """Write at least one row, all with the same columns, as CSV; what is ``None`` is empty, and no text a formula.
 
     Raises:
         OSError: If the file cannot be written.
@@ -55,7 +56,7 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
     with target(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows({name: spreadsheet_cell(value) for name, value in row.items()} for row in rows)
 
 
 def write_parquet(path: Path, trials: Sequence[Trial]) -> bool:
@@ -156,9 +157,9 @@ def _interval(mean: float | None, lower: float | None, upper: float | None, digi
 
 
 def table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table under a heading."""
-    lines = [f"### {title}", "", f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
-    return "\n".join(lines + [f"| {' | '.join(row)} |" for row in rows])
+    """A Markdown table of texts under a heading."""
+    head, *body = (f"| {' | '.join(map(markdown_text, row))} |" for row in (header, *rows))
+    return "\n".join([f"### {markdown_text(title)}", "", head, "|" + "---|" * len(header), *body])
 
 
 def share(rate: SuccessRate | SuccessWithin) -> str:
@@ -190,5 +191,7 @@ def in_physics(physics: str) -> str:
 
 def errors(found: Iterable[tuple[str, str]]) -> list[str]:
     """Labels with their errors, listed as the only block; no block where all errors are empty."""
-    lines = dict.fromkeys(f"- `{label}`: {error}" for label, error in found if error)
+    lines = dict.fromkeys(
+        f"- `{one_line(label).replace('`', chr(39))}`: {markdown_text(error)}" for label, error in found if error
+    )
     return ["\n".join(["### Errors", "", *lines])] if lines else []

@@ -45,7 +45,7 @@ def move_robot(problem: Problem, robot: int, place: ArrayLike) -> Problem:
 
 def check_robot(problem: Problem, robot: int) -> None:
     """Refuse a robot that somebody has taken away while it was dragged."""
-    if robot >= problem.num_robots:
+    if not 0 <= robot < problem.num_robots:
         raise ValueError(f"robot_{robot} is not there any more; take another")
 
 
@@ -118,7 +118,7 @@ def move_obstacle(problem: Problem, kind: str, index: int, shift: ArrayLike) -> 
     """
     by, d = np.asarray(shift, np.float32), problem.dimension
     shapes = [np.array(shape) for shape in getattr(problem.world, kind)]
-    if index >= len(shapes):
+    if not 0 <= index < len(shapes):
         raise ValueError("the obstacle is not there any more; take another")
     if kind == "boxes":
         shapes[index] = shapes[index] + np.tile(by, 2)

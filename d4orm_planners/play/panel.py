@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 import viser
 
+from d4orm_env.core.errors import describe
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.yaml_text import parse_yaml
-from d4orm_env.scenarios import list_scenarios, make_problem
+from d4orm_env.scenarios import list_scenarios
 from d4orm_env.scenarios.problem_files import scenario_text
+from d4orm_env.scenarios.scenario_registry import SCENARIOS
 from d4orm_env.scenarios.schema import parse
+from d4orm_planners.escaping import markdown_text
 from d4orm_planners.play import edits
 from d4orm_planners.play.scene_frame import Frame
 from d4orm_planners.play.session import Session
 from d4orm_planners.play.sliders import Dials
+from d4orm_planners.play.validation import LARGEST_UPLOAD
 from d4orm_planners.play.view import View
 
 POLICIES = {
@@ -35,7 +40,6 @@ POLICIES = {
 MODELS = ("scenario's own", "holonomic2d", "velocity2d", "differential_drive", "unicycle", "car", "holonomic3d")
 OWN_MODEL = MODELS[0]
 STATUS_EVERY = 0.2
-LARGEST_UPLOAD = 2_000_000
 PUSH = 0.8
 """Velocity that a push gives a robot [m/s]."""
 
@@ -52,6 +56,7 @@ class Panel:
     def __init__(self, server: viser.ViserServer, session: Session, view: View) -> None:
         self._gui, self._session, self._view = server.gui, session, view
         self._random = np.random.default_rng(0)
+        self._saving = threading.Lock()
         self._status_at = 0.0
         self._text, self._refused = "", 0
         self._status = self._gui.add_markdown("")
@@ -154,9 +159,10 @@ class Panel:
         seed = self._gui.add_number("Seed", 0, min=0, max=2**31 - 1, step=1)
 
         def load(_: object) -> None:
+            name, number, first = scenario.value, int(robots.value), int(seed.value)
             chosen = None if model.value == OWN_MODEL else model.value
-            make = partial(make_problem, scenario.value, int(robots.value), int(seed.value), model=chosen)
-            self._session.load(make, int(seed.value))
+            # By name only, as in scenario files: nothing that a page says is imported.
+            self._session.load(lambda: SCENARIOS.look_up(name).problem(number, first, model=chosen), first)
 
         self._gui.add_button("Begin").on_click(load)
 
@@ -177,15 +183,25 @@ class Panel:
         scene, replay = self._gui.add_button("Save scene"), self._gui.add_button("Save replay")
         load = self._gui.add_upload_button("Load scene", mime_type=".yaml,.yml")
 
-        def save_scene(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
-            _send(event.client, "scene.yaml", scenario_text(edits.at_rest(self._session.scene)))
-
-        def save_replay(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
-            _send(event.client, "replay.html", self._session.replay().html)
-
-        scene.on_click(save_scene)
-        replay.on_click(save_replay)
+        scene.on_click(self._saved("scene.yaml", lambda: scenario_text(edits.at_rest(self._session.scene))))
+        replay.on_click(self._saved("replay.html", lambda: self._session.replay().html))
         load.on_upload(lambda _: self._session.load(partial(read_scene, load.value.content)))
+
+    def _saved(self, name: str, text: Callable[[], str]) -> Callable[[viser.GuiEvent[viser.GuiButtonHandle]], None]:
+        """What sends a file to whoever asks for it: one at a time, as a long replay takes seconds to write."""
+
+        def save(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+            if not self._saving.acquire(blocking=False):
+                self._session.refuse(f"a file is being written; ask for {name} when that is done")
+                return
+            try:
+                _send(event.client, name, text())
+            except Exception as error:
+                self._session.refuse(f"{name} cannot be written: {describe(error)}")
+            finally:
+                self._saving.release()
+
+        return save
 
 
 THEME: dict[str, Any] = {"show_logo": False, "show_share_button": False, "control_width": "medium"}
@@ -202,7 +218,10 @@ def status_text(frames: Sequence[Frame]) -> str:
     first, status = frames[0], frames[0].status
     team = first.problem.num_robots
     who = ", ".join(frame.policy for frame in frames)
-    lines = [f"**{first.problem.name}, {team} robots, {plain(who)}: {status.state}**", f"time {status.time:.1f} s"]
+    lines = [
+        f"**{markdown_text(first.problem.name)}, {team} robots, {markdown_text(who)}: {status.state}**",
+        f"time {status.time:.1f} s",
+    ]
     for frame in frames:
         contacts = int(frame.collided.sum())
         touching = f", **{contacts} in contact**" if contacts else ""
@@ -215,17 +234,11 @@ def status_text(frames: Sequence[Frame]) -> str:
                 f"control loop {loop}, last replanning {planning}",
             ]
         else:
-            lines.append(
-                f"**{plain(frame.policy)}**: {arrived}, {100 * frame.closest:.1f} cm{touching}, {loop}, {planning}"
-            )
+            name = markdown_text(frame.policy)
+            lines.append(f"**{name}**: {arrived}, {100 * frame.closest:.1f} cm{touching}, {loop}, {planning}")
     if status.message:
-        lines.append(f"**{plain(status.message)}**")
+        lines.append(f"**{markdown_text(status.message)}**")
     return "  \n".join(lines)
-
-
-def plain(text: str) -> str:
-    """Text that Markdown reads as itself."""
-    return "".join(f"\\{letter}" if letter in "\\`*_{}[]()<>#+!|~" else letter for letter in text)
 
 
 def read_scene(content: bytes) -> Problem:
@@ -240,7 +253,16 @@ def read_scene(content: bytes) -> Problem:
         text = content.decode("utf-8")
     except UnicodeDecodeError:
         raise ValueError("the file is not UTF-8 text; load a scenario's YAML file") from None
-    problem = parse(parse_yaml(text))
-    if problem.num_robots > edits.MOST_ROBOTS:
-        raise ValueError(f"the scene has {problem.num_robots} robots; at most {edits.MOST_ROBOTS} can be played with")
+    data = parse_yaml(text)
+    _check_size(data if isinstance(data, dict) else {})
+    problem = parse(data)
+    _check_size({"num_robots": problem.num_robots, "num_obstacles": problem.world.num_obstacles})
     return problem
+
+
+def _check_size(scene: Mapping[str, object]) -> None:
+    """Refuse more than a page can show, before it is made where a file says so."""
+    for name, most in {"num_robots": edits.MOST_ROBOTS, "num_obstacles": edits.MOST_OBSTACLES}.items():
+        number = scene.get(name)
+        if isinstance(number, int) and number > most:
+            raise ValueError(f"the scene's {name} is {number}; at most {most} can be played with")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import logging
 import socket
 import threading
 import time
@@ -18,6 +19,8 @@ from d4orm_planners.play.session import Session
 from d4orm_planners.play.view import View
 
 FRAMES_PER_SECOND = 33
+LAST_WAIT = 1.5
+"""Seconds that closing takes at most, whatever is planned, and whoever does not hang up."""
 
 
 class _Server(viser.ViserServer):
@@ -54,7 +57,9 @@ class Playground:
                 host="127.0.0.1", port=chosen if local else _free_port("127.0.0.1", 0), verbose=False
             )
         self._gate = None if local else Gate(host, chosen, self._server.get_port())
-        Admission(self._server, None if self._gate is None else self._gate.token)
+        # Otherwise Python prints every request that cannot be read, which anybody can make.
+        logging.getLogger("websockets").addHandler(logging.NullHandler())
+        Admission(self._server, None if self._gate is None else self._gate.token, self.session.refuse)
         if self._gate is None:
             self.address = f"http://127.0.0.1:{self._server.get_port()}/"
         else:
@@ -100,11 +105,14 @@ class Playground:
         self._panel.update()
 
     def close(self) -> None:
-        """Leave no thread and no port."""
-        self.session.close()
-        if self._gate is not None:
-            self._gate.close()
-        self._server.stop()
+        """Leave no thread and no port, but for what does not end in :data:`LAST_WAIT`, which the process's end ends."""
+        ends = [self.session.close, self._server.stop, *([] if self._gate is None else [self._gate.close])]
+        ending = [threading.Thread(target=end, daemon=True) for end in ends]
+        deadline = time.perf_counter() + LAST_WAIT
+        for thread in ending:
+            thread.start()
+        for thread in ending:
+            thread.join(max(deadline - time.perf_counter(), 0))
 
 
 def _free_port(host: str, port: int) -> int:

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import asyncio
 import hmac
+import logging
 import secrets
 import socket
 import threading
-from http.cookies import CookieError, SimpleCookie
+from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 GATE_HEADER = "X-D4orm-Gate"
 """What the gate writes its token into, so that what is behind it can tell who has come through the gate."""
 
+logger = logging.getLogger(__name__)
+
 _HEAD = 16_384
 _PATIENCE = 10.0
+_MOST_WAITING = 100
+"""Connections that have not shown the token yet; who comes while so many wait is hung up on."""
 
 
 class Gate:
@@ -41,7 +46,9 @@ class Gate:
         self._target = target
         self._socket = socket.create_server((host, port))
         self.port = self._socket.getsockname()[1]
+        self._waiting = 0
         self._loop = asyncio.new_event_loop()
+        self._loop.set_exception_handler(_tell_quietly)
         self._thread = threading.Thread(target=self._serve, name="d4orm-gate", daemon=True)
         self._ready = threading.Event()
         self._thread.start()
@@ -64,9 +71,8 @@ class Gate:
 
     async def _pass(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
-            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _PATIENCE)
-            answer = self._answer(head)
-            if answer:
+            head = await self._head(reader)
+            if answer := self._answer(head):
                 writer.write(answer)
                 await writer.drain()
                 return
@@ -79,29 +85,43 @@ class Gate:
                 for pump in pumps:
                     pump.cancel()
                 ahead.close()
-        except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+        except (OSError, asyncio.IncompleteReadError):
             pass  # whoever it was has gone, or speaks something else
         except asyncio.CancelledError:
             pass  # the gate closes; Python 3.11 complains of connections that end otherwise
         finally:
             writer.close()
 
+    async def _head(self, reader: asyncio.StreamReader) -> bytes:
+        """The first lines of a request, up to the empty one; nothing where there are too many.
+
+        Raises:
+            OSError: If they do not come, or too many others are waited for.
+        """
+        if self._waiting >= _MOST_WAITING:
+            raise ConnectionRefusedError
+        self._waiting += 1
+        try:
+            return await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _PATIENCE)
+        except asyncio.LimitOverrunError:
+            return b""
+        finally:
+            self._waiting -= 1
+
     def _answer(self, head: bytes) -> bytes:
-        """What to say to a request; nothing if it may pass."""
+        """What to say to a request; nothing if it may pass. One that cannot be read has shown no token."""
         lines = head.decode("latin-1").split("\r\n")
         headers = {
             name.strip().lower(): value.strip() for name, _, value in (line.partition(":") for line in lines[1:])
         }
         target = lines[0].partition(" ")[2].partition(" ")[0]
-        if self._is_token(parse_qs(urlsplit(target).query).get("token", [""])[0]):
+        if self._is_token(_token_in(target)):
             cookie = f"{self._cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
             return _response("303 See Other", f"Location: /\r\nSet-Cookie: {cookie}\r\n")
-        try:
-            shown = SimpleCookie(headers.get("cookie", "")).get(self._cookie)
-        except CookieError:
-            shown = None
+        # Other pages of this host may have cookies of any form.
+        cookies = dict(part.strip().partition("=")[::2] for part in headers.get("cookie", "").split(";"))
         own_page = headers.get("origin") in (None, f"http://{headers.get('host')}")
-        if shown is not None and self._is_token(shown.value) and own_page:
+        if self._is_token(cookies.get(self._cookie, "")) and own_page:
             return b""
         return _response("403 Forbidden", "", b"open the address with the token that d4orm play has printed\n")
 
@@ -111,6 +131,14 @@ class Gate:
 
     def _is_token(self, text: str) -> bool:
         return hmac.compare_digest(text.encode(), self.token.encode())
+
+
+def _token_in(target: str) -> str:
+    """The token in an address; nothing where there is none, or the address is none."""
+    try:
+        return parse_qs(urlsplit(target).query).get("token", [""])[0]
+    except ValueError:
+        return ""
 
 
 def _response(status: str, headers: str, body: bytes = b"") -> bytes:
@@ -134,3 +162,8 @@ async def _pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
             await writer.drain()
     except OSError:
         pass
+
+
+def _tell_quietly(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Whoever knocks must not be able to fill the terminal."""
+    logger.debug("%s", context["message"], exc_info=context.get("exception"))

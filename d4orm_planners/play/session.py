@@ -7,7 +7,6 @@ each has a team of its own in the same world, and whatever is changed is changed
 
 from __future__ import annotations
 
-import queue
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,18 +15,21 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.errors import first_line
+from d4orm_env.core.errors import describe, first_line
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import count
 from d4orm_env.disturbances.disturbance_registry import disturbances_at
 from d4orm_env.render.replay import Replay
 from d4orm_planners.base.planner_registry import make_policy, setting_names
 from d4orm_planners.base.policy import Policy
+from d4orm_planners.play.command_queue import MOST_WAITING, Command, CommandQueue
 from d4orm_planners.play.edits import Edit, followed
 from d4orm_planners.play.scene_frame import Frame, Status
 from d4orm_planners.play.viewport import Lane, Terms
 
 _IDLE = 0.1
+_MOST_EDITING = 0.25
+"""Seconds from one step to the next after which no other change is begun; the clock goes on first."""
 
 HORIZON = "predict_horizon"
 """Setting of policies that look ahead."""
@@ -56,8 +58,7 @@ class Session:
         self._terms, self._levels = Terms(seed, lifelong), dict[str, float]()
         self._policies: dict[tuple[str, int | None], Policy] = {}
         self._horizon: int | None = None
-        self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._wake, self._closing = threading.Event(), threading.Event()
+        self._commands = CommandQueue()
         self._paused, self._steps_wanted, self._speed = False, 0, 1.0
         self._status = Status(0, 0, 0.0, 0.0, problem.dt, "planning", "", 0)
         self._frames: tuple[Frame, ...] = ()
@@ -110,10 +111,17 @@ class Session:
 
     def close(self) -> None:
         """Stop the clock and wait for the thread."""
-        self._closing.set()
-        self._wake.set()
+        self._commands.close()
         if self._thread.is_alive():
             self._thread.join()
+
+    def refuse(self, reason: str) -> None:
+        """Say why what somebody asked for is left."""
+
+        def make() -> None:
+            raise ValueError(reason)
+
+        self._post(make, "refusal")
 
     def edit(self, edit: Edit, lane: int = 0) -> None:
         """Change the scene between two steps; what cannot be is left, and the next frame's message says why.
@@ -183,7 +191,7 @@ class Session:
             scenes = {lane.name: lane.scene for lane in self._lanes}
             self._begin([scenes.get(name, self._lanes[0].scene) for name in policies], names=policies, afresh=True)
 
-        self._post(make)
+        self._post(make, "policies")
 
     def set_horizon(self, steps: int) -> None:
         """How many steps a policy that predicts looks ahead; others have no such setting."""
@@ -196,11 +204,11 @@ class Session:
                 self._horizon = former
                 raise
 
-        self._post(make)
+        self._post(make, "horizon")
 
     def set_lifelong(self, lifelong: bool) -> None:
         """Whether robots that arrive go on to new goals."""
-        self._post(lambda: self._begin_here(replace(self._terms, lifelong=lifelong)))
+        self._post(lambda: self._begin_here(replace(self._terms, lifelong=lifelong)), "lifelong")
 
     def disturb(self, levels: Mapping[str, float]) -> None:
         """What goes wrong from the next step on.
@@ -214,7 +222,7 @@ class Session:
                 self._begin_here(replace(self._terms, disturbances=disturbances_at(levels)))
                 self._levels = dict(levels)
 
-        self._post(make)
+        self._post(make, "disturbances")
 
     def pause(self, paused: bool) -> None:
         """Stop the clock, or let it run."""
@@ -223,7 +231,7 @@ class Session:
             self._paused, self._steps_wanted = paused, 0
             self._show(self._state)
 
-        self._post(make)
+        self._post(make, "paused")
 
     def step(self) -> None:
         """Stop the clock after one step."""
@@ -231,31 +239,28 @@ class Session:
         def make() -> None:
             self._paused, self._steps_wanted = True, 1
 
-        self._post(make)
+        self._post(make, "step")
 
     def set_speed(self, speed: float) -> None:
         """How many times faster than real time the clock runs."""
         self._speed = min(max(float(speed), 0.05), 50.0)
 
-    def _post(self, command: Callable[[], None]) -> None:
-        self._commands.put(command)
-        self._wake.set()
+    def _post(self, command: Command, setting: str | None = None) -> None:
+        self._commands.put(command, setting)
 
     def _live(self) -> None:
         try:
             due = time.perf_counter()
-            while not self._closing.is_set():
+            while not self._commands.closed:
                 if self._obey():
                     due = time.perf_counter()
                 if self._state != "running" and not self._steps_wanted:
-                    self._wake.wait(_IDLE)
-                    self._wake.clear()
+                    self._commands.wait(_IDLE)
                     due = time.perf_counter()
                     continue
                 left = due - time.perf_counter()
                 if left > 0 and not self._steps_wanted:
-                    self._wake.wait(left)
-                    self._wake.clear()
+                    self._commands.wait(left)
                     continue
                 self._steps_wanted = 0
                 due = max(due, time.perf_counter() - self._pace) + self._pace
@@ -271,22 +276,27 @@ class Session:
                     lane.advance()
                 self._status = replace(self._status, time=self._status.time + self._lanes[0].scene.dt)
                 self._show(self._state, moved=True)
-        except (ValueError, RuntimeError) as error:
+        except Exception as error:  # of policies, whatever they are
             self._paused = True
-            self._show(self._state, first_line(error))
+            self._show(self._state, _told(error))
 
     def _obey(self) -> bool:
-        """Do what was asked for meanwhile; whether there was anything."""
-        obeyed = False
-        while not self._commands.empty():
+        """Do what was asked for meanwhile, or some of it if that takes long; whether there was anything."""
+        begin, obeyed = time.perf_counter(), False
+        while time.perf_counter() - begin < _MOST_EDITING and (command := self._commands.take()) is not None:
             obeyed = True
             self._status = replace(self._status, message="")
             try:
-                self._commands.get()()
-            except (ValueError, RuntimeError, ImportError) as error:
-                self._status = replace(self._status, refused=self._status.refused + 1)
-                self._show(self._state, first_line(error))
+                command()
+            except Exception as error:  # nothing that anybody asks for ends the session
+                self._say_refused(1, _told(error))
+        if dropped := self._commands.dropped():
+            self._say_refused(dropped, f"{dropped} changes are left, as {MOST_WAITING} were waiting; make them slower")
         return obeyed
+
+    def _say_refused(self, changes: int, reason: str) -> None:
+        self._status = replace(self._status, refused=self._status.refused + changes)
+        self._show(self._state, reason)
 
     @property
     def _pace(self) -> float:
@@ -351,3 +361,8 @@ class Session:
             message=self._status.message if message is None else message,
         )
         self._frames = tuple(lane.frame(self._status) for lane in self._lanes)
+
+
+def _told(error: Exception) -> str:
+    """An error for people; with its kind where it was not written for them."""
+    return first_line(error) if isinstance(error, ValueError | RuntimeError | ImportError) else describe(error)

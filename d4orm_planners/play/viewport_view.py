@@ -193,43 +193,43 @@ class LaneView:
     def _drag(self, name: str, kind: str, edit: Callable[[int, FloatArray, FloatArray], edits.Edit]) -> None:
         """Let a shape be dragged: it follows the pointer, and where it is let go the scene is changed."""
         node = self._nodes[name]
-        grips: dict[int, tuple[Points, Points]] = {}
+        grips: dict[tuple[int, int], tuple[Points, Points]] = {}
 
         @node.on_drag("left")
-        def _(event: viser.SceneNodeDragEvent[viser.SceneNodeHandle]) -> None:
-            index, frame = event.instance_index or 0, self._frame
+        async def _(event: viser.SceneNodeDragEvent[viser.SceneNodeHandle]) -> None:  # one after the other
+            index, hand = event.instance_index or 0, (event.client_id, event.instance_index or 0)
             if event.phase == "start":
-                at = self._place_of(kind, index, frame)
-                grips[index] = (at, self._pointed(event, at))
-            if index not in grips:
+                at = self._place_of(kind, index)
+                grips[hand] = (at, self._pointed(event, at))
+            if hand not in grips:
                 return
-            at, grip = grips[index]
+            at, grip = grips[hand]
             moved = at + self._pointed(event, at) - grip
             if event.phase != "end":
                 self._held[kind, index] = moved
                 if kind not in ("robot", "goal"):
                     node.position = moved
                 return
-            del grips[index]
+            del grips[hand]
             self._held.pop((kind, index), None)
             if kind not in ("robot", "goal"):
                 node.position = at  # until the session has agreed
-            d = frame.problem.dimension
+            d = self._frame.problem.dimension
             self._session.edit(edit(index, moved[:d], (moved - at)[:d]), self._index)
 
     def _drag_pushes(self) -> None:
         """Let robots be pushed: the page draws an arrow, and where it is let go the robot gets its velocity."""
-        grips: dict[int, tuple[Points, Points]] = {}
+        grips: dict[tuple[int, int], tuple[Points, Points]] = {}
 
         @self._nodes["robots"].on_drag("left", modifier="shift")
-        def _(event: viser.SceneNodeDragEvent[viser.SceneNodeHandle]) -> None:
-            index, frame = event.instance_index or 0, self._frame
+        async def _(event: viser.SceneNodeDragEvent[viser.SceneNodeHandle]) -> None:
+            index, hand = event.instance_index or 0, (event.client_id, event.instance_index or 0)
             if event.phase == "start":
-                at = self._place_of("robot", index, frame)
-                grips[index] = (at, self._pointed(event, at))
-            elif event.phase == "end" and index in grips:
-                at, grip = grips.pop(index)
-                arrow = (self._pointed(event, at) - grip)[: frame.problem.dimension]
+                at = self._place_of("robot", index)
+                grips[hand] = (at, self._pointed(event, at))
+            elif event.phase == "end" and hand in grips:
+                at, grip = grips.pop(hand)
+                arrow = (self._pointed(event, at) - grip)[: self._frame.problem.dimension]
                 self._session.push(index, PUSH_PER_METER * arrow, self._index)
 
     @property
@@ -237,12 +237,10 @@ class LaneView:
         frames = self._session.frames
         return frames[min(self._index, len(frames) - 1)]
 
-    def _place_of(self, kind: str, index: int, frame: Frame) -> Points:
-        if kind == "robot":
-            return in_space(frame.positions(time.perf_counter()))[index]
-        if kind == "goal":
-            return in_space(frame.goals)[index]
-        return np.asarray(self._nodes[kind].position, np.float32)
+    def _place_of(self, kind: str, index: int) -> Points:
+        """``(3,)`` where the page shows it; the session may be further on."""
+        many = {"robot": "robots", "goal": "goals"}.get(kind)
+        return np.array(self._nodes[kind].position if many is None else self._nodes[many].batched_positions[index])
 
     def _pointed(self, event: viser.SceneNodeDragEvent[viser.SceneNodeHandle], at: Points) -> Points:
         """Where the pointer is: on the plane that planar robots drive on, or as far from the camera as the shape."""

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core.files import replaced_when_done
+from d4orm_planners.escaping import spreadsheet_cell
 from d4orm_planners.rl.network import Network
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 from d4orm_planners.rl.task_mixture import MixedVecEnv
@@ -85,7 +86,8 @@ def write_curve(folder: Path, evaluations: Sequence[Evaluation]) -> None:
     with replaced_when_done(folder / "curve.csv") as temporary, temporary.open("w", newline="") as file:
         writer = csv.DictWriter(file, [field.name for field in fields(Evaluation)])
         writer.writeheader()
-        writer.writerows(asdict(evaluation) for evaluation in evaluations)
+        rows = (asdict(evaluation) for evaluation in evaluations)
+        writer.writerows({name: spreadsheet_cell(value) for name, value in row.items()} for row in rows)
     with replaced_when_done(folder / "curve.png") as temporary:
         _draw(temporary, evaluations)
 

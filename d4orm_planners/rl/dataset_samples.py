@@ -10,6 +10,8 @@ import numpy as np
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.errors import first_line
+from d4orm_env.scenarios.problems import is_scenario_file
+from d4orm_env.scenarios.scenario_registry import SCENARIOS
 from d4orm_planners.rl.samples import Samples
 
 if TYPE_CHECKING:
@@ -74,6 +76,9 @@ def _environment(dataset: MinariDataset, path: str) -> tuple[ParallelEnv, Mappin
     metadata = dataset.storage.metadata.get("demonstrations")
     try:
         arguments = {name: value for name, value in metadata["environment"].items() if name != "disturbances"}
+        scenario = arguments.get("scenario", "circle")
+        if not is_scenario_file(scenario):
+            SCENARIOS.look_up(scenario)  # by name only: a dataset may be from anybody, and imports no code
         return navigation_v0.parallel_env(**arguments), metadata
     except (TypeError, KeyError, AttributeError, ValueError) as error:
         raise ValueError(

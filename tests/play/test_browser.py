@@ -329,6 +329,49 @@ def test_policies_are_ticked_and_drive_side_by_side(page: Page, tmp_path: Path) 
 
 
 @viser_leaves_loops
+def test_two_browsers_play_with_one_team(page: Page, tmp_path: Path) -> None:
+    with running(make_problem("circle", num_robots=3, seed=0), "goal") as playground:
+        session = playground.session
+        session.pause(True)
+        look_at(page, playground, "circle, 3 robots, goal: paused")
+        with browser(tmp_path) as other:
+            look_at(other, playground, "circle, 3 robots, goal: paused")
+            wait_for(lambda: len(playground.clients) == 2)
+            tick(other, "Lifelong goals")
+            lifelong = beside("Lifelong goals", "input[type=checkbox]")
+            page.until(f"{lifelong}.checked")
+            wait_for(lambda: session._terms.lifelong)
+            wait_for(lambda: abs(pixel(playground, session.frame.goals[0])[0]) < 1200)
+            goals = session.frame.goals
+            for each in (page, other):
+                each.frames(8)
+            hands = [(page, pixel(playground, goals[0]), pixel(playground, (0.4, 0.9))),
+                     (other, pixel(playground, goals[1]), pixel(playground, (-0.6, -0.5)))]  # fmt: skip
+            for each, start, _ in hands:
+                each.mouse("Moved", *start, held=False)
+                each.frames(8)
+                each.mouse("Pressed", *start)
+            for share in (0.2, 0.6, 1.0):
+                for each, (x, y), (right, down) in hands:
+                    each.mouse("Moved", x + share * (right - x), y + share * (down - y))
+                    each.frames(2)
+            for each, _, end in hands:
+                each.mouse("Released", *end)
+            wait_for(lambda: (session.frame.goals[:2] != goals[:2]).any(axis=1).all())
+            other.mouse("Moved", *pixel(playground, session.frame.states[2, :2]), held=False)
+            other.frames(8)
+            other.mouse("Pressed", *pixel(playground, session.frame.states[2, :2]))
+            other.mouse("Moved", *pixel(playground, (0.1, 0.1)))
+            other.frames(4)
+        wait_for(lambda: len(playground.clients) == 1)  # it is killed with the robot in its hand
+        wait_for(lambda: not playground._view._lanes[0]._held)
+        session.pause(False)
+        wait_for(lambda: session.frame.status.time > 0)
+        assert session.failure is None
+        assert page.complaints == []
+
+
+@viser_leaves_loops
 def test_a_slow_planner_does_not_freeze_the_page(page: Page) -> None:
     with running(make_problem("circle", num_robots=3, seed=0), "goal") as playground:
         session = playground.session

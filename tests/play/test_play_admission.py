@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import gc
-import socket
-import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
@@ -17,41 +13,20 @@ from d4orm_env import make_problem
 pytest.importorskip("viser")
 
 import msgspec
-import viser
+from play_support import opened, reached, running, until
 from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import ClientConnection
 
 from d4orm_planners.play.playground import Playground
-
-PATIENCE = 60.0
 
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # viser leaves a loop open
 
 
 @pytest.fixture
 def playground(request: pytest.FixtureRequest) -> Iterator[Playground]:
-    shown = Playground(make_problem("circle", num_robots=2), "goal", host=getattr(request, "param", "127.0.0.1"))
-    thread = threading.Thread(target=shown.run, daemon=True)
-    thread.start()
-    yield shown
-    shown.stop()
-    thread.join()
-    shown.close()
-    del shown
-    gc.collect()
-
-
-def opened(
-    raw: socket.socket, host: str, origin: str | None, headers: dict[str, str] | None = None
-) -> ClientConnection:
-    """A web socket over a connection, by a name and on behalf of a page."""
-    claims: Any = {"origin": origin, "subprotocols": [f"viser-v{viser.__version__}"], "additional_headers": headers}
-    return connect(f"ws://{host}/", sock=raw, max_size=None, **claims)
-
-
-def reached(port: int, host: str = "127.0.0.1") -> socket.socket:
-    """A connection to a port of this machine."""
-    return socket.create_connection((host, port), timeout=PATIENCE)
+    scene = make_problem("circle", num_robots=2)
+    with running(scene, "goal", host=getattr(request, "param", "127.0.0.1")) as shown:
+        yield shown
 
 
 def ticks(connection: ClientConnection, playground: Playground) -> bool:
@@ -122,11 +97,3 @@ def through(gate: Any, token: str | None) -> ClientConnection:
     """A web socket through a gate, with the cookie of who has shown a token."""
     cookie = {} if token is None else {"Cookie": f"d4orm_play_{gate.port}={token}"}
     return opened(reached(gate.port, "127.0.0.2"), f"127.0.0.2:{gate.port}", f"http://127.0.0.2:{gate.port}", cookie)
-
-
-def until(condition: Callable[[], object]) -> None:
-    """Wait for something that another thread does."""
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.005)

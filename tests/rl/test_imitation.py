@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import make_policy, run_episode
 from d4orm_planners.cli import app as cli
+from d4orm_planners.rl.dataset_samples import dataset_samples
 from d4orm_planners.rl.features import Features
 from d4orm_planners.rl.imitation import OTHERS_DRIVE, ImitationSettings, imitate
 from d4orm_planners.rl.network import load_network
@@ -125,6 +127,24 @@ def test_it_begins_with_a_dataset(agents: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"holonomic2d robots .* differential_drive .* 'd4orm dataset --model'"):
         imitate(replace(settings, model="differential_drive"), tmp_path / "other")
     assert not (tmp_path / "other").exists()
+
+
+def test_a_dataset_of_others_imports_no_code(tmp_path: Path) -> None:
+    pytest.importorskip("minari")
+    from d4orm_planners.rl.dataset import Demonstrations, write_dataset
+
+    code, marker = tmp_path / "theirs.py", tmp_path / "was here"
+    code.write_text(f"open({str(marker)!r}, 'w').close()\n"
+                    "from d4orm_env.scenarios.generators import circle as scene\n")  # fmt: skip
+    environment = {"scenario": "circle", "num_robots": 2}
+    write_dataset(Demonstrations(policy="goal", environment=environment, seeds=[0]), tmp_path / "data", workers=1)
+    metadata = tmp_path / "data" / "data" / "metadata.json"
+    content = json.loads(metadata.read_text())
+    content["demonstrations"]["environment"]["scenario"] = f"{code}:scene"
+    metadata.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"dataset .* \(scenario .* is unknown"):
+        dataset_samples(str(tmp_path / "data"), "holonomic2d", 30)
+    assert not marker.exists()
 
 
 def test_a_dataset_that_is_none_is_one_clear_error(tmp_path: Path) -> None:

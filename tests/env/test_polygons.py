@@ -13,8 +13,8 @@ from shapely import Polygon
 
 from d4orm_env import World
 from d4orm_env.core import simple_polygon
-from d4orm_env.core.simple_polygon import first_crossing, orientation
 from d4orm_env.geometry.polygon import triangulate
+from d4orm_env.geometry.simple_polygon import first_crossing, orientation
 
 Corners: TypeAlias = list[tuple[float, float]]
 GRID = st.lists(st.tuples(st.integers(0, 4).map(float), st.integers(0, 4).map(float)), min_size=3, max_size=8)
