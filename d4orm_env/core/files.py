@@ -1,7 +1,8 @@
-"""Writing files so that they are whole or not there."""
+"""Writing files so that they are whole or not there, after a power cut too."""
 
 from __future__ import annotations
 
+import errno
 import os
 import time
 from collections.abc import Iterator
@@ -14,7 +15,7 @@ def replaced_when_done(path: Path, suffixes: tuple[str, ...] = ()) -> Iterator[P
     """Give a temporary path in the same folder; rename it to ``path`` at the end, or remove it after an error.
 
     Args:
-        path: The file to write.
+        path: The file to write; where it is a symbolic link, that which it leads to.
         suffixes: Endings that are allowed; none given allows all.
 
     Raises:
@@ -24,18 +25,26 @@ def replaced_when_done(path: Path, suffixes: tuple[str, ...] = ()) -> Iterator[P
     """
     if suffixes and path.suffix.lower() not in suffixes:
         raise ValueError(f"{path} ends in {path.suffix!r}; choose one of {', '.join(suffixes)}")
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"folder {path.parent} does not exist; create it, or write {path.name} elsewhere")
-    if path.is_dir():
+    target = Path(os.path.realpath(path))  # what a symbolic link leads to, be it there or not
+    if target.is_symlink():
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"folder {target.parent} does not exist; create it, or write {path.name} elsewhere")
+    if target.is_dir():
         raise IsADirectoryError(f"{path} is a folder; give the name of a file")
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.{time.monotonic_ns()}{path.suffix}")
+    if target.exists() and not target.is_file():
+        raise OSError(f"{path} is a device or a pipe; give the name of a file")
+    # Of a long name a part, because it must not become longer than a name may be.
+    temporary = target.with_name(f".{path.stem[:32]}.{os.getpid()}.{time.monotonic_ns()}{path.suffix[:16]}")
     try:
         try:
             temporary.touch(exist_ok=False)
         except OSError as error:
-            raise type(error)(f"cannot write to folder {path.parent}: {error.strerror}") from error
+            raise type(error)(f"cannot write to folder {target.parent}: {error.strerror}") from error
         yield temporary
-        temporary.replace(path)
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())  # or a power cut may leave the new name with nothing in it
+        temporary.replace(target)
     except OSError as error:
         # A full disk names no file, and others the temporary one.
         if error.errno is not None and error.filename in (None, str(temporary), temporary):

@@ -4,19 +4,37 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+import os
+import stat
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+from tempfile import TemporaryFile
 from types import ModuleType
 from typing import Any, ParamSpec, Protocol, TypeVar
 
 import numba
-from numba.core.base import BaseContext
-from numba.core.caching import FunctionCache
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    IndexDataCacheFile,
+    InTreeCacheLocator,
+    UserProvidedCacheLocator,
+)
 from numba.core.codegen import JITCPUCodegen
+from numba.core.compiler import CompileResult
 from numba.core.typing.templates import Signature
+from numba.misc.appdirs import AppDirs
+
+from d4orm_env.core.files import replaced_when_done
 
 P = ParamSpec("P")
 R_co = TypeVar("R_co", covariant=True)
+_DIGEST_SIZE = hashlib.sha256().digest_size
+_ROOM = 2**24
+"""Bytes that all kernels of the package take, more or less."""
 
 
 class Kernel(Protocol[P, R_co]):
@@ -37,30 +55,99 @@ def fingerprint(modules: tuple[ModuleType, ...]) -> str:
     return hashlib.sha256("".join(inspect.getsource(module) for module in modules).encode()).hexdigest()
 
 
+class _Files(IndexDataCacheFile):
+    """numba's index and data files, with a digest of the content and of what it depends on behind it.
+
+    What a power cut, a full disk or another version has left counts as missing: it is neither unpickled nor executed.
+    """
+
+    def load(self, key: tuple[object, ...]) -> Any:
+        """What is kept under a key, or ``None``."""
+        kept = super().load(key)
+        # Two processes that add to an index at once may have given the same file to different keys.
+        return kept[1] if kept is not None and kept[0] == key else None
+
+    def save(self, key: tuple[object, ...], data: object) -> None:
+        """Keep it."""
+        super().save(key, (key, data))
+
+    def _load_index(self) -> dict[tuple[object, ...], str]:
+        return self._if_whole(self._index_path, super()._load_index) or {}
+
+    def _load_data(self, name: str) -> Any:
+        return self._if_whole(self._data_path(name), partial(super()._load_data, name))
+
+    def _if_whole(self, path: str, load: Callable[[], Any]) -> Any:
+        # ImportError, AttributeError: another version of this package kept types that are gone.
+        with suppress(OSError, ImportError, AttributeError):
+            content = Path(path).read_bytes()
+            if content[-_DIGEST_SIZE:] == self._digest(content[:-_DIGEST_SIZE]):
+                return load()
+        return None
+
+    @contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[BytesIO]:
+        with BytesIO() as content, replaced_when_done(Path(filepath)) as temporary:
+            yield content
+            # What is behind a pickle is no part of it.
+            temporary.write_bytes(content.getvalue() + self._digest(content.getvalue()))
+
+    def _digest(self, content: bytes) -> bytes:
+        return hashlib.sha256(repr((self._version, self._source_stamp)).encode() + content).digest()
+
+
+class _Place(CompileResultCacheImpl):
+    """The folder that numba chooses, but none in a home folder that is not there or that others can write to."""
+
+    def __init__(self, function: Callable[..., object]) -> None:
+        if not _is_private(Path(AppDirs(appname="numba", appauthor=False).user_cache_dir)):
+            self._locator_classes = [UserProvidedCacheLocator, InTreeCacheLocator]
+        super().__init__(function)
+
+
+def _is_private(folder: Path) -> bool:
+    """Whether nobody else can put files there, which would be unpickled and executed."""
+    if not folder.is_absolute():  # where nobody knows the home folder, it begins with ~
+        return False
+    if not hasattr(os, "getuid"):
+        return True
+    try:
+        states = [place.stat() for place in (folder, *folder.parents) if place.exists()]
+    except OSError:
+        return False
+    # Others may make folders in /tmp, but not put them in the place of ours.
+    return all(
+        state.st_uid in (0, os.getuid()) and (not state.st_mode & stat.S_IWOTH or state.st_mode & stat.S_ISVTX)
+        for state in states
+    )
+
+
 class _SourceKeyedCache(FunctionCache):
     """Kernels by a key of our own: numba notices an edit of the file a kernel is in, but neither of those it calls into
     nor what functions one kernel of a factory has that another has not.
     """
 
+    _impl_class = _Place
+
     def __init__(self, function: Callable[..., object], key: str) -> None:
         super().__init__(function)
         self._source_key = key
+        self._cache_file = _Files(self.cache_path, self._impl.filename_base, self._impl.locator.get_source_stamp())
 
     def _index_key(self, sig: Signature, codegen: JITCPUCodegen) -> tuple[object, ...]:
         return sig, codegen.magic_tuple(), self._source_key
 
-    def load_overload(self, sig: Signature, target_context: BaseContext) -> object:
-        """What is kept for arguments of these types, or ``None``."""
-        self.kept()
-        return super().load_overload(sig, target_context)
+    def save_overload(self, sig: Signature, data: CompileResult) -> None:
+        """Keep a kernel where there is room for it; elsewhere the next process compiles it anew."""
+        with suppress(OSError):
+            super().save_overload(sig, data)
 
-    def kept(self) -> tuple[tuple[object, ...], ...]:
-        """Keys of all that is kept; none, from then on, where another version kept what this one cannot read."""
-        try:
-            return tuple(self._cache_file._load_index())
-        except (ImportError, AttributeError):
-            self.flush()
-            return ()
+    def is_kept(self) -> bool:
+        """Whether anything is, for the sources as they are now."""
+        return any(
+            key[-1] == self._source_key and self._cache_file.load(key) is not None
+            for key in self._cache_file._load_index()
+        )
 
 
 def cached_kernel(key: str, variant: str = "", **options: Any) -> Callable[[Callable[P, R_co]], Kernel[P, R_co]]:
@@ -71,11 +158,16 @@ def cached_kernel(key: str, variant: str = "", **options: Any) -> Callable[[Call
 
     Where neither the package's folder nor the user's cache folder can be written, kernels are compiled anew in every
     process; set ``NUMBA_CACHE_DIR`` to a folder that can.
+
+    Raises:
+        ImportError: From the decorator, if ``NUMBA_DISABLE_JIT`` is set.
     """
 
     def decorate(function: Callable[P, R_co]) -> Kernel[P, R_co]:
         function.__qualname__ += variant and f"_{variant}"
         dispatcher = numba.njit(nogil=True, **options)(function)
+        if dispatcher is function:
+            raise ImportError("NUMBA_DISABLE_JIT is set, but the kernels run only when compiled; unset it")
         with suppress(RuntimeError):
             dispatcher._cache = _SourceKeyedCache(function, key)
         return dispatcher
@@ -83,9 +175,26 @@ def cached_kernel(key: str, variant: str = "", **options: Any) -> Callable[[Call
     return decorate
 
 
+def check_can_be_kept() -> None:
+    """Find out whether kernels can be kept on disk.
+
+    Raises:
+        OSError: If no folder can be written to, or the disk is full.
+    """
+    try:
+        folder = _Place(check_can_be_kept).locator.get_cache_path()
+    except RuntimeError:
+        raise OSError("no cache folder can be written to; set NUMBA_CACHE_DIR to one that can") from None
+    try:
+        with TemporaryFile(dir=folder) as file:
+            file.write(bytes(_ROOM))
+    except OSError as error:
+        raise OSError(
+            f"cache {folder} cannot be written to ({error.strerror}); set NUMBA_CACHE_DIR to another"
+        ) from None
+
+
 def has_to_be_compiled(kernel: Kernel[..., object]) -> bool:
     """Whether a kernel of :func:`cached_kernel` could be kept on disk and has not been yet, as its sources are now."""
     cache = getattr(kernel, "_cache", None)
-    if not isinstance(cache, _SourceKeyedCache):
-        return False
-    return not any(key[-1] == cache._source_key for key in cache.kept())
+    return isinstance(cache, _SourceKeyedCache) and not cache.is_kept()

@@ -7,13 +7,18 @@ Heavy imports happen inside the commands, so that ``--help`` is quick.
 from __future__ import annotations
 
 import importlib.metadata
-import os
+import io
+import signal
 import sys
-from collections.abc import Callable
-from typing import Annotated, Any
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
+from d4orm_planners.base.escaping import one_line
 from d4orm_planners.cli.bench import bench
 from d4orm_planners.cli.common_options import Quiet
 from d4orm_planners.cli.dataset_command import dataset
@@ -28,13 +33,28 @@ from d4orm_planners.cli.reproduce import reproduce
 from d4orm_planners.cli.robustness_command import robustness
 from d4orm_planners.cli.run import run
 from d4orm_planners.cli.train import train
-from d4orm_planners.escaping import one_line
+
+if TYPE_CHECKING:
+    from typing_extensions import Buffer
 
 # Typer carries its own copy of click, whose base class it does not export.
 ClickException: Any = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
 
+
+class Commands(TyperGroup):
+    """The commands. A file that ends too early is not taken for the end of what somebody types, which Typer does."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command that was chosen."""
+        try:
+            return super().invoke(ctx)
+        except EOFError as error:
+            raise OSError(f"something that was read ended too early ({error or 'no message'})") from error
+
+
 app = typer.Typer(
     name="d4orm",
+    cls=Commands,
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -65,8 +85,10 @@ def options(
 @app.command()
 def warmup(quiet: Quiet = False) -> None:
     """Compile ahead what planning and the environments need, so that the next start is quick."""
+    from d4orm_env.engine.caching import check_can_be_kept
     from d4orm_planners.cli.warmup import warm_up
 
+    check_can_be_kept()
     report = warm_up()
     if not quiet:
         typer.echo(
@@ -74,8 +96,8 @@ def warmup(quiet: Quiet = False) -> None:
         )
         for folder in report.folders:
             typer.echo(f"cache {folder}")
-    if not report.folders:
-        raise ValueError("no cache folder can be written to; set NUMBA_CACHE_DIR to one that can")
+    if report.lost:
+        raise OSError(f"{len(report.lost)} kernels could not be kept; free some space, or set NUMBA_CACHE_DIR")
 
 
 @app.command()
@@ -116,10 +138,52 @@ def _or_error(describe: Callable[[str], str], name: str) -> str:
         return f"unusable: {error}"
 
 
+class _Pipe(io.FileIO):
+    """A stream that nobody may read to its end, as ``head`` does: what is left is dropped, and the command goes on."""
+
+    _ended = False
+
+    def write(self, data: Buffer, /) -> int:
+        try:
+            return memoryview(data).nbytes if self._ended else super().write(data)
+        except OSError as error:
+            self._ended = True  # a full disk is told of once, not at the exit again
+            if not isinstance(error, BrokenPipeError):
+                raise
+            return memoryview(data).nbytes
+
+
+def _standard_streams() -> None:
+    """Have no character that they lack, and no reader that leaves, end a command."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if not isinstance(stream, io.TextIOWrapper):  # closed, or a test's
+            continue
+        stream.reconfigure(errors="backslashreplace")
+        if stream is getattr(sys, f"__{name}__") and not stream.isatty():
+            pipe = io.BufferedWriter(_Pipe(stream.fileno(), "w", closefd=False))
+            setattr(sys, name, io.TextIOWrapper(pipe, stream.encoding, stream.errors, line_buffering=True))
+
+
+@contextmanager
+def _interrupted_by_sigterm() -> Iterator[None]:
+    """Let SIGTERM be what Ctrl-C is, so that nothing half-written is left behind."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    former = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, former)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit."""
+    _standard_streams()
     try:
-        status = app(arguments, standalone_mode=False)
+        with _interrupted_by_sigterm():
+            status = app(arguments, standalone_mode=False)
     except ClickException as error:
         status = _complain(error.format_message())
     except (ValueError, OSError, ImportError) as error:  # ImportError: an extra that is not installed
@@ -136,8 +200,7 @@ def _message(error: Exception) -> str:
 
 
 def _complain(message: str) -> int:
-    line = one_line(" ".join(message.split()))
-    sys.stderr.write(f"d4orm: {line}{os.linesep}")
+    typer.echo(f"d4orm: {one_line(' '.join(message.split()))}", err=True)
     return 2
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -181,8 +182,9 @@ def check_target(path: Path | None, suffixes: tuple[str, ...]) -> None:
         return
     if path.suffix not in suffixes:
         raise ValueError(f"output file {str(path)!r} must end in {' or '.join(suffixes)}")
-    if not path.parent.is_dir():
-        raise ValueError(f"folder {str(path.parent)!r} does not exist; create it first")
-    if path.is_dir():
+    target = Path(os.path.realpath(path))  # of a symbolic link, what is written
+    if not target.parent.is_dir():
+        raise ValueError(f"folder {str(target.parent)!r} does not exist; create it first")
+    if target.is_dir():
         raise ValueError(f"output file {str(path)!r} is a folder")
-    check_writable(path.parent)
+    check_writable(target.parent)

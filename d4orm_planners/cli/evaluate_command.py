@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from d4orm_planners.base.escaping import one_line
 from d4orm_planners.cli.arguments import (
     decimals,
     make_folder,
@@ -20,7 +21,6 @@ from d4orm_planners.cli.arguments import (
 )
 from d4orm_planners.cli.common_options import Physics, Quiet, ScenarioSettings, TimeLimit
 from d4orm_planners.cli.dataclass_options import takes
-from d4orm_planners.escaping import one_line
 
 if TYPE_CHECKING:
     from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from d4orm_planners.escaping import one_line
+from d4orm_planners.base.escaping import one_line
 
 if TYPE_CHECKING:
     from d4orm_planners.base.episode import Episode

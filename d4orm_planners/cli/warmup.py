@@ -10,7 +10,7 @@ import pkgutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -44,12 +44,14 @@ class WarmupReport:
         compiled: Kernels that had to be compiled.
         loaded: Kernels that were in the cache already.
         folders: Where the cache is; empty if no folder can be written to, so that nothing is kept.
+        lost: Kernels that could not be written there.
     """
 
     seconds: float
     compiled: tuple[str, ...]
     loaded: tuple[str, ...]
     folders: tuple[Path, ...]
+    lost: tuple[str, ...]
 
 
 TEAMS = (*((model, model) for model in COMMON), ("holonomic2d", "differential_drive"))
@@ -80,8 +82,10 @@ def compile_for_planning(
 
 
 def _in_another_process(call: str) -> subprocess.Popen[bytes]:
+    # What ends it, as Ctrl-C, ends this process too, which says so.
     return subprocess.Popen(
-        [sys.executable, "-c", f"from {__name__} import find_ways, roll_out_once, sample_once; {call}"]
+        [sys.executable, "-c", f"from {__name__} import find_ways, roll_out_once, sample_once; {call}"],
+        stderr=subprocess.DEVNULL,
     )
 
 
@@ -144,11 +148,13 @@ def warm_up() -> WarmupReport:
     kernels = [kernel for kernel in _kernels() if kernel.signatures]
     compiled = [kernel for kernel in kernels if kernel.stats.cache_misses or kernel in missing]
     loaded = [kernel for kernel in kernels if kernel not in compiled]
-    return WarmupReport(
-        seconds,
-        tuple(kernel.py_func.__name__ for kernel in compiled), tuple(kernel.py_func.__name__ for kernel in loaded),
-        tuple(sorted({Path(path) for kernel in kernels if (path := kernel.stats.cache_path)})),
-    )  # fmt: skip
+    lost = [kernel for kernel in compiled if has_to_be_compiled(kernel)]
+    folders = tuple(sorted({Path(path) for kernel in kernels if (path := kernel.stats.cache_path)}))
+    return WarmupReport(seconds, _names(compiled), _names(loaded), folders, _names(lost))
+
+
+def _names(kernels: Iterable[Dispatcher[Callable[..., object]]]) -> tuple[str, ...]:
+    return tuple(kernel.py_func.__name__ for kernel in kernels)
 
 
 def _smallest_problem(models: tuple[str, ...]) -> Problem:

@@ -10,7 +10,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from d4orm_env.core.files import replaced_when_done
-from d4orm_planners.escaping import markdown_text, one_line, spreadsheet_cell
+from d4orm_planners.base.escaping import markdown_text, one_line, spreadsheet_cell
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore, config_now
 from d4orm_planners.evaluation.summary import SuccessRate, SuccessWithin
 

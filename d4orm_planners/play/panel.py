@@ -18,7 +18,7 @@ from d4orm_env.scenarios import list_scenarios
 from d4orm_env.scenarios.problem_files import scenario_text
 from d4orm_env.scenarios.scenario_registry import SCENARIOS
 from d4orm_env.scenarios.schema import parse
-from d4orm_planners.escaping import markdown_text
+from d4orm_planners.base.escaping import markdown_text
 from d4orm_planners.play import edits
 from d4orm_planners.play.scene_frame import Frame
 from d4orm_planners.play.session import Session

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core.files import replaced_when_done
-from d4orm_planners.escaping import spreadsheet_cell
+from d4orm_planners.base.escaping import spreadsheet_cell
 from d4orm_planners.rl.network import Network
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 from d4orm_planners.rl.task_mixture import MixedVecEnv
@@ -83,7 +83,10 @@ def run_worlds(network: Network, worlds: RobotVecEnv, seed: int) -> list[tuple[b
 
 def write_curve(folder: Path, evaluations: Sequence[Evaluation]) -> None:
     """Write ``curve.csv`` and ``curve.png``."""
-    with replaced_when_done(folder / "curve.csv") as temporary, temporary.open("w", newline="") as file:
+    with (
+        replaced_when_done(folder / "curve.csv") as temporary,
+        temporary.open("w", newline="", encoding="utf-8") as file,
+    ):
         writer = csv.DictWriter(file, [field.name for field in fields(Evaluation)])
         writer.writeheader()
         rows = (asdict(evaluation) for evaluation in evaluations)

@@ -166,8 +166,9 @@ class _Run:
         )  # fmt: skip
         self.evaluations = [*self.evaluations, evaluation]
         self.checkpoints.keep_best(network, self.evaluations)
-        self.checkpoints.save(index, self._model, self._env, self.evaluations)
+        # The checkpoint last: what a round that was broken off has written is written again.
         write_curve(self._out, self.evaluations)
+        self.checkpoints.save(index, self._model, self._env, self.evaluations)
 
     @property
     def _so_far(self) -> str:

@@ -292,8 +292,9 @@ class _Run:
         )  # fmt: skip
         self.evaluations = [*self.evaluations, evaluation]
         self.checkpoints.keep_best(network, self.evaluations)
-        self._checkpoint = self.checkpoints.save(index, model, normalized, self.evaluations)
+        # The checkpoint last: what a lesson that was broken off has written is written again.
         write_curve(self._out, self.evaluations)
+        self._checkpoint = self.checkpoints.save(index, model, normalized, self.evaluations)
         robots.close()
 
     def _restored(self, env: VecNormalize) -> BaseAlgorithm:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib.metadata
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import pytest
@@ -281,3 +283,112 @@ def test_help_loads_nothing_heavy() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, env={**os.environ, "COLUMNS": "100"}
     )
     assert result.stdout.splitlines()[-1] == "[]"
+
+
+def command_line(*arguments: str, shell: str = '"$@"', **environment: str) -> subprocess.CompletedProcess[str]:
+    """The command line in a process of its own, run by a shell."""
+    return subprocess.run(
+        ["sh", "-c", shell, "sh", sys.executable, "-m", "d4orm_planners.cli.app", *arguments],
+        capture_output=True, text=True, errors="replace", env={**os.environ, **environment},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("shell", "status", "lines"),
+    [
+        ('("$@"; echo $? >&2) | head -n 1', "0", 0),
+        ('("$@"; echo $? >&2) | true', "0", 0),
+        ('"$@" >&-; echo $? >&2', "0", 0),
+        ('"$@" <&- >&-; echo $? >&2', "0", 0),
+        ('"$@" > /dev/full; echo $? >&2', "2", 1),
+    ],
+)
+def test_what_becomes_of_the_output_decides_on_nothing(shell: str, status: str, lines: int) -> None:
+    complaint = command_line("scenarios", shell=shell).stderr.splitlines()
+    assert complaint[-1] == status
+    assert len(complaint) == 1 + lines
+
+
+def test_without_a_place_for_complaints_the_status_says_it() -> None:
+    assert command_line("planners", "nobody", shell='"$@" 2>&-').returncode == 2
+    assert command_line("planners", "nobody", shell='"$@" <&- >&- 2>&-').returncode == 2
+
+
+def test_a_character_that_the_output_lacks_ends_nothing(tmp_path: Path) -> None:
+    options = ("--policy", "goal", "--num-robots", "2", "--out", str(tmp_path / "\u00e4\u4e2d.html"))
+    outcome = command_line("run", *options, PYTHONIOENCODING="latin-1:strict")
+    assert (outcome.returncode, outcome.stderr) in ((0, ""), (1, ""))
+    assert outcome.stdout.rstrip().endswith("\\u4e2d.html")
+
+
+def test_a_file_that_ends_too_early_is_not_taken_for_ctrl_c(d4orm, monkeypatch: pytest.MonkeyPatch) -> None:
+    def ended(name: str) -> None:
+        raise EOFError("Ran out of input")
+
+    monkeypatch.setattr("d4orm_planners.base.planner_registry.default_settings", ended)
+    outcome = d4orm("planners", "d4orm")
+    assert outcome.status == 2
+    assert outcome.err == "d4orm: something that was read ended too early (Ran out of input)\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_leaves_nothing_half_written(
+    d4orm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+
+    def interrupted(file: BinaryIO, **arrays: object) -> None:
+        file.write(b"half")
+        signal.raise_signal(number)
+
+    monkeypatch.setattr(np, "savez_compressed", interrupted)
+    outcome = d4orm("plan", "--num-robots", "2", *QUICK, "--out", "plan.npz", "--quiet")
+    assert outcome.status == 130
+    assert not list(tmp_path.iterdir())
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+@pytest.mark.parametrize("name", ["link.npz", "x" * 251 + ".npz", "\u00e4" * 125 + ".npz", "-.npz"])
+def test_a_plan_is_written_whatever_the_name_is(d4orm, tmp_path: Path, name: str) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "link.npz").symlink_to("folder/plan.npz")
+    outcome = d4orm("plan", "--num-robots", "2", *QUICK, f"--out={name}", "--quiet")
+    assert outcome.status in (0, 1), outcome.err
+    assert Plan.load(tmp_path / name).problem.num_robots == 2
+    assert (tmp_path / "link.npz").is_symlink()
+    assert (tmp_path / "folder" / "plan.npz").exists() == (name == "link.npz")
+
+
+@pytest.mark.parametrize(
+    ("target", "complaint"),
+    [("nowhere/plan.npz", "does not exist"), ("folder", "is a folder"), ("link.npz", "Too many")],
+)
+def test_a_link_that_leads_to_no_file_is_refused_before_planning(
+    d4orm, tmp_path: Path, target: str, complaint: str
+) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "link.npz").symlink_to(target)
+    outcome = d4orm("plan", "--out", "link.npz")
+    assert outcome.status == 2
+    assert outcome.err.count("\n") == 1
+    assert complaint in outcome.err
+
+
+def test_warmup_says_beforehand_that_nothing_can_be_kept(
+    d4orm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("d4orm_planners.cli.warmup.warm_up", lambda: pytest.fail("it compiles"))
+    monkeypatch.setattr("numba.core.config.CACHE_DIR", str(tmp_path / "cache"))
+
+    def full(**options: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as context:
+        context.setattr("d4orm_env.engine.caching.TemporaryFile", full)
+        outcome = d4orm("warmup")
+        assert outcome.status == 2
+        assert outcome.err.count("\n") == 1
+        assert "cannot be written to (No space left on device); set NUMBA_CACHE_DIR" in outcome.err
+    monkeypatch.setattr("d4orm_env.engine.caching._Place._locator_classes", [])
+    monkeypatch.setattr("d4orm_env.engine.caching._is_private", lambda folder: True)
+    assert "no cache folder can be written to; set NUMBA_CACHE_DIR" in d4orm("warmup").err

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import threading
-from pathlib import Path
 from typing import Any
 
 import numba
@@ -20,8 +18,7 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.transition import TimeStep, advance
-from d4orm_env.engine import elementary, threads, tiles
-from d4orm_env.engine.caching import fingerprint
+from d4orm_env.engine import elementary
 from d4orm_env.engine.choice import ENGINES, get_engine
 from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.engine.threads import Threads, available_cores
@@ -297,54 +294,3 @@ class TestThreads:
         monkeypatch.setenv("D4ORM_NUM_THREADS", value)
         with pytest.raises(ValueError, match=f"D4ORM_NUM_THREADS is {value!r}; it must be a positive whole number"):
             get_engine("cpu")
-
-
-KERNEL = """
-from os import environ
-from d4orm_env.engine.caching import cached_kernel
-
-@cached_kernel(environ["KERNEL_KEY"])
-def twice(x):
-    return 2 * x
-"""
-
-
-class TestKernelCache:
-    def hits(self, path: Path, key: str) -> int:
-        """Load the kernel as a new process would, call it, and say how often it came from disk."""
-        os.environ["KERNEL_KEY"] = key
-        spec = importlib.util.spec_from_file_location("kernel", path)
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        assert module.twice(21) == 42
-        return sum(module.twice.stats.cache_hits.values())
-
-    def test_kernels_come_from_disk_until_the_sources_they_call_change(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setenv("KERNEL_KEY", "")
-        path = tmp_path / "kernel.py"
-        path.write_text(KERNEL)
-        assert self.hits(path, "one version") == 0
-        assert self.hits(path, "one version") == 1
-        assert self.hits(path, "another version") == 0
-        assert self.hits(path, "one version") == 1
-
-    def test_what_another_version_kept_and_this_one_cannot_read_is_compiled_anew(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setenv("KERNEL_KEY", "")
-        path = tmp_path / "kernel.py"
-        path.write_text(KERNEL)
-        assert self.hits(path, "one version") == 0
-        (index,) = tmp_path.rglob("*.nbi")
-        # A type that the other version knew, of a module that is gone.
-        index.write_bytes(index.read_bytes().replace(b"numba.core.types", b"numba.gone.types"))
-        assert self.hits(path, "one version") == 0
-        assert self.hits(path, "one version") == 1
-
-    def test_fingerprints_follow_the_source(self) -> None:
-        assert fingerprint((tiles, threads)) == fingerprint((tiles, threads))
-        assert len({fingerprint(modules) for modules in ((tiles,), (threads,), (tiles, threads))}) == 3

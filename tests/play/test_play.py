@@ -22,8 +22,8 @@ from d4orm_env import World, make_problem
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance_registry import DISTURBANCES
 from d4orm_env.scenarios.problem_files import scenario_text
+from d4orm_planners.base.escaping import markdown_text
 from d4orm_planners.baselines.go_to_goal import GoToGoal
-from d4orm_planners.escaping import markdown_text
 from d4orm_planners.play import edits
 from d4orm_planners.play.proxy import Gate
 from d4orm_planners.play.scene_frame import closest_approach

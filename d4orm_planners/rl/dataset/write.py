@@ -93,10 +93,17 @@ def checked_id(dataset_id: str) -> str:
 
 
 def dataset_folder(dataset_id: str) -> Path:
-    """Where Minari looks for a dataset: below ``MINARI_DATASETS_PATH``, or ``~/.minari/datasets``."""
+    """Where Minari looks for a dataset: below ``MINARI_DATASETS_PATH``, or ``~/.minari/datasets``.
+
+    Raises:
+        ValueError: If there is no home folder.
+    """
     from minari.storage.datasets_root_dir import get_dataset_path
 
-    return Path(get_dataset_path(dataset_id))
+    folder = Path(get_dataset_path(dataset_id))
+    if folder.parts[0] == "~":  # the system does not know where it is
+        raise ValueError("there is no home folder to keep datasets in; set MINARI_DATASETS_PATH, or give a folder")
+    return folder
 
 
 def dataset_files(demonstrations: Demonstrations, folder: Path) -> DatasetFiles:

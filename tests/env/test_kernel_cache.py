@@ -1,0 +1,150 @@
+"""Compiled kernels on disk: when they are taken from there, and that no damage and no lack of room ends a start."""
+
+from __future__ import annotations
+
+import errno
+import importlib.util
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from numba.core import config
+
+from d4orm_env.engine import threads, tiles
+from d4orm_env.engine.caching import fingerprint, has_to_be_compiled
+
+KERNEL = """
+from os import environ
+from d4orm_env.engine.caching import cached_kernel
+
+@cached_kernel(environ["KERNEL_KEY"])
+def twice(x):
+    return 2 * x
+"""
+
+
+DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+    "empty": lambda content: b"",
+    "half": lambda content: content[: len(content) // 2],
+    "zeros": lambda content: bytes(len(content)),
+    "text": lambda content: b"not a pickle\n" * 100,
+    "longer": lambda content: content + b"x",
+    # A type that another version knew, of a module that is gone.
+    "another version": lambda content: content.replace(b"numba.core.types", b"numba.gone.types"),
+    **{
+        f"a bit at {share}": lambda content, share=share: flipped(content, int(share * (len(content) - 1)))
+        for share in (0.0, 0.1, 0.37, 0.63, 0.9, 1.0)
+    },
+}
+
+
+def flipped(content: bytes, place: int) -> bytes:
+    return content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :]
+
+
+class TestKernelCache:
+    @pytest.fixture
+    def path(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+        """The file of a kernel, whose cache is beside it."""
+        monkeypatch.setattr(config, "CACHE_DIR", "")
+        monkeypatch.setenv("KERNEL_KEY", "")
+        path = tmp_path / "kernel.py"
+        path.write_text(KERNEL)
+        return path
+
+    def hits(self, path: Path, key: str = "one version") -> int:
+        """Load the kernel as a new process would, call it, and say how often it came from disk."""
+        os.environ["KERNEL_KEY"] = key
+        module = self.module(path)
+        assert module.twice(21) == 42
+        return sum(module.twice.stats.cache_hits.values())
+
+    def module(self, path: Path) -> Any:
+        spec = importlib.util.spec_from_file_location("kernel", path)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module
+
+    def test_kernels_come_from_disk_until_the_sources_they_call_change(self, path: Path) -> None:
+        assert self.hits(path, "one version") == 0
+        assert self.hits(path, "one version") == 1
+        assert self.hits(path, "another version") == 0
+        assert self.hits(path, "one version") == 1
+
+    @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
+    @pytest.mark.parametrize("kind", ["nbi", "nbc"])
+    def test_what_is_damaged_is_compiled_anew_and_written_again(
+        self, path: Path, kind: str, damage: Callable[[bytes], bytes]
+    ) -> None:
+        assert self.hits(path) == 0
+        (file,) = path.parent.rglob(f"*.{kind}")
+        damaged = damage(file.read_bytes())
+        changed = damaged != file.read_bytes()
+        file.write_bytes(damaged)
+        assert has_to_be_compiled(self.module(path).twice) == changed
+        assert self.hits(path) == 1 - changed
+        assert self.hits(path) == 1
+
+    @pytest.mark.parametrize("kind", ["nbi", "nbc"])
+    def test_a_folder_in_the_place_of_a_file_is_done_without(self, path: Path, kind: str) -> None:
+        self.hits(path)
+        (file,) = path.parent.rglob(f"*.{kind}")
+        file.unlink()
+        file.mkdir()
+        assert self.hits(path) == self.hits(path) == 0
+
+    @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EIO])
+    def test_a_kernel_that_cannot_be_kept_is_used_all_the_same(
+        self, path: Path, monkeypatch: pytest.MonkeyPatch, code: int
+    ) -> None:
+        def full(descriptor: int) -> None:
+            raise OSError(code, os.strerror(code))
+
+        with monkeypatch.context() as context:
+            context.setattr(os, "fsync", full)
+            assert self.hits(path) == self.hits(path) == 0
+        assert not [*path.parent.rglob("*.nb*"), *path.parent.rglob(".*")]
+        assert self.hits(path) == 0
+        assert self.hits(path) == 1
+
+    def test_the_data_of_another_key_is_not_taken_for_this_ones(self, path: Path) -> None:
+        # As when two processes add to an index at once: both choose the same name for their data.
+        self.hits(path, "one version")
+        (data,) = path.parent.rglob("*.nbc")
+        first = data.read_bytes()
+        data.unlink()
+        next(path.parent.rglob("*.nbi")).unlink()
+        self.hits(path, "another version")
+        data.write_bytes(first)
+        assert self.hits(path, "another version") == 0
+        assert self.hits(path, "another version") == 1
+
+    @pytest.mark.skipif(os.name != "posix", reason="permissions are POSIX's")
+    @pytest.mark.parametrize(
+        ("home", "mode", "kept"), [("home", 0o755, True), ("home", 0o777, False), ("~", 0o755, False)]
+    )
+    def test_nothing_is_kept_where_others_can_write_or_nobody_lives(
+        self, path: Path, monkeypatch: pytest.MonkeyPatch, home: str, mode: int, kept: bool
+    ) -> None:
+        monkeypatch.chdir(path.parent)
+        (path.parent / "home").mkdir()
+        (path.parent / "home").chmod(mode)
+        # Where the package cannot be written to, numba takes the folder of the user.
+        (path.parent / "__pycache__").write_text("a file")
+        monkeypatch.setenv("XDG_CACHE_HOME", home if home == "~" else str(path.parent / home))
+        assert self.hits(path) == 0
+        assert self.hits(path) == kept
+        assert not (path.parent / "~").exists()
+
+    def test_without_compiling_nothing_works_and_it_is_said(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(config, "DISABLE_JIT", 1)
+        with pytest.raises(ImportError, match="NUMBA_DISABLE_JIT is set"):
+            self.hits(path)
+
+    def test_fingerprints_follow_the_source(self) -> None:
+        assert fingerprint((tiles, threads)) == fingerprint((tiles, threads))
+        assert len({fingerprint(modules) for modules in ((tiles,), (threads,), (tiles, threads))}) == 3
