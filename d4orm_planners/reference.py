@@ -110,7 +110,7 @@ def _at_rest(model: str, x: Array) -> Array:
 def _near_robot(team: PlainTeam, place: Array) -> Array:
     """``(K,)`` bool from the full distance matrix."""
     distance = jnp.linalg.norm(place[:, None] - place[None, :], axis=-1)
-    distance = distance + jnp.diag(jnp.full(len(place), jnp.inf))
+    distance = distance + jnp.diag(jnp.full(len(place), jnp.inf, jnp.float32))
     return (distance <= team.radius[:, None] + team.radius[None, :] + team.margin).any(axis=1)
 
 
@@ -192,7 +192,7 @@ def denoise(
 
     def update(mean: Array, xs: tuple[Array, Array]) -> tuple[Array, Array]:
         sigma, step_key = xs
-        samples = mean[None] + sigma * jax.random.normal(step_key, (num_samples, *mean.shape))
+        samples = mean[None] + sigma * jax.random.normal(step_key, (num_samples, *mean.shape), jnp.float32)
         rewards = score(model, team, samples, collisions).mean(axis=1)
         return softmax_mean(rewards, samples, temperature), rewards.mean()
 
@@ -219,6 +219,6 @@ def denoise_around_rest(
         ValueError: If the team mixes models.
     """
     model, team = plain_team(problem)
-    zero = jnp.zeros((problem.horizon, problem.num_robots, problem.control_size))
-    key = jax.random.key(seed)
-    return np.asarray(denoise(model, team, zero, noise_scale, key, num_samples, temperature, collisions))
+    zero = jnp.zeros((problem.horizon, problem.num_robots, problem.control_size), jnp.float32)
+    scale, key = jnp.asarray(noise_scale, jnp.float32), jax.random.key(seed)
+    return np.asarray(denoise(model, team, zero, scale, key, num_samples, temperature, collisions))

@@ -50,7 +50,7 @@ def main() -> None:
     arguments = parser.parse_args()
     num_worlds, num_updates = (8, 3) if arguments.quick else (256, 20)
     problem = make_problem("circle", num_robots=4)
-    shifts = 0.3 * jax.random.normal(jax.random.key(1), (num_worlds, problem.num_robots, 2))
+    shifts = 0.3 * jax.random.normal(jax.random.key(1), (num_worlds, problem.num_robots, 2), jnp.float32)
     starts = jnp.tile(problem.start, (num_worlds, 1, 1)).at[:, :, :2].add(shifts)
 
     worlds = jax.vmap(episode, in_axes=(None, None, 0))
@@ -58,7 +58,7 @@ def main() -> None:
     arrived_of = jax.jit(lambda gains: worlds(gains, problem, starts)[1].mean())
     ascend = jax.jit(jax.grad(reward_of))
 
-    gains, rows = jnp.array([0.2, 1.0]), []
+    gains, rows = jnp.array([0.2, 1.0], jnp.float32), []
     for update in range(num_updates + 1):
         rows.append(
             {

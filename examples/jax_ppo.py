@@ -49,10 +49,11 @@ def make_network(key: Any, inputs: int, outputs: int, width: int = 64) -> Any:
     sizes = {"actor": (inputs, width, width, outputs), "critic": (inputs, width, width, 1)}
     keys = iter(jax.random.split(key, 6))
     layers = {
-        name: [(initial(next(keys), (a, b)), jnp.zeros(b)) for a, b in pairwise(size)] for name, size in sizes.items()
+        name: [(initial(next(keys), (a, b), jnp.float32), jnp.zeros(b, jnp.float32)) for a, b in pairwise(size)]
+        for name, size in sizes.items()
     }
     layers["actor"][-1] = (0.01 * layers["actor"][-1][0], layers["actor"][-1][1])
-    return {**layers, "log_std": jnp.full(outputs, -0.5)}
+    return {**layers, "log_std": jnp.full(outputs, -0.5, jnp.float32)}
 
 
 def along(vector: Any, rows: Any) -> Any:
@@ -89,7 +90,7 @@ def collect(env: FunctionalEnv, network: Any, carry: Any, key: Any) -> tuple[Any
     observation = seen(env, observations)
     draw, move = jax.random.split(key)
     mean = apply(network["actor"], observation)
-    action = mean + along(jnp.exp(network["log_std"]), mean) * jax.random.normal(draw, mean.shape)
+    action = mean + along(jnp.exp(network["log_std"]), mean) * jax.random.normal(draw, mean.shape, jnp.float32)
     value = apply(network["critic"], observation)[..., 0]
     controls = jnp.clip(action, -1, 1) * along(env.action_limits, action)
     state, transition = jax.vmap(env.step)(jax.random.split(move, len(observations)), state, controls)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,18 +26,28 @@ over a whole horizon."""
 
 
 def as_float32(value: ArrayLike) -> FloatArray:
-    """A new float32 array of ``value``; what is too large for float32 becomes infinite.
+    """A new float32 array of ``value``, PyTorch's tensors included; what is too large for float32 becomes infinite.
 
     Raises:
         ValueError: If it cannot be read as numbers, or holds a whole number that no float holds.
     """
     try:
         with np.errstate(over="ignore"):
-            return np.array(value, np.float32)
+            return np.array(_detached(value), np.float32)
     except OverflowError:
         raise ValueError("it holds a whole number too large for a float") from None
-    except (TypeError, ValueError):
+    except (RuntimeError, TypeError, ValueError):
         raise ValueError("it does not hold numbers only, in rows of one length") from None
+
+
+def _detached(value: Any) -> Any:
+    """``value`` with PyTorch's tensors, in a list too, as arrays, wherever they are and whether they have gradients."""
+    if hasattr(value, "detach"):
+        # In double precision NumPy has all their types.
+        return value.detach().cpu().double().numpy()
+    if isinstance(value, list | tuple):
+        return [part if isinstance(part, np.ndarray | float | int) else _detached(part) for part in value]
+    return value
 
 
 def frozen_array(

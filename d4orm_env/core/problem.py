@@ -24,7 +24,7 @@ from d4orm_env.core.arrays import (
     whole_number,
 )
 from d4orm_env.core.problem_arrays import ProblemArrays, inverse_initial_distance
-from d4orm_env.core.problem_checks import check_places, check_resolution, check_states, check_turning
+from d4orm_env.core.problem_checks import check_places, check_resolution, check_states, check_turning, unwound_states
 from d4orm_env.core.summary_line import Row, count, joined, team_text
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
@@ -149,6 +149,7 @@ class Problem(Frozen):
                 f"horizon is {self.horizon} steps for {team.num_robots} robots; it must be at most {most} for so many"
             )
         check_states(team, self.start)
+        self._set(start=unwound_states(team, self.start))
         check_resolution(team, np.concatenate([places, self.goal], axis=1), self.dt, self.goal_radius)
         check_turning(team, self.dt, self.goal_radius)
         for what, positions in (("start", places), ("goal", self.goal)):

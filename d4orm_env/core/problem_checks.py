@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray
+from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.team import Team
+from d4orm_env.core.winding import MAX_ANGLE, MOST_TURNS, unwound
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.robot_model import SPEED, STANDARD_LIMITS, TURN_RATE, Model
 
 MAX_HEADING = 1000.0
-"""Largest heading of a start [rad]; float32 resolves it to 6e-5 rad."""
+"""Largest heading that is given as a state [rad]; float32 resolves it to 6e-5 rad. What is taken is unwound."""
 RESOLUTION = 100
 """The goal radius is at least so many times what float32 resolves at the farthest start or goal."""
 STEP_RESOLUTION = 10
@@ -40,12 +42,27 @@ def check_states(team: Team, states: FloatArray, what: str = "start") -> None:
                     f"{what} {model.state_names[index]} of robot_{robot} is {value:g}, "
                     f"above its {model.limit_names[column]} of {limit:g}"
                 )
-        heading = 0.0 if model.heading_index is None else float(state[model.heading_index])
-        if abs(heading) > MAX_HEADING:
-            raise ValueError(
-                f"{what} heading of robot_{robot} is {heading:g} rad; it must be at most {MAX_HEADING:g} in "
-                f"magnitude, so take whole turns off"
-            )
+        for index in model.angles:
+            if abs(float(state[index])) > MAX_HEADING:
+                raise ValueError(
+                    f"{what} {model.state_names[index]} of robot_{robot} is {state[index]:g} rad; it must be at most "
+                    f"{MAX_HEADING:g} in magnitude, so take whole turns off"
+                )
+
+
+def unwound_states(team: Team, states: FloatArray) -> FloatArray:
+    """``states`` ``(..., K, n)`` with all angles within :data:`MAX_ANGLE`; a copy if any was not."""
+    angles = np.zeros(states.shape[-2:], np.bool_)
+    for robot, model in enumerate(team.robot_models):
+        angles[robot, list(model.angles)] = True
+    wound = angles & (np.abs(states) > MAX_ANGLE)
+    if not wound.any():
+        return states
+    values, within = states[wound].astype(np.float64), states.copy()
+    while (np.abs(values) > MAX_ANGLE).any():
+        values = unwound(values, NUMPY_OPS)
+    within[wound] = values
+    return within
 
 
 def check_resolution(team: Team, places: FloatArray, dt: float, goal_radius: float) -> None:
@@ -75,6 +92,11 @@ def check_turning(team: Team, dt: float, goal_radius: float) -> None:
             continue
         speed = float(team_limits[robot, SPEED])
         angle = model.turn_rate(team_limits[robot]) * dt
+        if angle > MAX_ANGLE:
+            raise ValueError(
+                f"robot_{robot} may turn by {angle:.3g} rad in a step of {dt:g} s, more than {MOST_TURNS} turns; use a "
+                f"smaller dt or {_turning_limits(model)}"
+            )
         error = speed * dt * angle**4 / 2880
         if error > most:
             raise ValueError(
@@ -97,21 +119,43 @@ def check_places(team: Team, world: World, what: str, places: FloatArray, margin
             f"{what} of robot_{robot} at {_point(places[robot])} is {0 - gaps[robot]:.3g} m inside an "
             f"obstacle or outside the bounds (robot radius {radius[robot]:g} m); move it, or change the world"
         )
-    points, nearest = places.astype(np.float64), ["an obstacle or the bounds"] * len(places)
-    for later in range(1, len(points)):
-        between = np.linalg.norm(points[:later] - points[later], axis=1) - radius[:later] - radius[later]
-        other = int(np.argmin(between))
-        if between[other] <= 0:
-            raise ValueError(
-                f"{what}s of robot_{other} at {_point(points[other])} and robot_{later} at {_point(points[later])} "
-                f"overlap by {0 - between[other]:.3g} m; move them more than {radius[later] + radius[other]:g} m apart"
-            )
-        if between[other] < gaps[later]:
-            gaps[later], nearest[later] = between[other], f"robot_{other}"
+    first, second, between = _near_pairs(places.astype(np.float64), radius, margin)
+    overlapping = np.flatnonzero(between <= 0)
+    if len(overlapping):
+        of_first = overlapping[second[overlapping] == second[overlapping].min()]
+        pair = of_first[np.argmin(between[of_first])]
+        one, other = first[pair], second[pair]
+        raise ValueError(
+            f"{what}s of robot_{one} at {_point(places[one])} and robot_{other} at {_point(places[other])} "
+            f"overlap by {0 - between[pair]:.3g} m; move them more than {radius[one] + radius[other]:g} m apart"
+        )
     robot = int(np.argmin(gaps))
-    if gaps[robot] > margin:
+    gap, nearest = gaps[robot], "an obstacle or the bounds"
+    if len(between) and between.min() < gap:
+        pair = np.argmin(between)
+        robot, gap, nearest = int(second[pair]), between[pair], f"robot_{first[pair]}"
+    if gap > margin:
         return ""
-    return f"the {what} of robot_{robot} is {gaps[robot]:.3g} m from {nearest[robot]}, and the margin is {margin:g} m"
+    return f"the {what} of robot_{robot} is {gap:.3g} m from {nearest}, and the margin is {margin:g} m"
+
+
+def _near_pairs(points: Floats, radius: Floats, margin: float) -> tuple[IntArray, IntArray, Floats]:
+    """Pairs of robots at ``points`` ``(K, d)`` within the margin: the first, the second, and the gap between them [m]."""
+    axis = int(np.argmax(np.ptp(points, axis=0)))
+    order = np.argsort(points[:, axis], kind="stable")
+    along, reach = points[order, axis], 2 * radius.max() + margin
+    pairs: list[IntArray] = [np.empty((2, 0), np.int64)]
+    for offset in range(1, len(points)):
+        # Robots farther apart along the axis than any two reach need no look; a larger offset brings none nearer.
+        near = np.flatnonzero(along[offset:] - along[:-offset] <= reach)
+        if not len(near):
+            break
+        pairs.append(np.sort(np.stack([order[near], order[near + offset]]), axis=0))
+    first, second = np.concatenate(pairs, axis=1)
+    gaps = np.linalg.norm(points[first] - points[second], axis=1) - radius[first] - radius[second]
+    kept = gaps <= margin
+    by_robot = np.lexsort((first[kept], second[kept]))
+    return first[kept][by_robot], second[kept][by_robot], gaps[kept][by_robot]
 
 
 def _turning_limits(model: Model) -> str:

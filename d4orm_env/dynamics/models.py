@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import cache
+from itertools import chain
 
 import numpy as np
 
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.registry import Registry
+from d4orm_env.core.winding import Unwinding
 from d4orm_env.dynamics.car import CAR
 from d4orm_env.dynamics.differential_drive import DIFFERENTIAL_DRIVE
 from d4orm_env.dynamics.holonomic2d import HOLONOMIC2D
@@ -61,9 +63,17 @@ def model_digest(model: Model) -> str:
     """SHA-256 over all that a model is, its functions' sources and the constants that they name included."""
     sha = hashlib.sha256(repr([value for name, value in vars(model).items() if name != "functions"]).encode())
     for function in model.functions:
-        found = ["Runge-Kutta"] if isinstance(function, RungeKutta) else pieces(function)
-        sha.update(repr(list(found)).encode())
+        sha.update(repr(list(_pieces(function))).encode())
     return sha.hexdigest()
+
+
+def _pieces(function: object) -> Iterator[object]:
+    """:func:`~d4orm_env.dynamics.source_digest.pieces` of a model's function, or of what it was made of."""
+    if isinstance(function, RungeKutta):
+        return iter(["Runge-Kutta"])
+    if isinstance(function, Unwinding):
+        return chain(["unwinding", function.index], _pieces(function.limit_state))
+    return pieces(function)
 
 
 def register_model(model: Model) -> None:
@@ -100,7 +110,7 @@ def _admit(name: str, model: object) -> Model:
 
 def _check_attributes(model: Model) -> None:
     n, m, num_limits = model.state_size, model.control_size, len(model.limit_names)
-    indices = (*model.speed_indices, *(index for index, _ in model.state_limits), model.heading_index or 0)
+    indices = (*model.speed_indices, *(index for index, _ in model.state_limits), *model.angles)
     columns = (*model.control_limits, *(column for _, column in model.state_limits))
     name = model.name
     checks = (
@@ -148,13 +158,12 @@ def _check_functions(model: Model) -> None:
             raise ValueError(
                 f"model {model.name!r}: {name} returns {result!r}; expected a tuple of {size} finite numbers"
             )
-        if not isinstance(function, RungeKutta):
-            floats = [value for value in pieces(function) if isinstance(value, float)]
-            if floats:
-                raise ValueError(
-                    f"model {model.name!r}: {name} uses the float {floats[0]:g}, which would change an engine's "
-                    f"precision; make it one of own_limits"
-                )
+        floats = [value for value in _pieces(function) if isinstance(value, float)]
+        if floats:
+            raise ValueError(
+                f"model {model.name!r}: {name} uses the float {floats[0]:g}, which would change an engine's "
+                f"precision; make it one of own_limits"
+            )
 
 
 MODELS = Registry("model", "d4orm.models", _admit, model_digest)

@@ -15,6 +15,7 @@ from itertools import product
 from typing import Any, NamedTuple, Protocol, Self, TypeAlias, TypeVar
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.winding import Unwinding
 
 SPEED, ACCELERATION, TURN_RATE = range(3)
 """First columns of every robot's limits: speed [m/s], acceleration [m/s^2], turn rate [rad/s]."""
@@ -104,7 +105,7 @@ class ModelFunctions(NamedTuple):
     limit_control: ModelFunction
     """``(u, limits, ops) -> u`` inside the robot's limits."""
     limit_state: ModelFunction
-    """``(x, limits, ops) -> x`` at no more than the speed limit."""
+    """``(x, limits, ops) -> x`` at no more than the speed limit. :class:`Model` has it unwind the angles too."""
     velocity: ModelFunction
     """``(x, u, limits, ops) -> `` velocity vector in the world frame [m/s]."""
     rest: ModelFunction
@@ -200,6 +201,8 @@ class Model:
         own_limits: Limits beyond the three that all models have, from column :data:`OWN_LIMITS` on.
         state_limits: ``(state component, column of the limits)`` for components other than speeds that
             :attr:`ModelFunctions.limit_state` bounds.
+        own_angles: State components other than the heading that are angles, such as a trailer's: to them, as to the
+            heading, a whole turn makes no difference, so that they do not wind up.
     """
 
     name: str
@@ -212,11 +215,23 @@ class Model:
     functions: ModelFunctions
     own_limits: tuple[Limit, ...] = ()
     state_limits: tuple[tuple[int, int], ...] = ()
+    own_angles: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.functions.integrate is None:
-            integrate = RungeKutta(self.functions.derivative, self.state_size)
-            object.__setattr__(self, "functions", self.functions._replace(integrate=integrate))
+        functions = self.functions
+        if functions.integrate is None:
+            functions = functions._replace(integrate=RungeKutta(functions.derivative, self.state_size))
+        limit_state = functions.limit_state
+        while isinstance(limit_state, Unwinding):  # of the model that this one was copied from
+            limit_state = limit_state.limit_state
+        for index in self.angles:
+            limit_state = Unwinding(limit_state, index)
+        object.__setattr__(self, "functions", functions._replace(limit_state=limit_state))
+
+    @property
+    def angles(self) -> tuple[int, ...]:
+        """State components that are angles, the heading first."""
+        return self.own_angles if self.heading_index is None else (self.heading_index, *self.own_angles)
 
     @property
     def state_size(self) -> int:

@@ -10,6 +10,7 @@ import numpy as np
 from numba.extending import register_jitable
 from numba.np.unsafe import ndarray
 
+from d4orm_env.core import winding
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.dynamics import collision, reward, robot_model, transition
 
@@ -49,6 +50,7 @@ for _function in (
     robot_model.first_order_approach,
     robot_model.turn_towards,
     robot_model.runge_kutta,
+    winding.unwound,
     transition.advance,
     transition.arrives,
     transition.stands,

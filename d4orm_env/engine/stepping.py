@@ -7,6 +7,8 @@ from typing import TypeAlias
 
 import numpy as np
 
+from d4orm_env.core import winding
+from d4orm_env.core.winding import Unwinding, unwinding
 from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import COMMON, MODEL_CODES, MODELS, model_digest
 from d4orm_env.dynamics.robot_model import (
@@ -27,7 +29,7 @@ from d4orm_env.engine.compiling import ZERO, inlined
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.tile_layout import PICK, SQUARED_GAP, SQUARED_NORM, Row
 
-PARTS = (lanes, compiling, elementary, rows)
+PARTS = (winding, lanes, compiling, elementary, rows)
 """Modules that steps are made of, for fingerprints."""
 
 Docking: TypeAlias = tuple[np.float32, np.float32, np.bool_]
@@ -54,8 +56,10 @@ def models_key(sources: str, names: tuple[str, ...]) -> str:
     return f"{sources} {[(name, MODEL_CODES[name], model_digest(MODELS[name])) for name in names]}"
 
 
-def _integrator(function: ModelFunction) -> ModelFunction:
-    """The function itself, or in scalar style what :class:`RungeKutta` computes."""
+def _in_scalar_style(function: ModelFunction) -> ModelFunction:
+    """The function itself, or what :class:`RungeKutta` or :class:`Unwinding` computes."""
+    if isinstance(function, Unwinding):
+        return unwinding(inlined(_in_scalar_style(function.limit_state)), function.index)
     if not isinstance(function, RungeKutta):
         return function
     derivative, moved = inlined(function.derivative), inlined(MOVED[function.state_size])
@@ -72,7 +76,7 @@ def make_stepper(model: Model) -> tuple[Mover, Docker]:
     ``move(standing, x, u, limits, h) -> x`` and ``dock(standing, x, u, limits, goal, docking) -> (x, squared distance
     to the goal, whether docked)``.
     """
-    functions = ModelFunctions(*(inlined(_integrator(function)) for function in model.functions))
+    functions = ModelFunctions(*(inlined(_in_scalar_style(function)) for function in model.functions))
     pick_x = PICK[model.state_size]
     squared_norm, squared_gap = SQUARED_NORM[model.dimension], SQUARED_GAP[model.dimension]
 

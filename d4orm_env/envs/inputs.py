@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, as_float32, frozen_array, whole_number
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.problem_checks import check_states
+from d4orm_env.core.problem_checks import check_states, unwound_states
 from d4orm_env.disturbances.levels import check_components, per_component
 
 MAX_ACTION = 1e15
@@ -42,8 +42,10 @@ def checked_states(
     """
     array = frozen_array(states, "states", shape, largest=LARGEST)
     low, high = (bound[: problem.start.size].reshape(problem.start.shape) for bound in bounds)
-    for team, parked in zip(array.reshape(-1, *problem.start.shape), docked.reshape(-1, problem.num_robots)):
+    for team in array.reshape(-1, *problem.start.shape):
         check_states(problem.team, team, "state")
+    array = unwound_states(problem.team, array)
+    for team, parked in zip(array.reshape(-1, *problem.start.shape), docked.reshape(-1, problem.num_robots)):
         outside = ((team < low) | (team > high)).any(axis=1)
         if outside.any():
             robot = int(np.argmax(outside))

@@ -30,6 +30,7 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, Floats, frozen_array
 from d4orm_env.core.observation_layout import Spare
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.winding import MAX_ANGLE
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 
 __all__ = ["JointState", "join_state", "split_state"]
@@ -114,7 +115,7 @@ def state_bounds(
 ) -> tuple[FloatArray, FloatArray]:
     """Finite bounds that every joint state of an episode keeps.
 
-    A robot gets no farther from its start than its limits allow in ``max_cycles`` steps; headings wind up likewise.
+    A robot gets no farther from its start than its limits allow in ``max_cycles`` steps, and angles do not wind up.
 
     Args:
         problem: The problem.
@@ -156,10 +157,7 @@ def _robot_bounds(problem: Problem, places: FloatArray, duration: float, spare: 
     for robot, model in enumerate(team.robot_models):
         high[robot, dimension : model.state_size] = LARGEST  # what no limit bounds
         high[robot, list(model.speed_indices)] = speed[robot] + spare.speed
-        if model.heading_index is not None:
-            start = abs(float(problem.start[robot, model.heading_index]))
-            high[robot, model.heading_index] = start + 2 * np.pi + model.turn_rate(limits[robot]) * duration
-            high[robot, model.heading_index] += spare.heading
+        high[robot, list(model.angles)] = MAX_ANGLE + spare.heading
         for index, column in model.state_limits:
             high[robot, index] = limits[robot, column]
     low = -high

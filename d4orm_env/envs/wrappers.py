@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from pettingzoo import ParallelEnv
 from pettingzoo.utils.wrappers import BaseParallelWrapper
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, as_float32
 from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.envs.inputs import noise_std
 from d4orm_env.envs.team_step import AgentInfos
@@ -64,6 +64,10 @@ class GaussianControlNoise(BaseParallelWrapper[str, FloatArray, FloatArray]):
         }
         return super().step({**actions, **disturbed})
 
-    def _disturb(self, action: FloatArray, noise: FloatArray) -> FloatArray:
+    def _disturb(self, action: ArrayLike, noise: FloatArray) -> ArrayLike:
         # What is not a control of this shape goes on as it is, for the environment to refuse by name.
-        return action + noise if np.shape(action) == self._shape else action
+        try:
+            control = as_float32(action)
+        except ValueError:
+            return action
+        return control + noise if control.shape == self._shape else action

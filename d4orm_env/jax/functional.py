@@ -28,7 +28,7 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.robot_model import STANDARD_LIMITS
-from d4orm_env.envs.rewards import RewardFunction, RewardInput, find_reward
+from d4orm_env.envs.rewards import RewardFunction, RewardInput, find_reward, term_names
 from d4orm_env.jax.jax_engine import Worlds, advance_worlds, goal_distance, judge
 from d4orm_env.jax.jax_observation import observe_team
 
@@ -85,8 +85,8 @@ def reset(problem: Problem, key: jax.Array) -> State:
     """
     del key
     num_robots = len(problem.team.models)
-    idle = jnp.zeros((num_robots, problem.control_size))
-    return State(jnp.asarray(problem.start), jnp.zeros(num_robots, bool), jnp.int32(0), idle)
+    idle = jnp.zeros((num_robots, problem.control_size), jnp.float32)
+    return State(jnp.asarray(problem.start, jnp.float32), jnp.zeros(num_robots, bool), jnp.int32(0), idle)
 
 
 def step(
@@ -108,10 +108,10 @@ def step(
         ValueError: If there is no such reward.
     """
     function = find_reward(reward)
-    arrays = _arrays(problem)
+    arrays, controls = _arrays(problem), jnp.asarray(controls, jnp.float32)
     d = arrays.goal.shape[1]
     worlds = Worlds(state.states[..., None], state.arrived[..., None], jnp.zeros_like(controls)[..., None])
-    worlds = advance_worlds(problem.team.models, arrays, worlds, jnp.asarray(controls)[..., None])
+    worlds = advance_worlds(problem.team.models, arrays, worlds, controls[..., None])
     collided, margin_violated, rewards = judge(arrays, worlds.state[:, :d])
     before, after = (goal_distance(arrays, states[:, :d])[:, 0] for states in (state.states[..., None], worlds.state))
     steps = state.steps + 1
@@ -128,7 +128,9 @@ def step(
     if function is None:
         return following, happened
     given = _reward_input(problem, state, following, happened, before)
-    return following, happened._replace(rewards=jnp.asarray(function(given)))
+    # Flags times Python's numbers have JAX's default precision, so terms are rounded before they are summed.
+    parts = function.terms(given).values() if term_names(function) else [function(given)]  # type: ignore[attr-defined]
+    return following, happened._replace(rewards=sum(jnp.asarray(part, jnp.float32) for part in parts))
 
 
 def _reward_input(problem: Problem, state: State, after: State, happened: Step, distances: jax.Array) -> RewardInput:
@@ -169,7 +171,7 @@ def observe(problem: Problem, state: State, layout: ObservationLayout, max_cycle
     if layout.observed_way:
         raise ValueError("the functional API does not know the shortest free ways; leave observed_way out")
     cycles = problem.horizon if max_cycles is None else max_cycles
-    time_left = jnp.maximum(0, 1 - state.steps / cycles)
+    time_left = jnp.maximum(0, 1 - state.steps.astype(jnp.float32) / np.float32(cycles))
     world = Worlds(state.states, state.arrived, state.controls)
     arrays = _arrays(problem)
     if problem.world.lower is None:
@@ -180,11 +182,14 @@ def observe(problem: Problem, state: State, layout: ObservationLayout, max_cycle
 def _arrays(problem: Problem) -> ProblemArrays:
     """:attr:`Problem.arrays` for a problem whose numbers may be traced."""
     team, world = problem.team, problem.world
-    place = jnp.asarray(problem.start)[:, : team.dimension]
-    gap2 = ((place - problem.goal) ** 2).sum(axis=-1)
-    distance = jnp.sqrt(jnp.maximum(gap2, problem.goal_radius**2))
     goal_speed = jnp.inf if problem.goal_speed is None else problem.goal_speed
-    dt = problem.dt
+    # Rounded before they are computed with, whatever precision JAX has by default.
+    start, goal, dt, margin, goal_radius, goal_speed = (
+        jnp.asarray(value, jnp.float32)
+        for value in (problem.start, problem.goal, problem.dt, problem.margin, problem.goal_radius, goal_speed)
+    )
+    gap2 = ((start[:, : team.dimension] - goal) ** 2).sum(axis=-1)
+    distance = jnp.sqrt(jnp.maximum(gap2, goal_radius**2))
     if world.lower is None:
         bounds = jnp.array([[-jnp.inf] * team.dimension, [jnp.inf] * team.dimension], jnp.float32)
     else:
@@ -193,17 +198,17 @@ def _arrays(problem: Problem) -> ProblemArrays:
         "model_codes": None,
         "limits": _limits(team),
         "radius": jnp.asarray(team.radius),
-        "start": problem.start,
-        "goal": jnp.asarray(problem.goal),
+        "start": start,
+        "goal": goal,
         "inverse_initial_distance": 1 / distance,
         "boxes": _rounded_boxes(world),
         "triangles": _triangles(world),
         "grid": None,
         "bounds": bounds,
-        "time_step": jnp.stack([jnp.asarray(dt / part, jnp.float32) for part in (1, 2, 3, 6)]),
-        "margin": jnp.asarray(problem.margin, jnp.float32),
-        "squared_goal_radius": jnp.asarray(problem.goal_radius**2, jnp.float32),
-        "squared_goal_speed": jnp.asarray(goal_speed**2, jnp.float32),
+        "time_step": jnp.stack([dt / part for part in (1, 2, 3, 6)]),
+        "margin": margin,
+        "squared_goal_radius": goal_radius**2,
+        "squared_goal_speed": goal_speed**2,
         "docks": problem.arrival == "dock",
     }
     return ProblemArrays(**arrays)
@@ -215,7 +220,7 @@ def _rounded_boxes(world: World) -> jax.Array:
     balls, cylinders = jnp.asarray(world.balls), jnp.asarray(world.cylinders)
     rows = [jnp.concatenate([balls[:, :d], balls], axis=1)]
     if d == 3:
-        end = jnp.full((len(cylinders), 1), jnp.inf)
+        end = jnp.full((len(cylinders), 1), jnp.inf, jnp.float32)
         rows.append(jnp.concatenate([cylinders[:, :2], -end, cylinders[:, :2], end, cylinders[:, 2:]], axis=1))
     rows.append(jnp.pad(jnp.asarray(world.boxes), ((0, 0), (0, 1))))
     return jnp.concatenate(rows)
@@ -225,7 +230,7 @@ def _triangles(world: World) -> jax.Array:
     """The triangles of :attr:`World.shapes` of a world whose numbers may be traced."""
     pairs = zip(world.polygons, world.triangles, strict=True)
     corners = [jnp.asarray(polygon)[np.array(own)].reshape(-1, 6) for polygon, own in pairs]
-    return jnp.concatenate([jnp.zeros((0, 6)), *corners])
+    return jnp.concatenate([jnp.zeros((0, 6), jnp.float32), *corners])
 
 
 def _limits(team: Team) -> jax.Array:

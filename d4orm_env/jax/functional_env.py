@@ -165,20 +165,21 @@ class FunctionalEnv:
         return after, transition._replace(observations=self.observe(after))
 
     def _begin(self, key: jax.Array) -> EnvState:
-        number = jax.random.randint(key, (), 0, self._num_instances)
+        number = jax.random.randint(key, (), 0, self._num_instances, jnp.int32)
         problem = self.instance(number)
         return EnvState(functional.reset(problem, key), number, jnp.zeros(problem.num_robots, bool))
 
     def _move(self, key: jax.Array, state: EnvState, actions: jax.Array) -> tuple[EnvState, Transition]:
         problem, team = self.instance(state.instance), state.team
+        actions = jnp.asarray(actions, jnp.float32)
         if np.any(self._noise):
-            actions = actions + self._noise * jax.random.normal(key, actions.shape)
+            actions = actions + self._noise * jax.random.normal(key, actions.shape, jnp.float32)
         after, step = functional.step(problem, team, actions, self._reward)
         before, finished = (self._finished(arrived) for arrived in (team.arrived, step.arrived))
         touched = state.touched | step.collided
         everyone = step.arrived.all()
         transition = Transition(
-            observations=jnp.zeros(()),
+            observations=jnp.zeros((), jnp.float32),
             rewards=step.rewards,
             acted=~before,
             finished=finished,

@@ -59,7 +59,7 @@ def observe_team(
 
 def _motion(models: tuple[str, ...], arrays: ProblemArrays, world: Worlds) -> tuple[Columns, Columns]:
     """Velocities, and cosine and sine of the headings, zeros for models without one."""
-    zero = jnp.zeros(len(models))
+    zero = jnp.zeros(len(models), jnp.float32)
     velocity, heading = [zero] * arrays.goal.shape[1], [zero, zero]
     for name in dict.fromkeys(models):
         model = MODELS[name]
@@ -90,7 +90,8 @@ class _Nearest(NamedTuple):
 
     @classmethod
     def nothing(cls, num_robots: int, count: int, width: int) -> _Nearest:
-        return cls((jnp.full(num_robots, jnp.inf),) * count, ((jnp.zeros(num_robots),) * width,) * count)
+        far, zero = jnp.full(num_robots, jnp.inf, jnp.float32), jnp.zeros(num_robots, jnp.float32)
+        return cls((far,) * count, ((zero,) * width,) * count)
 
     def with_another(self, key: Array, columns: Sequence[Array]) -> _Nearest:
         """One more where it belongs; the last drops out for it."""
@@ -116,7 +117,7 @@ class _Nearest(NamedTuple):
 
 def _neighbors(arrays: ProblemArrays, place: Columns, velocity: Columns, count: int) -> Columns:
     """``2 d + 2`` for each."""
-    robots = np.arange(len(arrays.radius))
+    robots = np.arange(len(arrays.radius), dtype=np.int32)
 
     def look(other: tuple[IntArray, Columns, Array | FloatArray]) -> tuple[Array, Columns]:
         number, motion, radius = other

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.winding import unwound
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TimeStep
 from d4orm_env.mujoco.physics import Physics
 from d4orm_env.mujoco.scene import DRIVES, HALF_TRACK, NOT_SOLID, OBSTACLE, PUCKS, WHEEL_RADIUS, build_scene
@@ -117,7 +118,7 @@ class TeamBodies:
         return Moved(self.states(), touched)
 
     def states(self) -> FloatArray:
-        """``(K, n)`` the robots' states, headings wound up as the models' are."""
+        """``(K, n)`` the robots' states, headings wound up no farther than the models' are."""
         states: FloatArray = np.zeros(self.problem.start.shape, np.float32)
         qpos, qvel = self.data.qpos, self.data.qvel
         for robot, model in enumerate(self.problem.team.robot_models):
@@ -161,8 +162,9 @@ class TeamBodies:
         joint = self.scene.joints[robot] + 3
         w, x, y, z = self.data.qpos[joint : joint + 4].tolist()
         angle = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        self._headings[robot] += math.remainder(angle - self._headings[robot], 2 * math.pi)
-        return float(self._headings[robot])
+        turned = self._headings[robot] + math.remainder(angle - self._headings[robot], 2 * math.pi)
+        self._headings[robot] = heading = float(unwound(turned, NUMPY_OPS))
+        return heading
 
     def _push(self, controls: FloatArray, states: FloatArray, limits: FloatArray) -> None:
         """Push the pucks that are controlled by acceleration, no faster than they may be, for a whole step."""

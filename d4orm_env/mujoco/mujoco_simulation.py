@@ -19,9 +19,6 @@ from d4orm_env.mujoco.bodies import TeamBodies
 from d4orm_env.mujoco.physics import Physics
 from d4orm_env.mujoco.scene import check_problem
 
-_WHIRL = 100.0
-"""How far the heading of a robot that others run into may wind up beyond what it commands [rad]."""
-
 
 class MujocoSimulation(Simulation):
     """A simulation whose bodies MuJoCo moves.
@@ -58,7 +55,7 @@ class MujocoSimulation(Simulation):
     def _spare_of(self, problem: Problem) -> Spare:
         # Who is run into may be faster for a moment than it can drive.
         fastest = float(problem.team.max_speed.max())
-        return super()._spare_of(problem).joined(Spare(speed=fastest, heading=_WHIRL, drift=fastest))
+        return super()._spare_of(problem).joined(Spare(speed=fastest, drift=fastest))
 
     def set_state(self, states: object) -> TeamStep:
         """See :meth:`d4orm_env.envs.simulation.Simulation.set_state`."""

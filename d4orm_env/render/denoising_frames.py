@@ -13,6 +13,7 @@ from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.problem import Problem
 from d4orm_env.render.panels import Panel, TeamLayer, view_limits
 from d4orm_env.render.pictures import PICTURE_SUFFIXES
+from d4orm_env.render.style import own_style
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +48,7 @@ class Denoising:
             raise ValueError("paths and samples must be finite")
 
 
+@own_style()
 def save_denoising(problem: Problem, denoising: Denoising, path: str | Path, panels: int = 6) -> Path:
     """Write a picture of a plan's denoising: the ways of its candidate, from the first step to the last.
 

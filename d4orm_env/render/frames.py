@@ -19,6 +19,7 @@ from d4orm_env.core.disturbance_events import Marks
 from d4orm_env.core.problem import Problem
 from d4orm_env.render.event_marks import MarkLayer
 from d4orm_env.render.panels import INK, Array, Panel, TeamLayer, make_axes, view_limits
+from d4orm_env.render.style import own_style
 
 
 class FrameRenderer:
@@ -43,6 +44,7 @@ class FrameRenderer:
         self._closed = False
         self._build(view_limits(problem, points))
 
+    @own_style()
     def _build(self, limits: Array) -> None:
         width, height = self.size
         scale = float(np.clip(min(width, height) / 480, 0.5, 2.0))
@@ -145,6 +147,7 @@ class FrameRenderer:
                 )
             )
 
+    @own_style()
     def _paint(self) -> NDArray[np.uint8]:
         self._canvas.restore_region(self._background)
         for artist, panel in self._artists:
@@ -185,6 +188,7 @@ class WindowRenderer:
         """Whether there is a window: not without a display, nor after the user closed it."""
         return self._manager is not None
 
+    @own_style()
     def _open_window(self, problem: Problem, size: tuple[int, int]) -> None:
         canvas_class = backend_registry.load_backend_module(mpl.get_backend()).FigureCanvas
         if not canvas_class.required_interactive_framework:

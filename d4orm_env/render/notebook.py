@@ -13,6 +13,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import Row
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.render.pictures import plot_problem, plot_trajectory
+from d4orm_env.render.style import own_style
 
 _DPI = 72
 
@@ -27,6 +28,7 @@ def problem_html(problem: Problem, title: str, rows: Iterable[Row]) -> str:
     return _page(title, rows, plot_problem(problem))
 
 
+@own_style()
 def paths_html(trajectory: Trajectory, title: str, rows: Iterable[Row]) -> str:
     """A motion whose world is not known: where the robots went, seen from above, and its key figures, escaped."""
     figure = Figure(figsize=(4.6, 4.6), layout="constrained")
@@ -37,6 +39,7 @@ def paths_html(trajectory: Trajectory, title: str, rows: Iterable[Row]) -> str:
     return _page(title, rows, figure)
 
 
+@own_style()
 def _page(title: str, rows: Iterable[Row], figure: Figure) -> str:
     stream = BytesIO()
     figure.savefig(stream, format="png", dpi=_DPI)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -30,6 +29,7 @@ from d4orm_env.render.panels import (
     make_axes,
     view_limits,
 )
+from d4orm_env.render.style import own_style
 
 PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
 
@@ -63,6 +63,7 @@ def checked_trajectory(problem: Problem, trajectory: Trajectory) -> None:
         raise ValueError(f"state of robot_{robot} at step {t} is not finite; roll out finite controls to draw them")
 
 
+@own_style()
 def plot_trajectory(
     problem: Problem, trajectory: Trajectory, *, title: str | None = None, marks: Marks | None = None
 ) -> Figure:
@@ -154,13 +155,15 @@ def plot(problem: Problem, trajectory: Trajectory | None = None, axes: Axes | No
     if axes is None:
         from matplotlib import pyplot
 
-        figure = pyplot.figure(layout="constrained")
-        axes = make_axes(figure, 111, "space" if problem.dimension == 3 else "plane")
+        with own_style():
+            figure = pyplot.figure(layout="constrained")
+            axes = make_axes(figure, 111, "space" if problem.dimension == 3 else "plane")
     elif axes.name == "3d" and problem.dimension == 2:
         raise ValueError("the axes are spatial and the problem is planar; give axes without projection='3d'")
     return _plot_on(axes, problem, trajectory)
 
 
+@own_style()
 def plot_problem(problem: Problem) -> Figure:
     """A problem alone, as :func:`plot` draws it, in a figure that belongs to no window."""
     figure = Figure(figsize=(4.6, 4.6), layout="constrained")
@@ -168,6 +171,7 @@ def plot_problem(problem: Problem) -> Figure:
     return figure
 
 
+@own_style()
 def _plot_on(axes: Axes, problem: Problem, trajectory: Trajectory | None) -> Axes:
     positions = () if trajectory is None else trajectory.positions
     layer = TeamLayer(Panel(axes, problem, view_limits(problem, positions)), problem)
@@ -235,6 +239,6 @@ def save_picture(
     undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
     with replaced_when_done(path, PICTURE_SUFFIXES) as temporary:
         figure = plot_trajectory(problem, trajectory, title=title, marks=marks)
-        with mpl.rc_context({"svg.hashsalt": "d4orm", "pdf.fonttype": 42}):
+        with own_style({"svg.hashsalt": "d4orm", "pdf.fonttype": 42}):
             figure.savefig(temporary, format=kind, dpi=160, metadata=undated.get(kind))
     return path

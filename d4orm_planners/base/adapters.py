@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, as_float32
 from d4orm_planners.base.policy import Actions, Observations, Policy
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ class SharedPolicy(Policy):
         if not observations:
             return {}
         stacked = np.stack([np.asarray(observation, np.float32) for observation in observations.values()])
-        actions = np.asarray(self._predict(stacked), np.float32)
+        actions = as_float32(self._predict(stacked))
         if self._normalized:
             spaces = [self._spaces[agent] for agent in observations]
             low, high = np.stack([space.low for space in spaces]), np.stack([space.high for space in spaces])

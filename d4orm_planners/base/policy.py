@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
@@ -17,6 +18,7 @@ from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.plan import Plan
 from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.settings import CheckedSettings
+from d4orm_planners.driving import ATTRIBUTE, driven_alone
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
@@ -29,7 +31,8 @@ Actions = dict[str, FloatArray]
 class Policy(ABC):
     """Something that chooses every robot's control at every step.
 
-    A subclass has :meth:`act`, and a :meth:`reset` if it draws, plans or remembers anything.
+    A subclass has :meth:`act`, and a :meth:`reset` if it draws, plans or remembers anything. One object drives one
+    episode at a time: calls from several threads that would mix theirs are a RuntimeError.
 
     Attributes:
         problem: Problem of the present episode, from the reset on.
@@ -42,6 +45,16 @@ class Policy(ABC):
     presets: ClassVar[Mapping[str, Mapping[str, object]]] = {}
     problem: Problem
 
+    def __init_subclass__(cls, **keywords: object) -> None:
+        super().__init_subclass__(**keywords)
+        for name in ("reset", "act"):
+            if inspect.isfunction(method := vars(cls).get(name)):
+                setattr(cls, name, driven_alone(method))
+
+    def __getstate__(self) -> dict[str, object]:
+        return {name: value for name, value in vars(self).items() if name != ATTRIBUTE}
+
+    @driven_alone
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:
         """Get ready for an episode that ``env.reset()`` has begun.
 
@@ -63,7 +76,7 @@ class Policy(ABC):
             ``{agent: (m,) float32 control}``.
 
         Raises:
-            RuntimeError: Before the first reset, if the policy needs one.
+            RuntimeError: Before the first reset, if the policy needs one, or if another thread uses the policy.
         """
 
     def identity(self) -> dict[str, object]:

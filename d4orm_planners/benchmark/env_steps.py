@@ -102,6 +102,7 @@ def _measure_batch(settings: BenchmarkSettings, size: int, **options: Any) -> Sp
 def measure_functional(settings: BenchmarkSettings) -> Row:
     """Worlds of 8 robots as pure functions of JAX, all in one program: random controls, observations, auto-reset."""
     import jax
+    import jax.numpy as jnp
 
     from d4orm_env.jax.functional_env import EnvState, FunctionalEnv
 
@@ -111,14 +112,14 @@ def measure_functional(settings: BenchmarkSettings) -> Row:
 
     def move(carry: tuple[EnvState, Any], key: jax.Array) -> tuple[tuple[EnvState, Any], None]:
         (state, total), keys = carry, jax.random.split(key, 1 + size)
-        controls = jax.random.uniform(keys[0], (size, *limits.shape), minval=-limits, maxval=limits)
+        controls = jax.random.uniform(keys[0], (size, *limits.shape), jnp.float32, minval=-limits, maxval=limits)
         state, transition = jax.vmap(env.step)(keys[1:], state, controls)
         # What nobody reads would not be computed.
         return (state, total + transition.rewards.sum() + transition.observations.sum()), None
 
     @jax.jit
-    def steps(state: EnvState, key: jax.Array) -> tuple[EnvState, float]:
-        return jax.lax.scan(move, (state, 0.0), jax.random.split(key, calls))[0]
+    def steps(state: EnvState, key: jax.Array) -> tuple[EnvState, jax.Array]:
+        return jax.lax.scan(move, (state, jnp.float32(0)), jax.random.split(key, calls))[0]
 
     state, _ = begin(jax.random.split(jax.random.key(0), size))
     spread = measure(

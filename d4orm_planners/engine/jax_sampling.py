@@ -101,11 +101,11 @@ def _score(static: _Static, inputs: _Inputs, step: Array, mean: Array, scale: Ar
     worlds = Worlds(
         jnp.broadcast_to(arrays.start[..., None], (*arrays.start.shape, static.num_samples)),
         jnp.broadcast_to(inputs.docked[:, None], (num_robots, static.num_samples)),
-        jnp.zeros((num_robots, mean.shape[2], static.num_samples)),
+        jnp.zeros((num_robots, mean.shape[2], static.num_samples), jnp.float32),
     )
     times = jnp.arange(len(mean), dtype=jnp.uint32)
     obstacles = None if inputs.moving is None else inputs.moving.positions
-    carry = (worlds, jnp.zeros((num_robots, static.num_samples)))
+    carry = (worlds, jnp.zeros((num_robots, static.num_samples), jnp.float32))
     (_, total), deformations = jax.lax.scan(advance, carry, (times, inputs.base, mean, scale, obstacles))
     return total / len(mean), deformations
 
@@ -137,15 +137,17 @@ def _denoise(static: _Static, inputs: _Inputs, noise_scale: Array, run: _Run, be
             ratio = ratio.sum(axis=0, keepdims=True) if static.credit == "team" else ratio
             extra = (static.rules.importance * ratio,)
         weights = static.rules.weights(jnp.where(finite, rewards, -jnp.inf), jnp, *extra)
-        weights = jnp.broadcast_to(weights, (mean.shape[1], static.num_samples))
+        weights = jnp.broadcast_to(jnp.asarray(weights, jnp.float32), (mean.shape[1], static.num_samples))
         new_mean = jnp.einsum("tkms,ks->tkm", usable, weights)
         # Nothing to go by: every sample was excluded.
         new_mean = jnp.where((weights.sum(axis=-1) > 0)[None, :, None], new_mean, mean)
         if static.rules.adapt is not None:
             deviation2 = jnp.einsum("tkms,ks->tkm", (usable - new_mean[..., None]) ** 2, weights)
-            factor = static.rules.adapt(deviation2 / inputs.units**2, jnp)
-        average = jnp.where(finite, rewards, 0).sum() / jnp.maximum(finite.sum(), 1)
-        return _Run(new_mean, factor, run.rewards.at[step].set(average), run.excluded + (~finite).sum())
+            factor = jnp.asarray(static.rules.adapt(deviation2 / inputs.units**2, jnp), jnp.float32)
+        usable_samples = finite.sum(dtype=jnp.int32)
+        average = jnp.where(finite, rewards, 0).sum() / jnp.maximum(usable_samples, 1).astype(jnp.float32)
+        excluded = run.excluded + (finite.size - usable_samples)
+        return _Run(new_mean, factor, run.rewards.at[step].set(average), excluded)
 
     return jax.lax.fori_loop(begin, end, update, run)
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from d4orm_env.render.style import own_style
 from d4orm_planners.evaluation.comparison import PairedPolicies, compare_pairs
 from d4orm_planners.evaluation.summary import THRESHOLD, SuccessRate, Tolerance, TrialGroup, success_rates, tolerances
 from d4orm_planners.evaluation.tables import markdown, panels, table, target, write_csv, write_rates
@@ -144,6 +145,7 @@ def _pair_cells(pair: PairedPolicies) -> tuple[str, ...]:
     )
 
 
+@own_style()
 def _draw_noise(path: Path, rates: Sequence[SuccessRate]) -> None:
     """Success against the execution noise: one line per policy, one panel per scenario and team."""
     groups = panels(rates)
@@ -155,6 +157,7 @@ def _draw_noise(path: Path, rates: Sequence[SuccessRate]) -> None:
     figure.savefig(path, dpi=150)
 
 
+@own_style()
 def _draw_disturbance(path: Path, name: str, rates: Sequence[SuccessRate]) -> None:
     """Success against the level of one disturbance: one line per policy, one panel per scenario, team and noise.
 
@@ -193,6 +196,7 @@ def _draw_lines(ax: Any, rates: Sequence[SuccessRate], place: Callable[[SuccessR
     ax.grid(alpha=0.3)
 
 
+@own_style()
 def _draw_map(path: Path, rates: Sequence[SuccessRate]) -> None:
     """A heat map of success: a row per policy, a column per level of every disturbance, a panel as above."""
     groups = _panels([rate for rate in rates if rate.disturbance])

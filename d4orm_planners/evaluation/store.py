@@ -13,6 +13,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from d4orm_env.core.arrays import shown
+
 APPLICATION_ID = 0x64346F72
 """Marks the file as one of ours, in its header ("d4or")."""
 VERSION = 9
@@ -255,13 +257,11 @@ class TrialStore:
         return [self._trial(number, dict(zip(_NAMES, row))) for number, row in enumerate(rows)]
 
     def _trial(self, number: int, values: dict[str, Any]) -> Trial:
-        """A row as a trial. SQLite keeps truth values as numbers, and whatever it is given in any column."""
-        for name, kinds in _KINDS.items():
-            if not isinstance(values[name], kinds) or (name in _JSON and not _is_json(values[name], _JSON[name])):
-                raise self._damaged(f"trial {number} has {values[name]!r} as {name}")
-        for name in _TRUTHS:
-            values[name] = None if values[name] is None else bool(values[name])
-        return Trial(**values)
+        """A row as a trial. SQLite keeps whatever it is given in any column."""
+        try:
+            return checked_trial(values)
+        except ValueError as error:
+            raise self._damaged(f"trial {number} {error}") from None
 
     def finished(self) -> set[TrialKey]:
         """Keys of all trials that ran to their end."""
@@ -340,6 +340,19 @@ class TrialStore:
         )
 
 
+def checked_trial(values: Mapping[str, Any]) -> Trial:
+    """A trial of what a file has for each of its attributes; truth values may be numbers.
+
+    Raises:
+        ValueError: If one is of another type; the message goes on from the name of the trial.
+    """
+    for name, kinds in _KINDS.items():
+        if not isinstance(values[name], kinds) or (name in _JSON and not _is_json(values[name], _JSON[name])):
+            raise ValueError(f"has {shown(values[name])} as {name}")
+    truths = {name: None if values[name] is None else bool(values[name]) for name in _TRUTHS}
+    return Trial(**{**values, **truths})
+
+
 def _columns(connection: sqlite3.Connection) -> set[str]:
     return {row[1] for row in connection.execute("PRAGMA table_info(trials)")}
 
@@ -366,7 +379,7 @@ def config_now(config: str | bytes | float | None) -> str | bytes | float | None
         return config
     try:
         return json.dumps({**json.loads(config), "penalty": 1.0}, sort_keys=True)
-    except (ValueError, TypeError):  # damaged, which whoever reads it says
+    except (ValueError, TypeError, RecursionError):  # damaged, which whoever reads it says
         return config
 
 
@@ -388,7 +401,7 @@ def _is_json(text: str, kind: type | tuple[int, ...]) -> bool:
     """Whether a text is JSON of this kind: an object, or a list of lists of one of these lengths."""
     try:
         content = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return False
     if isinstance(kind, tuple):
         lists = content if isinstance(content, list) else [None]

@@ -6,14 +6,22 @@ import csv
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from d4orm_env.core.arrays import shown
+from d4orm_env.core.errors import first_line
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.base.escaping import markdown_text, one_line, spreadsheet_cell
-from d4orm_planners.evaluation.store import STORE, Trial, TrialStore, config_now
+from d4orm_planners.evaluation.store import STORE, Trial, TrialStore, checked_trial, config_now
 from d4orm_planners.evaluation.summary import SuccessRate, SuccessWithin
 
+if TYPE_CHECKING:
+    from pyarrow.parquet import ParquetFile
+
+MAX_TRIALS, MAX_BYTES = 10**7, 2**32
+"""Of a Parquet file that is read."""
 PARQUET_HINT = 'trials.parquet is not written, which needs pyarrow; install it with pip install "d4orm-env[evaluate]"'
 HEADER = ("policy", "noise", "success", "95% interval", "verified", "contact", "not in time", "errors",
           "travel time, s", "stretch", "planning, s", "decision, ms", "training, min",
@@ -90,17 +98,41 @@ def read_parquet(path: str | os.PathLike[str]) -> list[Trial]:
 
     Raises:
         ImportError: If pyarrow is not installed.
-        ValueError: If the file is no Parquet, or has other columns.
+        ValueError: If the file is no Parquet, has other columns, or more than a store has room for, or a value of
+            another type.
         OSError: If it cannot be read.
     """
     import pyarrow
     from pyarrow import parquet
 
     try:
-        rows = parquet.read_table(path).to_pylist()
-        return [Trial(**{**row, "config": config_now(row["config"])}) for row in rows]
-    except (pyarrow.ArrowInvalid, TypeError, KeyError) as error:
-        raise ValueError(f"{os.fspath(path)} is no Parquet file of trials: {str(error).splitlines()[0]}") from error
+        with parquet.ParquetFile(path) as file:
+            return list(_trials(file))
+    except (pyarrow.ArrowException, OSError, TypeError, KeyError, ValueError, OverflowError) as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise
+        # A damaged file is to pyarrow an OSError as well.
+        raise ValueError(f"{os.fspath(path)} is no Parquet file of trials: {first_line(error)}") from error
+
+
+def _trials(file: ParquetFile) -> Iterator[Trial]:
+    """The trials of a file that another may have written, which says first how much it holds."""
+    about = file.metadata
+    size = sum(about.row_group(group).total_byte_size for group in range(about.num_row_groups))
+    if about.num_rows > MAX_TRIALS or size > MAX_BYTES:
+        raise ValueError(f"it has {about.num_rows} rows of {size} bytes; at most {MAX_TRIALS} of {MAX_BYTES} are read")
+    defaults = {field.name: field.default for field in fields(Trial) if field.default is not MISSING}
+    names, required = set(file.schema_arrow.names), {field.name for field in fields(Trial)} - defaults.keys()
+    if wrong := sorted((names - required - defaults.keys()) | (required - names)):
+        raise ValueError(f"its columns differ from those of trials in {', '.join(map(shown, wrong[:5]))}")
+    number = 0
+    for batch in file.iter_batches(batch_size=1024):
+        for row in batch.to_pylist():
+            try:
+                yield checked_trial({**defaults, **row, "config": config_now(row["config"])})
+            except ValueError as error:
+                raise ValueError(f"trial {number} {error}") from None
+            number += 1
 
 
 @contextmanager

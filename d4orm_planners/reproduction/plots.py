@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from d4orm_env.render.style import own_style
 from d4orm_planners.evaluation.comparison import steps_spent, steps_to_solution, survival
 from d4orm_planners.evaluation.store import BestSoFar, Trial
 from d4orm_planners.reproduction.figure import Figure, Group
@@ -26,6 +27,7 @@ INSTANTS = 200
 """Points of an anytime curve."""
 
 
+@own_style()
 def draw(path: Path, figure: Figure, groups: Sequence[Group], rows: Sequence[Measured]) -> None:
     """Write the picture.
 

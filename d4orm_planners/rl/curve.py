@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core.files import replaced_when_done
+from d4orm_env.render.style import own_style
 from d4orm_planners.base.escaping import spreadsheet_cell
 from d4orm_planners.rl.network import Network
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
@@ -95,6 +96,7 @@ def write_curve(folder: Path, evaluations: Sequence[Evaluation]) -> None:
         _draw(temporary, evaluations)
 
 
+@own_style()
 def _draw(path: Path, evaluations: Sequence[Evaluation]) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,9 +10,10 @@ import numpy as np
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.errors import first_line
+from d4orm_env.core.team import Team
 from d4orm_env.scenarios.problems import is_scenario_file
 from d4orm_env.scenarios.scenario_registry import SCENARIOS
-from d4orm_planners.rl.samples import Samples
+from d4orm_planners.rl.samples import MAX_BYTES, Samples
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -41,16 +42,39 @@ def dataset_samples(path: str, model: str, size: int) -> list[Samples]:
             "record one for them with 'd4orm dataset --model'"
         )
     env.close()
-    episodes = []
+    try:
+        _check_arrays(Path(dataset.storage.data_path))
+        return list(_episodes(dataset, team, size, metadata["agents"] == "team"))
+    except Exception as error:  # HDF5, Minari and NumPy have a dozen kinds for a damaged file
+        raise ValueError(
+            f"dataset {path!r} is damaged ({first_line(error)}); record it anew with 'd4orm dataset'"
+        ) from None
+
+
+def _check_arrays(folder: Path) -> None:
+    """Refuse a dataset that does not hold plain numbers of a size that makes sense, before any is read."""
+    import h5py
+
+    def look(name: str, thing: object) -> None:
+        if isinstance(thing, h5py.Dataset) and (thing.dtype.kind not in "biuf" or thing.nbytes > MAX_BYTES):
+            raise ValueError(
+                f"{name} is {thing.nbytes} bytes of {thing.dtype}; numbers in at most {MAX_BYTES} bytes are read"
+            )
+
+    with h5py.File(folder / "main_data.hdf5") as file:
+        for number in file:
+            file[number].visititems(look)
+
+
+def _episodes(dataset: MinariDataset, team: Team, size: int, together: bool) -> Iterator[Samples]:
     for episode, own in zip(dataset, dataset.storage.get_episode_metadata(dataset.episode_indices), strict=True):
-        limits = team.control_limits[:] if metadata["agents"] == "team" else team.control_limits[[int(own["robot"])]]
+        limits = team.control_limits[:] if together else team.control_limits[[int(own["robot"])]]
         moments = (len(episode.actions), len(limits))
         # A team's robots that have arrived send zeros.
         acting = ~np.asarray(episode.infos["arrived"])[:-1].reshape(moments)
         seen = np.asarray(episode.observations[:-1], np.float32).reshape(*moments, size)
         controls = np.asarray(episode.actions, np.float32).reshape(*moments, limits.shape[1])
-        episodes.append(Samples(seen[acting], controls[acting], np.broadcast_to(limits, controls.shape)[acting]))
-    return episodes
+        yield Samples(seen[acting], controls[acting], np.broadcast_to(limits, controls.shape)[acting])
 
 
 def _dataset(path: str) -> MinariDataset:
@@ -58,12 +82,9 @@ def _dataset(path: str) -> MinariDataset:
         import minari
     except ModuleNotFoundError as error:
         raise ImportError(f"a dataset needs {error.name}; install it with: pip install 'd4orm-env[dataset]'") from None
-    folders = (Path(path), Path(path) / "data")
-    for folder in folders:
-        if (folder / "main_data.hdf5").is_file():
-            return minari.MinariDataset(folder)
+    folders = [folder for folder in (Path(path), Path(path) / "data") if (folder / "main_data.hdf5").is_file()]
     try:
-        return minari.load_dataset(path)
+        return minari.MinariDataset(folders[0]) if folders else minari.load_dataset(path)
     except Exception as error:  # a name that is none, a folder that is none, or files that Minari cannot read
         raise ValueError(
             f"dataset {path!r} cannot be read ({first_line(error)}); give the folder or the name of one of "

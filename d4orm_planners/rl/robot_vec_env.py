@@ -12,7 +12,7 @@ from gymnasium.spaces import Box
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray, as_float32
 from d4orm_env.core.observation_layout import ObservationSlices
 from d4orm_env.envs.rewards import RewardFunction
 from d4orm_env.envs.team_step import Info
@@ -109,7 +109,7 @@ class RobotVecEnv(VecEnv):
         return features
 
     def step_async(self, actions: FloatArray) -> None:
-        self._actions = np.asarray(actions, np.float32)
+        self._actions = as_float32(actions)
 
     def step_wait(self) -> tuple[FloatArray, FloatArray, BoolArray, list[Info]]:
         begin = time.perf_counter()

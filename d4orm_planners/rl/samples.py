@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from d4orm_env.core.archives import ArrayArchive
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, as_float32
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.base.policy import Policy, robot_indices
 from d4orm_planners.rl.features import Features
@@ -95,7 +95,7 @@ def record_samples(env: ParallelEnv, expert: Policy, seed: int, learner: Driver 
         acting = {agent: observations[agent] for agent in env.agents}
         asked = expert.act(acting, env.state())
         seen, own = np.stack(list(acting.values())), limits[robot_indices(acting)]
-        controls = np.stack([np.asarray(asked[agent], np.float32) for agent in acting])
+        controls = as_float32([asked[agent] for agent in acting])
         parts.append(Samples(seen, controls, own))
         driven = controls if learner is None else learner(seen, own)
         observations, *_ = env.step(dict(zip(acting, driven, strict=True)))

@@ -13,7 +13,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.yaml_text import parse_yaml
 from d4orm_env.disturbances.disturbance_registry import disturbances_at
@@ -281,7 +281,7 @@ class MixedVecEnv(VecEnv):
         return features
 
     def step_async(self, actions: FloatArray) -> None:
-        self._actions = np.asarray(actions, np.float32)
+        self._actions = as_float32(actions)
 
     def step_wait(self) -> tuple[FloatArray, FloatArray, BoolArray, list[Info]]:
         begin = time.perf_counter()

@@ -108,8 +108,14 @@ def _metadata(folder: Path) -> dict[str, Any]:
     """
     path = folder / METADATA
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError) as error:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        counts, seeds = [content[name] for name in ("total_episodes", "total_steps")], content["recorded_seeds"]
+        if not all(isinstance(number, int) and number >= 0 for number in (*counts, *seeds)):
+            raise ValueError("its counts and seeds must be whole numbers")
+        return dict(content)
+    except KeyError as error:
+        raise ValueError(f"{path} lacks {error}; remove {folder} to record its episodes anew") from None
+    except (OSError, ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"{path} cannot be read ({error}); remove {folder} to record its episodes anew") from None
 
 

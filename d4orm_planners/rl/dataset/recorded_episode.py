@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from d4orm_env.core.archives import ArrayArchive
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.envs.team_step import TeamStep
 from d4orm_planners.base.episode import run_episode
@@ -79,12 +79,30 @@ class RecordedEpisode:
             with path.open("rb") as stream, ArrayArchive(stream, (*_ARRAYS, "metadata")) as archive:
                 arrays = {name: archive.array(name, MAX_BYTES) for name in _ARRAYS}
                 metadata = json.loads(archive.array("metadata", MAX_BYTES).tobytes())
-        except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            _check(arrays, metadata)
+        except (ValueError, KeyError, EOFError, RecursionError, zipfile.BadZipFile, zlib.error) as error:
             raise ValueError(f"{path} is no recorded episode ({error}); remove it to record it anew") from None
         return cls(**arrays, metadata=metadata)
 
 
 _ARRAYS = tuple(field.name for field in fields(RecordedEpisode) if field.name != "metadata")
+_FLAGS = ("acting", "terminations", "arrived", "collided", "margin_violated")
+_OF_STEPS = ("actions", "acting", "rewards", "terminations")
+"""Of ``T`` moments; the others have one more."""
+
+
+def _check(arrays: Mapping[str, np.ndarray], metadata: object) -> None:
+    """Refuse what is no episode, in types or shapes."""
+    actions = arrays["actions"]
+    if actions.ndim != 3 or not isinstance(metadata, dict) or not isinstance(metadata.get("seed"), int):
+        raise ValueError("it lacks a seed, or actions of every robot at every step")
+    steps, robots = actions.shape[:2]
+    axes = {"observations": 3, "actions": 3}
+    for name, array in arrays.items():
+        kind = np.dtype(np.bool_ if name in _FLAGS else np.float32)
+        lengths = (steps + (name not in _OF_STEPS), *(() if name == "state" else (robots,)))
+        if array.dtype != kind or array.ndim != axes.get(name, 2) or array.shape[: len(lengths)] != lengths:
+            raise ValueError(f"{name} is of type {array.dtype} and shape {array.shape}")
 
 
 def record_episode(env: ParallelEnv, policy: Policy, seed: int = 0) -> RecordedEpisode:
@@ -155,5 +173,5 @@ class _Recorder(Policy):
         for step, actions in enumerate(self._actions):
             robots = robot_indices(actions)
             acting[step, robots] = True
-            controls[step, robots] = list(actions.values())
+            controls[step, robots] = as_float32(list(actions.values()))
         return acting, controls

@@ -45,7 +45,7 @@ class Recording:
             return
         try:
             before = dict(json.loads(path.read_text(encoding="utf-8")))
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, RecursionError):
             raise ValueError(f"{path} cannot be read; remove the folder, or choose another") from None
         for name, value in identity.items():
             if before.get(name) != value:
