@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray, as_float32
-from d4orm_planners.base.policy import Actions, Observations, Policy
+from d4orm_planners.base.policy import Actions, Observations, Policy, within_limits
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
@@ -53,7 +53,7 @@ class SharedPolicy(Policy):
             spaces = [self._spaces[agent] for agent in observations]
             low, high = np.stack([space.low for space in spaces]), np.stack([space.high for space in spaces])
             actions = low + (np.clip(actions, -1, 1) + 1) / 2 * (high - low)
-        return dict(zip(observations, actions))
+        return within_limits(self.problem, dict(zip(observations, actions)))
 
     def identity(self) -> dict[str, object]:
         digest = hashlib.sha256()

@@ -10,15 +10,18 @@ from functools import partial
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, as_float32
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
+from d4orm_env.envs.inputs import usable
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.plan import Plan
 from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.settings import CheckedSettings
 from d4orm_planners.driving import ATTRIBUTE, driven_alone
+from d4orm_planners.tracking.steering import limit_controls
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
@@ -73,7 +76,8 @@ class Policy(ABC):
             state: ``env.state()``; :func:`d4orm_env.envs.joint_state.split_state` takes it apart.
 
         Returns:
-            ``{agent: (m,) float32 control}``.
+            ``{agent: (m,) float32 control}``. All that come with the package are inside the robot's own limits, so that
+            the step, or a real robot, executes them as they are; see :func:`within_limits`.
 
         Raises:
             RuntimeError: Before the first reset, if the policy needs one, or if another thread uses the policy.
@@ -113,7 +117,7 @@ class StatePolicy(Policy):
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:
         require_reset(self)
-        controls = self._controls(split_state(self.problem, state))
+        controls = limit_controls(self.problem, self._controls(split_state(self.problem, state)))
         return {agent: controls[robot] for agent, robot in zip(observations, robot_indices(observations))}
 
     def _begin(self, env: ParallelEnv, seed: int) -> None:
@@ -139,6 +143,29 @@ def robot_indices(agents: Iterable[str]) -> list[int]:
     return [int(agent.rsplit("_", 1)[1]) for agent in agents]
 
 
+def within_limits(problem: Problem, actions: Mapping[str, ArrayLike]) -> Actions:
+    """Actions as the step executes them: each inside its robot's own limits.
+
+    What is no action of this team, such as one that is not finite, stays as it is: the environment says what is wrong.
+
+    Args:
+        problem: Whose robots they are.
+        actions: ``(m,)`` controls by agent.
+    """
+    controls, size = np.zeros((problem.num_robots, problem.control_size), np.float32), (problem.control_size,)
+    robots = {f"robot_{robot}": robot for robot in range(problem.num_robots)}
+    for agent, action in actions.items():
+        try:
+            control = as_float32(action)
+        except ValueError:
+            return dict(actions)
+        if agent not in robots or control.shape != size or not usable(control).all():
+            return dict(actions)
+        controls[robots[agent]] = control
+    limited = limit_controls(problem, controls)
+    return {agent: limited[robots[agent]] for agent in actions}
+
+
 class TeamFunction(Policy):
     """A function ``(observations, state) -> actions`` as a policy."""
 
@@ -146,7 +173,8 @@ class TeamFunction(Policy):
         self.function = function
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:
-        return self.function(observations, state)
+        require_reset(self)
+        return within_limits(self.problem, self.function(observations, state))
 
 
 class RobotFunction(Policy):
@@ -156,7 +184,9 @@ class RobotFunction(Policy):
         self.function = function
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:
-        return {agent: self.function(observation) for agent, observation in observations.items()}
+        require_reset(self)
+        actions = {agent: self.function(observation) for agent, observation in observations.items()}
+        return within_limits(self.problem, actions)
 
 
 class OpenLoop(StatePolicy):
@@ -202,7 +232,7 @@ class OpenLoop(StatePolicy):
 
 
 class RandomControls(StatePolicy):
-    """Controls drawn uniformly from the box of each robot's limits."""
+    """Controls drawn uniformly from the box of each robot's limits, and then clipped to what it can do."""
 
     name = "random"
 

@@ -24,8 +24,14 @@ class PlanOptions(PictureOptions, ProblemOptions):
     """What to plan, with what, and what to write."""
 
     planner: Annotated[
-        str, typer.Option("--planner", "-p", help="Planner (see `d4orm planners`), or package.module:Name.")
-    ] = "hybrid"
+        str | None,
+        typer.Option(
+            "--planner",
+            "-p",
+            help="Planner (see `d4orm planners`), or package.module:Name.",
+            show_default="that of make_planner()",
+        ),
+    ] = None
     preset: Annotated[
         str | None, typer.Option("--preset", help="`paper` for the paper's parameters, `tuned` for tuned ones.")
     ] = None
@@ -41,7 +47,7 @@ class PlanOptions(PictureOptions, ProblemOptions):
 @takes(PlanOptions)
 def plan(options: PlanOptions) -> None:
     """Plan for a team; write the plan, a picture or an animation."""
-    from d4orm_planners.base.planner_registry import make_planner
+    from d4orm_planners.base.planner_registry import RECOMMENDED, make_planner
 
     check_target(options.out, (".npz", ".html"))
     options.check_pictures()
@@ -49,7 +55,10 @@ def plan(options: PlanOptions) -> None:
     for name in {"engine", "preset", "max_iterations"}.intersection(chosen):
         refuse_options(options.context, (name,), f"and --set {name} say the same; give one of them")
     problem = options.problem()
-    planner = make_planner(options.planner, **{"engine": options.engine, "preset": options.preset, **chosen})
+    planner = make_planner(
+        RECOMMENDED if options.planner is None else options.planner,
+        **{"engine": options.engine, "preset": options.preset, **chosen},
+    )
     with solving(planner, problem, options.max_iterations, options.quiet) as callback:
         found = planner.solve(problem, options.seed, options.time_limit, options.max_iterations, callback)
     if not options.quiet:

@@ -27,7 +27,15 @@ class RunOptions(PictureOptions, ProblemOptions):
     """What to run, and where."""
 
     plan_file: Annotated[Path | None, typer.Argument(help="Plan to execute; plans anew without one.")] = None
-    policy: Annotated[str, typer.Option("--policy", "-p", help="Planner, policy or package.module:Name.")] = "d4orm"
+    policy: Annotated[
+        str | None,
+        typer.Option(
+            "--policy",
+            "-p",
+            help="Planner, policy or package.module:Name.",
+            show_default="the planner of make_planner()",
+        ),
+    ] = None
     preset: Annotated[str | None, typer.Option("--preset", help="Preset of the policy, as `paper`.")] = None
     control_noise_std: Annotated[
         float, typer.Option("--control-noise-std", "--noise", help="Standard deviation of the execution noise.")
@@ -70,12 +78,12 @@ class RunOptions(PictureOptions, ProblemOptions):
             ValueError: For an option that makes no sense, or does not go with a plan file.
         """
         from d4orm_planners.base.plan import Plan
-        from d4orm_planners.base.planner_registry import make_policy
+        from d4orm_planners.base.planner_registry import RECOMMENDED, make_policy
         from d4orm_planners.base.policy import OpenLoop
 
         if self.plan_file is None:
             chosen = {} if self.preset is None else {"preset": self.preset}
-            return self.problem(), make_policy(self.policy, **chosen)
+            return self.problem(), make_policy(RECOMMENDED if self.policy is None else self.policy, **chosen)
         refuse_options(
             self.context,
             {"policy", "preset", "compare", *(field.name for field in fields(ProblemOptions) if field.name != "seed")},

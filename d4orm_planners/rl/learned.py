@@ -11,7 +11,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.envs.joint_state import split_state
-from d4orm_planners.base.policy import Actions, Observations, Policy, require_reset, robot_indices
+from d4orm_planners.base.policy import Actions, Observations, Policy, require_reset, robot_indices, within_limits
 from d4orm_planners.base.settings import CheckedSettings, PathText
 from d4orm_planners.rl.network import SUFFIX, Network, load_network
 from d4orm_planners.tracking.steering import goals_along_ways
@@ -117,7 +117,8 @@ class LearnedPolicy(Policy):
         among_obstacles = self.problem.world.num_obstacles > 0
         if among_obstacles and isinstance(self._actor, _NetworkActor) and self._actor.network.header.ways:
             self._look_along_ways(self._actor.network, robots, seen, state)
-        return dict(zip(observations, self._actor.controls(seen, self.problem.team.control_limits[robots])))
+        controls = self._actor.controls(seen, self.problem.team.control_limits[robots])
+        return within_limits(self.problem, dict(zip(observations, controls)))
 
     def _look_along_ways(self, network: Network, robots: list[int], seen: FloatArray, state: FloatArray) -> None:
         """Change the goals in ``seen`` ``(N, D)`` as in training, by the map that everybody has.

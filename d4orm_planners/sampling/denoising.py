@@ -47,7 +47,8 @@ class DenoisingFilm:
 
     def __call__(self, step: DenoisingStep) -> None:
         """Remember a step."""
-        if step.task.problem is not self._problem:
+        # That of a part of the team has a team of its own.
+        if step.task.problem.team is not self._problem.team:
             return
         base, weights = step.task.base, np.atleast_2d(step.weights)[:, : self._num_samples]
         shares = weights.mean(axis=0) / max(float(weights.max()), 1e-12)
@@ -85,5 +86,7 @@ class DenoisingFilm:
         )
 
     def _path(self, controls: FloatArray) -> FloatArray:
-        positions = rollout(self._problem, controls, engine="cpu").positions
+        whole = np.zeros((self._problem.horizon, *controls.shape[1:]), np.float32)
+        whole[: len(controls)] = controls
+        positions = rollout(self._problem, whole, engine="cpu").positions
         return positions[np.linspace(0, len(positions) - 1, min(POINTS, len(positions))).round().astype(int)]

@@ -22,6 +22,7 @@ from d4orm_planners.base.solve import Search
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
 from d4orm_planners.sampling.schedule import alpha_bar
 from d4orm_planners.sampling.settings import DenoisingConfig, SamplingConfig
+from d4orm_planners.sampling.short_paths import on_short_paths
 from d4orm_planners.sampling.weights import GroupWeights
 
 
@@ -68,6 +69,10 @@ class SamplingPlanner(Planner):
         """One run of the sampling loop over the whole team."""
         base, mean = self.initial(search)
         task, rules = self.task(search, base), self.rules()
+        if self.config.short_paths:
+            task = on_short_paths(task, search)
+        horizon = task.problem.horizon
+        mean = np.ascontiguousarray(mean[:horizon])
         if self.config.credit == "group":
             rules = rules._replace(weights=GroupWeights(rules.weights, conflict_groups(search)))
         num_steps = excluded = 0
@@ -75,7 +80,9 @@ class SamplingPlanner(Planner):
             seed = search.iteration_seed(Stream.SAMPLES, stage)
             result = search.denoise(task, rules, mean, noise_scale, num_samples, seed)
             mean, num_steps, excluded = result.mean, num_steps + len(result.rewards), excluded + result.excluded
-        return Iteration(base + mean, num_steps, excluded)
+        controls = np.zeros_like(base)
+        controls[:horizon] = task.base + mean
+        return Iteration(controls, num_steps, excluded)
 
 
 def conflict_groups(search: Search) -> Groups:

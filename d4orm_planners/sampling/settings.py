@@ -17,7 +17,13 @@ from d4orm_planners.sampling.weights import SoftmaxWeights
 Credit = Annotated[str, one_of(("team", "robot", "alternate", "group"))]
 Cutoff = Annotated[NotNegative, Field(lt=1)]
 
-PAPER = {"num_samples": 1024, "num_steps": 100, "weight_cutoff": 0.0, "clip_between_iterations": False}
+PAPER = {
+    "num_samples": 1024,
+    "num_steps": 100,
+    "weight_cutoff": 0.0,
+    "clip_between_iterations": False,
+    "short_paths": False,
+}
 """What the paper's experiments share (section IV-B)."""
 
 
@@ -35,12 +41,16 @@ class SamplingConfig(PlannerConfig):
         penalty: What a violation of the margin costs a robot per step, 1 in the paper. A robot's own reward does not
             tell what touching it costs the other, so that going through can be cheaper than making way; 2 makes up for
             that.
+        short_paths: Whether robots whose paths are all short next to their size are sampled over the steps that evading
+            each other takes, by rewards that make up for the shortness (:mod:`d4orm_planners.sampling.short_paths`).
+            The paper always samples all steps.
     """
 
     num_samples: Samples = 1024
     num_steps: Steps = 100
     credit: Credit = "team"
     penalty: Positive = 1.0
+    short_paths: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)

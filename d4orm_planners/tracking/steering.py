@@ -99,6 +99,21 @@ def track_velocities(problem: Problem, states: FloatArray, velocities: FloatArra
     return np.clip(controls, -limit, limit)
 
 
+def limit_controls(problem: Problem, controls: FloatArray) -> FloatArray:
+    """``(K, m)`` what a step executes of controls: clipped to each robot's own limits, zero on padding.
+
+    Args:
+        problem: Whose robots they are.
+        controls: ``(K, m)`` float32.
+    """
+    limited = np.zeros_like(controls)
+    for model, robots in by_model(problem):
+        u, limits = controls[robots, : model.control_size].T, problem.team.limits[robots].T
+        allowed = model.functions.limit_control(tuple(u), tuple(limits), NUMPY_OPS)
+        limited[robots, : model.control_size] = np.stack(allowed, axis=1)
+    return limited
+
+
 def present_velocities(problem: Problem, states: FloatArray, controls: FloatArray) -> FloatArray:
     """``(K, d)`` velocities [m/s]; that of a first-order robot is its last command.
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from d4orm_env import make_problem
+from d4orm_planners import make_planner
 from d4orm_planners.base.plan import Plan
 
 QUICK = ("--set", "num_samples=64", "--set", "num_steps=5", "--max-iterations", "1")
@@ -38,6 +39,14 @@ def test_plan_writes_a_replay(d4orm, tmp_path: Path) -> None:
     assert outcome.status == 0, outcome.err
     assert "wrote plan.html" in outcome.out
     assert "circle, 2 robots by d4orm-d" in (tmp_path / "plan.html").read_text(encoding="utf-8")
+
+
+def test_planning_and_running_take_the_recommended_planner(d4orm) -> None:
+    assert d4orm("plan", "--num-robots", "2", "--out", "plan.npz", "--quiet").status == 0
+    assert Plan.load("plan.npz").planner == make_planner().name
+    chosen = [d4orm("run", "--num-robots", "4", *given) for given in ((), ("--policy", make_planner().name))]
+    assert chosen[0].out == chosen[1].out
+    assert d4orm("run", "--num-robots", "4", "--policy", "").status == 2
 
 
 def test_run_compares_policies_side_by_side(d4orm, tmp_path: Path) -> None:

@@ -476,6 +476,7 @@ def test_the_paper_preset_has_the_papers_parameters(name: str) -> None:
         "credit": "team",
         "weight_cutoff": 0,
         "clip_between_iterations": name == "d4orm-d",
+        "short_paths": False,
     }
     without = {
         "mppi": {"beta_start", "beta_end"},

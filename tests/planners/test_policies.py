@@ -19,6 +19,7 @@ from d4orm_env.envs.joint_state import split_state
 from d4orm_env.envs.wrappers import GaussianControlNoise
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import OpenLoop, Plan, Policy, list_planners, list_policies, make_policy, run_episode
+from d4orm_planners.base.adapters import SharedPolicy
 from d4orm_planners.base.planner_registry import PLANNERS, POLICIES, describe_policy
 from d4orm_planners.rl.learned import LearnedPolicy
 from d4orm_planners.tracking.steering import goals_along_ways
@@ -80,6 +81,56 @@ def test_actions_are_those_of_the_live_agents_and_in_their_spaces(name: str, mak
         observations = env.step(actions)[0]
         steps += 1
     assert 3 <= steps <= 25
+
+
+@ALL
+@pytest.mark.parametrize("models", [("velocity2d", "differential_drive", "holonomic2d"), ("holonomic3d",) * 3])
+def test_actions_are_executed_as_they_are(name: str, models: tuple[str, ...]) -> None:
+    spatial = models[0] == "holonomic3d"
+    if spatial and name in ("orca", "ppo", "sac"):
+        pytest.skip("in the plane only")
+    if isinstance(policy := cheap_policy(name), LearnedPolicy):
+        models = ("holonomic2d",) * 3
+    env = navigation_v0.parallel_env(scenario="circle", num_robots=3, model=models, horizon=30, max_acceleration=0.7)
+    observations, _ = env.reset(seed=0)
+    policy.reset(env, seed=0)
+    problem, hardest = env.unwrapped.problem, 0.0
+    while env.agents:
+        actions = policy.act({agent: observations[agent] for agent in env.agents}, env.state())
+        observations = env.step(actions)[0]
+        executed = split_state(problem, env.state()).controls
+        for agent, action in actions.items():
+            np.testing.assert_array_equal(executed[env.possible_agents.index(agent)], action)
+            hardest = max(hardest, float(np.abs(action).max()))
+    assert hardest > 0.1
+
+
+@pytest.mark.parametrize(
+    "policy",
+    [
+        lambda observations, state: {agent: np.array([3.0, 4.0, 0.0]) for agent in observations},
+        lambda observation: [3, 4, 0],
+        SharedPolicy(lambda stacked: np.tile(np.float32([3, 4, 0]), (len(stacked), 1)), None),
+        SharedPolicy(lambda stacked: np.tile(np.float32([1, 1, 1]), (len(stacked), 1)), None, normalized=True),
+    ],
+)  # fmt: skip
+def test_what_functions_and_models_answer_is_clipped_as_the_step_does(policy: Any) -> None:
+    env = navigation_v0.parallel_env(scenario="circle", num_robots=2, model="holonomic3d")
+    observations, _ = env.reset(seed=0)
+    policy = make_policy(policy)
+    policy.reset(env)
+    actions = policy.act(observations, env.state())
+    wanted = np.float32([1, 1, 1]) / np.sqrt(3) if getattr(policy, "_normalized", False) else [0.6, 0.8, 0]
+    np.testing.assert_allclose(list(actions.values()), [wanted] * 2, rtol=1e-6)
+    env.step(actions)
+    np.testing.assert_array_equal(split_state(env.unwrapped.problem, env.state()).controls, list(actions.values()))
+
+
+@pytest.mark.parametrize("bad", [[np.nan, 0], [1e16, 0], [0, 0, 0], "fast", None])
+def test_the_environment_says_what_is_wrong_with_the_answer_of_a_function(bad: Any) -> None:
+    env = navigation_v0.parallel_env(scenario="circle", num_robots=2)
+    with pytest.raises(ValueError, match="robot_0"):
+        run_episode(env, lambda observation: bad)
 
 
 @ALL
@@ -453,8 +504,8 @@ def test_driving_to_the_goal_goes_on_in_lifelong_mode() -> None:
     assert sum(info[agent]["arrived"] for info in episode.infos for agent in info) == reached
 
 
-@pytest.mark.parametrize("name", ["goal", "random"])
-def test_acting_before_the_reset_says_what_to_do(name: str) -> None:
+@pytest.mark.parametrize("name", ["goal", "random", lambda observations, state: {}, lambda observation: observation])
+def test_acting_before_the_reset_says_what_to_do(name: Any) -> None:
     with pytest.raises(RuntimeError, match=r"call reset\(env\) before act"):
         make_policy(name).act({}, np.zeros(1, np.float32))
 
