@@ -17,7 +17,7 @@ from pettingzoo.utils import OrderEnforcingWrapper
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
 from d4orm_env.core.arrays import FloatArray, as_float32, whole_number
-from d4orm_env.envs.base_env import EnvironmentShell
+from d4orm_env.envs.base_env import BaseEnv
 from d4orm_env.envs.inputs import MAX_ACTION, check_options, checked_cycles, usable
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.team_step import AgentInfos, TeamStep, agent_infos
@@ -29,7 +29,7 @@ __all__ = ["env", "parallel_env", "raw_env"]
 _OPTIONS_OF_CONFORMANCE_TESTS = ("options",)  # PettingZoo's API tests send options={"options": 1}
 
 
-class parallel_env(EnvironmentShell, ParallelEnv[str, FloatArray, FloatArray]):
+class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
     """All robots act at once.
 
     Agents are ``robot_0`` .. ``robot_{K-1}``. An agent that arrives is terminated and leaves ``agents``; its body stays
@@ -61,7 +61,7 @@ class parallel_env(EnvironmentShell, ParallelEnv[str, FloatArray, FloatArray]):
         self._control_size = self.problem.control_size
         self._make_spaces()
         self._np_random: np.random.Generator | None = None
-        self.turn_taker: TurnByTurn | None = None
+        self.turn_taker: AECNavigationEnv | None = None
 
     def _make_spaces(self) -> None:
         layout = self._simulation.layout
@@ -236,7 +236,7 @@ class parallel_env(EnvironmentShell, ParallelEnv[str, FloatArray, FloatArray]):
         return ""
 
 
-class TurnByTurn(parallel_to_aec_wrapper):
+class AECNavigationEnv(parallel_to_aec_wrapper):
     """PettingZoo's conversion, with a bad action refused when it is given, and by the name of who gave it."""
 
     def __init__(self, environment: parallel_env) -> None:
@@ -263,7 +263,7 @@ def raw_env(
     scenario: ScenarioLike | None = None, num_robots: int | None = None, **options: object
 ) -> AECEnv[str, FloatArray, FloatArray | None]:
     """The robots act in turn and move together when the last has chosen; arguments of :class:`parallel_env`."""
-    return TurnByTurn(parallel_env(scenario, num_robots, **options))
+    return AECNavigationEnv(parallel_env(scenario, num_robots, **options))
 
 
 def env(

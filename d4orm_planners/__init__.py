@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
     from d4orm_planners.base.planner_registry import list_planners, list_policies, make_planner, make_policy
     from d4orm_planners.base.policy import OpenLoop, Policy
-    from d4orm_planners.base.solve import Search
+    from d4orm_planners.base.solve import SolveRun
     from d4orm_planners.evaluation.evaluate import evaluate
 
 __all__ = [
@@ -24,7 +24,7 @@ __all__ = [
     "Planner",
     "PlannerConfig",
     "Policy",
-    "Search",
+    "SolveRun",
     "evaluate",
     "list_planners",
     "list_policies",
@@ -44,7 +44,7 @@ _HOMES = {
     "base.planner": ("Iteration", "Planner", "PlannerConfig"),
     "base.policy": ("OpenLoop", "Policy"),
     "base.planner_registry": ("list_planners", "list_policies", "make_planner", "make_policy"),
-    "base.solve": ("Search",),
+    "base.solve": ("SolveRun",),
 }
 
 

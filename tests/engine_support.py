@@ -17,7 +17,7 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.robot_model import Ops
 from d4orm_env.engine import noise
-from d4orm_env.engine.types import Engine, Sight, StepResult
+from d4orm_env.engine.types import Engine, ObservationInputs, StepResult
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
 from d4orm_planners.engine.select import get_sampling_engine
 
@@ -43,7 +43,7 @@ def observe_team(
 ) -> np.ndarray:
     """``(K, D)`` what the robots of one team see."""
     out = np.empty((1, len(states), layout.size), np.float32)
-    sight = Sight.of_team(arrays.goal, states, controls, arrived, time_left)
+    sight = ObservationInputs.of_team(arrays.goal, states, controls, arrived, time_left)
     get_sampling_engine("cpu").observe_worlds(arrays, layout, sight, out)
     return out[0]
 

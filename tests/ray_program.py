@@ -18,7 +18,7 @@ from typing import Any
 from d4orm_env import make_problem
 from d4orm_planners import make_planner
 from d4orm_planners.base.plan import Plan
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d_d4orm import ray_planner
 from d4orm_planners.d_d4orm.ray_connection import RayConnection
 
@@ -47,7 +47,7 @@ def kill(restarts: int, mode: str) -> tuple[list[int], list[int], list[str], boo
     planner = make_planner(
         "d-d4orm", engine="cpu", transport="ray", mode=mode, improve=True, patience=60, num_steps=400
     )
-    search = Search(planner, make_problem("circle", num_robots=8), 0, None)
+    search = SolveRun(planner, make_problem("circle", num_robots=8), 0, None)
     notes: list[str] = []
     try:
         notes.append(search.advance().note)

@@ -10,7 +10,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)
-class Marks:
+class DisturbanceEvents:
     """What happened to a team in ``T`` steps that it did not do itself.
 
     Attributes:
@@ -23,9 +23,9 @@ class Marks:
     stalled: BoolArray
     bodies: FloatArray
 
-    def until(self, step: int) -> Marks:
+    def until(self, step: int) -> DisturbanceEvents:
         """The same up to that step."""
-        return Marks(self.pushed[: step + 1], self.stalled[: step + 1], self.bodies[: step + 1])
+        return DisturbanceEvents(self.pushed[: step + 1], self.stalled[: step + 1], self.bodies[: step + 1])
 
     @property
     def stall_starts(self) -> BoolArray:

@@ -17,7 +17,7 @@ WINDING = 10
 """The longest way that an observation tells, over the farthest that anything may be from a robot."""
 
 
-class Spare(NamedTuple):
+class BoundsSlack(NamedTuple):
     """Room beyond what robots and their observations keep to by themselves.
 
     Attributes:
@@ -34,9 +34,9 @@ class Spare(NamedTuple):
     drift: float = 0.0
     radius: float = 0.0
 
-    def joined(self, other: Spare) -> Spare:
+    def joined(self, other: BoundsSlack) -> BoundsSlack:
         """Room for both."""
-        sums = Spare(*(a + b for a, b in zip(self, other)))
+        sums = BoundsSlack(*(a + b for a, b in zip(self, other)))
         return sums._replace(radius=max(self.radius, other.radius))
 
 
@@ -183,7 +183,7 @@ class ObservationLayout(ObservationSlices):
         num_neighbors: int = 4,
         num_obstacles: int = 4,
         observed_way: bool = False,
-        spare: Spare = Spare(),  # noqa: B008 - it is immutable
+        spare: BoundsSlack = BoundsSlack(),  # noqa: B008 - it is immutable
     ) -> ObservationLayout:
         """The layout for a problem, with bounds that no motion of its robots can leave.
 
@@ -248,7 +248,7 @@ def _fill(values: FloatArray, parts: NamedTuple, bounds: Mapping[str, float]) ->
         values[..., getattr(parts, name)] = bound
 
 
-def _reach(problem: Problem, spare: Spare) -> float:
+def _reach(problem: Problem, spare: BoundsSlack) -> float:
     """Farthest that anything may be from a robot [m]."""
     team, places = (
         problem.team,

@@ -33,7 +33,7 @@ from d4orm_env.dynamics.models import MODEL_CODES, NUM_BUILT_IN, model_digest
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from d4orm_env.paths.shortest_paths import Ways
+    from d4orm_env.paths.shortest_paths import ShortestPaths
 
 Arrival = Literal["dock", "stay"]
 """What it means to arrive."""
@@ -240,7 +240,7 @@ class Problem(Frozen):
         return self.arrays._replace(grid=grid)
 
     @cached_property
-    def ways(self) -> Ways:
+    def ways(self) -> ShortestPaths:
         """The shortest free way of every robot; see :func:`d4orm_env.paths.shortest_paths.shortest_ways`."""
         # The one road up from here: it is compiled.
         from d4orm_env.paths.shortest_paths import shortest_ways

@@ -123,8 +123,8 @@ def check_places(team: Team, world: World, what: str, places: FloatArray, margin
     overlapping = np.flatnonzero(between <= 0)
     if len(overlapping):
         of_first = overlapping[second[overlapping] == second[overlapping].min()]
-        pair = of_first[np.argmin(between[of_first])]
-        one, other = first[pair], second[pair]
+        pair = int(of_first[np.argmin(between[of_first])])
+        one, other = int(first[pair]), int(second[pair])
         raise ValueError(
             f"{what}s of robot_{one} at {_point(places[one])} and robot_{other} at {_point(places[other])} "
             f"overlap by {0 - between[pair]:.3g} m; move them more than {radius[one] + radius[other]:g} m apart"
@@ -132,7 +132,7 @@ def check_places(team: Team, world: World, what: str, places: FloatArray, margin
     robot = int(np.argmin(gaps))
     gap, nearest = gaps[robot], "an obstacle or the bounds"
     if len(between) and between.min() < gap:
-        pair = np.argmin(between)
+        pair = int(np.argmin(between))
         robot, gap, nearest = int(second[pair]), between[pair], f"robot_{first[pair]}"
     if gap > margin:
         return ""

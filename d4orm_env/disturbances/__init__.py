@@ -7,7 +7,7 @@ environments to the bit, and one disturbance draws the same whatever stands besi
 """
 
 from d4orm_env.disturbances.controls import Bias, ControlNoise, CorrelatedNoise, Delay, Dropout, Gain, Quantisation
-from d4orm_env.disturbances.disturbance import Disturbance, Effect, Scene, Seen
+from d4orm_env.disturbances.disturbance import Disturbance, DisturbanceEffect, Scene, Seen
 from d4orm_env.disturbances.draws import Draws
 from d4orm_env.disturbances.intruder import Intruder
 from d4orm_env.disturbances.perception import Occlusion, StateDelay, StateNoise
@@ -19,10 +19,10 @@ __all__ = [
     "CorrelatedNoise",
     "Delay",
     "Disturbance",
+    "DisturbanceEffect",
     "Drag",
     "Draws",
     "Dropout",
-    "Effect",
     "Gain",
     "Intruder",
     "LimitMismatch",

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from functools import reduce
 
 from d4orm_env.core.arrays import shown
-from d4orm_env.core.observation_layout import Spare
+from d4orm_env.core.observation_layout import BoundsSlack
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbance
 
@@ -43,6 +43,6 @@ def at_work(disturbances: Disturbances, problem: Problem) -> Disturbances:
     return tuple(one for one in disturbances if not one.negligible)
 
 
-def total_spare(disturbances: Disturbances, problem: Problem) -> Spare:
+def total_spare(disturbances: Disturbances, problem: Problem) -> BoundsSlack:
     """Room that all of them need together."""
-    return reduce(Spare.joined, (one.spare(problem) for one in disturbances), Spare())
+    return reduce(BoundsSlack.joined, (one.spare(problem) for one in disturbances), BoundsSlack())

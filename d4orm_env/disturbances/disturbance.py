@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
-from d4orm_env.core.observation_layout import ObservationLayout, Spare
+from d4orm_env.core.observation_layout import BoundsSlack, ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.draws import Draws
 
@@ -82,7 +82,7 @@ class Seen(NamedTuple):
     bodies: FloatArray
 
 
-class Effect(NamedTuple):
+class DisturbanceEffect(NamedTuple):
     """What a disturbance has done that judges and pictures have to know; ``None`` for what it never does.
 
     Attributes:
@@ -98,7 +98,7 @@ class Effect(NamedTuple):
     lost: BoolArray | None = None
     bodies: FloatArray | None = None
 
-    def copy(self) -> Effect:
+    def copy(self) -> DisturbanceEffect:
         """A copy, for the arrays go on with the episode."""
         return copy.deepcopy(self)
 
@@ -126,12 +126,12 @@ class Disturbance(Generic[M]):
     def check(self, problem: Problem) -> None:
         """Raise ``ValueError``, in one line, where the robots or the world cannot have this disturbance."""
 
-    def spare(self, problem: Problem) -> Spare:
+    def spare(self, problem: Problem) -> BoundsSlack:
         """By how much it may lead robots, or what is seen of them, out of the bounds that they would keep without it.
 
         The spaces grow by so much.
         """
-        return Spare()
+        return BoundsSlack()
 
     def begin(self, scene: Scene, draws: Draws) -> M:
         """The memory of ``B`` worlds whose episodes begin."""
@@ -162,9 +162,9 @@ class Disturbance(Generic[M]):
         """What robots observe ``(B, K, D)`` of what is seen."""
         return observations
 
-    def effect(self, memory: M, scene: Scene) -> Effect:
+    def effect(self, memory: M, scene: Scene) -> DisturbanceEffect:
         """What it has done up to now."""
-        return Effect()
+        return DisturbanceEffect()
 
 
 AnyDisturbance: TypeAlias = Disturbance[Any]

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbance, Effect, Memory, Scene, Seen
+from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbance, DisturbanceEffect, Memory, Scene, Seen
 from d4orm_env.disturbances.draws import Ahead, Draws, Keys, Steps, episode_keys
 
 Worlds = NDArray[np.intp]
@@ -37,7 +37,7 @@ T = TypeVar("T")
 
 
 @dataclass(eq=False)
-class _Running:
+class _ActiveDisturbance:
     """A disturbance at work: its stream of random numbers, what it draws by purpose, and what it remembers."""
 
     disturbance: AnyDisturbance
@@ -80,11 +80,11 @@ class DisturbedWorlds:
     ) -> None:
         self.problem, self.max_cycles = problem, max_cycles
         occurrences: Counter[str] = Counter()
-        self._all: list[_Running] = []
+        self._all: list[_ActiveDisturbance] = []
         for disturbance in disturbances:
             name = type(disturbance).__name__
             # By name and not by place, so that each draws the same whatever stands beside it.
-            self._all.append(_Running(disturbance, zlib.crc32(f"{name}/{occurrences[name]}".encode())))
+            self._all.append(_ActiveDisturbance(disturbance, zlib.crc32(f"{name}/{occurrences[name]}".encode())))
             occurrences[name] += 1
         self._commanding, self._moving, self._seeing, self._observing, self._effective = (
             [one for one in self._all if one.has(method)] for method in ("command", "move", "see", "observe", "effect")
@@ -92,13 +92,13 @@ class DisturbedWorlds:
         self.alters_limits = any(one.has("limits") for one in self._all)
         self._keys: Keys = np.zeros((num_worlds, 2), np.uint32)
         self._bodies: FloatArray = np.zeros((num_worlds, 0, 2 * problem.dimension + 1), np.float32)
-        self._bringing: list[_Running] = []
+        self._bringing: list[_ActiveDisturbance] = []
         self._begun = False
         self._ahead: Ahead | None = {} if num_worlds == 1 else None
 
     @property
     def bodies(self) -> FloatArray:
-        """``(B, N, 2 d + 1)`` what moves among the robots and is none, see :class:`Effect`."""
+        """``(B, N, 2 d + 1)`` what moves among the robots and is none, see :class:`DisturbanceEffect`."""
         return self._bodies
 
     @property
@@ -183,10 +183,10 @@ class DisturbedWorlds:
             self._bodies = there[0] if len(there) == 1 else np.concatenate(there, axis=1)
         return states, controls
 
-    def effect(self, scene: Scene) -> Effect:
+    def effect(self, scene: Scene) -> DisturbanceEffect:
         """What all have done together up to now."""
         effects = [one.disturbance.effect(one.memory, scene) for one in self._effective]
-        return Effect(
+        return DisturbanceEffect(
             pushed=_together(np.add, [effect.pushed for effect in effects]),
             stalled=_together(np.logical_or, [effect.stalled for effect in effects]),
             lost=_together(np.logical_or, [effect.lost for effect in effects]),
@@ -235,7 +235,7 @@ class DisturbedWorlds:
             observations = np.clip(observations, layout.low, layout.high)
         return observations
 
-    def _draws(self, one: _Running, scene: Scene, purpose: _Purpose) -> Draws:
+    def _draws(self, one: _ActiveDisturbance, scene: Scene, purpose: _Purpose) -> Draws:
         draws = one.draws.get(purpose)
         if draws is None:
             one.draws[purpose] = draws = Draws(self._keys, scene.steps, one.stream, purpose, self._ahead)
@@ -258,7 +258,7 @@ def _together(join: Callable[[T, T], T], parts: Sequence[T | None]) -> T | None:
     return reduce(join, done) if done else None
 
 
-def _checked(values: ArrayLike, shape: tuple[int, ...], one: _Running, method: str) -> FloatArray:
+def _checked(values: ArrayLike, shape: tuple[int, ...], one: _ActiveDisturbance, method: str) -> FloatArray:
     """What a disturbance returned, as float32."""
     array = values if isinstance(values, np.ndarray) and values.dtype == _FLOAT32 else as_float32(values)
     if array.shape != shape:

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core.arrays import LARGEST, FloatArray, positive_number, whole_number
-from d4orm_env.core.observation_layout import Spare
+from d4orm_env.core.observation_layout import BoundsSlack
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.disturbance import Disturbance, Effect, Scene
+from d4orm_env.disturbances.disturbance import Disturbance, DisturbanceEffect, Scene
 from d4orm_env.disturbances.draws import Draws
 from d4orm_env.disturbances.levels import standard_deviation
 
@@ -63,9 +63,9 @@ class Intruder(Disturbance[Courses]):
     def replayable(self) -> bool:
         return True  # it changes neither states nor controls
 
-    def spare(self, problem: Problem) -> Spare:
+    def spare(self, problem: Problem) -> BoundsSlack:
         faster = max(0.0, self.speed - float(problem.team.max_speed.max()))
-        return Spare(distance=2 * self._room(problem) + self.speed * problem.dt, speed=faster, radius=self.radius)
+        return BoundsSlack(distance=2 * self._room(problem) + self.speed * problem.dt, speed=faster, radius=self.radius)
 
     def _room(self, problem: Problem) -> float:
         """What keeps an intruder clear of any robot [m]."""
@@ -91,8 +91,8 @@ class Intruder(Disturbance[Courses]):
                 past[out] = fresh[left]
         return states, controls
 
-    def effect(self, memory: Courses, scene: Scene) -> Effect:
-        return Effect(bodies=memory.bodies)
+    def effect(self, memory: Courses, scene: Scene) -> DisturbanceEffect:
+        return DisturbanceEffect(bodies=memory.bodies)
 
     def _courses(self, scene: Scene, draws: Draws) -> Courses:
         """New lines for all worlds, their bodies at the beginning."""

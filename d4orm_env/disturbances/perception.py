@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core.arrays import LARGEST, FloatArray, positive_number, whole_number
-from d4orm_env.core.observation_layout import ObservationLayout, Spare
+from d4orm_env.core.observation_layout import BoundsSlack, ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import Disturbance, Memory, Scene, Seen
 from d4orm_env.disturbances.draws import Draws
@@ -68,8 +68,8 @@ class StateNoise(Disturbance[Scales]):
                 "out, or use a model that has one"
             )
 
-    def spare(self, problem: Problem) -> Spare:
-        return Spare(*(_FARTHEST * std for std in (self.position_std, self.velocity_std, self.heading_std)))
+    def spare(self, problem: Problem) -> BoundsSlack:
+        return BoundsSlack(*(_FARTHEST * std for std in (self.position_std, self.velocity_std, self.heading_std)))
 
     def begin(self, scene: Scene, draws: Draws) -> Scales:
         scales, d = Scales(np.zeros_like(scene.states), np.zeros_like(scene.bodies)), scene.problem.dimension

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import LARGEST, FloatArray, positive_number, whole_number
-from d4orm_env.core.observation_layout import Spare
+from d4orm_env.core.observation_layout import BoundsSlack
 from d4orm_env.core.portable import cos, sin
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.brakes import brake
-from d4orm_env.disturbances.disturbance import Disturbance, Effect, Memory, Scene
+from d4orm_env.disturbances.disturbance import Disturbance, DisturbanceEffect, Memory, Scene
 from d4orm_env.disturbances.draws import Draws
 from d4orm_env.disturbances.levels import share, standard_deviation
 from d4orm_env.dynamics.robot_model import STANDARD_LIMITS
@@ -53,8 +53,8 @@ class Push(Disturbance[Given]):
     def negligible(self) -> bool:
         return not (self.rate and self.speed)
 
-    def spare(self, problem: Problem) -> Spare:
-        return Spare(drift=self.speed)
+    def spare(self, problem: Problem) -> BoundsSlack:
+        return BoundsSlack(drift=self.speed)
 
     def begin(self, scene: Scene, draws: Draws) -> Given:
         return Given(np.zeros(scene.goal.shape, np.float32))
@@ -73,8 +73,8 @@ class Push(Disturbance[Given]):
             states[worlds] = pushed(scene.problem, states[worlds], given)
         return states, controls
 
-    def effect(self, memory: Given, scene: Scene) -> Effect:
-        return Effect(pushed=memory.velocity)
+    def effect(self, memory: Given, scene: Scene) -> DisturbanceEffect:
+        return DisturbanceEffect(pushed=memory.velocity)
 
 
 def pushed(problem: Problem, states: FloatArray, velocity: FloatArray) -> FloatArray:
@@ -162,9 +162,9 @@ class Stall(Disturbance[Stops]):
             return states, controls
         return states, np.where(stalled[..., None], brake(scene, states, stalled), controls)
 
-    def effect(self, memory: Stops, scene: Scene) -> Effect:
+    def effect(self, memory: Stops, scene: Scene) -> DisturbanceEffect:
         stalled = memory.now(scene)
-        return Effect(stalled=stalled, lost=stalled & (memory.end == _NEVER))
+        return DisturbanceEffect(stalled=stalled, lost=stalled & (memory.end == _NEVER))
 
 
 @dataclass(frozen=True)

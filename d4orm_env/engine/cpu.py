@@ -15,7 +15,7 @@ from d4orm_env.engine.observing import ObservationSpec
 from d4orm_env.engine.simd import TILE
 from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_env.engine.types import (
-    Sight,
+    ObservationInputs,
     StepResult,
     checked_controls,
 )
@@ -44,7 +44,9 @@ class CpuEngine:
         here = _rolled_out(arrays, states, np.zeros(robots, bool), np.zeros((0, robots, 1), np.float32))
         return here.collided[0], here.violated[0]
 
-    def observe_worlds(self, arrays: ProblemArrays, layout: ObservationLayout, sight: Sight, out: FloatArray) -> None:
+    def observe_worlds(
+        self, arrays: ProblemArrays, layout: ObservationLayout, sight: ObservationInputs, out: FloatArray
+    ) -> None:
         """See :meth:`d4orm_env.engine.types.WorldEngine.observe_worlds`."""
         arrays = typed(arrays)
         kernel, view = _kernels(arrays).observe_worlds, _view(layout)

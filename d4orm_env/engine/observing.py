@@ -19,7 +19,7 @@ from d4orm_env.engine.compiling import INLINED, ONE, OPTIONS, ZERO, aligned_zero
 from d4orm_env.engine.simd import TILE
 from d4orm_env.engine.stepping import models_key
 from d4orm_env.engine.tiles import STATE, STRIDE, MotionReader, motion_reader
-from d4orm_env.engine.types import Sight
+from d4orm_env.engine.types import ObservationInputs
 from d4orm_env.engine.world_tiles import WorldArrays, load
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def _sense_bodies(bodies: FloatArray, num_robots: int, sensed: observation.Sense
 def observe(
     read_motion: MotionReader,
     arrays: ProblemArrays,
-    worlds: WorldArrays | Sight | WorldBatch,
+    worlds: WorldArrays | ObservationInputs | WorldBatch,
     b: int,
     time_left: np.float32,
     w: FloatArray,
@@ -118,13 +118,13 @@ def observe(
 @cache
 def observe_worlds_kernel(
     names: tuple[str, ...],
-) -> Kernel[[ProblemArrays, Sight, ObservationSpec, IntArray, FloatArray], None]:
+) -> Kernel[[ProblemArrays, ObservationInputs, ObservationSpec, IntArray, FloatArray], None]:
     """A kernel that fills ``out`` ``(B, K, D)`` with what every robot of every world sees.
 
     Args:
         names: Models that the kernel is for.
         arrays: The problem that the worlds share; its starts and goals are not looked at.
-        sight: What there is to see, a :class:`~d4orm_env.engine.types.Sight`.
+        sight: What there is to see, a :class:`~d4orm_env.engine.types.ObservationInputs`.
         view: What an observation is made of, a :class:`ObservationSpec`.
         tile_range: First tile of worlds and the one after the last.
     """
@@ -132,7 +132,7 @@ def observe_worlds_kernel(
 
     @cached_kernel(models_key(SOURCES, names), variant="_".join(names), **OPTIONS)
     def observe_worlds(
-        arrays: ProblemArrays, sight: Sight, view: ObservationSpec, tile_range: IntArray, out: FloatArray
+        arrays: ProblemArrays, sight: ObservationInputs, view: ObservationSpec, tile_range: IntArray, out: FloatArray
     ) -> None:
         num_robots, dimension = arrays.goal.shape
         w = aligned_zeros(num_robots * STRIDE)

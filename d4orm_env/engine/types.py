@@ -54,7 +54,7 @@ class Engine(Protocol):
         ...
 
 
-class Sight(NamedTuple):
+class ObservationInputs(NamedTuple):
     """What there is to see of ``B`` worlds.
 
     Attributes:
@@ -83,7 +83,7 @@ class Sight(NamedTuple):
         docked: BoolArray,
         time_left: float,
         bodies: FloatArray | None = None,
-    ) -> Sight:
+    ) -> ObservationInputs:
         """Of one world, in arrays of its own: kernels are compiled anew for read-only ones."""
         if bodies is None:
             bodies = np.empty((0, 2 * goal.shape[1] + 1), np.float32)
@@ -97,9 +97,9 @@ class Sight(NamedTuple):
             np.array([time_left], np.float32),
         )
 
-    def of(self, worlds: slice) -> Sight:
+    def of(self, worlds: slice) -> ObservationInputs:
         """The same of some of the worlds."""
-        return Sight(*(part[worlds] for part in self))  # type: ignore[arg-type]
+        return ObservationInputs(*(part[worlds] for part in self))  # type: ignore[arg-type]
 
 
 class WorldEngine(Engine, Protocol):
@@ -109,7 +109,9 @@ class WorldEngine(Engine, Protocol):
         """``(collided (K,), margin_violated (K,))`` of a team standing at ``states`` ``(K, n)``."""
         ...
 
-    def observe_worlds(self, arrays: ProblemArrays, layout: ObservationLayout, sight: Sight, out: FloatArray) -> None:
+    def observe_worlds(
+        self, arrays: ProblemArrays, layout: ObservationLayout, sight: ObservationInputs, out: FloatArray
+    ) -> None:
         """Fill ``out`` ``(B, K, D)`` with what every robot of every world sees, inside the layout's bounds."""
         ...
 

@@ -26,7 +26,7 @@ from d4orm_env.engine.tiles import (
     STRIDE,
     mark_pairs,
 )
-from d4orm_env.engine.types import Sight
+from d4orm_env.engine.types import ObservationInputs
 
 if TYPE_CHECKING:
     from d4orm_env.engine.episodes import WorldBatch
@@ -60,7 +60,7 @@ class WorldArrays(NamedTuple):
 
 
 @inlined
-def load_world(worlds: WorldArrays | Sight | WorldBatch, b: int, s: Whole, w: FloatArray) -> None:
+def load_world(worlds: WorldArrays | ObservationInputs | WorldBatch, b: int, s: Whole, w: FloatArray) -> None:
     """Put world ``b`` into lane ``s`` of a tile."""
     own = min(b, worlds.goal.shape[0] - 1)
     for k in range(worlds.state.shape[1]):
@@ -75,7 +75,7 @@ def load_world(worlds: WorldArrays | Sight | WorldBatch, b: int, s: Whole, w: Fl
 
 
 @compiled
-def load(worlds: WorldArrays | Sight | WorldBatch, first: int, w: FloatArray) -> None:
+def load(worlds: WorldArrays | ObservationInputs | WorldBatch, first: int, w: FloatArray) -> None:
     """Put worlds from number ``first`` on into the lanes of a tile."""
     for s in range(min(TILE, worlds.state.shape[0] - first)):
         load_world(worlds, first + s, s, w)

@@ -22,7 +22,7 @@ from d4orm_env.engine.observing import SOURCES, ObservationSpec, observe_worlds_
 from d4orm_env.engine.simd import TILE, use_wide_registers
 from d4orm_env.engine.stepping import models_key, models_of_kernel
 from d4orm_env.engine.tiles import STRIDE, measure_goal_distance, robot_mover
-from d4orm_env.engine.types import Sight
+from d4orm_env.engine.types import ObservationInputs
 from d4orm_env.engine.world_tiles import WorldArrays, judge, load, load_world, store_world
 
 
@@ -65,7 +65,7 @@ class WorldKernels(NamedTuple):
     """The kernels that step and observe teams of some models."""
 
     roll_out: Kernel[[ProblemArrays, WorldArrays], None]
-    observe_worlds: Kernel[[ProblemArrays, Sight, ObservationSpec, IntArray, FloatArray], None]
+    observe_worlds: Kernel[[ProblemArrays, ObservationInputs, ObservationSpec, IntArray, FloatArray], None]
     advance_worlds: Kernel[
         [ProblemArrays, ObservationSpec, int, NDArray[np.uint8], WorldBatch, IntArray, FloatArray], None
     ]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.disturbance import Effect
+from d4orm_env.disturbances.disturbance import DisturbanceEffect
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.simulation import Simulation
 from d4orm_env.envs.viewer import Frame, Viewer
 
 
-class EnvironmentShell:
+class BaseEnv:
     """A simulation, read and drawn; how it is reset and stepped is up to the environment."""
 
     metadata: dict[str, object]
@@ -55,7 +55,7 @@ class EnvironmentShell:
         """
         return self._simulation.true_state()
 
-    def effect(self) -> Effect:
+    def effect(self) -> DisturbanceEffect:
         """What disturbances have done up to now, as arrays with one world as their first axis.
 
         Raises:

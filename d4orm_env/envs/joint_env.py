@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.envs.base_env import EnvironmentShell
+from d4orm_env.envs.base_env import BaseEnv
 from d4orm_env.envs.inputs import check_options, joint_controls
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.simulation import Simulation
@@ -20,7 +20,7 @@ __all__ = ["JointNavigationEnv", "register_environments"]
 ENV_ID = "d4orm/Navigation-v0"
 
 
-class JointNavigationEnv(EnvironmentShell, gymnasium.Env[FloatArray, FloatArray]):
+class JointNavigationEnv(BaseEnv, gymnasium.Env[FloatArray, FloatArray]):
     """The joint environment, ``gymnasium.make("d4orm/Navigation-v0", scenario=..., num_robots=...)``.
 
     The observation ``(K * D,)`` is all robots' local observations one after the other, the action ``(K * m,)`` all

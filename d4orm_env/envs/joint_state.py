@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, Floats, frozen_array
-from d4orm_env.core.observation_layout import Spare
+from d4orm_env.core.observation_layout import BoundsSlack
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.winding import MAX_ANGLE
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
@@ -110,7 +110,7 @@ def state_bounds(
     problem: Problem,
     places: FloatArray,
     max_cycles: int,
-    spare: Spare = Spare(),  # noqa: B008 - it is immutable
+    spare: BoundsSlack = BoundsSlack(),  # noqa: B008 - it is immutable
     num_bodies: int = 0,
 ) -> tuple[FloatArray, FloatArray]:
     """Finite bounds that every joint state of an episode keeps.
@@ -146,7 +146,7 @@ def state_bounds(
     )
 
 
-def _robot_bounds(problem: Problem, places: FloatArray, duration: float, spare: Spare) -> tuple[Floats, Floats]:
+def _robot_bounds(problem: Problem, places: FloatArray, duration: float, spare: BoundsSlack) -> tuple[Floats, Floats]:
     """``(K, n)`` lowest and highest states within that time [s]."""
     team, dimension = problem.team, problem.dimension
     limits = team.limits.astype(np.float64)

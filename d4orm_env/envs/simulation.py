@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, frozen_array, whole_number
-from d4orm_env.core.disturbance_events import Marks
-from d4orm_env.core.observation_layout import ObservationLayout, Spare
+from d4orm_env.core.disturbance_events import DisturbanceEvents
+from d4orm_env.core.observation_layout import BoundsSlack, ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays, inverse_initial_distance
 from d4orm_env.disturbances.chosen import total_spare
-from d4orm_env.disturbances.disturbance import Effect, Scene, Seen
+from d4orm_env.disturbances.disturbance import DisturbanceEffect, Scene, Seen
 from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
 from d4orm_env.disturbances.recorded_events import marks_of
-from d4orm_env.engine.types import Sight, StepResult, WorldEngine
+from d4orm_env.engine.types import ObservationInputs, StepResult, WorldEngine
 from d4orm_env.envs.episode_record import EpisodeRecord
 from d4orm_env.envs.inputs import checked_cycles, checked_states
 from d4orm_env.envs.joint_state import JointState, join_state, state_bounds
@@ -208,7 +208,7 @@ class Simulation:
         self.record.add(rewards, arrived, result.collided, result.margin_violated)
         return self._report(rewards, arrived, result.margin_violated)
 
-    def _spare_of(self, problem: Problem) -> Spare:
+    def _spare_of(self, problem: Problem) -> BoundsSlack:
         """Room beyond the limits of the robots that the spaces need."""
         return total_spare(self.disturbances, problem)
 
@@ -262,10 +262,10 @@ class Simulation:
         lost = self.effect().lost
         return self.record.metrics(None if lost is None else lost[0])
 
-    def effect(self) -> Effect:
+    def effect(self) -> DisturbanceEffect:
         """What disturbances have done up to now, as of a batch of one world."""
         self.require_reset()
-        return Effect() if self._disturbed is None else self._disturbed.effect(self._scene())
+        return DisturbanceEffect() if self._disturbed is None else self._disturbed.effect(self._scene())
 
     @property
     def finished(self) -> BoolArray:
@@ -274,7 +274,7 @@ class Simulation:
             return np.zeros_like(self.arrived)
         return self.arrived if self.problem.docks else self.arrived & self.arrived.all()
 
-    def marks(self) -> Marks | None:
+    def marks(self) -> DisturbanceEvents | None:
         """Where the present moment is disturbed, as far as it can be drawn; ``None`` without disturbances."""
         return marks_of([self.effect()], self.problem) if self.disturbances else None
 
@@ -356,7 +356,7 @@ class Simulation:
         if self._disturbed is not None and self._disturbed.alters_sight:
             self._seen = self._disturbed.see(self._scene())
             states, controls, bodies = (part[0] for part in self._seen)
-        sight = Sight.of_team(self.arrays.goal, states, controls, self.arrived, time_left, bodies)
+        sight = ObservationInputs.of_team(self.arrays.goal, states, controls, self.arrived, time_left, bodies)
         observations: FloatArray = np.empty((len(self.states), layout.size), np.float32)
         self._engine.observe_worlds(self.arrays, layout, sight, observations[None])
         if layout.observed_way:

@@ -16,7 +16,7 @@ from d4orm_env.envs.simulation import Simulation
 
 if TYPE_CHECKING:
     from d4orm_env.engine.episodes import WorldBatch
-    from d4orm_env.engine.types import Sight
+    from d4orm_env.engine.types import ObservationInputs
 
 Worlds = NDArray[np.intp]
 
@@ -86,9 +86,9 @@ class DisturbedBatch:
         worlds.collided[:] |= touched
         worlds.violated[:] |= near
 
-    def look(self, worlds: Worlds) -> Sight:
+    def look(self, worlds: Worlds) -> ObservationInputs:
         """What there is to see of these worlds now, or is believed to be."""
-        from d4orm_env.engine.types import Sight
+        from d4orm_env.engine.types import ObservationInputs
 
         batch = self._worlds
         rows: Worlds | slice = slice(None) if len(worlds) == len(batch.steps) else worlds
@@ -102,7 +102,7 @@ class DisturbedBatch:
                 past[worlds] = new
         states, controls, bodies = (part[rows] for part in self._seen)
         time_left = np.maximum(0.0, 1.0 - batch.steps[rows] / self._cycles).astype(np.float32)
-        return Sight(batch.goal[rows], states, controls, batch.docked[rows], bodies, time_left)
+        return ObservationInputs(batch.goal[rows], states, controls, batch.docked[rows], bodies, time_left)
 
     def observe(self, observations: FloatArray, layout: ObservationLayout) -> FloatArray:
         """``(b, K, D)`` observations of what is seen, as robots make them."""

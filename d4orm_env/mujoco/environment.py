@@ -13,7 +13,7 @@ from d4orm_env.envs.viewer import RENDER_MODES
 from d4orm_env.mujoco.mujoco_simulation import MujocoSimulation
 from d4orm_env.mujoco.mujoco_viewer import RENDERERS, MujocoViewer
 from d4orm_env.mujoco.physics import Physics
-from d4orm_env.navigation_v0 import TurnByTurn
+from d4orm_env.navigation_v0 import AECNavigationEnv
 from d4orm_env.scenarios.problems import ScenarioLike
 
 
@@ -72,7 +72,7 @@ def raw_env(
     scenario: ScenarioLike | None = None, num_robots: int | None = None, **options: object
 ) -> AECEnv[str, FloatArray, FloatArray | None]:
     """The robots act in turn and move together when the last has chosen; arguments of :class:`parallel_env`."""
-    return TurnByTurn(parallel_env(scenario, num_robots, **options))  # type: ignore[arg-type] # checked there
+    return AECNavigationEnv(parallel_env(scenario, num_robots, **options))  # type: ignore[arg-type] # checked there
 
 
 def env(

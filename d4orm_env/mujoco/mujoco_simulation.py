@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32
-from d4orm_env.core.observation_layout import Spare
+from d4orm_env.core.observation_layout import BoundsSlack
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
@@ -52,10 +52,10 @@ class MujocoSimulation(Simulation):
             bodies.begin()
         return step
 
-    def _spare_of(self, problem: Problem) -> Spare:
+    def _spare_of(self, problem: Problem) -> BoundsSlack:
         # Who is run into may be faster for a moment than it can drive.
         fastest = float(problem.team.max_speed.max())
-        return super()._spare_of(problem).joined(Spare(speed=fastest, drift=fastest))
+        return super()._spare_of(problem).joined(BoundsSlack(speed=fastest, drift=fastest))
 
     def set_state(self, states: object) -> TeamStep:
         """See :meth:`d4orm_env.envs.simulation.Simulation.set_state`."""

@@ -30,7 +30,7 @@ _PALETTE = ((0.12, 0.47, 0.71), (1.0, 0.5, 0.05), (0.17, 0.63, 0.17), (0.84, 0.1
             (0.55, 0.34, 0.29), (0.89, 0.47, 0.76), (0.74, 0.74, 0.13))  # fmt: skip
 
 
-class Scene(NamedTuple):
+class MujocoScene(NamedTuple):
     """A compiled scene and where things are in it.
 
     Attributes:
@@ -71,7 +71,7 @@ def check_problem(problem: Problem) -> None:
             )
 
 
-def build_scene(problem: Problem, physics: Physics, body_radius: FloatArray, step: float) -> Scene:
+def build_scene(problem: Problem, physics: Physics, body_radius: FloatArray, step: float) -> MujocoScene:
     """The scene of a problem, all robots at their starts.
 
     Args:
@@ -111,7 +111,7 @@ def build_scene(problem: Problem, physics: Physics, body_radius: FloatArray, ste
     return _addresses(model, problem, physics)
 
 
-def _addresses(model: mujoco.MjModel, problem: Problem, physics: Physics) -> Scene:
+def _addresses(model: mujoco.MjModel, problem: Problem, physics: Physics) -> MujocoScene:
     names = [f"robot_{robot}" for robot in range(problem.num_robots)]
     first = [int(model.body(name).jntadr[0]) for name in names]
     owner = np.full(model.ngeom, NOT_SOLID)
@@ -120,7 +120,7 @@ def _addresses(model: mujoco.MjModel, problem: Problem, physics: Physics) -> Sce
     for robot, name in enumerate(names):
         owner[solid & (model.geom_bodyid == model.body(name).id)] = robot
     radius = np.asarray(problem.team.radius, np.float64)
-    return Scene(
+    return MujocoScene(
         model,
         np.array(model.jnt_qposadr[first], np.int64),
         np.array(model.jnt_dofadr[first], np.int64),

@@ -34,7 +34,7 @@ REFINEMENTS = 2
 
 
 @dataclass(frozen=True, eq=False)
-class Ways:
+class ShortestPaths:
     """The shortest free way of every robot of a problem to its goal, other robots not counted.
 
     A free way keeps the radius of the robot and the margin to obstacles and bounds. A place that is nearer to something
@@ -116,7 +116,7 @@ def _find(world: tuple[Space, Fields], robot: int, places: Floats) -> tuple[Floa
     return target, length, anchor
 
 
-def shortest_ways(problem: Problem) -> Ways:
+def shortest_ways(problem: Problem) -> ShortestPaths:
     """The shortest free ways of a team.
 
     In a world without obstacles they are straight, and there is nothing to compute. Otherwise a wavefront spreads from
@@ -127,7 +127,7 @@ def shortest_ways(problem: Problem) -> Ways:
     """
     start = problem.start[:, : problem.dimension].astype(np.float64)
     if not problem.world.num_obstacles:
-        return Ways(problem, np.linalg.norm(problem.goal - start, axis=1), None)
+        return ShortestPaths(problem, np.linalg.norm(problem.goal - start, axis=1), None)
     # Here, because importing the compiler takes longer than importing all the rest of the package.
     from d4orm_env.paths.wavefront import gather, make_space, spread
 
@@ -153,7 +153,7 @@ def shortest_ways(problem: Problem) -> Ways:
     world = space, gather(reaches, list(lattices.values()), np.array([number[key] for key in chosen]), fronts)
     length = _find(world, 0, starts)[1][:, 0]
     length.setflags(write=False)
-    return Ways(problem, length, world)
+    return ShortestPaths(problem, length, world)
 
 
 def _towards(places: Floats, targets: Floats) -> Floats:
@@ -164,8 +164,8 @@ def _towards(places: Floats, targets: Floats) -> Floats:
     return direction
 
 
-def ahead_in_each(ways: Sequence[Ways], places: FloatArray) -> tuple[Floats, Floats]:
-    """:meth:`Ways.ahead` in ``B`` worlds, each with ways of its own, from places ``(B, K, d)``."""
+def ahead_in_each(ways: Sequence[ShortestPaths], places: FloatArray) -> tuple[Floats, Floats]:
+    """:meth:`ShortestPaths.ahead` in ``B`` worlds, each with ways of its own, from places ``(B, K, d)``."""
     from d4orm_env.paths.wavefront import look
 
     given = places.astype(np.float64)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from d4orm_env.core.arrays import positive_number, whole_number
-from d4orm_env.core.disturbance_events import Marks
+from d4orm_env.core.disturbance_events import DisturbanceEvents
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.metrics import arrival_times
 from d4orm_env.core.problem import Problem
@@ -39,7 +39,7 @@ def save_animation(
     fps: float | None = None,
     speed: float = 1.0,
     max_frames: int = 400,
-    marks: Marks | None = None,
+    marks: DisturbanceEvents | None = None,
 ) -> Path:
     """Write a trajectory as a moving picture, up to half a second after the last robot has arrived, or to its end.
 
@@ -109,7 +109,11 @@ class _Frames:
     """The images of an animation, drawn when asked for."""
 
     def __init__(
-        self, renderer: FrameRenderer, trajectory: Trajectory, steps: NDArray[np.int64], marks: Marks | None = None
+        self,
+        renderer: FrameRenderer,
+        trajectory: Trajectory,
+        steps: NDArray[np.int64],
+        marks: DisturbanceEvents | None = None,
     ) -> None:
         self.renderer, self.trajectory, self.steps, self.marks = renderer, trajectory, steps, marks
         self.contacts = contact_points(trajectory)

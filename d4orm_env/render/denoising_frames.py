@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.problem import Problem
-from d4orm_env.render.panels import Panel, TeamLayer, view_limits
+from d4orm_env.render.panels import Axes2D, TeamLayer, view_limits
 from d4orm_env.render.pictures import PICTURE_SUFFIXES
 from d4orm_env.render.style import own_style
 
@@ -69,7 +69,7 @@ def save_denoising(problem: Problem, denoising: Denoising, path: str | Path, pan
     limits = view_limits(problem)
     figure = Figure(figsize=(9.6, 3.5 * rows), layout="constrained")
     for place, step in enumerate(shown):
-        panel = Panel(figure.add_subplot(rows, 3, place + 1), problem, limits)
+        panel = Axes2D(figure.add_subplot(rows, 3, place + 1), problem, limits)
         panel.axes.set_title(denoising.labels[step].partition(" of ")[0], fontsize=10)
         panel.axes.label_outer()
         _draw_step(TeamLayer(panel, problem), denoising, int(step))

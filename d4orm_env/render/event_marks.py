@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.lines import Line2D
 
-from d4orm_env.core.disturbance_events import Marks
+from d4orm_env.core.disturbance_events import DisturbanceEvents
 from d4orm_env.core.problem import Problem
-from d4orm_env.render.panels import BODY, INK, PUSH, Array, Panel
+from d4orm_env.render.panels import BODY, INK, PUSH, Array, Axes2D
 
 _ARROW_SECONDS = 1.0
 """An arrow is as long as the way at its speed in this time."""
@@ -22,7 +22,7 @@ class MarkLayer:
         artists: The matplotlib artists, in drawing order.
     """
 
-    def __init__(self, panel: Panel, problem: Problem) -> None:
+    def __init__(self, panel: Axes2D, problem: Problem) -> None:
         self.panel, self.problem = panel, problem
         self.radius = np.asarray(problem.team.radius, np.float64)
         empty = np.empty((0, 4, len(panel.right)))
@@ -32,20 +32,20 @@ class MarkLayer:
         self.stalls = panel.segments(empty, colors=INK, linewidths=1.8, zorder=6.7)
         self.artists = [self.ways, self.bodies, self.pushes, self.stalls]
 
-    def show_last(self, marks: Marks, positions: Array) -> None:
+    def show_last(self, marks: DisturbanceEvents, positions: Array) -> None:
         """Show the last moment of ``marks``, with ``(T + 1, K, d)`` positions of the robots."""
         shown = max(1, round(_SHOWN_SECONDS / self.problem.dt))
         self._draw_bodies(marks)
         self._draw_pushes(marks.pushed, positions, max(0, len(positions) - shown))
         self._draw_stalls(positions[-1:], marks.stalled[-1:])
 
-    def show_all(self, marks: Marks, positions: Array) -> None:
+    def show_all(self, marks: DisturbanceEvents, positions: Array) -> None:
         """Show the whole execution; arguments as for :meth:`show_last`."""
         self._draw_bodies(marks)
         self._draw_pushes(marks.pushed, positions, 0)
         self._draw_stalls(positions, marks.stall_starts)
 
-    def _draw_bodies(self, marks: Marks) -> None:
+    def _draw_bodies(self, marks: DisturbanceEvents) -> None:
         d, bodies = self.problem.dimension, np.asarray(marks.bodies, np.float64)
         self.bodies.set_verts(self.panel.outlines(bodies[-1, :, :d], bodies[-1, :, -1]))
         # A body that has left comes again somewhere else.
@@ -77,7 +77,7 @@ class MarkLayer:
         self.stalls.set_segments(np.concatenate(crosses))
 
 
-def mark_legend(marks: Marks) -> list[Line2D]:
+def mark_legend(marks: DisturbanceEvents) -> list[Line2D]:
     """Entries of a legend for what there is."""
     entries = [
         (marks.pushed.any(), Line2D([], [], color=PUSH, linewidth=1.8, label="push")),

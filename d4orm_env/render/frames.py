@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.disturbance_events import Marks
+from d4orm_env.core.disturbance_events import DisturbanceEvents
 from d4orm_env.core.problem import Problem
 from d4orm_env.render.event_marks import MarkLayer
-from d4orm_env.render.panels import INK, Array, Panel, TeamLayer, make_axes, view_limits
+from d4orm_env.render.panels import INK, Array, Axes2D, TeamLayer, make_axes, view_limits
 from d4orm_env.render.style import own_style
 
 
@@ -61,12 +61,12 @@ class FrameRenderer:
         self._background = self._canvas.copy_from_bbox(figure.bbox)
 
     @property
-    def _artists(self) -> Iterator[tuple[Any, Panel]]:
+    def _artists(self) -> Iterator[tuple[Any, Axes2D]]:
         """All that moves, in drawing order, with its panel."""
         for layer, mark_layer in zip(self._layers, self._mark_layers):
             yield from ((artist, layer.panel) for artist in (*layer.artists, *mark_layer.artists))
 
-    def _panels(self, figure: Figure, limits: Array) -> list[Panel]:
+    def _panels(self, figure: Figure, limits: Array) -> list[Axes2D]:
         if self.problem.dimension == 2:
             places = [("plane", (0.12, 0.1, 0.85, 0.83))]
         elif self.size[0] >= 1.6 * self.size[1]:
@@ -75,7 +75,7 @@ class FrameRenderer:
             places = [("space", (0.01, 0.04, 0.86, 0.86))]
         panels = []
         for view, rectangle in places:
-            panel = Panel(make_axes(figure, 111, view), self.problem, limits)
+            panel = Axes2D(make_axes(figure, 111, view), self.problem, limits)
             panel.axes.set_position(rectangle)
             panels.append(panel)
         return panels
@@ -90,7 +90,7 @@ class FrameRenderer:
         *,
         contacts: ArrayLike = (),
         caption: str | None = None,
-        marks: Marks | None = None,
+        marks: DisturbanceEvents | None = None,
     ) -> NDArray[np.uint8]:
         """Draw one state.
 

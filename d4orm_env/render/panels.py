@@ -101,7 +101,7 @@ def make_axes(figure: Figure, place: int, view: str) -> Axes:
     return figure.add_subplot(place, projection="3d" if view == "space" else None)
 
 
-class Panel:
+class Axes2D:
     """One view of the world on one axes: the plane, space, or space seen from above.
 
     Args:
@@ -173,7 +173,7 @@ class Panel:
         return self.axes.add_collection(LineCollection(list(paths), **style), autolim=False)
 
 
-def draw_world(panel: Panel, problem: Problem) -> None:
+def draw_world(panel: Axes2D, problem: Problem) -> None:
     """Obstacles and bounds."""
     world = problem.world
     solid = {"facecolors": OBSTACLE, "edgecolors": OBSTACLE_EDGE, "linewidths": 0.8, "zorder": 1}
@@ -193,7 +193,7 @@ def draw_world(panel: Panel, problem: Problem) -> None:
         panel.segments([rectangle], colors=BOUND, linewidths=1.4, zorder=1)
 
 
-def _draw_solids(panel: Panel, problem: Problem) -> None:
+def _draw_solids(panel: Axes2D, problem: Problem) -> None:
     """The obstacles of a view of space, translucent: nothing may hide behind them."""
     style = {"facecolors": (*to_rgb(OBSTACLE), 0.4), "edgecolors": (*to_rgb(OBSTACLE_EDGE), 0.6), "zorder": 1}
     faces: list[Array] = []
@@ -223,7 +223,7 @@ class TeamLayer:
         artists: The matplotlib artists, in drawing order.
     """
 
-    def __init__(self, panel: Panel, problem: Problem) -> None:
+    def __init__(self, panel: Axes2D, problem: Problem) -> None:
         self.panel, self.problem = panel, problem
         self.colors = robot_colors(problem.num_robots)
         self.radius = np.asarray(problem.team.radius, np.float64)

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from d4orm_env.core.disturbance_events import Marks
+from d4orm_env.core.disturbance_events import DisturbanceEvents
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.metrics import arrival_times
 from d4orm_env.core.problem import Problem
@@ -24,7 +24,7 @@ from d4orm_env.render.panels import (
     OBSTACLE,
     OBSTACLE_EDGE,
     Array,
-    Panel,
+    Axes2D,
     TeamLayer,
     make_axes,
     view_limits,
@@ -65,7 +65,7 @@ def checked_trajectory(problem: Problem, trajectory: Trajectory) -> None:
 
 @own_style()
 def plot_trajectory(
-    problem: Problem, trajectory: Trajectory, *, title: str | None = None, marks: Marks | None = None
+    problem: Problem, trajectory: Trajectory, *, title: str | None = None, marks: DisturbanceEvents | None = None
 ) -> Figure:
     """Draw a whole trajectory, to scale: what the world is, where every robot went, and what went wrong.
 
@@ -95,7 +95,7 @@ def plot_trajectory(
     figure = Figure(figsize=(11.0 if spatial else 5.8, height + 0.9), layout="constrained")
     layer = None
     for place, view in ((121, "space"), (122, "above")) if spatial else ((111, "plane"),):
-        panel = Panel(make_axes(figure, place, view), problem, limits)
+        panel = Axes2D(make_axes(figure, place, view), problem, limits)
         layer = TeamLayer(panel, problem)
         _draw_history(layer, trajectory)
         if marks is not None:
@@ -174,7 +174,7 @@ def plot_problem(problem: Problem) -> Figure:
 @own_style()
 def _plot_on(axes: Axes, problem: Problem, trajectory: Trajectory | None) -> Axes:
     positions = () if trajectory is None else trajectory.positions
-    layer = TeamLayer(Panel(axes, problem, view_limits(problem, positions)), problem)
+    layer = TeamLayer(Axes2D(axes, problem, view_limits(problem, positions)), problem)
     if trajectory is None:
         nowhere = np.empty((0, problem.num_robots, problem.dimension))
         layer.update(problem.start, np.zeros(problem.num_robots, bool), problem.goal, nowhere, nowhere[:, 0])
@@ -223,7 +223,7 @@ def save_picture(
     path: str | Path,
     *,
     title: str | None = None,
-    marks: Marks | None = None,
+    marks: DisturbanceEvents | None = None,
 ) -> Path:
     """Write :func:`plot_trajectory` to a PNG, SVG or PDF file, by its suffix. The same input gives the same bytes.
 

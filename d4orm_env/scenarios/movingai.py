@@ -68,7 +68,7 @@ def _size(lines: list[bytes]) -> tuple[int, int]:
     return height, width
 
 
-class Task(NamedTuple):
+class MapTask(NamedTuple):
     """A row of a ``.scen`` file: cells as column and row, the upper left one being (0, 0), and the way in cells."""
 
     line: int
@@ -77,7 +77,7 @@ class Task(NamedTuple):
     way: float
 
 
-def parse_scenario(content: bytes, shape: tuple[int, int], count: int) -> list[Task]:
+def parse_scenario(content: bytes, shape: tuple[int, int], count: int) -> list[MapTask]:
     """The first rows of a ``.scen`` file.
 
     Args:
@@ -92,7 +92,7 @@ def parse_scenario(content: bytes, shape: tuple[int, int], count: int) -> list[T
     lines = [line.decode("latin-1") for line in content.removeprefix(BYTE_ORDER_MARK).splitlines()]
     if not lines or lines[0].split()[:1] != ["version"]:
         raise ValueError("is not a Moving AI scenario; it must begin with a line 'version 1'")
-    tasks: list[Task] = []
+    tasks: list[MapTask] = []
     for number, line in enumerate(lines[1:], 2):
         if len(tasks) < count and line.strip():
             tasks.append(_task(line, number, shape))
@@ -101,7 +101,7 @@ def parse_scenario(content: bytes, shape: tuple[int, int], count: int) -> list[T
     return tasks
 
 
-def _task(line: str, number: int, shape: tuple[int, int]) -> Task:
+def _task(line: str, number: int, shape: tuple[int, int]) -> MapTask:
     try:
         width, height, *cells = (int(value) for value in line.split()[-7:-1])
         start, goal, way = (cells[0], cells[1]), (cells[2], cells[3]), float(line.split()[-1])
@@ -119,7 +119,7 @@ def _task(line: str, number: int, shape: tuple[int, int]) -> Task:
             raise ValueError(f"names the cell ({column}, {row}) in line {number}, which is not on the map")
     if not (math.isfinite(way) and way >= 0):
         raise ValueError(f"gives a length of {way} in line {number}; it must be zero or more and finite")
-    return Task(number, start, goal, way)
+    return MapTask(number, start, goal, way)
 
 
 def _count(text: bytes, name: str) -> int:

@@ -29,7 +29,7 @@ class _HasMotion(Protocol):
     def animate(self) -> Replay: ...
 
 
-class Shown:
+class DisplayMixin:
     """A motion of a team in a world, with a title and key figures. What draws is imported when it is asked for."""
 
     def __repr__(self: _HasMotion) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import BoolArray, FloatArray, shown, whole_number
-from d4orm_env.core.disturbance_events import Marks
+from d4orm_env.core.disturbance_events import DisturbanceEvents
 from d4orm_env.core.metrics import mean_squared_jerk, mean_stretch
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import Row, count, outcome_rows
@@ -18,7 +18,7 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.disturbances.recorded_events import marks_of
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.envs.team_step import AgentInfos
-from d4orm_planners.base.display import Shown
+from d4orm_planners.base.display import DisplayMixin
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ PHYSICS = ("model", "mujoco")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Episode(Shown):
+class Episode(DisplayMixin):
     """What happened.
 
     Attributes:
@@ -49,7 +49,7 @@ class Episode(Shown):
     observations: tuple[dict[str, FloatArray], ...]
     infos: tuple[AgentInfos, ...]
     goals: FloatArray
-    marks: Marks | None = None
+    marks: DisturbanceEvents | None = None
 
     @property
     def title(self) -> str:

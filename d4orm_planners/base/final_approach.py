@@ -14,7 +14,7 @@ from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.tracking.steering import drives, prepare_drives
 
 if TYPE_CHECKING:
-    from d4orm_planners.base.solve import Search
+    from d4orm_planners.base.solve import SolveRun
 
 EARLIER = (1, 2, 4, 8)
 """Steps before its arrival from which on a robot drives otherwise."""
@@ -22,7 +22,7 @@ SHARES = (1.0, 0.5, 0.75, 0.25)
 """Of its control in the first of these steps that it takes: a stride that ends at the radius must begin elsewhere."""
 
 
-def drive_further_in(search: Search, candidate: Candidate, judge: Callable[[FloatArray], Candidate]) -> Candidate:
+def drive_further_in(search: SolveRun, candidate: Candidate, judge: Callable[[FloatArray], Candidate]) -> Candidate:
     """The candidate, or if rounding alone decides who has arrived in it, one whose robots drive further in.
 
     Args:
@@ -48,7 +48,7 @@ def drive_further_in(search: Search, candidate: Candidate, judge: Callable[[Floa
     return candidate
 
 
-def _driven(search: Search, candidate: Candidate, robot: int, step: int, share: float) -> FloatArray:
+def _driven(search: SolveRun, candidate: Candidate, robot: int, step: int, share: float) -> FloatArray:
     """The team's controls, where a robot takes a share of its control at a step and drives straight home from there."""
     part, controls = search.problem.select([robot]), candidate.controls.copy()
     own = np.ascontiguousarray(controls[:, [robot], : part.control_size])

@@ -25,7 +25,7 @@ from d4orm_env.rollout import rollout
 from d4orm_env.scenarios.schema import describe, parse
 from d4orm_env.verify import VerificationReport, verify
 from d4orm_planners.base.conflict_groups import conflicts
-from d4orm_planners.base.display import Shown
+from d4orm_planners.base.display import DisplayMixin
 from d4orm_planners.base.infeasibility import prove_infeasible
 from d4orm_planners.base.provenance import Provenance
 
@@ -83,7 +83,7 @@ class IterationRecord:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Plan(Shown):
+class Plan(DisplayMixin):
     """Controls for a whole team, how they were found and what they lead to.
 
     Attributes:

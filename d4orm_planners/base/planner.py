@@ -15,7 +15,7 @@ from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.infeasibility import prove_infeasible
 from d4orm_planners.base.plan import IterationRecord, Plan, Status
 from d4orm_planners.base.settings import CheckedSettings, Count, EngineName
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.sampling_types import StepWatcher
 
 Callback = Callable[[IterationRecord], object]
@@ -88,15 +88,15 @@ class Planner(ABC):
     def __init__(self, config: PlannerConfig) -> None:
         self.config = config
 
-    def init(self, search: Search) -> State:
+    def init(self, search: SolveRun) -> State:
         """The state that the first iteration begins with."""
         del search
 
     @abstractmethod
-    def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
+    def iterate(self, search: SolveRun, state: State) -> tuple[State, Iteration]:
         """One iteration from the search's current candidate to the next: the new state, and what came of it."""
 
-    def finish(self, search: Search, state: State) -> None:  # noqa: B027 - a hook that most planners need not fill
+    def finish(self, search: SolveRun, state: State) -> None:  # noqa: B027 - a hook that most planners need not fill
         """Let go of what the state holds open; called once after :meth:`init`, however the solve ends."""
 
     def solve(
@@ -136,7 +136,7 @@ class Planner(ABC):
         most = (
             self.config.max_iterations if max_iterations is None else whole_number(max_iterations, "max_iterations", 1)
         )
-        search = Search(self, problem, seed, initial_controls)
+        search = SolveRun(self, problem, seed, initial_controls)
         search.time_limit = limit
         search.watcher = watcher
         try:
@@ -149,7 +149,7 @@ class Planner(ABC):
         return search.plan(status)
 
 
-def _run(search: Search, most: int, callback: Callback | None) -> Status:
+def _run(search: SolveRun, most: int, callback: Callback | None) -> Status:
     """Iterate until something ends the search, and say what."""
     while not search.is_over:
         if search.iteration >= most:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from d4orm_planners.base.planner import Planner, State
 
 
-class Search:
+class SolveRun:
     """One solve on its way.
 
     Args:

@@ -10,8 +10,8 @@ from d4orm_env.core.metrics import arrival_steps
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.verify import VerificationReport
 from d4orm_planners.base.conflict_groups import Graph, graph_of
-from d4orm_planners.base.solve import Search
-from d4orm_planners.tracking.steering import Drives
+from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.tracking.steering import Rollouts
 
 MISSING = 5
 """Robots that a robot may meet rather than never arrive, or touch an obstacle."""
@@ -19,7 +19,7 @@ MISSING = 5
 Costs = NDArray[np.float64]
 
 
-class TeamPaths:
+class WorkingPlan:
     """What the team does, to be changed for some robots around all others.
 
     Args:
@@ -35,7 +35,7 @@ class TeamPaths:
         index: Where everybody is.
     """
 
-    def __init__(self, search: Search, trajectory: Trajectory, report: VerificationReport | None = None) -> None:
+    def __init__(self, search: SolveRun, trajectory: Trajectory, report: VerificationReport | None = None) -> None:
         # Here, because importing numba takes long.
         from d4orm_planners.engine.path_index import PathIndex
 
@@ -92,7 +92,7 @@ class TeamPaths:
         refused = self.refused[index]
         return np.floor(costs[:, 0]) + (refused <= self.problem.horizon), np.minimum(first[:, 0], refused)
 
-    def take_best(self, robots: ArrayLike, ways: Drives, *, or_longer: bool = False) -> None:
+    def take_best(self, robots: ArrayLike, ways: Rollouts, *, or_longer: bool = False) -> None:
         """Let one robot after the other take the best of its ways, if that is better than what it does.
 
         Args:

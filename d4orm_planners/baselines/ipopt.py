@@ -12,8 +12,8 @@ from d4orm_env.core.seeds import Stream
 from d4orm_planners.base.candidate import Candidate, evaluate_controls
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
 from d4orm_planners.base.settings import Count, NotNegative, Positive
-from d4orm_planners.base.solve import Search
-from d4orm_planners.baselines.collocation import Contacts, Motion, TeamProgram, load_casadi
+from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.baselines.collocation import Contacts, TeamMotion, TeamProgram, load_casadi
 from d4orm_planners.tracking.steering import prepare_drives, straight_drives
 
 FOUND = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
@@ -70,7 +70,7 @@ class WarmStart:
     """
 
     program: TeamProgram
-    motion: Motion
+    motion: TeamMotion
 
 
 class Ipopt(Planner):
@@ -93,18 +93,18 @@ class Ipopt(Planner):
         super().__init__(config)
         load_casadi()
 
-    def init(self, search: Search) -> WarmStart:
+    def init(self, search: SolveRun) -> WarmStart:
         """See :meth:`Planner.init`."""
         program = TeamProgram(search.problem, self.config.clearance * search.problem.team.largest_radius)
         return WarmStart(program, self._warm_start(search, program))
 
-    def iterate(self, search: Search, state: WarmStart) -> tuple[WarmStart, Iteration]:
+    def iterate(self, search: SolveRun, state: WarmStart) -> tuple[WarmStart, Iteration]:
         """See :meth:`Planner.iterate`: one perturbed restart."""
         if search.should_stop():
             return state, Iteration(state.motion.controls.astype(np.float32), note=OUT_OF_TIME)
         return state, self._restart(search, state)
 
-    def _restart(self, search: Search, state: WarmStart) -> Iteration:
+    def _restart(self, search: SolveRun, state: WarmStart) -> Iteration:
         config, problem, program = self.config, search.problem, state.program
         motion = self._perturbed(search, program, state.motion)
         lookout = None if config.lookout is None else config.lookout * problem.team.largest_radius
@@ -133,7 +133,7 @@ class Ipopt(Planner):
         config = self.config
         return {"tol": config.tolerance, "max_iter": config.solver_iterations, "mu_init": config.barrier}
 
-    def _warm_start(self, search: Search, program: TeamProgram) -> Motion:
+    def _warm_start(self, search: SolveRun, program: TeamProgram) -> TeamMotion:
         """The controls that the search was given, or else the solution of the program without collisions."""
         if search.current.controls.any():
             return _motion(search.current)
@@ -144,7 +144,7 @@ class Ipopt(Planner):
         docks = np.full(problem.num_robots, problem.horizon)
         return program.solve(_motion(straight), {}, docks, self._options(), search.should_stop)[0]
 
-    def _perturbed(self, search: Search, program: TeamProgram, warm_start: Motion) -> Motion:
+    def _perturbed(self, search: SolveRun, program: TeamProgram, warm_start: TeamMotion) -> TeamMotion:
         random = np.random.default_rng(search.iteration_seed(Stream.PERTURBATION))
         parts = []
         for part, units in zip(warm_start, program.units, strict=True):
@@ -152,11 +152,11 @@ class Ipopt(Planner):
             for robot, unit in enumerate(units):
                 noise[:, robot, : unit.size] *= unit
             parts.append(part + noise)
-        return Motion(*parts)
+        return TeamMotion(*parts)
 
 
-def _motion(candidate: Candidate) -> Motion:
-    return Motion(candidate.trajectory.states.astype(float), candidate.controls.astype(float))
+def _motion(candidate: Candidate) -> TeamMotion:
+    return TeamMotion(candidate.trajectory.states.astype(float), candidate.controls.astype(float))
 
 
 def _docks(candidate: Candidate) -> np.ndarray:

@@ -11,7 +11,7 @@ import typer
 from d4orm_planners.cli.arguments import check_target, parse_settings, refuse_options
 
 if TYPE_CHECKING:
-    from d4orm_env.core.disturbance_events import Marks
+    from d4orm_env.core.disturbance_events import DisturbanceEvents
     from d4orm_env.core.problem import Problem
     from d4orm_env.core.trajectory import Trajectory
 
@@ -87,7 +87,7 @@ class PictureOptions:
         check_target(self.picture, (".png", ".svg", ".pdf"))
         check_target(self.animation, (".gif", ".mp4"))
 
-    def draw(self, problem: Problem, trajectory: Trajectory, marks: Marks | None = None) -> None:
+    def draw(self, problem: Problem, trajectory: Trajectory, marks: DisturbanceEvents | None = None) -> None:
         """Write the pictures that were asked for."""
         from d4orm_env.render import save_animation, save_picture
 

@@ -26,7 +26,7 @@ from d4orm_env.engine.caching import Kernel, has_to_be_compiled
 from d4orm_env.envs.joint_state import JointState
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.planner_registry import make_planner
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
 from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.sampling.weights import SoftmaxWeights
@@ -106,7 +106,7 @@ def roll_out_once(models: tuple[str, ...], *, drives: bool = True) -> None:
     if drives:
         # What it drives by itself, and how it looks for ways around others.
         planner = make_planner(engine="cpu")
-        planner.init(Search(planner, problem, seed=0))
+        planner.init(SolveRun(planner, problem, seed=0))
 
 
 def sample_once(teams: tuple[tuple[str, ...], ...]) -> None:

@@ -11,7 +11,7 @@ from d4orm_env.core.problem import Problem
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Waypoints:
+class CoarseWaypoints:
     """What a team follows.
 
     Attributes:
@@ -24,7 +24,7 @@ class Waypoints:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Guidance(Waypoints):
+class CoarsePlan(CoarseWaypoints):
     """A coarse plan and the path made from it.
 
     Attributes:
@@ -96,7 +96,7 @@ def subgoal_indices(indices: IntArray, mean: int, offset: int, lag: int, last: i
     return np.minimum(np.minimum(mean, indices + lag) + offset, last)
 
 
-def rest_of(guidance: Guidance, index: int, factor: int) -> tuple[Problem, FloatArray]:
+def rest_of(guidance: CoarsePlan, index: int, factor: int) -> tuple[Problem, FloatArray]:
     """The coarse problem that is left from a waypoint on, and the controls of the coarse plan for it."""
     step = min(-(-index // factor), len(guidance.controls) - 1)
     coarse = guidance.problem

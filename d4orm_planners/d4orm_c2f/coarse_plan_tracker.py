@@ -13,18 +13,18 @@ from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.planner import Planner
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.coarse_plan import (
-    Guidance,
-    Waypoints,
+    CoarsePlan,
+    CoarseWaypoints,
     coarse_problem,
     interpolate,
     nearest_indices,
     rest_of,
     subgoal_indices,
 )
-from d4orm_planners.d4orm_c2f.following import BARRED_AFTER, STUCK_AFTER, WAITING_WITHIN, Patience, keep_time
+from d4orm_planners.d4orm_c2f.following import BARRED_AFTER, STUCK_AFTER, WAITING_WITHIN, StagnationMonitor, keep_time
 from d4orm_planners.d4orm_c2f.lookahead import within_sight
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.d4orm_c2f.warm_start import episode_of
@@ -33,7 +33,7 @@ from d4orm_planners.d4orm_d.settings import D4ormDConfig
 from d4orm_planners.engine.sampling_types import SamplingEngine
 from d4orm_planners.hybrid.planner import Hybrid
 from d4orm_planners.hybrid.settings import HybridConfig
-from d4orm_planners.mapf.planner import Guide as Ways
+from d4orm_planners.mapf.planner import RoadmapSolution
 from d4orm_planners.mapf.relay import relay_ways
 from d4orm_planners.tracking.steering import straight_drives
 
@@ -41,7 +41,7 @@ NEARER = 1 / 3
 """What counts as coming nearer to the goals, all robots together, in radii of the largest one."""
 
 
-class Guide:
+class CoarsePlanTracker:
     """Leads a team through an episode.
 
     Args:
@@ -61,7 +61,7 @@ class Guide:
         stuck: ``(K,)`` robots that do not get on, or did not until a short while ago.
     """
 
-    guidance: Waypoints
+    guidance: CoarseWaypoints
     index: int
     anew: BoolArray
     stuck: BoolArray
@@ -72,7 +72,7 @@ class Guide:
         config: D4ormC2FConfig,
         seed: int,
         refiner: SamplingEngine,
-        background: Background[Guidance],
+        background: Background[CoarsePlan],
         lifelong: bool,
         last_step: int,
     ) -> None:
@@ -86,7 +86,7 @@ class Guide:
     def begin(self, joint: JointState, docked: BoolArray) -> None:
         """Plan for the episode, in which those ``docked`` ``(K,)`` stay where they are."""
         everybody = np.ones(self.problem.num_robots, bool)
-        self._patience, self.stuck = Patience(joint), ~everybody
+        self._patience, self.stuck = StagnationMonitor(joint), ~everybody
         self.guidance, self.index = self.plan(joint, docked, self._guess(joint), self._config.coarse_iterations), 0
         self._follow(joint, self._relayed(joint, everybody) or self.guidance, everybody)
 
@@ -97,7 +97,7 @@ class Guide:
         coarse = coarse_problem(self.problem.resumed_at(joint.states, joint.goals), self._config.coarse_factor)
         return episode_of(self._config.first_guess, coarse, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps))
 
-    def _follow(self, joint: JointState, guidance: Waypoints, anew: BoolArray) -> None:
+    def _follow(self, joint: JointState, guidance: CoarseWaypoints, anew: BoolArray) -> None:
         """Begin at the beginning of a guidance, which sends the robots ``anew`` ``(K,)`` another way than before."""
         self.anew = anew
         self.guidance = guidance
@@ -112,7 +112,7 @@ class Guide:
         initial: FloatArray | None,
         iterations: int,
         thorough: bool = False,
-    ) -> Guidance:
+    ) -> CoarsePlan:
         """Plan for the whole team from where it is, until a plan passes the checks (Algorithm 4, lines 1 to 3)."""
         # Whoever has docked at the rim of its goal could leave it within a coarse step.
         goals = np.where(docked[:, None], joint.states[:, : self.problem.dimension], joint.goals)
@@ -134,25 +134,27 @@ class Guide:
 
     def _planned(
         self, coarse: Problem, step: int, initial: FloatArray | None, iterations: int, thorough: bool
-    ) -> tuple[Candidate, Guidance]:
+    ) -> tuple[Candidate, CoarsePlan]:
         """The first plan that passes the checks, or the best one."""
         planner = self._thorough if thorough else self._planner
         seed, interval = derived_seed(self._seed, Stream.COARSE_PLAN, step), self._config.check_interval
         start = None if initial is None else initial[: coarse.horizon]
-        search = Search(planner, coarse, seed, start, check_interval=interval)
+        search = SolveRun(planner, coarse, seed, start, check_interval=interval)
         chosen, ordered = search.current, False
         for number in range(iterations):
             if not chosen.failed.any():
                 break
             search.advance()
             if number == 0:
-                ordered = isinstance(search.state, Ways)
+                ordered = isinstance(search.state, RoadmapSolution)
             chosen = search.current if search.current.rank >= search.best.rank else search.best
             if not search.current.failed.any():
                 chosen = search.current
         plan = chosen.trajectory
         path = interpolate(plan.positions, self._config.coarse_factor)
-        return chosen, Guidance(problem=coarse, controls=plan.controls, states=plan.states, path=path, ordered=ordered)
+        return chosen, CoarsePlan(
+            problem=coarse, controls=plan.controls, states=plan.states, path=path, ordered=ordered
+        )
 
     def subgoals(self, joint: JointState, docked: BoolArray) -> IntArray:
         """``(K,)`` waypoints that the robots head for; finds out where on the path they are (Algorithm 4, line 6)."""
@@ -184,7 +186,7 @@ class Guide:
 
     def fresh_start(self, base: FloatArray) -> None:
         """Have those that are sent another way begin ``base`` ``(H_predict, K, m)`` with the coarse plan's controls."""
-        if self.anew.any() and isinstance(self.guidance, Guidance):
+        if self.anew.any() and isinstance(self.guidance, CoarsePlan):
             # Each is held for as long as it stands for.
             held = np.repeat(self.guidance.controls, self._config.coarse_factor, axis=0)[: len(base)]
             base[:, self.anew] = 0
@@ -222,21 +224,21 @@ class Guide:
         self._follow(joint, guidance, ~keep | lost)
         return True
 
-    def _relayed(self, joint: JointState, changed: BoolArray) -> Waypoints | None:
+    def _relayed(self, joint: JointState, changed: BoolArray) -> CoarseWaypoints | None:
         """New ways on the roadmap for those ``changed`` ``(K,)``, around all others on theirs, where goals are many."""
         if not (self._lifelong and self.guidance.ordered):
             return None
         factor, seed = self._config.coarse_factor, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps)
         present = coarse_problem(self.problem.resumed_at(joint.states, joint.goals), factor)
         ways = relay_ways(present, self.guidance.path[self.index :: factor], changed, seed)
-        return None if ways is None else Waypoints(path=interpolate(ways, factor), ordered=True)
+        return None if ways is None else CoarseWaypoints(path=interpolate(ways, factor), ordered=True)
 
     def _beginning(self, joint: JointState, keep: BoolArray) -> FloatArray | None:
         """``(H_c, K, m)`` straight drives, but for those that ``keep`` ``(K,)`` back to and along their ways.
 
         ``None`` among walls: there the whole team's ways are found anew on the roadmap.
         """
-        if self.guidance.ordered or not isinstance(self.guidance, Guidance):
+        if self.guidance.ordered or not isinstance(self.guidance, CoarsePlan):
             return None
         factor = self._config.coarse_factor
         present = coarse_problem(self.problem.resumed_at(joint.states, joint.goals), factor)
@@ -288,7 +290,7 @@ class Guide:
         """Take over what the refinement has done meanwhile, and give it more to do if that is ``due``."""
         index = self.index + self._config.subgoal_offset
         guidance, over = self.guidance, index >= len(self.guidance.path) - 1
-        if self._config.refine == "off" or over or not isinstance(guidance, Guidance):
+        if self._config.refine == "off" or over or not isinstance(guidance, CoarsePlan):
             return False
         seed = derived_seed(self._seed, Stream.REFINEMENT, step)
         if self._config.refine == "sync":
@@ -303,10 +305,10 @@ class Guide:
             self._background.start(lambda: self._refined(guidance, index, seed))
         return self.guidance is refined
 
-    def _refined(self, guidance: Guidance, index: int, seed: int) -> Guidance:
+    def _refined(self, guidance: CoarsePlan, index: int, seed: int) -> CoarsePlan:
         """The guidance with what is left of it from a waypoint on made better, if that succeeds (line 4)."""
         left, controls = rest_of(guidance, index, self._config.coarse_factor)
-        search = Search(self._planner, left, seed, controls, self._refiner)
+        search = SolveRun(self._planner, left, seed, controls, self._refiner)
         search.advance()
         done = guidance.problem.horizon - left.horizon
         before, after = guidance.states[: done + 1], search.best.trajectory

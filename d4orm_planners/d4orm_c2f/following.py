@@ -26,7 +26,7 @@ CATCHING_UP = 2.0
 """What of its lag a robot makes good in a second [1/s]."""
 
 
-class Patience:
+class StagnationMonitor:
     """Watches an episode for robots that do not get on along their paths.
 
     Args:

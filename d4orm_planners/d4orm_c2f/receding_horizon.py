@@ -16,8 +16,8 @@ from d4orm_planners.base.policy import StatePolicy
 from d4orm_planners.base.settings import CheckedSettings
 from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.barrier import safe_velocities
-from d4orm_planners.d4orm_c2f.coarse_plan import Guidance, Waypoints
-from d4orm_planners.d4orm_c2f.coarse_plan_tracker import Guide
+from d4orm_planners.d4orm_c2f.coarse_plan import CoarsePlan, CoarseWaypoints
+from d4orm_planners.d4orm_c2f.coarse_plan_tracker import CoarsePlanTracker
 from d4orm_planners.d4orm_c2f.deviation import Deviation
 from d4orm_planners.d4orm_c2f.fine_plan import Prediction, Situation, Window
 from d4orm_planners.d4orm_c2f.settings import PAPER_CONTROL, D4ormC2FConfig
@@ -82,7 +82,7 @@ class D4ormC2F(StatePolicy):
         self._engine = get_sampling_engine(self.config.engine)
         # On one thread the refinement leaves the other cores, and their threads, to the control loop.
         self._refiner = get_sampling_engine(self.config.engine, 1 if self.config.refine == "background" else None)
-        self._refinement: Background[Guidance] = Background(yielding=True)
+        self._refinement: Background[CoarsePlan] = Background(yielding=True)
         self._control: Background[Prediction] = Background()
 
     @property
@@ -91,7 +91,7 @@ class D4ormC2F(StatePolicy):
         return sum(loop.missed for loop in self.loops)
 
     @property
-    def guidance(self) -> Waypoints:
+    def guidance(self) -> CoarseWaypoints:
         """What is followed at present."""
         return self._guide.guidance
 
@@ -113,7 +113,9 @@ class D4ormC2F(StatePolicy):
         self._see_docked(joint)
         begin = time.perf_counter()
         last_step = env.unwrapped.max_cycles
-        self._guide = Guide(self.problem, self.config, seed, self._refiner, self._refinement, lifelong, last_step)
+        self._guide = CoarsePlanTracker(
+            self.problem, self.config, seed, self._refiner, self._refinement, lifelong, last_step
+        )
         self._guide.begin(joint, self._docked)
         self._deviation = Deviation(self.problem, self._engine, self.config, docks=not lifelong)
         self.coarse_time = time.perf_counter() - begin

@@ -13,13 +13,13 @@ from d4orm_env.core.seeds import Stream
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.verify import VerificationReport
 from d4orm_planners.base.planner import Iteration
-from d4orm_planners.base.solve import Search
-from d4orm_planners.base.working_plan import TeamPaths
+from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine.sampling_types import MovingObstacles, SamplingTask
 from d4orm_planners.sampling.d4orm import DeformingPlanner
 
 
-class DeformedTeam(TeamPaths):
+class DeformedPlan(WorkingPlan):
     """What the team does, some robots' controls deformed around all others.
 
     Args:
@@ -32,7 +32,7 @@ class DeformedTeam(TeamPaths):
     def __init__(
         self,
         planner: DeformingPlanner,
-        search: Search,
+        search: SolveRun,
         trajectory: Trajectory,
         report: VerificationReport | None = None,
     ) -> None:

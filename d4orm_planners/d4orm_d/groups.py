@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from d4orm_planners.base.conflict_groups import Graph, conflicts, failure_groups, reconnected
-from d4orm_planners.d4orm_d.deformed_plan import DeformedTeam
+from d4orm_planners.d4orm_d.deformed_plan import DeformedPlan
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,7 +18,7 @@ class Groups:
 
     graph: Graph | None = None
 
-    def replan(self, team: DeformedTeam) -> Groups:
+    def replan(self, team: DeformedPlan) -> Groups:
         """Replan every group with a failed robot in turn, the robots outside it as moving obstacles."""
         planner, search, problem = team.planner, team.search, team.problem
         checked = search.current.trajectory.positions[:: search.check_interval]

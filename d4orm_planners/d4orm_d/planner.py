@@ -9,8 +9,8 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_planners.base.conflict_groups import conflicts
 from d4orm_planners.base.planner import Iteration
-from d4orm_planners.base.solve import Search
-from d4orm_planners.d4orm_d.deformed_plan import DeformedTeam
+from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.d4orm_d.deformed_plan import DeformedPlan
 from d4orm_planners.d4orm_d.groups import Groups
 from d4orm_planners.d4orm_d.repairs import Repairs
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
@@ -42,37 +42,37 @@ class D4ormD(DeformingPlanner):
     }
     config: D4ormDConfig
 
-    def init(self, search: Search) -> State:
+    def init(self, search: SolveRun) -> State:
         """See :meth:`Planner.init`."""
         with search.watch.paused():
             prepare_drives(search.problem)
         return Groups() if self.config.decoupling == "groups" else Repairs.of(search.problem.num_robots)
 
-    def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
+    def iterate(self, search: SolveRun, state: State) -> tuple[State, Iteration]:
         """See :meth:`Planner.iterate`: the whole team at first and once nobody fails, the failed robots in between."""
         if search.iteration == 0 and not search.current.controls.any():
             drives = self.straight_start(search.problem)
             return self.whole_team(search, state) if drives is None else (state, Iteration(drives))
         if not search.current.unsolved.any() or (isinstance(state, Groups) and search.best.solved):
             return self.whole_team(search, state)
-        team = DeformedTeam(self, search, search.current.trajectory, search.current.report)
+        team = DeformedPlan(self, search, search.current.trajectory, search.current.report)
         state = state.replan(team) if isinstance(state, Groups) else state.repair(team, self.config)
         return state, team.iteration()
 
-    def whole_team(self, search: Search, state: State) -> tuple[State, Iteration]:
+    def whole_team(self, search: SolveRun, state: State) -> tuple[State, Iteration]:
         """Deform everybody's controls at once; unless in groups, then straight home from wherever that is as good."""
         iteration = self.run(search)
         if not isinstance(state, Repairs):
             return state, iteration
-        team = DeformedTeam(self, search, search.engine.rollout(search.problem, iteration.controls))
+        team = DeformedPlan(self, search, search.engine.rollout(search.problem, iteration.controls))
         return state.shorten(team), replace(iteration, controls=team.controls)
 
-    def num_samples(self, search: Search) -> int:
+    def num_samples(self, search: SolveRun) -> int:
         """See :meth:`SamplingPlanner.num_samples`."""
         big = self.config.big_team is not None and search.problem.num_robots > self.config.big_team
         return max(self.config.num_samples // 2, 2) if big else self.config.num_samples
 
-    def task(self, search: Search, base: FloatArray) -> SamplingTask:
+    def task(self, search: SolveRun, base: FloatArray) -> SamplingTask:
         """See :meth:`SamplingPlanner.task`."""
         task = super().task(search, base)
         return replace(task, penalty=1.0, collisions=search.iteration > 0 or self.config.first_collisions)

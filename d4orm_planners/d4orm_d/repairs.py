@@ -13,7 +13,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_planners.base.conflict_groups import components, independent_robots
-from d4orm_planners.d4orm_d.deformed_plan import DeformedTeam
+from d4orm_planners.d4orm_d.deformed_plan import DeformedPlan
 from d4orm_planners.d4orm_d.settings import RULES, D4ormDConfig
 from d4orm_planners.tracking.steering import drives
 
@@ -35,13 +35,13 @@ class Repairs:
         """The state before the first repair."""
         return cls(np.zeros(num_robots, int), np.zeros(num_robots))
 
-    def repair(self, team: DeformedTeam, config: D4ormDConfig) -> Repairs:
+    def repair(self, team: DeformedPlan, config: D4ormDConfig) -> Repairs:
         """Deform some of the failed robots' controls, and take over what is no worse."""
         repair = _Repair(team, self)
         repair.run(config)
         return Repairs(repair.failures, repair.recency)
 
-    def shorten(self, team: DeformedTeam) -> Repairs:
+    def shorten(self, team: DeformedPlan) -> Repairs:
         """Let everybody turn home as soon as that is no worse."""
         repair = _Repair(team, self)
         repair.shorten()
@@ -51,7 +51,7 @@ class Repairs:
 class _Repair:
     """One iteration of repairs."""
 
-    def __init__(self, team: DeformedTeam, before: Repairs) -> None:
+    def __init__(self, team: DeformedPlan, before: Repairs) -> None:
         self.team, self.search, self.problem = team, team.search, team.problem
         self.failures, self.recency = before.failures.copy(), before.recency
 

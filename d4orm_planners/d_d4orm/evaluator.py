@@ -14,7 +14,7 @@ class Stopped(Exception):
     """An iteration was left because its result is no longer wanted."""
 
 
-class Judge:
+class Evaluator:
     """Judges candidates, and remembers some.
 
     Args:

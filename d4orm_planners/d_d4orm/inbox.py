@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from d4orm_planners.base.candidate import Candidate
-from d4orm_planners.d_d4orm.evaluator import Judge
+from d4orm_planners.d_d4orm.evaluator import Evaluator
 from d4orm_planners.d_d4orm.messages import KINDS, Message, MessageError, decode
 from d4orm_planners.d_d4orm.selection import merge
 from d4orm_planners.d_d4orm.transport import Transport
@@ -51,7 +51,7 @@ class Inbox:
         namesake: The number of the last candidate that another node sent under this one's own number, or ``None``.
     """
 
-    def __init__(self, judge: Judge, transport: Transport, num_nodes: int, own: int | None = None) -> None:
+    def __init__(self, judge: Evaluator, transport: Transport, num_nodes: int, own: int | None = None) -> None:
         self._judge, self._transport = judge, transport
         self._num_nodes, self._own = num_nodes, own
         self._owner = "the observer" if own is None else f"node {own}"

@@ -6,26 +6,26 @@ import logging
 from collections.abc import Callable
 
 from d4orm_planners.base.candidate import Candidate
-from d4orm_planners.d_d4orm.evaluator import Judge
+from d4orm_planners.d_d4orm.evaluator import Evaluator
 from d4orm_planners.d_d4orm.node import Node
-from d4orm_planners.d_d4orm.node_pool import SyncCrew
+from d4orm_planners.d_d4orm.node_pool import SyncNodePool
 from d4orm_planners.d_d4orm.transport import Transport
 
 logger = logging.getLogger(__name__)
 
 
-class NetworkCrew(SyncCrew):
+class NetworkNodePool(SyncNodePool):
     """A single node here; a round is over when the others were heard from, or patience has ended.
 
     Args:
         node: The node.
         transport: Its access to the others.
-        patience: See :class:`~d4orm_planners.d_d4orm.node_pool.Crew`.
-        judge: See :class:`~d4orm_planners.d_d4orm.node_pool.Crew`.
+        patience: See :class:`~d4orm_planners.d_d4orm.node_pool.NodePool`.
+        judge: See :class:`~d4orm_planners.d_d4orm.node_pool.NodePool`.
         linger: Seconds that a solution is sent to the others in the end, see :meth:`Node.settle`.
     """
 
-    def __init__(self, node: Node, transport: Transport, patience: float, judge: Judge, linger: float) -> None:
+    def __init__(self, node: Node, transport: Transport, patience: float, judge: Evaluator, linger: float) -> None:
         super().__init__([node], [transport], patience, judge)
         self._node, self._linger = node, linger
         self._seen: set[int] = set()

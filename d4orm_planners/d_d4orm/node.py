@@ -12,13 +12,13 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.planner import Planner
-from d4orm_planners.base.solve import Search
-from d4orm_planners.d_d4orm.evaluator import Judge
+from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.d_d4orm.evaluator import Evaluator
 from d4orm_planners.d_d4orm.inbox import TOLERANCE, Inbox
 from d4orm_planners.d_d4orm.messages import Message, encode
 from d4orm_planners.d_d4orm.node_events import Event, Observer
 from d4orm_planners.d_d4orm.selection import choose
-from d4orm_planners.d_d4orm.traffic import Meter
+from d4orm_planners.d_d4orm.traffic import TrafficStats
 from d4orm_planners.d_d4orm.transport import Transport
 
 RESEND = 0.2
@@ -77,16 +77,16 @@ class Node:
         task: Task,
         planner: Planner,
         transport: Transport,
-        judge: Judge,
+        judge: Evaluator,
         sequence: int = 0,
         observer: Observer | None = None,
     ) -> None:
         self.number = number
         seed = node_seed(task.seed, number)
-        self.search = Search(planner, judge.problem, seed, task.controls, judge.engine, judge.own)
+        self.search = SolveRun(planner, judge.problem, seed, task.controls, judge.engine, judge.own)
         self.search.cancelled = judge.stop
         self.candidate = self.search.current
-        self.transport = Meter(transport)
+        self.transport = TrafficStats(transport)
         self.inbox = Inbox(judge, self.transport, task.num_nodes, number)
         self.excluded = 0
         self._task = task

@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.plan import IterationRecord
 from d4orm_planners.base.planner import Iteration
-from d4orm_planners.base.solve import Search
-from d4orm_planners.d_d4orm.evaluator import Judge, Stopped
+from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.d_d4orm.evaluator import Evaluator, Stopped
 from d4orm_planners.d_d4orm.inbox import Inbox
 from d4orm_planners.d_d4orm.node import Node
 from d4orm_planners.d_d4orm.transport import Transport
@@ -87,7 +87,7 @@ class _Job:
             atexit.register(self.wait, LAST_WAIT)
 
 
-class Crew(ABC):
+class NodePool(ABC):
     """The nodes of one solve.
 
     Args:
@@ -97,7 +97,9 @@ class Crew(ABC):
         judge: The nodes' common judge.
     """
 
-    def __init__(self, nodes: Sequence[Node], transports: Sequence[Transport], patience: float, judge: Judge) -> None:
+    def __init__(
+        self, nodes: Sequence[Node], transports: Sequence[Transport], patience: float, judge: Evaluator
+    ) -> None:
         self.alive = list(nodes)
         self.patience = patience
         self._judge = judge
@@ -112,7 +114,7 @@ class Crew(ABC):
         self._read: Counter[Node] = Counter()
         self._seconds = self._waited = 0.0
 
-    def iterate(self, search: Search) -> Iteration:
+    def iterate(self, search: SolveRun) -> Iteration:
         """The best new candidate, after a round of all nodes that live.
 
         Raises:
@@ -224,11 +226,11 @@ class Crew(ABC):
         return new
 
 
-class SyncCrew(Crew):
+class SyncNodePool(NodePool):
     """Rounds: all nodes refine, then all of them exchange. The same seed gives the same rounds."""
 
     def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
-        """See :meth:`Crew._round`."""
+        """See :meth:`NodePool._round`."""
         self._all(Node.refine, time_left)
         candidates = [node.candidate for node in self.alive]
         # Judging what others claim to be solutions takes its time, and after the last round nobody goes on from it.
@@ -259,32 +261,32 @@ class SyncCrew(Crew):
         self._waited += sum(seconds - job.seconds for job in self._jobs)
 
 
-class AsyncCrew(Crew):
+class AsyncNodePool(NodePool):
     """Every node runs on by itself; a round is over when each was heard from, or patience ended after the first.
 
     Args:
         nodes: The nodes.
         transports: All ends to close in the end.
-        patience: See :class:`Crew`.
-        judge: See :class:`Crew`.
+        patience: See :class:`NodePool`.
+        judge: See :class:`NodePool`.
         observer: What the solve itself hears of the nodes.
     """
 
     def __init__(
-        self, nodes: Sequence[Node], transports: Sequence[Transport], patience: float, judge: Judge, observer: Inbox
+        self, nodes: Sequence[Node], transports: Sequence[Transport], patience: float, judge: Evaluator, observer: Inbox
     ) -> None:
         super().__init__(nodes, transports, patience, judge)
         self._observer = observer
 
     def close(self) -> Candidate:
-        """See :meth:`Crew.close`."""
+        """See :meth:`NodePool.close`."""
         best = super().close()
         self._seconds += sum(job.seconds for job in self._jobs)
         self._waited = sum(node.transport.waited for node in self._nodes)
         return best
 
     def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
-        """See :meth:`Crew._round`."""
+        """See :meth:`NodePool._round`."""
         self._run(improve)
         heard: set[int] = set()
         first = None

@@ -9,13 +9,13 @@ from typing import ClassVar
 
 from d4orm_env.engine.threads import available_cores
 from d4orm_planners.base.planner import Iteration, Planner
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d4orm_d.planner import D4ormD
-from d4orm_planners.d_d4orm.evaluator import Judge
+from d4orm_planners.d_d4orm.evaluator import Evaluator
 from d4orm_planners.d_d4orm.inbox import Inbox
-from d4orm_planners.d_d4orm.network_node import NetworkCrew
+from d4orm_planners.d_d4orm.network_node import NetworkNodePool
 from d4orm_planners.d_d4orm.node import Node, Task, node_seed
-from d4orm_planners.d_d4orm.node_pool import AsyncCrew, Crew, SyncCrew
+from d4orm_planners.d_d4orm.node_pool import AsyncNodePool, NodePool, SyncNodePool
 from d4orm_planners.d_d4orm.ray_connection import RayConnection, import_ray
 from d4orm_planners.d_d4orm.ray_planner import ray_planners
 from d4orm_planners.d_d4orm.settings import DD4ormConfig
@@ -25,7 +25,7 @@ from d4orm_planners.engine.select import get_sampling_engine
 
 
 @dataclass(frozen=True)
-class NodesAtWork:
+class RunningNodes:
     """The state of a solve: its nodes live from one iteration to the next.
 
     Attributes:
@@ -33,7 +33,7 @@ class NodesAtWork:
         opened: What they need and ends after them.
     """
 
-    crew: Crew
+    crew: NodePool
     opened: ExitStack
 
 
@@ -62,20 +62,20 @@ class DD4orm(Planner):
         if config.transport == "ray":
             import_ray("transport 'ray' of d-d4orm")
 
-    def init(self, search: Search) -> NodesAtWork:
+    def init(self, search: SolveRun) -> RunningNodes:
         """See :meth:`Planner.init`: the nodes, ready to begin."""
         with ExitStack() as opened:
             number = self.config.nodes or search.problem.num_robots
             task = Task(number, search.seed, search.current.planned, self.config.selection, self.config.k)
             zenoh = self.config.zenoh
             crew = self._local_crew(search, task, opened) if zenoh is None else self._network_crew(search, task, zenoh)
-            return NodesAtWork(crew, opened.pop_all())
+            return RunningNodes(crew, opened.pop_all())
 
-    def iterate(self, search: Search, state: NodesAtWork) -> tuple[NodesAtWork, Iteration]:
+    def iterate(self, search: SolveRun, state: RunningNodes) -> tuple[RunningNodes, Iteration]:
         """See :meth:`Planner.iterate`: one round of all nodes, and the best candidate that they made in it."""
         return state, state.crew.iterate(search)
 
-    def finish(self, search: Search, state: NodesAtWork) -> None:
+    def finish(self, search: SolveRun, state: RunningNodes) -> None:
         """See :meth:`Planner.finish`."""
         with state.opened:
             best = state.crew.close()
@@ -83,19 +83,19 @@ class DD4orm(Planner):
                 search.best = best
             search.metrics |= state.crew.metrics()
 
-    def _network_crew(self, search: Search, task: Task, zenoh: ZenohSettings) -> Crew:
+    def _network_crew(self, search: SolveRun, task: Task, zenoh: ZenohSettings) -> NodePool:
         """The one node of a network that this process is."""
         config = self.config
         config.check_node(task.num_nodes)
         assert config.node is not None
         planner = config.node_planners(task.num_nodes)[config.node]
         transport = ZenohTransport(zenoh)
-        judge = Judge(get_sampling_engine(config.engine), search.problem)
+        judge = Evaluator(get_sampling_engine(config.engine), search.problem)
         # Numbered by the clock, what a restarted node sends is newer than what it sent before.
         node = Node(config.node, task, planner, transport, judge, sequence=time.time_ns())
-        return NetworkCrew(node, transport, config.patience, judge, zenoh.linger)
+        return NetworkNodePool(node, transport, config.patience, judge, zenoh.linger)
 
-    def _local_crew(self, search: Search, task: Task, opened: ExitStack) -> Crew:
+    def _local_crew(self, search: SolveRun, task: Task, opened: ExitStack) -> NodePool:
         """All nodes, in threads of this process; what is to be closed after them is ``opened``."""
         config, problem, number = self.config, search.problem, task.num_nodes
         planners: list[Planner] = list(config.node_planners(number))
@@ -107,12 +107,12 @@ class DD4orm(Planner):
                 planners = list(ray_planners(connection, planners, problem, seeds))
         # Nodes of one machine share its cores.
         engine = get_sampling_engine(config.engine, max(available_cores() // number, 1))
-        network, judge = LocalNetwork(), Judge(engine, problem, 2 * number)
+        network, judge = LocalNetwork(), Evaluator(engine, problem, 2 * number)
         ends = [network.join() for _ in planners]
         nodes = [
             Node(i, task, planner, end, judge) for i, (planner, end) in enumerate(zip(planners, ends, strict=True))
         ]
         if config.mode == "sync":
-            return SyncCrew(nodes, ends, config.patience, judge)
+            return SyncNodePool(nodes, ends, config.patience, judge)
         observer = network.join()
-        return AsyncCrew(nodes, [*ends, observer], config.patience, judge, Inbox(judge, observer, number))
+        return AsyncNodePool(nodes, [*ends, observer], config.patience, judge, Inbox(judge, observer, number))

@@ -14,7 +14,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.engine.threads import available_cores
 from d4orm_planners.base.candidate import evaluate_controls
 from d4orm_planners.base.planner import Iteration, Planner
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d_d4orm.messages import Message, decode, encode
 from d4orm_planners.d_d4orm.ray_connection import RayConnection
 from d4orm_planners.engine.select import get_sampling_engine
@@ -30,7 +30,7 @@ GLANCE = 0.1
 """Seconds between looks at whether an iteration under way is still wanted."""
 
 
-class Outcome(NamedTuple):
+class ActorOutcome(NamedTuple):
     """What an actor made of an iteration.
 
     Attributes:
@@ -63,16 +63,16 @@ class Worker:
     def __init__(self, node: int, num_nodes: int, planner: Planner, problem: Problem, seed: int, sharing: int) -> None:
         self._node, self._num_nodes = node, num_nodes
         self._engine = get_sampling_engine(planner.config.engine, max(available_cores() // sharing, 1))
-        self._search = Search(planner, problem, seed, None, self._engine)
+        self._search = SolveRun(planner, problem, seed, None, self._engine)
 
     def ready(self) -> int:
         """Compile what an iteration needs, by one of a single step; the number of this process."""
         planner, config = self._search.planner, self._search.planner.config
         short: dict[str, Any] = {name: 1 for name in ("num_steps", "repair_steps") if name in config.setting_names()}
-        Search(type(planner)(replace(config, **short)), self._search.problem, 0, None, self._engine).advance()
+        SolveRun(type(planner)(replace(config, **short)), self._search.problem, 0, None, self._engine).advance()
         return os.getpid()
 
-    def advance(self, iteration: int, data: bytes, time_left: float | None) -> Outcome:
+    def advance(self, iteration: int, data: bytes, time_left: float | None) -> ActorOutcome:
         """One iteration.
 
         Args:
@@ -88,7 +88,7 @@ class Worker:
         search.current = evaluate_controls(self._engine, search.problem, controls)
         steps, compiling = search.denoising_steps, search.watch.paused_seconds
         record = search.advance()
-        return Outcome(
+        return ActorOutcome(
             _message(self._node, search),
             search.denoising_steps - steps,
             record.excluded,
@@ -127,7 +127,7 @@ class RayPlanner(Planner):
                 "check that d4orm-env is installed on every machine of the cluster"
             ) from error
 
-    def iterate(self, search: Search, state: None) -> tuple[None, Iteration]:
+    def iterate(self, search: SolveRun, state: None) -> tuple[None, Iteration]:
         """See :meth:`Planner.iterate`."""
         with self._calling:
             outcome = self._outcome(search.iteration, _message(self._node, search), search.time_left)
@@ -137,7 +137,7 @@ class RayPlanner(Planner):
         controls = decode(outcome.data, search.problem, self._num_nodes).controls
         return None, Iteration(controls, outcome.denoising_steps, outcome.excluded, note)
 
-    def finish(self, search: Search, state: None) -> None:
+    def finish(self, search: SolveRun, state: None) -> None:
         """See :meth:`Planner.finish`: end the actor, whatever it is at."""
         self._closed.set()
         self._ray.kill(self._actor)
@@ -145,7 +145,7 @@ class RayPlanner(Planner):
         with self._calling:
             pass
 
-    def _outcome(self, iteration: int, data: bytes, time_left: float | None) -> Outcome:
+    def _outcome(self, iteration: int, data: bytes, time_left: float | None) -> ActorOutcome:
         if self._closed.is_set():
             raise ChildProcessError("its actor has been ended")
         try:
@@ -154,7 +154,7 @@ class RayPlanner(Planner):
             while not self._ray.wait([call], timeout=GLANCE)[0]:
                 if self._closed.is_set():
                     raise ChildProcessError("its actor has been ended")
-            outcome: Outcome = self._ray.get(call)
+            outcome: ActorOutcome = self._ray.get(call)
         except self._ray.exceptions.RayTaskError as error:
             raise error.cause from error
         except self._ray.exceptions.RayError as error:
@@ -192,7 +192,7 @@ def ray_planners(
     return remote
 
 
-def _message(node: int, search: Search) -> bytes:
+def _message(node: int, search: SolveRun) -> bytes:
     """The search's current candidate."""
     candidate = search.current
     message = Message(node, search.iteration, candidate.planned, candidate.reward, bool(candidate.solved))

@@ -7,7 +7,7 @@ import time
 from d4orm_planners.d_d4orm.transport import Transport
 
 
-class Meter:
+class TrafficStats:
     """A transport that counts.
 
     Attributes:

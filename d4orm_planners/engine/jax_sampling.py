@@ -110,7 +110,7 @@ def _score(static: _Static, inputs: _Inputs, step: Array, mean: Array, scale: Ar
     return total / len(mean), deformations
 
 
-class _Run(NamedTuple):
+class _DenoisingState(NamedTuple):
     """A denoising run on its way: means, factors on the schedule, rewards ``(N,)`` so far, samples left out."""
 
     mean: Array
@@ -119,10 +119,12 @@ class _Run(NamedTuple):
     excluded: Array
 
 
-def _denoise(static: _Static, inputs: _Inputs, noise_scale: Array, run: _Run, begin: Array, end: Array) -> _Run:
+def _denoise(
+    static: _Static, inputs: _Inputs, noise_scale: Array, run: _DenoisingState, begin: Array, end: Array
+) -> _DenoisingState:
     """The steps from ``begin`` to before ``end``; both are arguments, so that one compilation serves all parts."""
 
-    def update(step: Array, run: _Run) -> _Run:
+    def update(step: Array, run: _DenoisingState) -> _DenoisingState:
         mean, factor, scale = run.mean, run.factor, run.factor * noise_scale[step] * inputs.units
         rewards, deformations = _score(static, inputs, step.astype(jnp.uint32), mean, scale)
         if static.credit == "team":
@@ -147,7 +149,7 @@ def _denoise(static: _Static, inputs: _Inputs, noise_scale: Array, run: _Run, be
         usable_samples = finite.sum(dtype=jnp.int32)
         average = jnp.where(finite, rewards, 0).sum() / jnp.maximum(usable_samples, 1).astype(jnp.float32)
         excluded = run.excluded + (finite.size - usable_samples)
-        return _Run(new_mean, factor, run.rewards.at[step].set(average), excluded)
+        return _DenoisingState(new_mean, factor, run.rewards.at[step].set(average), excluded)
 
     return jax.lax.fori_loop(begin, end, update, run)
 
@@ -172,7 +174,7 @@ class JaxSamplingEngine(JaxEngine):
         noise_scale: FloatArray,
         num_samples: int,
         seed: int,
-    ) -> tuple[jax.stages.Compiled, tuple[_Inputs, Array, _Run, Array, Array]]:
+    ) -> tuple[jax.stages.Compiled, tuple[_Inputs, Array, _DenoisingState, Array, Array]]:
         problem = task.problem
         docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
         scored = (
@@ -188,7 +190,7 @@ class JaxSamplingEngine(JaxEngine):
         scale = np.asarray(noise_scale, np.float32)
         begun = (mean, np.ones_like(mean), np.zeros_like(scale), np.int32(0))
         scored, scale, begun = jax.tree.map(jnp.asarray, (scored, scale, begun))
-        arguments = (_Inputs(*scored), scale, _Run(*begun), jnp.int32(0), jnp.int32(len(scale)))
+        arguments = (_Inputs(*scored), scale, _DenoisingState(*begun), jnp.int32(0), jnp.int32(len(scale)))
         leaves, treedef = jax.tree.flatten(arguments)
         return _compiled_denoise(static, treedef, tuple((leaf.shape, leaf.dtype) for leaf in leaves)), arguments
 

@@ -26,7 +26,7 @@ QUEUED = 2
 """Jobs under way per core of the cluster: one that runs, and one that need not be waited for."""
 
 
-class Sign(Enum):
+class JobEvent(Enum):
     """What a process says about a job, apart from its trials."""
 
     BEGUN = "begun"
@@ -34,7 +34,7 @@ class Sign(Enum):
 
 
 @dataclass(frozen=True)
-class Lost:
+class WorkerLost:
     """The process that ran a job is gone.
 
     Attributes:
@@ -44,7 +44,7 @@ class Lost:
     reason: str
 
 
-class Message(NamedTuple):
+class WorkerMessage(NamedTuple):
     """News of a job.
 
     Attributes:
@@ -53,7 +53,7 @@ class Message(NamedTuple):
     """
 
     ticket: int
-    content: Trial | Sign | Lost
+    content: Trial | JobEvent | WorkerLost
 
 
 class Pool(Protocol):
@@ -65,7 +65,7 @@ class Pool(Protocol):
     def start(self, job: Job) -> int:
         """Hand a job over; returns a ticket for it."""
 
-    def wait(self, timeout: float | None) -> list[Message]:
+    def wait(self, timeout: float | None) -> list[WorkerMessage]:
         """Wait for news, at most so long [s]."""
 
     def stop(self, ticket: int) -> None:
@@ -76,7 +76,7 @@ class Pool(Protocol):
 
 
 @dataclass
-class _Running:
+class _RunningJob:
     """A job under way: how many of its trials are done, and since when the present one runs."""
 
     job: Job
@@ -89,21 +89,21 @@ class _Schedule:
     pool: Pool
     trial_timeout: float | None
     waiting: deque[Job]
-    running: dict[int, _Running] = field(default_factory=dict)
+    running: dict[int, _RunningJob] = field(default_factory=dict)
 
     def hand_out(self) -> None:
         while self.waiting and self.pool.free():
             job = self.waiting.popleft()
-            self.running[self.pool.start(job)] = _Running(job)
+            self.running[self.pool.start(job)] = _RunningJob(job)
 
     def collect(self) -> list[Trial]:
         """Wait for news; the trials that have ended."""
         trials = []
         for ticket, content in self.pool.wait(self._patience()):
             run = self.running[ticket]
-            if isinstance(content, Lost):
+            if isinstance(content, WorkerLost):
                 trials += self._give_up(ticket, content.reason)
-            elif content is Sign.ENDED:
+            elif content is JobEvent.ENDED:
                 del self.running[ticket]
             else:
                 run.since = time.monotonic()
@@ -125,7 +125,7 @@ class _Schedule:
             self.waiting.appendleft(replace(run.job, conditions=left[lost:]))
         return [run.job.failed(condition, reason) for condition in left[:lost]]
 
-    def _left(self, run: _Running) -> float:
+    def _left(self, run: _RunningJob) -> float:
         if self.trial_timeout is None or run.since is None or run.done == len(run.job.conditions):
             return float("inf")
         return run.since + self.trial_timeout - time.monotonic()
@@ -204,7 +204,7 @@ class ProcessPool:
             worker.pipe.send(job)
         return worker.ticket
 
-    def wait(self, timeout: float | None) -> list[Message]:
+    def wait(self, timeout: float | None) -> list[WorkerMessage]:
         busy = {worker.pipe: worker for worker in self._workers if worker.ticket is not None}
         messages = []
         for pipe in wait(list(busy), timeout):
@@ -216,9 +216,9 @@ class ProcessPool:
             except (EOFError, OSError):
                 content = self._bury(worker)
             worker.proven = True
-            if content is Sign.ENDED:
+            if content is JobEvent.ENDED:
                 worker.ticket = None
-            messages.append(Message(ticket, content))
+            messages.append(WorkerMessage(ticket, content))
         return messages
 
     def stop(self, ticket: int) -> None:
@@ -246,7 +246,7 @@ class ProcessPool:
         worker.pipe.close()
         self._workers.remove(worker)
 
-    def _bury(self, worker: _Worker) -> Lost:
+    def _bury(self, worker: _Worker) -> WorkerLost:
         """Say what a worker died of.
 
         Raises:
@@ -261,7 +261,7 @@ class ProcessPool:
                 f"a worker process died at its start ({how}); a program that evaluates must do so under "
                 '`if __name__ == "__main__":`, because workers import it; or run with one worker'
             )
-        return Lost(f"ChildProcessError: the worker process died ({how})")
+        return WorkerLost(f"ChildProcessError: the worker process died ({how})")
 
 
 def _work(pipe: Connection, parent: Connection, threads: int, run: Callable[[Any], Iterator[object]]) -> None:
@@ -277,10 +277,10 @@ def _work(pipe: Connection, parent: Connection, threads: int, run: Callable[[Any
     with suppress(EOFError, BrokenPipeError):  # the parent is gone
         while True:
             job = pipe.recv()
-            pipe.send(Sign.BEGUN)
+            pipe.send(JobEvent.BEGUN)
             for result in run(job):
                 pipe.send(result)
-            pipe.send(Sign.ENDED)
+            pipe.send(JobEvent.ENDED)
 
 
 class RayPool:
@@ -315,10 +315,10 @@ class RayPool:
         self._jobs[self._task.remote(job)] = ticket
         return ticket
 
-    def wait(self, timeout: float | None) -> list[Message]:
+    def wait(self, timeout: float | None) -> list[WorkerMessage]:
         running = list(self._jobs)
         ready, _ = self._ray.wait(running, num_returns=1, timeout=timeout)
-        return [Message(self._jobs[task], self._next(task)) for task in ready]
+        return [WorkerMessage(self._jobs[task], self._next(task)) for task in ready]
 
     def stop(self, ticket: int) -> None:
         task = next(task for task, number in self._jobs.items() if number == ticket)
@@ -330,20 +330,20 @@ class RayPool:
             self._ray.cancel(task, force=True)
         self._connection.close()
 
-    def _next(self, task: Iterator[object]) -> Trial | Sign | Lost:
+    def _next(self, task: Iterator[object]) -> Trial | JobEvent | WorkerLost:
         try:
-            content: Trial | Sign = self._ray.get(next(task))
+            content: Trial | JobEvent = self._ray.get(next(task))
         except (self._ray.exceptions.RayError, StopIteration) as error:
             del self._jobs[task]
-            return Lost(f"ChildProcessError: the worker was lost ({describe(error)})")
-        if content is Sign.ENDED:
+            return WorkerLost(f"ChildProcessError: the worker was lost ({describe(error)})")
+        if content is JobEvent.ENDED:
             del self._jobs[task]
         return content
 
 
-def _work_remotely(job: Job) -> Iterator[Trial | Sign]:
+def _work_remotely(job: Job) -> Iterator[Trial | JobEvent]:
     """Run a job on one core of some machine."""
     os.environ.update(D4ORM_NUM_THREADS="1", OMP_NUM_THREADS="1")
-    yield Sign.BEGUN
+    yield JobEvent.BEGUN
     yield from run_job(job)
-    yield Sign.ENDED
+    yield JobEvent.ENDED

@@ -8,26 +8,26 @@ from typing import ClassVar
 import numpy as np
 
 from d4orm_planners.base.planner import Iteration, Planner
-from d4orm_planners.base.solve import Search
-from d4orm_planners.base.working_plan import TeamPaths
-from d4orm_planners.d4orm_d.deformed_plan import DeformedTeam
+from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.base.working_plan import WorkingPlan
+from d4orm_planners.d4orm_d.deformed_plan import DeformedPlan
 from d4orm_planners.d4orm_d.groups import Groups
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d4orm_d.repairs import Repairs
 from d4orm_planners.hybrid.settings import HybridConfig
-from d4orm_planners.mapf.improvement import FIRST_ROUNDS, GUIDED_ROUNDS, refined_iteration, shorten_first_ways
+from d4orm_planners.mapf.improvement import FIRST_ROUNDS, GUIDED_ROUNDS, improve_by_lns, improve_first_paths
 from d4orm_planners.mapf.planner import (
-    Guide,
     MAPFConfig,
-    better_ways,
+    RoadmapSolution,
     compile_roadmap,
-    first_ways,
+    find_roadmap_solution,
     going_on_from_best,
-    guided_iteration,
-    leads_round,
+    improve_roadmap_solution,
+    needs_detour,
+    roadmap_iteration,
 )
 
-State = Groups | Repairs | Guide
+State = Groups | Repairs | RoadmapSolution
 """What is kept between iterations: the repairer's state, or the roadmap solution once there is one."""
 
 REPLANNING = MAPFConfig()
@@ -49,7 +49,7 @@ class Hybrid(Planner):
         super().__init__(config)
         self.denoiser = D4ormD(config)
 
-    def init(self, search: Search) -> State:
+    def init(self, search: SolveRun) -> State:
         """See :meth:`Planner.init`."""
         state = self.denoiser.init(search)
         if isinstance(state, Repairs) and (self.config.reroute or self.improves_by_lns):
@@ -57,7 +57,7 @@ class Hybrid(Planner):
             from d4orm_planners.mapf.beams import prepare_beams
 
             with search.watch.paused():
-                prepare_beams(TeamPaths(search, search.current.trajectory))
+                prepare_beams(WorkingPlan(search, search.current.trajectory))
         return state
 
     @property
@@ -65,33 +65,33 @@ class Hybrid(Planner):
         """Return whether solutions become better by large-neighbourhood search."""
         return self.config.improver == "lns"
 
-    def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
+    def iterate(self, search: SolveRun, state: State) -> tuple[State, Iteration]:
         """See :meth:`Planner.iterate`: initialise, then repair who fails, then improve."""
-        if isinstance(state, Guide):
+        if isinstance(state, RoadmapSolution):
             return self.improve_roadmap_solution(search, state)
         if self.finds_paths(search):
-            solution = first_ways(search)
-            if isinstance(solution, Guide):
+            solution = find_roadmap_solution(search)
+            if isinstance(solution, RoadmapSolution):
                 return solution, self.follow(search, solution)
             state, iteration = self.without_paths(search, state)
             return state, solution.explained(iteration)
         return self.without_paths(search, state)
 
-    def without_paths(self, search: Search, state: Groups | Repairs) -> tuple[State, Iteration]:
+    def without_paths(self, search: SolveRun, state: Groups | Repairs) -> tuple[State, Iteration]:
         """Start straight or with the whole team, repair who fails, then improve."""
         if search.iteration == 0 and not search.current.controls.any():
             drives = self.denoiser.straight_start(search.problem)
             return self.whole_team(search, state) if drives is None else (state, Iteration(drives))
         if self.improves_by_lns and search.best.solved:
-            return state, refined_iteration(search)
+            return state, improve_by_lns(search)
         if not search.current.unsolved.any() or (isinstance(state, Groups) and search.best.solved):
             return self.whole_team(search, state)
-        team = DeformedTeam(self.denoiser, search, search.current.trajectory, search.current.report)
+        team = DeformedPlan(self.denoiser, search, search.current.trajectory, search.current.report)
         if isinstance(state, Groups):
             return state.replan(team), team.iteration()
         return self.repair(team, state), team.iteration()
 
-    def repair(self, team: DeformedTeam, state: Repairs) -> Repairs:
+    def repair(self, team: DeformedPlan, state: Repairs) -> Repairs:
         """Search for paths around others for who fails, and deform who fails nevertheless."""
         if self.config.reroute:
             # Here, because importing numba takes long.
@@ -102,37 +102,39 @@ class Hybrid(Planner):
         self.improve_first(team)
         return state
 
-    def whole_team(self, search: Search, state: Groups | Repairs) -> tuple[State, Iteration]:
+    def whole_team(self, search: SolveRun, state: Groups | Repairs) -> tuple[State, Iteration]:
         """Deform everybody's controls at once, as D4orm-D does, and improve them if nobody fails."""
         state, iteration = self.denoiser.whole_team(search, state)
         if not isinstance(state, Repairs):
             return state, iteration
-        team = DeformedTeam(self.denoiser, search, search.engine.rollout(search.problem, iteration.controls))
+        team = DeformedPlan(self.denoiser, search, search.engine.rollout(search.problem, iteration.controls))
         self.improve_first(team)
         return state, replace(iteration, controls=team.controls)
 
-    def follow(self, search: Search, solution: Guide) -> Iteration:
+    def follow(self, search: SolveRun, solution: RoadmapSolution) -> Iteration:
         """What a team does on a roadmap solution, a little improved if that is all that is left to do."""
-        iteration = guided_iteration(search, solution)
+        iteration = roadmap_iteration(search, solution)
         if not self.improves_by_lns:
             return iteration
-        team = DeformedTeam(self.denoiser, search, search.engine.rollout(search.problem, iteration.controls))
+        team = DeformedPlan(self.denoiser, search, search.engine.rollout(search.problem, iteration.controls))
         self.improve_first(team, GUIDED_ROUNDS)
         return replace(iteration, controls=team.controls)
 
-    def improve_roadmap_solution(self, search: Search, solution: Guide) -> tuple[Guide, Iteration]:
+    def improve_roadmap_solution(
+        self, search: SolveRun, solution: RoadmapSolution
+    ) -> tuple[RoadmapSolution, Iteration]:
         """Replan robots on the roadmap, and by turns search among the motions.
 
         The first finds other ways round, the second cuts corners and leaves out stops.
         """
         if search.best.solved and self.improves_by_lns:
             if search.iteration % LNS_PERIOD == 1:
-                return solution, refined_iteration(search)
+                return solution, improve_by_lns(search)
             solution = going_on_from_best(search, solution)
-        solution = better_ways(search, solution, REPLANNING.neighbours, REPLANNING.replannings)
-        return solution, guided_iteration(search, solution)
+        solution = improve_roadmap_solution(search, solution, REPLANNING.neighbours, REPLANNING.replannings)
+        return solution, roadmap_iteration(search, solution)
 
-    def finds_paths(self, search: Search) -> bool:
+    def finds_paths(self, search: SolveRun) -> bool:
         """Return whether this iteration is to find paths: the first, or one after some without a solution."""
         start = self.config.start
         if search.iteration == 0:
@@ -142,11 +144,11 @@ class Hybrid(Planner):
                 return True
             with search.watch.paused():
                 compile_roadmap(search.problem)
-            return leads_round(search.problem)
+            return needs_detour(search.problem)
         stuck = search.iteration == MAPF_AFTER and not search.best.solved and search.problem.world.num_obstacles > 0
         return stuck and start == "auto"
 
-    def improve_first(self, team: DeformedTeam, rounds: int = FIRST_ROUNDS) -> None:
+    def improve_first(self, team: DeformedPlan, rounds: int = FIRST_ROUNDS) -> None:
         """Improve a team in which nobody fails any more, for some rounds."""
         if self.improves_by_lns and not team.faults(np.arange(team.problem.num_robots))[0].any():
-            shorten_first_ways(team, rounds)
+            improve_first_paths(team, rounds)

@@ -8,11 +8,11 @@ from d4orm_env.core import portable
 from d4orm_env.core.arrays import IntArray
 from d4orm_env.core.seeds import Stream
 from d4orm_planners.base.conflict_groups import components
-from d4orm_planners.base.working_plan import TeamPaths
+from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine.path_index import BLOCK
 from d4orm_planners.hybrid.settings import REROUTE_RULES
 from d4orm_planners.mapf.beam_search import BeamRules
-from d4orm_planners.mapf.beams import Company, Manner, find_ways
+from d4orm_planners.mapf.beams import MotionPrimitives, OtherAgents, find_ways
 from d4orm_planners.tracking.steering import drives, standing
 
 AWAY = np.float32(1e6)
@@ -21,7 +21,7 @@ SPREAD = 20 / 3
 """Deviation of detours' points from straight ways, beyond half of their lengths, in radii of the largest robot."""
 
 
-def reroute(team: TeamPaths) -> None:
+def reroute(team: WorkingPlan) -> None:
     """Let the robots that fail look for other ways, some times in turn, those that meet most others first.
 
     As prioritised planning does, but robots that have no way yet are in the way of others all the same, at a cost: who
@@ -33,7 +33,7 @@ def reroute(team: TeamPaths) -> None:
         faults, _ = team.faults(everybody)
         failed = np.lexsort((random.random(len(everybody)), -faults))[: np.count_nonzero(faults)]
         swing = (2 * random.random() - 1) * REROUTE_RULES.swing
-        manner = Manner(tuple(np.array(REROUTE_RULES.angles) + swing), REROUTE_RULES.paces)
+        manner = MotionPrimitives(tuple(np.array(REROUTE_RULES.angles) + swing), REROUTE_RULES.paces)
         contact = REROUTE_RULES.contact * REROUTE_RULES.contact_growth**sweep
         rules = BeamRules(REROUTE_RULES.width, contact, REROUTE_RULES.apart * team.problem.team.largest_radius)
         for first in range(0, len(failed), REROUTE_RULES.batch):
@@ -59,7 +59,7 @@ def reroute(team: TeamPaths) -> None:
             _reroute_pair(team, np.array(pair), manner, rules)
 
 
-def _reroute_pair(team: TeamPaths, pair: IntArray, manner: Manner, rules: BeamRules) -> None:
+def _reroute_pair(team: WorkingPlan, pair: IntArray, manner: MotionPrimitives, rules: BeamRules) -> None:
     """Let two that meet only each other look for ways from the start, one after the other, if that is better.
 
     Where they face each other at once, nothing that one of them does helps while the other comes on.
@@ -73,7 +73,7 @@ def _reroute_pair(team: TeamPaths, pair: IntArray, manner: Manner, rules: BeamRu
         beside[:, :, : REROUTE_RULES.standing * BLOCK + 1] = problem.start[second, : problem.dimension]
         ways = []
         for robot, other in ((first, second), (second, first)):
-            company = Company(pair[None], beside, radius[[[other]]])
+            company = OtherAgents(pair[None], beside, radius[[[other]]])
             ways.append(find_ways(team, np.array([robot]), 0, manner, rules, company=company))
             beside = np.ascontiguousarray(np.moveaxis(ways[-1].positions, 0, 2))
         controls = np.concatenate([way.controls[:, :, 0] for way in ways], axis=1)
@@ -84,7 +84,7 @@ def _reroute_pair(team: TeamPaths, pair: IntArray, manner: Manner, rules: BeamRu
         team.move(pair, *present)
 
 
-def _try_detours(team: TeamPaths, robots: IntArray, random: np.random.Generator) -> None:
+def _try_detours(team: WorkingPlan, robots: IntArray, random: np.random.Generator) -> None:
     """Let robots ``(R,)`` drive by random points around their straight ways, if that is better."""
     part = team.problem.select(robots.tolist())
     start, goal = (places[:, None] for places in (part.start[:, : part.dimension], part.goal))

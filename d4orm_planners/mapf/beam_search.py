@@ -68,7 +68,7 @@ class BeamRules(NamedTuple):
     apart: float
 
 
-class Seekers(NamedTuple):
+class Queries(NamedTuple):
     """Robots that look for ways.
 
     Attributes:
@@ -192,7 +192,7 @@ def _keep(ways: _Beam, way: Whole, kept: _Beam, number: Whole) -> None:
 
 @compiled
 def _count_beside(
-    table: PathTable, robot: Whole, seekers: Seekers, r: int, path: FloatArray, first: Whole, last: Whole
+    table: PathTable, robot: Whole, seekers: Queries, r: int, path: FloatArray, first: Whole, last: Whole
 ) -> int:
     """How many of the further ways a path meets from one step to another; at its end it stands still."""
     count, end = 0, path.shape[0] - 1
@@ -211,7 +211,7 @@ def _count_beside(
 
 
 Search: TypeAlias = Kernel[
-    [ProblemArrays, PathTable, Moves, BeamRules, Seekers, IntArray, FloatArray, FloatArray, BoolArray], None
+    [ProblemArrays, PathTable, Moves, BeamRules, Queries, IntArray, FloatArray, FloatArray, BoolArray], None
 ]
 """A kernel of :func:`search_kernel`."""
 
@@ -248,7 +248,7 @@ def search_kernel(name: str) -> Search:
 
     @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
     def search(
-        arrays: ProblemArrays, table: PathTable, moves: Moves, rules: BeamRules, seekers: Seekers, part: IntArray,
+        arrays: ProblemArrays, table: PathTable, moves: Moves, rules: BeamRules, seekers: Queries, part: IntArray,
         u: FloatArray, x: FloatArray, found: BoolArray,
     ) -> None:  # fmt: skip
         dt, closed = arrays.time_step, is_closed(arrays)

@@ -12,14 +12,14 @@ from d4orm_env.core import portable
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.engine.threads import Threads, available_cores
-from d4orm_planners.base.working_plan import TeamPaths
+from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine.path_index import BLOCK
-from d4orm_planners.mapf.beam_search import BeamRules, Moves, Seekers, search_kernel
-from d4orm_planners.tracking.steering import Drives, by_model
+from d4orm_planners.mapf.beam_search import BeamRules, Moves, Queries, search_kernel
+from d4orm_planners.tracking.steering import Rollouts, by_model
 
 
 @dataclass(frozen=True)
-class Manner:
+class MotionPrimitives:
     """What robots that look for a way may do.
 
     Attributes:
@@ -56,7 +56,7 @@ class Manner:
 
 
 @dataclass(frozen=True, eq=False)
-class Company:
+class OtherAgents:
     """Whom robots that look for a way mind other than they drive at present.
 
     Attributes:
@@ -70,21 +70,21 @@ class Company:
     radius: NDArray[np.float64]
 
     @classmethod
-    def nobody(cls, robots: IntArray, horizon: int, dimension: int) -> Company:
+    def nobody(cls, robots: IntArray, horizon: int, dimension: int) -> OtherAgents:
         """No others but the team."""
         beside = np.zeros((len(robots), 0, horizon + 1, dimension), np.float32)
         return cls(robots[:, None], beside, np.zeros((len(robots), 0)))
 
 
 def find_ways(
-    team: TeamPaths,
+    team: WorkingPlan,
     robots: IntArray,
     blocks: ArrayLike,
-    manner: Manner,
+    manner: MotionPrimitives,
     rules: BeamRules,
     limits: ArrayLike = np.inf,
-    company: Company | None = None,
-) -> Drives:
+    company: OtherAgents | None = None,
+) -> Rollouts:
     """The best ways that robots ``(R,)`` find; who finds none does what it does, and does not arrive.
 
     So do those left over when the search should stop.
@@ -103,24 +103,24 @@ def find_ways(
     """
     problem, horizon = team.problem, team.problem.horizon
     blocks, limits = np.broadcast_to(blocks, len(robots)), np.broadcast_to(np.asarray(limits, float), len(robots))
-    company = company or Company.nobody(robots, horizon, problem.dimension)
+    company = company or OtherAgents.nobody(robots, horizon, problem.dimension)
     u, x = (np.ascontiguousarray(rows[:, robots].swapaxes(0, 1)) for rows in (team.controls, team.states))
     arrived = np.zeros(len(robots), bool)
     for model, members in by_model(problem):
         mine = np.flatnonzero(np.isin(robots, members))
         if len(mine):
-            seekers = Seekers(
+            seekers = Queries(
                 robots[mine], blocks[mine], x[mine, blocks[mine] * BLOCK], limits[mine], company.without[mine],
                 company.beside[mine], company.radius[mine],
             )  # fmt: skip
             moves = manner.moves(problem.dimension, has_heading=model.heading_index is not None)
             u[mine], x[mine], arrived[mine] = _search(team, model, moves, rules, seekers, u[mine], x[mine])
     u, x = (rows.swapaxes(0, 1)[:, :, None] for rows in (u, x))
-    return Drives(u, x, arrived[:, None], problem.dimension)
+    return Rollouts(u, x, arrived[:, None], problem.dimension)
 
 
 def _search(
-    team: TeamPaths, model: Model, moves: Moves, rules: BeamRules, seekers: Seekers, u: FloatArray, x: FloatArray
+    team: WorkingPlan, model: Model, moves: Moves, rules: BeamRules, seekers: Queries, u: FloatArray, x: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Controls ``(R, H, m)``, states ``(R, H+1, n)`` and who arrives, of robots of one model that did as given."""
     found, search = np.zeros(len(u), bool), search_kernel(model.name)
@@ -136,11 +136,11 @@ def _search(
     return u, x, found
 
 
-def prepare_beams(team: TeamPaths) -> None:
+def prepare_beams(team: WorkingPlan) -> None:
     """Compile what the search of this team's ways needs, if it is not yet."""
     firsts: dict[str, int] = {model.name: robots[0] for model, robots in by_model(team.problem)}
     if not all(search_kernel(name).signatures for name in firsts):
         robots: Sequence[int] = list(firsts.values())
         team.faults(robots)
-        find_ways(team, np.array(robots), 0, Manner((90.0,), (1.0,)), BeamRules(2, 1.0, 1.0))
+        find_ways(team, np.array(robots), 0, MotionPrimitives((90.0,), (1.0,)), BeamRules(2, 1.0, 1.0))
         team.index.move(robots, team.positions[:, robots])

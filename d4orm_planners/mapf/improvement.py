@@ -6,8 +6,8 @@ from d4orm_env.core.seeds import Stream
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_planners.base.candidate import evaluate_controls
 from d4orm_planners.base.planner import Iteration
-from d4orm_planners.base.solve import Search
-from d4orm_planners.base.working_plan import TeamPaths
+from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.mapf.roundabout import drive_roundabout
 
 ROUNDS = 96
@@ -18,19 +18,19 @@ GUIDED_ROUNDS = 8
 """The same for one that was found on a roadmap, with all its corners and stops."""
 
 
-def refined_iteration(search: Search) -> Iteration:
+def improve_by_lns(search: SolveRun) -> Iteration:
     """The best plan so far, or a roundabout if that is better, whose robots have looked for faster ways."""
     # Here, because importing numba takes long.
     from d4orm_planners.mapf.beams import prepare_beams
-    from d4orm_planners.mapf.lns import shorten_ways
+    from d4orm_planners.mapf.lns import improve_paths
 
-    team = TeamPaths(search, _better_roundabout(search) or search.best.trajectory)
+    team = WorkingPlan(search, _better_roundabout(search) or search.best.trajectory)
     with search.watch.paused():
         prepare_beams(team)
-    return Iteration(shorten_ways(team, search.iteration_seed(Stream.NEIGHBOURHOODS), ROUNDS))
+    return Iteration(improve_paths(team, search.iteration_seed(Stream.NEIGHBOURHOODS), ROUNDS))
 
 
-def _better_roundabout(search: Search) -> Trajectory | None:
+def _better_roundabout(search: SolveRun) -> Trajectory | None:
     """A roundabout in which nobody fails, with more reward than the best plan so far."""
     best = search.best
     for side in (1, -1):
@@ -43,8 +43,8 @@ def _better_roundabout(search: Search) -> Trajectory | None:
     return None if best is search.best else best.trajectory
 
 
-def shorten_first_ways(team: TeamPaths, rounds: int = FIRST_ROUNDS) -> None:
+def improve_first_paths(team: WorkingPlan, rounds: int = FIRST_ROUNDS) -> None:
     """Take what faster ways there are at once for a team in which nobody fails, in so many rounds."""
-    from d4orm_planners.mapf.lns import shorten_ways
+    from d4orm_planners.mapf.lns import improve_paths
 
-    shorten_ways(team, team.search.iteration_seed(Stream.NEIGHBOURHOODS), rounds, temperature=0.0)
+    improve_paths(team, team.search.iteration_seed(Stream.NEIGHBOURHOODS), rounds, temperature=0.0)

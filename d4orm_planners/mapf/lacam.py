@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, IntArray
 from d4orm_env.core.problem import Problem
-from d4orm_planners.mapf.pibt import ROUNDING, Footprints, Workspace, fill_costs, is_open, step_team
+from d4orm_planners.mapf.pibt import ROUNDING, Footprints, PibtWorkspace, fill_costs, is_open, step_team
 from d4orm_planners.mapf.roadmap import PAIR_SLACK, Roadmap
 
 
-class Constraint(NamedTuple):
+class SearchConstraint(NamedTuple):
     """Robots that must go to nodes in the next step."""
 
     robots: tuple[int, ...] = ()
@@ -29,7 +29,7 @@ class Constraint(NamedTuple):
 
 
 @dataclass(eq=False)
-class Configuration:
+class TeamConfiguration:
     """Where the team is, and what has been tried from there.
 
     Attributes:
@@ -41,28 +41,28 @@ class Configuration:
     """
 
     positions: IntArray
-    parent: Configuration | None
+    parent: TeamConfiguration | None
     moves: IntArray
     priorities: np.ndarray
     order: IntArray = field(init=False)
-    untried: deque[Constraint] = field(default_factory=lambda: deque([Constraint()]))
+    untried: deque[SearchConstraint] = field(default_factory=lambda: deque([SearchConstraint()]))
 
     def __post_init__(self) -> None:
         self.order = np.argsort(-self.priorities, kind="stable").astype(np.int64)
 
-    def next_constraint(self, roadmap: Roadmap) -> Constraint:
+    def next_constraint(self, roadmap: Roadmap) -> SearchConstraint:
         """What to try next; those that say of one robot more where it goes come after all others."""
         constraint = self.untried.popleft()
         if len(constraint.robots) < len(self.order):
             robot = int(self.order[len(constraint.robots)])
             at = int(self.positions[robot])
             for place in (at, *roadmap.heads[roadmap.first[at] : roadmap.first[at + 1]].tolist()):
-                self.untried.append(Constraint((*constraint.robots, robot), (*constraint.places, place)))
+                self.untried.append(SearchConstraint((*constraint.robots, robot), (*constraint.places, place)))
         return constraint
 
 
 @dataclass(frozen=True, eq=False)
-class Moves:
+class TeamMoves:
     """What a search found.
 
     Attributes:
@@ -74,7 +74,7 @@ class Moves:
     arrived: BoolArray
 
 
-class Team:
+class TeamOnRoadmap:
     """The robots' ways to their goals around those that have docked."""
 
     def __init__(self, problem: Problem, roadmap: Roadmap) -> None:
@@ -152,8 +152,8 @@ class Team:
         return True
 
     def after(
-        self, here: Configuration, scratch: Workspace, seed: int, known: dict[bytes, Configuration]
-    ) -> Configuration | None:
+        self, here: TeamConfiguration, scratch: PibtWorkspace, seed: int, known: dict[bytes, TeamConfiguration]
+    ) -> TeamConfiguration | None:
         """Where a step leads under the next constraint that is untried; ``None`` where that cannot be kept.
 
         A configuration that is ``known`` is returned itself; others are added.
@@ -176,13 +176,13 @@ class Team:
         key = positions.tobytes()
         if key not in known:
             waiting = np.where(self.arrived(positions), here.priorities % 1, here.priorities + 1)
-            known[key] = Configuration(positions, here, scratch.moves[:count].copy(), waiting)
+            known[key] = TeamConfiguration(positions, here, scratch.moves[:count].copy(), waiting)
         return known[key]
 
 
 def find_moves(
     problem: Problem, roadmap: Roadmap, seed: int, should_stop: Callable[[], bool], max_steps: int = 1_000_000
-) -> Moves | None:
+) -> TeamMoves | None:
     """Moves that bring everybody to its goal, or as many as possible until the search is stopped.
 
     Args:
@@ -195,13 +195,13 @@ def find_moves(
     Returns:
         The moves; ``None`` where somebody has no way on the roadmap.
     """
-    team, num_robots = Team(problem, roadmap), problem.num_robots
+    team, num_robots = TeamOnRoadmap(problem, roadmap), problem.num_robots
     length = team.bodies.costs[np.arange(num_robots), roadmap.starts].astype(np.float64)
     if not np.isfinite(length).all():
         return None
     team.order_arrivals()
     scratch = _scratch(roadmap, num_robots)
-    start = Configuration(roadmap.starts.copy(), None, np.empty((0, 2), np.int64), length / (length.max() + 1))
+    start = TeamConfiguration(roadmap.starts.copy(), None, np.empty((0, 2), np.int64), length / (length.max() + 1))
     known, open_, best = {start.positions.tobytes(): start}, [start], start
     for step in range(max_steps):
         if not open_ or should_stop():
@@ -220,9 +220,9 @@ def find_moves(
     return _moves_to(best, team.arrived(best.positions))
 
 
-def _scratch(roadmap: Roadmap, num_robots: int) -> Workspace:
+def _scratch(roadmap: Roadmap, num_robots: int) -> PibtWorkspace:
     degree = int(np.diff(roadmap.first).max()) + 2
-    return Workspace(
+    return PibtWorkspace(
         state=np.zeros(num_robots, np.int8),
         may_dock=np.ones(num_robots, bool),
         who=np.zeros(len(roadmap.nodes), np.int32),
@@ -235,9 +235,9 @@ def _scratch(roadmap: Roadmap, num_robots: int) -> Workspace:
     )
 
 
-def _moves_to(configuration: Configuration, arrived: BoolArray) -> Moves:
+def _moves_to(configuration: TeamConfiguration, arrived: BoolArray) -> TeamMoves:
     steps, here = [], configuration
     while here.parent is not None:
         steps.append(here.moves)
         here = here.parent
-    return Moves(np.concatenate([here.moves, *steps[::-1]]), arrived)
+    return TeamMoves(np.concatenate([here.moves, *steps[::-1]]), arrived)

@@ -13,10 +13,10 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 from d4orm_env.core.metrics import arrival_steps
 from d4orm_env.core.portable import log
-from d4orm_planners.base.working_plan import TeamPaths
+from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine.path_index import BLOCK
 from d4orm_planners.mapf.beam_search import BeamRules
-from d4orm_planners.mapf.beams import Company, Manner, find_ways
+from d4orm_planners.mapf.beams import MotionPrimitives, OtherAgents, find_ways
 from d4orm_planners.tracking.steering import straight_drives
 
 
@@ -58,7 +58,7 @@ class NeighbourhoodRules:
 RULES = NeighbourhoodRules()
 
 
-def shorten_ways(team: TeamPaths, seed: int, rounds: int, temperature: float = RULES.temperature) -> FloatArray:
+def improve_paths(team: WorkingPlan, seed: int, rounds: int, temperature: float = RULES.temperature) -> FloatArray:
     """Let groups of robots look for faster ways, so many rounds, as long as there is time.
 
     What counts is the sum of all arrival times and of all distances left over time, each as a share of the robot's
@@ -87,7 +87,7 @@ def shorten_ways(team: TeamPaths, seed: int, rounds: int, temperature: float = R
 class _Neighbourhoods:
     """Groups of robots that look for faster ways."""
 
-    def __init__(self, team: TeamPaths, random: np.random.Generator) -> None:
+    def __init__(self, team: WorkingPlan, random: np.random.Generator) -> None:
         self.team, self.problem, self.random = team, team.problem, random
         self.num_robots, self.size = self.problem.num_robots, min(RULES.size, self.problem.num_robots)
         start = self.problem.start[:, : self.problem.dimension]
@@ -116,7 +116,7 @@ class _Neighbourhoods:
         slack = -temperature * log(1 - self.random.random(len(groups)))
         blocks = self.random.integers(0, 2, len(groups)) * self.arrival[groups[:, 0]] / self.problem.dt // BLOCK
         blocks = (blocks * self.random.random(len(groups))).astype(np.int64)
-        manner = Manner(tuple(np.array(RULES.angles) * self.random.uniform(*RULES.scales)), RULES.paces)
+        manner = MotionPrimitives(tuple(np.array(RULES.angles) * self.random.uniform(*RULES.scales)), RULES.paces)
         found = np.ones(len(groups), bool)
         controls = np.zeros((self.problem.horizon, *groups.shape, self.problem.control_size), np.float32)
         states = np.zeros((self.problem.horizon + 1, *groups.shape, self.problem.state_size), np.float32)
@@ -130,7 +130,7 @@ class _Neighbourhoods:
             if left.shape[1]:
                 limits = np.minimum(limits, self.arrival[robots] + RULES.give)
             before = groups[found, :member]
-            company = Company(
+            company = OtherAgents(
                 groups[found],
                 np.ascontiguousarray(np.moveaxis(states[:, found, :member, : self.problem.dimension], 0, 2)),
                 np.asarray(self.problem.team.radius, np.float64)[before],

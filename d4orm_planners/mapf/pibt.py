@@ -59,7 +59,7 @@ class Footprints(NamedTuple):
     costs: FloatArray
 
 
-class Workspace(NamedTuple):
+class PibtWorkspace(NamedTuple):
     """What a step is worked out in.
 
     Attributes:
@@ -180,7 +180,14 @@ def _mixed(a: np.uint64, b: np.uint64) -> float:
 
 @compiled
 def _rank_options(
-    roadmap: Roadmap, bodies: Footprints, scratch: Workspace, depth: int, k: Whole, at: Whole, pushed: bool, seed: int
+    roadmap: Roadmap,
+    bodies: Footprints,
+    scratch: PibtWorkspace,
+    depth: int,
+    k: Whole,
+    at: Whole,
+    pushed: bool,
+    seed: int,
 ) -> None:
     """Sort the edges that a robot may take, the best first, with staying among them unless it is pushed."""
     options, worth, count = scratch.options[depth], scratch.worth, 0
@@ -208,7 +215,7 @@ def _rank_options(
 
 @compiled
 def _in_the_way(
-    roadmap: Roadmap, bodies: Footprints, scratch: Workspace, positions: IntArray, k: Whole, e: Whole, depth: int
+    roadmap: Roadmap, bodies: Footprints, scratch: PibtWorkspace, positions: IntArray, k: Whole, e: Whole, depth: int
 ) -> Whole:
     """The first robot that has to make way before ``k`` takes an edge; -1 for none, -2 where that cannot be."""
     nodes, head, at = roadmap.nodes, np.int64(roadmap.heads[e]), positions[k]
@@ -241,7 +248,7 @@ def _in_the_way(
 def _move(
     roadmap: Roadmap,
     bodies: Footprints,
-    scratch: Workspace,
+    scratch: PibtWorkspace,
     positions: IntArray,
     root: Whole,
     forced: Whole,
@@ -306,7 +313,7 @@ def _move(
 def step_team(
     roadmap: Roadmap,
     bodies: Footprints,
-    scratch: Workspace,
+    scratch: PibtWorkspace,
     order: IntArray,
     robots: IntArray,
     places: IntArray,

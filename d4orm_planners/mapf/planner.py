@@ -13,11 +13,11 @@ from d4orm_env.core.seeds import Stream
 from d4orm_env.core.world import World
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
 from d4orm_planners.base.settings import Count
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 
 if TYPE_CHECKING:
     from d4orm_planners.mapf.roadmap import Roadmap
-    from d4orm_planners.mapf.roadmap_team import Driven, Replanning
+    from d4orm_planners.mapf.roadmap_team import Replanning, TeamRollout
 
 FINENESS = (1.6, 1.25, 1.0, 2.2, 3.0)
 """How fine the roadmaps are that are tried; see :func:`~d4orm_planners.mapf.roadmap.lay_roadmap`."""
@@ -25,7 +25,7 @@ TURNS = 30
 """Ways that are planned per robot before path finding for all at once is tried."""
 MAX_ROBOT_STEPS = 4_000_000
 """Most steps of all robots together, whose drives are kept several times over."""
-ROUND = 1.25
+DETOUR_RATIO = 1.25
 """How many times as long as straight a way is that leads far round; on a lattice any may be 1.1 times as long."""
 LEISURELY = 10
 """Times that a straight drive at full speed takes that the robots have for which kernels are compiled."""
@@ -48,7 +48,7 @@ class MAPFConfig(PlannerConfig):
 
 
 @dataclass(frozen=True, eq=False)
-class Guide:
+class RoadmapSolution:
     """The state of the search.
 
     Attributes:
@@ -59,11 +59,11 @@ class Guide:
 
     roadmap: Roadmap
     replanning: Replanning
-    driven: Driven
+    driven: TeamRollout
 
 
 @dataclass(frozen=True)
-class NoWays:
+class NoPaths:
     """The state of the search when no ways were found.
 
     Attributes:
@@ -75,7 +75,7 @@ class NoWays:
     unreachable: tuple[int, ...] = ()
 
     @classmethod
-    def unless_reachable(cls, problem: Problem) -> NoWays | None:
+    def unless_reachable(cls, problem: Problem) -> NoPaths | None:
         """Why there are no ways, if :meth:`Problem.check_reachable` knows."""
         try:
             problem.check_reachable()
@@ -97,31 +97,35 @@ class MAPF(Planner):
     presets: ClassVar = {"paper": {}}
     config: MAPFConfig
 
-    def iterate(self, search: Search, state: Guide | NoWays | None) -> tuple[Guide | NoWays, Iteration]:
+    def iterate(
+        self, search: SolveRun, state: RoadmapSolution | NoPaths | None
+    ) -> tuple[RoadmapSolution | NoPaths, Iteration]:
         """See :meth:`Planner.iterate`: first ways for the whole team, then better ones for some robots at a time."""
-        if isinstance(state, Guide):
-            state = better_ways(search, state, self.config.neighbours, self.config.replannings)
+        if isinstance(state, RoadmapSolution):
+            state = improve_roadmap_solution(search, state, self.config.neighbours, self.config.replannings)
         elif state is None:
-            state = first_ways(search)
-        if isinstance(state, NoWays):
+            state = find_roadmap_solution(search)
+        if isinstance(state, NoPaths):
             return state, state.explained(Iteration(search.current.controls))
-        return state, guided_iteration(search, state)
+        return state, roadmap_iteration(search, state)
 
 
-def guided_iteration(search: Search, guide: Guide) -> Iteration:
+def roadmap_iteration(search: SolveRun, guide: RoadmapSolution) -> Iteration:
     """What a team that drives so does within the horizon."""
     return Iteration(guide.driven.until(search.problem.horizon))
 
 
-def going_on_from_best(search: Search, guide: Guide) -> Guide:
+def going_on_from_best(search: SolveRun, guide: RoadmapSolution) -> RoadmapSolution:
     """The guide of a team that drives as in the best plan so far, whoever found it."""
     # Here, because importing numba takes long.
-    from d4orm_planners.mapf.roadmap_team import Driven
+    from d4orm_planners.mapf.roadmap_team import TeamRollout
 
-    return replace(guide, driven=Driven.of(search.best.trajectory))
+    return replace(guide, driven=TeamRollout.of(search.best.trajectory))
 
 
-def better_ways(search: Search, guide: Guide, neighbours: int, replannings: int) -> Guide:
+def improve_roadmap_solution(
+    search: SolveRun, guide: RoadmapSolution, neighbours: int, replannings: int
+) -> RoadmapSolution:
     """Replan so many groups of at most so many robots; what is no better for all together is left."""
     random, driven = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE)), guide.driven
     for _ in range(replannings):
@@ -132,7 +136,7 @@ def better_ways(search: Search, guide: Guide, neighbours: int, replannings: int)
     return replace(guide, driven=driven)
 
 
-def first_ways(search: Search) -> Guide | NoWays:
+def find_roadmap_solution(search: SolveRun) -> RoadmapSolution | NoPaths:
     """Ways for the whole team, or as many robots as possible; why there are none if nothing is found in time."""
     from d4orm_planners.mapf.lacam import find_moves
     from d4orm_planners.mapf.roadmap import lay_roadmap
@@ -140,56 +144,56 @@ def first_ways(search: Search) -> Guide | NoWays:
 
     problem, best = search.problem, None
     if problem.num_robots * problem.horizon > MAX_ROBOT_STEPS:
-        return NoWays(f"more than {MAX_ROBOT_STEPS} steps of all robots together are too many to look for ways")
+        return NoPaths(f"more than {MAX_ROBOT_STEPS} steps of all robots together are too many to look for ways")
     with search.watch.paused():
-        compile_guidance(problem)
+        compile_path_finding(problem)
     random = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE))
     for number, fineness in enumerate(FINENESS):
         roadmap = lay_roadmap(problem, fineness)
         replanning = Replanning(problem, roadmap)
         if not np.isfinite(replanning.alone).all():
-            reason = NoWays.unless_reachable(problem) if number == 0 else None
+            reason = NoPaths.unless_reachable(problem) if number == 0 else None
             if reason is not None:
                 return reason
             continue
         driven = replanning.one_by_one(random, search.should_stop, TURNS * problem.num_robots)
         if driven is not None:
-            return Guide(roadmap, replanning, driven)
+            return RoadmapSolution(roadmap, replanning, driven)
         if search.should_stop():
             break
         seed = search.iteration_seed(Stream.GUIDANCE, number + 1)
         found = find_moves(problem, roadmap, seed, search.should_stop, STEPS)
         if found is not None and (best is None or found.arrived.sum() > best[1].arrived.sum()):
-            best = Guide(roadmap, replanning, drive_moves(problem, roadmap, found.moves)), found
+            best = RoadmapSolution(roadmap, replanning, drive_moves(problem, roadmap, found.moves)), found
         if search.should_stop() or (found is not None and found.arrived.all()):
             break
-    return best[0] if best else NoWays("no ways found on the roadmaps in time")
+    return best[0] if best else NoPaths("no ways found on the roadmaps in time")
 
 
 def compile_roadmap(problem: Problem) -> None:
-    """Compile what :func:`leads_round` needs, if it is not yet."""
+    """Compile what :func:`needs_detour` needs, if it is not yet."""
     if not problem.world.num_obstacles:
         return
     from d4orm_planners.mapf.pibt import fill_costs
 
     if not fill_costs.signatures:
-        leads_round(_small_problem(problem, 0))
+        needs_detour(_small_problem(problem, 0))
 
 
-def leads_round(problem: Problem) -> bool:
+def needs_detour(problem: Problem) -> bool:
     """Whether obstacles lead somebody's shortest way far round, so that straight ways are no place to begin."""
     if not problem.world.num_obstacles:
         return False
-    from d4orm_planners.mapf.lacam import Team
+    from d4orm_planners.mapf.lacam import TeamOnRoadmap
     from d4orm_planners.mapf.roadmap import lay_roadmap
 
     roadmap = lay_roadmap(problem)
     straight = np.linalg.norm(problem.goal - problem.start[:, : problem.dimension], axis=1)
-    ways = Team(problem, roadmap).bodies.costs[np.arange(problem.num_robots), roadmap.starts]
-    return bool((ways > ROUND * straight + problem.goal_radius).any())
+    ways = TeamOnRoadmap(problem, roadmap).bodies.costs[np.arange(problem.num_robots), roadmap.starts]
+    return bool((ways > DETOUR_RATIO * straight + problem.goal_radius).any())
 
 
-def compile_guidance(problem: Problem) -> None:
+def compile_path_finding(problem: Problem) -> None:
     """Compile what path finding for such a team in such a world needs, if it is not yet."""
     from d4orm_planners.mapf.lacam import find_moves
     from d4orm_planners.mapf.roadmap import lay_roadmap

@@ -20,7 +20,7 @@ from d4orm_env.engine.compiling import OPTIONS
 from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.near_neighbours import Cells, cells_about, sort_into_cells
 from d4orm_planners.mapf.roadmap import Roadmap
-from d4orm_planners.tracking.routes import Route, Routes, Stops
+from d4orm_planners.tracking.routes import Corners, Route, Routes
 
 SOURCES = fingerprint((near_neighbours,))
 
@@ -39,7 +39,7 @@ SHARPEST = 2 / 3
 """Radius below which corners are not rounded."""
 
 
-def stops_of(roadmap: Roadmap, moves: IntArray, num_robots: int) -> Stops:
+def stops_of(roadmap: Roadmap, moves: IntArray, num_robots: int) -> Corners:
     """The corners that moves ``(M, 2)`` made one after another lead along."""
     order = np.argsort(moves[:, 0], kind="stable")
     begin = np.append(0, np.cumsum(np.bincount(moves[:, 0], minlength=num_robots) + 1)).astype(np.int64)
@@ -49,10 +49,10 @@ def stops_of(roadmap: Roadmap, moves: IntArray, num_robots: int) -> Stops:
     places[~moving] = roadmap.nodes[roadmap.starts]
     places[moving] = roadmap.nodes[roadmap.heads[moves[order, 1]]]
     times[moving] = order
-    return Stops(places, begin, times, times)
+    return Corners(places, begin, times, times)
 
 
-def make_routes(problem: Problem, stops: Stops, robots: Sequence[int], cut: float) -> list[Route]:
+def make_routes(problem: Problem, stops: Corners, robots: Sequence[int], cut: float) -> list[Route]:
     """The routes of robots along corners, which are rounded by ``cut`` at most [m], less where walls are near."""
     owner = np.repeat(np.asarray(robots), np.diff(stops.begin))
     spacing = SPACING * problem.team.largest_radius
@@ -73,7 +73,7 @@ def join_routes(problem: Problem, routes: Sequence[Route]) -> Routes:
     return Routes(points, times, bends, first, arcs, *_find_waits(cells, first, times, radius, apart))
 
 
-class Bends(NamedTuple):
+class RouteBends(NamedTuple):
     """Corners of ways, without the angles themselves, whose functions differ from one processor to the next.
 
     Attributes:
@@ -93,17 +93,17 @@ class Bends(NamedTuple):
     sine: Floats
 
 
-def _bends_at(corners: Floats, inner: IntArray) -> Bends:
+def _bends_at(corners: Floats, inner: IntArray) -> RouteBends:
     """The corners with these numbers, each with the one before it and the one after it."""
     before, after = corners[inner] - corners[inner - 1], corners[inner + 1] - corners[inner]
     one, other = _lengths(before), _lengths(after)
     before, after = before / np.maximum(one, TINY)[:, None], after / np.maximum(other, TINY)[:, None]
     cosine = np.clip(before[:, 0] * after[:, 0] + before[:, 1] * after[:, 1] + before[:, 2] * after[:, 2], -1.0, 1.0)
     halves = np.sqrt((1 + cosine) / 2), np.sqrt((1 - cosine) / 2)
-    return Bends(corners[inner], before, after, np.minimum(one, other) / 2, *halves)
+    return RouteBends(corners[inner], before, after, np.minimum(one, other) / 2, *halves)
 
 
-def _arcs(bends: Bends, radius: Floats, num_points: int) -> Floats:
+def _arcs(bends: RouteBends, radius: Floats, num_points: int) -> Floats:
     """``(C, P, 3)`` points along the arcs that round corners."""
     reach = radius * bends.sine / bends.cosine
     begin, end = bends.corners - bends.before * reach[:, None], bends.corners + bends.after * reach[:, None]
@@ -146,7 +146,7 @@ def _lengths(steps: Floats) -> Floats:
     return length
 
 
-def _rounded(stops: Stops, radii: Floats, spacing: float) -> tuple[Floats, IntArray, Floats, Floats]:
+def _rounded(stops: Corners, radii: Floats, spacing: float) -> tuple[Floats, IntArray, Floats, Floats]:
     """``(points, first, times, bends)``, so far apart at most, along ways with corners rounded by these radii."""
     corners, rounded = stops.places, np.flatnonzero((radii > 0) & np.isfinite(radii))
     arcs = _arcs(_bends_at(corners, rounded), radii[rounded], ARC_POINTS)

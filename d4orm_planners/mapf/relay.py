@@ -7,7 +7,7 @@ import numpy as np
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_planners.mapf.roadmap import lay_roadmap
-from d4orm_planners.mapf.roadmap_team import FAR, Driven, Replanning
+from d4orm_planners.mapf.roadmap_team import FAR, Replanning, TeamRollout
 
 FINENESS = 1.6
 """How fine the roadmap is."""
@@ -30,9 +30,9 @@ def relay_ways(problem: Problem, ways: FloatArray, changed: BoolArray, seed: int
     Returns:
         ``(H + 1, K, d)`` where everybody is going to be [m]; ``None`` if no ways were found.
     """
-    from d4orm_planners.mapf.planner import compile_guidance
+    from d4orm_planners.mapf.planner import compile_path_finding
 
-    compile_guidance(problem)
+    compile_path_finding(problem)
     num_robots, d = problem.num_robots, problem.dimension
     linger = int(np.ceil(LINGER / problem.dt))
     replanning = Replanning(problem, lay_roadmap(problem, FINENESS), linger)
@@ -52,7 +52,7 @@ def relay_ways(problem: Problem, ways: FloatArray, changed: BoolArray, seed: int
     return result
 
 
-def _driven(problem: Problem, ways: FloatArray, linger: int) -> Driven:
+def _driven(problem: Problem, ways: FloatArray, linger: int) -> TeamRollout:
     """A team on its ways ``(H + 1, K, d)``, which leaves its goals again; nothing is known of its controls."""
     steps, num_robots, d = problem.horizon, problem.num_robots, problem.dimension
     there = np.linalg.norm(ways - problem.goal, axis=2) <= problem.goal_radius
@@ -60,4 +60,4 @@ def _driven(problem: Problem, ways: FloatArray, linger: int) -> Driven:
     places = np.zeros((steps + 1, num_robots, 3))
     places[:, :, :d] = ways
     places[np.arange(steps + 1)[:, None] > arrivals + linger] = FAR
-    return Driven(np.zeros((steps, num_robots, problem.control_size), np.float32), places, arrivals)
+    return TeamRollout(np.zeros((steps, num_robots, problem.control_size), np.float32), places, arrivals)

@@ -14,13 +14,13 @@ from d4orm_env.core.metrics import arrival_steps
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.paths.wavefront import make_space
-from d4orm_planners.mapf.lacam import Team
+from d4orm_planners.mapf.lacam import TeamOnRoadmap
 from d4orm_planners.mapf.near_neighbours import sort_into_cells
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
 from d4orm_planners.mapf.replanning import Others, Trip, find_way, straighten, touches
 from d4orm_planners.mapf.roadmap import WALL_SLACK, Roadmap
 from d4orm_planners.tracking.path_drives import drive_along
-from d4orm_planners.tracking.routes import Stops
+from d4orm_planners.tracking.routes import Corners
 from d4orm_planners.tracking.timed_path import drive_by_clock, timed_kernel
 
 FIRST_CUT = 0.2
@@ -48,7 +48,7 @@ NEARNESS = 10 / 3
 
 
 @dataclass(frozen=True, eq=False)
-class Driven:
+class TeamRollout:
     """How a team drives.
 
     Attributes:
@@ -62,7 +62,7 @@ class Driven:
     arrivals: IntArray
 
     @classmethod
-    def of(cls, trajectory: Trajectory) -> Driven:
+    def of(cls, trajectory: Trajectory) -> TeamRollout:
         """How a team drives that docks."""
         places = np.zeros((*trajectory.positions.shape[:2], 3))
         places[..., : trajectory.positions.shape[2]] = trajectory.positions
@@ -79,13 +79,13 @@ class Driven:
         return controls
 
 
-def drive_moves(problem: Problem, roadmap: Roadmap, moves: IntArray) -> Driven:
+def drive_moves(problem: Problem, roadmap: Roadmap, moves: IntArray) -> TeamRollout:
     """Drive a team along the moves of a search."""
     stops = stops_of(roadmap, moves, problem.num_robots)
     routes = join_routes(
         problem, make_routes(problem, stops, range(problem.num_robots), FIRST_CUT * problem.team.largest_radius)
     )
-    return Driven(*drive_along(problem, routes, OVERTIME * problem.horizon))
+    return TeamRollout(*drive_along(problem, routes, OVERTIME * problem.horizon))
 
 
 class Replanning:
@@ -107,7 +107,7 @@ class Replanning:
         self.problem, self.roadmap, self.linger = problem, roadmap, linger
         self.cells = sort_into_cells(roadmap.nodes, float(2 * np.asarray(problem.team.radius).max() + problem.margin))
         self.space = make_space(problem) if problem.world.num_obstacles else None
-        self.bodies, self.size = Team(problem, roadmap).bodies, problem.team.largest_radius
+        self.bodies, self.size = TeamOnRoadmap(problem, roadmap).bodies, problem.team.largest_radius
         speed, acceleration = (np.asarray(problem.team.limits[:, column], np.float64) for column in (0, 1))
         self.strides = problem.dt * speed
         self.launch = np.round(LAUNCH * speed / acceleration / problem.dt).astype(np.int64)
@@ -121,7 +121,7 @@ class Replanning:
         self.own_room = ends.min(axis=0) - TOUCH * self.size
         self.alone = self.bodies.costs[np.arange(problem.num_robots), roadmap.starts] / self.strides
 
-    def neighbours(self, driven: Driven, random: np.random.Generator, most: int) -> IntArray:
+    def neighbours(self, driven: TeamRollout, random: np.random.Generator, most: int) -> IntArray:
         """Some robots to replan together, in random order: one that is much delayed, and those it drove nearest to."""
         delay = np.maximum(driven.arrivals - self.alone, 1.0)
         late = driven.arrivals > self.problem.horizon
@@ -135,11 +135,11 @@ class Replanning:
         return random.permutation(np.argsort(gaps)[: random.integers(1, min(len(delay), most) + 1)])
 
     def better(
-        self, driven: Driven, robots: IntArray, random: np.random.Generator, should_stop: Callable[[], bool]
-    ) -> Driven | None:
+        self, driven: TeamRollout, robots: IntArray, random: np.random.Generator, should_stop: Callable[[], bool]
+    ) -> TeamRollout | None:
         """The team with new ways for some robots, in their order, if that is better for all together, and in time."""
         last = int(driven.arrivals.max())
-        changed = Driven(driven.controls[:last].copy(), driven.places[: last + 1].copy(), driven.arrivals.copy())
+        changed = TeamRollout(driven.controls[:last].copy(), driven.places[: last + 1].copy(), driven.arrivals.copy())
         changed.places[:, robots] = FAR
         latest = np.minimum(driven.arrivals + LATER, last)
         for robot in robots.tolist():
@@ -147,7 +147,7 @@ class Replanning:
                 return None
         return changed if changed.cost(self.problem.horizon) < driven.cost(self.problem.horizon) else None
 
-    def one_by_one(self, random: np.random.Generator, should_stop: Callable[[], bool], most: int) -> Driven | None:
+    def one_by_one(self, random: np.random.Generator, should_stop: Callable[[], bool], most: int) -> TeamRollout | None:
         """The team with ways planned one after another; who finds none displaces others, whose turn comes again.
 
         Args:
@@ -161,13 +161,18 @@ class Replanning:
         problem, steps, num_robots = self.problem, self.problem.horizon, self.problem.num_robots
         places = np.full((steps + 1, num_robots, 3), FAR)
         controls = np.zeros((steps, num_robots, problem.control_size), np.float32)
-        driven = Driven(controls, places, np.full(num_robots, steps + 1))
+        driven = TeamRollout(controls, places, np.full(num_robots, steps + 1))
         waiting = np.argsort(self.alone + random.random(num_robots))
         return self.settle(driven, waiting, random, should_stop, most)
 
     def settle(
-        self, driven: Driven, robots: IntArray, random: np.random.Generator, should_stop: Callable[[], bool], most: int
-    ) -> Driven | None:
+        self,
+        driven: TeamRollout,
+        robots: IntArray,
+        random: np.random.Generator,
+        should_stop: Callable[[], bool],
+        most: int,
+    ) -> TeamRollout | None:
         """The same for those ``robots``, the last of them first, among all others in ``driven``, which is changed."""
         steps, waiting, num_robots = len(driven.controls), robots.tolist(), self.problem.num_robots
         settled = np.ones(num_robots, bool)
@@ -180,7 +185,7 @@ class Replanning:
             for hard in (1.0, 0.5, 0.0):
                 around = driven.places.copy()
                 around[:, settled & (random.random(num_robots) >= hard)] = FAR
-                here = Driven(driven.controls, around, driven.arrivals)
+                here = TeamRollout(driven.controls, around, driven.arrivals)
                 if self.replan_one(here, robot, steps, random):
                     break
             else:
@@ -201,12 +206,12 @@ class Replanning:
         """The step from which on a robot that arrives at a step is nobody's obstacle any more, if any."""
         return None if self.linger is None else arrival + self.linger + 1
 
-    def replan_one(self, driven: Driven, robot: int, latest: int, random: np.random.Generator) -> bool:
+    def replan_one(self, driven: TeamRollout, robot: int, latest: int, random: np.random.Generator) -> bool:
         """Plan a robot's way around all others in ``driven``, which is changed; whether that succeeds."""
         haste = 1 - random.random() * LEISURE
         return any(self.find_and_drive(driven, robot, latest, cruise * haste, cut) for cruise, cut in MANNERS)
 
-    def find_and_drive(self, driven: Driven, robot: int, latest: int, cruise: float, cut: float) -> bool:
+    def find_and_drive(self, driven: TeamRollout, robot: int, latest: int, cruise: float, cut: float) -> bool:
         """The same in one of the :data:`MANNERS`."""
         roadmap, bodies, steps = self.roadmap, self.bodies, len(driven.controls)
         apart = bodies.radius[robot] + bodies.radius + bodies.margin
@@ -223,7 +228,7 @@ class Replanning:
         reach = bodies.reach[robot] * (1 + WALL_SLACK * 2 / 3)
         left = straighten(roadmap, bodies, self.space, others, robot, reach, way)
         nodes, departs, arrives = way[:left].T
-        stops = Stops(roadmap.nodes[nodes], np.array([0, left]), departs.astype(float), arrives.astype(float))
+        stops = Corners(roadmap.nodes[nodes], np.array([0, left]), departs.astype(float), arrives.astype(float))
         route = make_routes(self.problem, stops, [robot], cut * self.size)[0]
         # As soon as it can, or else by the clock of its way.
         for backs_up, hurrying in product(self.turns[robot], (True, False)):

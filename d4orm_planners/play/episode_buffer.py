@@ -26,7 +26,7 @@ class _Snapshot(NamedTuple):
     bodies: FloatArray
 
 
-class Recording:
+class EpisodeBuffer:
     """What happened since team, world or policies last changed; one thread may add while others make replays."""
 
     def __init__(self, problem: Problem) -> None:

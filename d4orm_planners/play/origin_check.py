@@ -30,7 +30,7 @@ _MESSAGE_PERIOD = 0.002
 """Seconds from one message of a page to its next at least; a hand makes one every 16 ms."""
 
 
-class Admission:
+class OriginCheck:
     """Turns away web sockets of a page before anything that they have sent is looked at.
 
     Of what the others send, only what the page offers comes through.

@@ -12,9 +12,9 @@ import time
 import viser
 
 from d4orm_env.core.problem import Problem
-from d4orm_planners.play.origin_check import LOOPBACK, Admission
+from d4orm_planners.play.origin_check import LOOPBACK, OriginCheck
 from d4orm_planners.play.panel import THEME, Panel
-from d4orm_planners.play.proxy import Gate
+from d4orm_planners.play.proxy import AuthenticatingProxy
 from d4orm_planners.play.session import Session
 from d4orm_planners.play.view import View
 
@@ -56,10 +56,10 @@ class Playground:
             self._server = _Server(
                 host="127.0.0.1", port=chosen if local else _free_port("127.0.0.1", 0), verbose=False
             )
-        self._gate = None if local else Gate(host, chosen, self._server.get_port())
+        self._gate = None if local else AuthenticatingProxy(host, chosen, self._server.get_port())
         # Otherwise Python prints every request that cannot be read, which anybody can make.
         logging.getLogger("websockets").addHandler(logging.NullHandler())
-        Admission(self._server, None if self._gate is None else self._gate.token, self.session.refuse)
+        OriginCheck(self._server, None if self._gate is None else self._gate.token, self.session.refuse)
         if self._gate is None:
             self.address = f"http://127.0.0.1:{self._server.get_port()}/"
         else:

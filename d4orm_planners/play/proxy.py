@@ -22,7 +22,7 @@ _MOST_WAITING = 100
 """Connections that have not shown the token yet; who comes while so many wait is hung up on."""
 
 
-class Gate:
+class AuthenticatingProxy:
     """Passes connections on to a port of this machine once they have shown the token.
 
     The page and its web socket are asked for by requests of their own, one per connection. The first brings the token

@@ -25,7 +25,7 @@ from d4orm_planners.base.policy import Policy
 from d4orm_planners.play.command_queue import MOST_WAITING, Command, CommandQueue
 from d4orm_planners.play.edits import Edit, followed
 from d4orm_planners.play.scene_frame import Frame, Status
-from d4orm_planners.play.viewport import Lane, Terms
+from d4orm_planners.play.viewport import EpisodeOptions, Viewport
 
 _IDLE = 0.1
 _MOST_EDITING = 0.25
@@ -55,14 +55,14 @@ class Session:
 
     def __init__(self, problem: Problem, *policies: str, seed: int = 0, lifelong: bool = False) -> None:
         self._loaded, self._names = problem, policies or ("d4orm-c2f",)
-        self._terms, self._levels = Terms(seed, lifelong), dict[str, float]()
+        self._terms, self._levels = EpisodeOptions(seed, lifelong), dict[str, float]()
         self._policies: dict[tuple[str, int | None], Policy] = {}
         self._horizon: int | None = None
         self._commands = CommandQueue()
         self._paused, self._steps_wanted, self._speed = False, 0, 1.0
         self._status = Status(0, 0, 0.0, 0.0, problem.dt, "planning", "", 0)
         self._frames: tuple[Frame, ...] = ()
-        self._lanes: tuple[Lane, ...] = ()
+        self._lanes: tuple[Viewport, ...] = ()
         self.failure: BaseException | None = None
         self._thread = threading.Thread(target=self._live, name="d4orm-play", daemon=True)
         self._begin([problem] * len(self._names), afresh=True)
@@ -308,7 +308,7 @@ class Session:
             return "paused"
         return "arrived" if all(lane.finished for lane in self._lanes) else "running"
 
-    def _begin_here(self, terms: Terms | None = None) -> None:
+    def _begin_here(self, terms: EpisodeOptions | None = None) -> None:
         """Go on from where everybody is."""
         self._begin([lane.scene for lane in self._lanes], terms=terms)
 
@@ -316,7 +316,7 @@ class Session:
         self,
         scenes: Sequence[Problem],
         names: tuple[str, ...] | None = None,
-        terms: Terms | None = None,
+        terms: EpisodeOptions | None = None,
         afresh: bool = False,
     ) -> None:
         """Go on from scenes, one for each policy: episodes of their own, which the policies plan for.
@@ -329,7 +329,7 @@ class Session:
             self._show("planning")
         try:
             lanes = tuple(
-                Lane(name, self._driver(name), scene, terms, recording)
+                Viewport(name, self._driver(name), scene, terms, recording)
                 for name, scene, recording in zip(names, scenes, recordings, strict=True)
             )
         except Exception:

@@ -12,7 +12,7 @@ from d4orm_env.render.panels import view_limits
 from d4orm_planners.play.meshes import Points, in_space
 from d4orm_planners.play.scene_frame import Frame
 from d4orm_planners.play.session import Session
-from d4orm_planners.play.viewpoint import Camera
+from d4orm_planners.play.viewpoint import Viewpoint
 from d4orm_planners.play.viewport_view import LaneView
 
 GAP = 0.12
@@ -41,7 +41,7 @@ class View:
             "margins": False,
             "dark": False,
         }
-        self._camera = Camera(server)
+        self._camera = Viewpoint(server)
         self._lanes: list[LaneView] = []
         self._built: object = None
         self._looked_at: object = None

@@ -16,7 +16,7 @@ WIDE, NARROW = 1.5, 1.0
 Vector = NDArray[np.float64]
 
 
-class Camera:
+class Viewpoint:
     """Shows all that lies between two corners to whoever looks at a page.
 
     Args:

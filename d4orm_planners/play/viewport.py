@@ -17,7 +17,7 @@ from d4orm_env.disturbances.robot_faults import pushed
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.policy import Policy
 from d4orm_planners.play.edits import check_robot
-from d4orm_planners.play.episode_buffer import Recording
+from d4orm_planners.play.episode_buffer import EpisodeBuffer
 from d4orm_planners.play.scene_frame import Frame, Status, closest_approach, guidance, plan
 
 MOST_CYCLES = 10_000_000
@@ -25,7 +25,7 @@ MOST_CYCLES = 10_000_000
 
 
 @dataclass(frozen=True)
-class Terms:
+class EpisodeOptions:
     """What holds for all that drive side by side.
 
     Attributes:
@@ -39,7 +39,7 @@ class Terms:
     disturbances: Sequence[AnyDisturbance] = ()
 
 
-class Lane:
+class Viewport:
     """A policy that drives a scene.
 
     Args:
@@ -55,7 +55,7 @@ class Lane:
     """
 
     def __init__(
-        self, name: str, policy: Policy, scene: Problem, terms: Terms, recording: Recording | None = None
+        self, name: str, policy: Policy, scene: Problem, terms: EpisodeOptions, recording: EpisodeBuffer | None = None
     ) -> None:
         self.name, self._policy, self._scene, self._seed = name, policy, scene, terms.seed
         # A robot stalls within the scene's usual duration, after which this episode goes on all the same.
@@ -68,7 +68,7 @@ class Lane:
         self.regain()
         self._replanned, self._loop = time.perf_counter() - begin, 0.0
         self._before = scene.start[:, : scene.dimension]
-        self.recording = Recording(scene) if recording is None else recording
+        self.recording = EpisodeBuffer(scene) if recording is None else recording
         self._remember()
 
     def regain(self) -> None:

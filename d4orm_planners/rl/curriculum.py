@@ -9,7 +9,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Lesson:
+class Stage:
     """One part of a training, at whose end there is a checkpoint.
 
     Attributes:
@@ -34,9 +34,7 @@ def common_batch(sizes: tuple[int, ...], wanted: int) -> int:
     return max(wanted // unit, 1) * unit
 
 
-def make_lessons(
-    num_robots: int, scenario: str, steps: int, unit: int, count: int, gradual: bool
-) -> tuple[Lesson, ...]:
+def make_lessons(num_robots: int, scenario: str, steps: int, unit: int, count: int, gradual: bool) -> tuple[Stage, ...]:
     """The lessons of a training.
 
     Teams grow, and every size gets as many steps of whole worlds as any other. Instances are random ones; where another
@@ -59,5 +57,5 @@ def make_lessons(
         size = sizes[int(np.searchsorted(turns, (index + 0.5) / count))]
         name = scenario if size == num_robots and index % 2 == 0 else "random"
         length = units * (index + 1) // count - units * index // count
-        lessons.append(Lesson(size, name, length * unit))
+        lessons.append(Stage(size, name, length * unit))
     return tuple(lessons)

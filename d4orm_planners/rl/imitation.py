@@ -34,7 +34,7 @@ from d4orm_planners.rl.dataset_samples import dataset_samples
 from d4orm_planners.rl.network import CLIP, EPSILON, Network
 from d4orm_planners.rl.samples import Samples, record_samples
 from d4orm_planners.rl.sb3_network import network_of
-from d4orm_planners.rl.train_config import VALIDATION_SEED, Many, Practice
+from d4orm_planners.rl.train_config import VALIDATION_SEED, Many, TrainConfig
 from d4orm_planners.rl.training import Progress, TrainingResult
 
 LEARNER = "ppo"
@@ -50,7 +50,7 @@ they are late, weak, noisy or stalled."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImitationSettings(Practice):
+class ImitationSettings(TrainConfig):
     """Whom to imitate, and how long.
 
     Attributes:
@@ -105,13 +105,13 @@ def imitate(
         ValueError: For settings that make no sense, or other settings than those of the training in ``out``.
         OSError: If the folder cannot be used.
     """
-    run = _Run(settings, Path(out), progress or (lambda what, done, total: None), command)
+    run = _ImitationRun(settings, Path(out), progress or (lambda what, done, total: None), command)
     for index in range(len(run.evaluations), settings.rounds):
         run.learn(index)
     return TrainingResult(run.checkpoints.policy(), tuple(run.evaluations), run.checkpoints.policy_path)
 
 
-class _Run:
+class _ImitationRun:
     """An imitation under way."""
 
     def __init__(self, settings: ImitationSettings, out: Path, progress: Progress, command: str) -> None:

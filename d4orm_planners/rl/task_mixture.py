@@ -99,7 +99,7 @@ MIXTURES: Mapping[str, tuple[str, ...]] = MappingProxyType(
 
 
 @dataclass(frozen=True)
-class Exercise:
+class TrainTask:
     """One part of a mixture.
 
     Attributes:
@@ -117,7 +117,7 @@ class Exercise:
     disturbances: Mapping[str, object] = field(default_factory=dict)
 
     @classmethod
-    def parse(cls, text: str) -> Exercise:
+    def parse(cls, text: str) -> TrainTask:
         """From a scenario, a team size, and settings ``name=value``, separated by blanks.
 
         ``sight=4`` and ``disturb.delay=2``, with any disturbance's name and level, are among the settings.
@@ -207,24 +207,24 @@ class Instances:
         return self._drawn[own]
 
 
-def parse_mixture(texts: Sequence[str]) -> tuple[Exercise, ...]:
-    """The parts of a mixture: texts as :meth:`Exercise.parse` takes them, and names of :data:`MIXTURES`.
+def parse_mixture(texts: Sequence[str]) -> tuple[TrainTask, ...]:
+    """The parts of a mixture: texts as :meth:`TrainTask.parse` takes them, and names of :data:`MIXTURES`.
 
     Raises:
         ValueError: If one is neither.
     """
     named = [part for text in texts for part in MIXTURES.get(text.strip(), (text,))]
-    return tuple(Exercise.parse(text) for text in named)
+    return tuple(TrainTask.parse(text) for text in named)
 
 
-def gather_parts(exercises: Sequence[Exercise], counts: Sequence[int]) -> list[tuple[Exercise, list[int | None]]]:
+def gather_parts(exercises: Sequence[TrainTask], counts: Sequence[int]) -> list[tuple[TrainTask, list[int | None]]]:
     """Parts that differ in nothing but sight as one, since each takes its time to step, and the sight of its worlds.
 
     Args:
         exercises: Parts of a mixture.
         counts: How many worlds each has.
     """
-    gathered: list[tuple[Exercise, list[int | None]]] = []
+    gathered: list[tuple[TrainTask, list[int | None]]] = []
     for exercise, count in zip(exercises, counts, strict=True):
         own = replace(exercise, sight=None)
         if own not in [other for other, _ in gathered]:

@@ -12,7 +12,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios.problems import unknown_argument
 from d4orm_planners.base.settings import CheckedSettings, Count, Whole
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
-from d4orm_planners.rl.task_mixture import Exercise, MixedVecEnv
+from d4orm_planners.rl.task_mixture import MixedVecEnv, TrainTask
 
 VALIDATION_SEED = 0
 """Worlds are seeded one by one from here in validation, and in training from numbers of 64 random bits."""
@@ -23,7 +23,7 @@ Seed = Annotated[Whole, Field(ge=0)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Practice(CheckedSettings):
+class TrainConfig(CheckedSettings):
     """What to train for.
 
     Attributes:
@@ -66,9 +66,9 @@ class Practice(CheckedSettings):
         settings = self.exercise(scenario, self.num_robots).settings
         return {"scenario": scenario, "model": self.model_in(scenario), **settings}
 
-    def exercise(self, scenario: str, num_robots: int) -> Exercise:
+    def exercise(self, scenario: str, num_robots: int) -> TrainTask:
         """The same scenario with a team of that size."""
-        return Exercise(scenario, num_robots, self.scenario_settings if scenario == self.scenario else {})
+        return TrainTask(scenario, num_robots, self.scenario_settings if scenario == self.scenario else {})
 
     def model_in(self, scenario: str) -> str | None:
         """The model of its robots; ``None`` is the scenario's own."""

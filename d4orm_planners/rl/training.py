@@ -28,14 +28,14 @@ from d4orm_env.envs.rewards import TrainingReward
 from d4orm_planners.base.settings import Count, Number, PathText, Positive, Whole, one_of
 from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm
 from d4orm_planners.rl.checkpoints import Checkpoints
-from d4orm_planners.rl.curriculum import Lesson, common_batch, make_lessons, team_sizes
+from d4orm_planners.rl.curriculum import Stage, common_batch, make_lessons, team_sizes
 from d4orm_planners.rl.curve import Evaluation, evaluate_network, write_curve
 from d4orm_planners.rl.network import CLIP, EPSILON, Network, load_network
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 from d4orm_planners.rl.sb3_network import network_of, set_network
 from d4orm_planners.rl.sb3_sets import leave_as_they_are
-from d4orm_planners.rl.task_mixture import Exercise, Instances, MixedVecEnv, gather_parts, parse_mixture
-from d4orm_planners.rl.train_config import VALIDATION_SEED, Many, Practice
+from d4orm_planners.rl.task_mixture import Instances, MixedVecEnv, TrainTask, gather_parts, parse_mixture
+from d4orm_planners.rl.train_config import VALIDATION_SEED, Many, TrainConfig
 
 Progress = Callable[[str, int, int], object]
 _INSTANCES, _STEPS_PER_INSTANCE = 256, 25_000
@@ -53,7 +53,7 @@ def _as_tuple(value: object) -> object:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainingSettings(Practice):
+class TrainingSettings(TrainConfig):
     """What to train for, and how long.
 
     Attributes:
@@ -73,7 +73,7 @@ class TrainingSettings(Practice):
             those of :mod:`d4orm_planners.rl.algorithms`: ``{"gradient_steps": 8}``.
         reward_settings: Weights of the :class:`~d4orm_env.envs.rewards.TrainingReward` to learn from, where they are others.
         mixture: Scenarios and team sizes to be practised all at once, in place of ``scenario`` and ``num_robots``:
-            texts as :meth:`~d4orm_planners.rl.task_mixture.Exercise.parse` takes them, or names of
+            texts as :meth:`~d4orm_planners.rl.task_mixture.TrainTask.parse` takes them, or names of
             :data:`~d4orm_planners.rl.task_mixture.MIXTURES`. Each has as many robots, as nearly as whole worlds allow, and
             as many validation worlds as any other.
 
@@ -112,7 +112,7 @@ class TrainingSettings(Practice):
         self.exercises  # noqa: B018 - refuses what is none
 
     @cached_property
-    def exercises(self) -> tuple[Exercise, ...]:
+    def exercises(self) -> tuple[TrainTask, ...]:
         """The parts of the mixture."""
         return parse_mixture(self.mixture)
 
@@ -135,7 +135,7 @@ class TrainingSettings(Practice):
         sizes = team_sizes(self.num_robots) if self.curriculum else (self.num_robots,)
         return common_batch(sizes, self.num_envs or ALGORITHMS[self.algorithm].num_envs)
 
-    def parts(self, lesson: Lesson) -> list[tuple[Exercise, list[int | None], str | None]]:
+    def parts(self, lesson: Stage) -> list[tuple[TrainTask, list[int | None], str | None]]:
         """What is practised in a lesson: exercises, with the sight of each of their worlds and the robots' model."""
         if self.mixture:
             return [(*part, self.model) for part in gather_parts(self.exercises, self.worlds_of_exercises)]
@@ -143,7 +143,7 @@ class TrainingSettings(Practice):
         return [(exercise, [None] * (self.batch // lesson.num_robots), self.model_in(lesson.scenario))]
 
     def worlds(
-        self, lesson: Lesson, number: int = 0, done: int = 0, drawn: Drawn | None = None
+        self, lesson: Stage, number: int = 0, done: int = 0, drawn: Drawn | None = None
     ) -> RobotVecEnv | MixedVecEnv:
         """Worlds for a lesson.
 
@@ -220,13 +220,13 @@ def train(
         ValueError: For settings that make no sense, or other settings than those of the training in ``out``.
         OSError: If the folder cannot be used.
     """
-    run = _Run(settings, Path(out), progress or (lambda what, done, total: None), command)
+    run = _TrainingRun(settings, Path(out), progress or (lambda what, done, total: None), command)
     for index in range(len(run.evaluations), len(run.lessons)):
         run.learn(index)
     return TrainingResult(run.checkpoints.policy(), tuple(run.evaluations), run.checkpoints.policy_path)
 
 
-class _Run:
+class _TrainingRun:
     """A training under way."""
 
     def __init__(self, settings: TrainingSettings, out: Path, progress: Progress, command: str) -> None:
@@ -238,7 +238,7 @@ class _Run:
         )
         if settings.mixture:
             largest = max(exercise.num_robots for exercise in settings.exercises)
-            self.lessons = tuple(Lesson(largest, MIXTURE, lesson.steps) for lesson in self.lessons)
+            self.lessons = tuple(Stage(largest, MIXTURE, lesson.steps) for lesson in self.lessons)
         self._total = sum(lesson.steps for lesson in self.lessons)
         self._model: BaseAlgorithm | None = None
         self._drawn: Drawn = {}
@@ -338,6 +338,6 @@ class _Watch(BaseCallback):
         self._report(self.num_timesteps - self._first)
 
 
-def _describe(lesson: Lesson, evaluations: list[Evaluation]) -> str:
+def _describe(lesson: Stage, evaluations: list[Evaluation]) -> str:
     last = f"; success {evaluations[-1].success_rate:.0%}" if evaluations else ""
     return f"{lesson.scenario}, {lesson.num_robots} robots{last}"

@@ -10,7 +10,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_planners.base.settings import Positive, Share
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.sampling_types import SamplingRules
 from d4orm_planners.sampling.loop import SamplingPlanner
 from d4orm_planners.sampling.schedule import constant
@@ -66,7 +66,7 @@ class CEM(SamplingPlanner):
         adapt = EliteDeviation(config.sigma, config.sigma_floor) if config.adapt_variance else None
         return SamplingRules(weights=EliteWeights(config.elite_fraction), adapt=adapt)
 
-    def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
+    def initial(self, search: SolveRun) -> tuple[FloatArray, FloatArray]:
         """See :meth:`SamplingPlanner.initial`."""
         base = self.config.continued(search.current)
         return base, np.zeros_like(base)

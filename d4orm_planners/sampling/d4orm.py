@@ -10,7 +10,7 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.team import Team
 from d4orm_planners.base.settings import Positive, Samples, Share, ShareOrNone, Steps
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.sampling_types import SamplingTask
 from d4orm_planners.sampling.loop import DenoisingPlanner, standard_normal
 from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, Credit, DenoisingConfig
@@ -56,7 +56,7 @@ class DeformingPlanner(DenoisingPlanner):
 
     config: DeformationConfig
 
-    def stages(self, search: Search) -> list[tuple[FloatArray, int]]:
+    def stages(self, search: SolveRun) -> list[tuple[FloatArray, int]]:
         """See :meth:`SamplingPlanner.stages`."""
         noise_scale, num_samples = self.noise_scale(), self.num_samples(search)
         early = len(noise_scale) - round(self.config.late_steps * len(noise_scale))
@@ -66,12 +66,12 @@ class DeformingPlanner(DenoisingPlanner):
         parts = [(noise_scale[:early], num_samples), (noise_scale[early:], fewer)]
         return [(scale, samples) for scale, samples in parts if len(scale)]
 
-    def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
+    def initial(self, search: SolveRun) -> tuple[FloatArray, FloatArray]:
         """See :meth:`SamplingPlanner.initial`."""
         base = self.config.continued(search.current)
         return base, self.start(search, base, search.problem.team)
 
-    def start(self, search: Search, base: FloatArray, team: Team, number: int = 0) -> FloatArray:
+    def start(self, search: SolveRun, base: FloatArray, team: Team, number: int = 0) -> FloatArray:
         """``U_N`` of a deformation of ``base``, a team's controls, as a mean to draw samples around, in its shape.
 
         ``number`` tells the deformations of one iteration apart.
@@ -94,23 +94,23 @@ class D4orm(DeformingPlanner):
     presets: ClassVar = {"paper": PAPER_DEFORMATION, "tuned": {**PAPER_DEFORMATION, **TUNED["d4orm"]}}
     config: D4ormConfig
 
-    def task(self, search: Search, base: FloatArray) -> SamplingTask:
+    def task(self, search: SolveRun, base: FloatArray) -> SamplingTask:
         """See :meth:`SamplingPlanner.task`."""
         task = super().task(search, base)
         return replace(task, credit="team") if self.in_fallback(search) else task
 
-    def num_samples(self, search: Search) -> int:
+    def num_samples(self, search: SolveRun) -> int:
         """See :meth:`SamplingPlanner.num_samples`."""
         samples = self.config.num_samples
         return FALLBACK_SAMPLE_FACTOR * samples if self.in_fallback(search) else samples
 
-    def stages(self, search: Search) -> list[tuple[FloatArray, int]]:
+    def stages(self, search: SolveRun) -> list[tuple[FloatArray, int]]:
         """See :meth:`SamplingPlanner.stages`."""
         if self.in_fallback(search):
             return [(self.noise_scale(), self.num_samples(search))]
         return super().stages(search)
 
-    def in_fallback(self, search: Search) -> bool:
+    def in_fallback(self, search: SolveRun) -> bool:
         """Return whether ``"alternate"`` has stagnated, and draws more samples for the team's reward."""
         alternating = self.config.credit == "alternate"
         return alternating and search.iteration // FALLBACK_PERIOD % 2 == 1 and not search.best.solved

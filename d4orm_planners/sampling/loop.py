@@ -18,7 +18,7 @@ from d4orm_env.core.seeds import Stream
 from d4orm_env.core.team import Team
 from d4orm_planners.base.conflict_groups import Groups, components, conflicts
 from d4orm_planners.base.planner import Iteration, Planner, State
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
 from d4orm_planners.sampling.schedule import alpha_bar
 from d4orm_planners.sampling.settings import DenoisingConfig, SamplingConfig
@@ -40,10 +40,10 @@ class SamplingPlanner(Planner):
         """The method's weights, and how it adapts its noise."""
 
     @abstractmethod
-    def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
+    def initial(self, search: SolveRun) -> tuple[FloatArray, FloatArray]:
         """``(base, mean)``, each ``(H, K, m)``: samples are drawn around ``mean`` on top of ``base``."""
 
-    def task(self, search: Search, base: FloatArray) -> SamplingTask:
+    def task(self, search: SolveRun, base: FloatArray) -> SamplingTask:
         """What this iteration samples and scores."""
         credit = self.config.credit
         if credit == "alternate":
@@ -52,20 +52,20 @@ class SamplingPlanner(Planner):
             credit = "robot"
         return SamplingTask(search.problem, base, credit=credit, penalty=self.config.penalty)
 
-    def num_samples(self, search: Search) -> int:
+    def num_samples(self, search: SolveRun) -> int:
         """``M`` of this iteration."""
         del search
         return self.config.num_samples
 
-    def stages(self, search: Search) -> list[tuple[FloatArray, int]]:
+    def stages(self, search: SolveRun) -> list[tuple[FloatArray, int]]:
         """The steps of an iteration, in parts that each have their number of samples: ``(noise scale, M)``."""
         return [(self.noise_scale(), self.num_samples(search))]
 
-    def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
+    def iterate(self, search: SolveRun, state: State) -> tuple[State, Iteration]:
         """See :meth:`Planner.iterate`."""
         return state, self.run(search)
 
-    def run(self, search: Search) -> Iteration:
+    def run(self, search: SolveRun) -> Iteration:
         """One run of the sampling loop over the whole team."""
         base, mean = self.initial(search)
         task, rules = self.task(search, base), self.rules()
@@ -85,7 +85,7 @@ class SamplingPlanner(Planner):
         return Iteration(controls, num_steps, excluded)
 
 
-def conflict_groups(search: Search) -> Groups:
+def conflict_groups(search: SolveRun) -> Groups:
     """The robots that are in conflict with each other in the present candidate, directly or by others."""
     problem = search.problem
     positions = search.current.trajectory.positions
@@ -111,7 +111,7 @@ class DenoisingPlanner(SamplingPlanner):
         return noise / np.float32(np.sqrt(final))
 
 
-def standard_normal(search: Search, team: Team, num_steps: int, number: int = 0) -> FloatArray:
+def standard_normal(search: SolveRun, team: Team, num_steps: int, number: int = 0) -> FloatArray:
     """``(H, K, m)`` standard normal controls of a team, in its units, for the start of a run of this iteration."""
     generator = np.random.default_rng(search.iteration_seed(Stream.DEFORMATION_START, number))
     return portable.standard_normal(generator, (num_steps, *team.control_units.shape)) * team.control_units

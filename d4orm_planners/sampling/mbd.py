@@ -9,7 +9,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_planners.base.settings import Count, Steps
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.sampling.loop import DenoisingPlanner, standard_normal
 from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, DenoisingConfig
 from d4orm_planners.sampling.tuned import TUNED
@@ -30,11 +30,11 @@ class MBD(DenoisingPlanner):
     config_class: ClassVar[type[DenoisingConfig]] = MBDConfig
     presets: ClassVar = {"paper": {**PAPER, "num_steps": 10_000}, "tuned": {**PAPER, **TUNED["mbd"]}}
 
-    def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
+    def initial(self, search: SolveRun) -> tuple[FloatArray, FloatArray]:
         """See :meth:`SamplingPlanner.initial`: the controls themselves are denoised, not a deformation."""
         return np.zeros_like(search.current.controls), self.first_mean(self.noisy_controls(search))
 
-    def noisy_controls(self, search: Search) -> FloatArray:
+    def noisy_controls(self, search: SolveRun) -> FloatArray:
         """``U_N`` of this iteration, ``(H, K, m)``."""
         return standard_normal(search, search.problem.team, search.problem.horizon)
 
@@ -52,6 +52,6 @@ class IterativeMBD(MBD):
     presets: ClassVar = {"paper": PAPER, "tuned": {**PAPER, **TUNED["i-mbd"]}}
     config: IterativeMBDConfig
 
-    def noisy_controls(self, search: Search) -> FloatArray:
+    def noisy_controls(self, search: SolveRun) -> FloatArray:
         """The last result, or noise in the first iteration."""
         return self.config.continued(search.current) if search.iteration else super().noisy_controls(search)

@@ -9,7 +9,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_planners.base.settings import Positive, ShareOrNone
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.sampling_types import SamplingRules
 from d4orm_planners.sampling.loop import SamplingPlanner
 from d4orm_planners.sampling.schedule import constant
@@ -51,7 +51,7 @@ class MPPI(SamplingPlanner):
         """See :meth:`SamplingPlanner.noise_scale`."""
         return constant(self.config.num_steps, self.config.sigma)
 
-    def initial(self, search: Search) -> tuple[FloatArray, FloatArray]:
+    def initial(self, search: SolveRun) -> tuple[FloatArray, FloatArray]:
         """See :meth:`SamplingPlanner.initial`."""
         base = self.config.continued(search.current)
         return base, np.zeros_like(base)

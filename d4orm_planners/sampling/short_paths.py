@@ -15,7 +15,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import Floats
 from d4orm_env.core.problem import Problem
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.sampling_types import SamplingTask
 
 SHORT = 5.0
@@ -24,7 +24,7 @@ SLACK, SLACK_GROWTH = 2.0, 0.2
 """Times the drive that samples look ahead at first, and how much more with every iteration: it may take longer."""
 
 
-def on_short_paths(task: SamplingTask, search: Search) -> SamplingTask:
+def on_short_paths(task: SamplingTask, search: SolveRun) -> SamplingTask:
     """The task itself, unless all robots' paths are short: then one of fewer steps, with rewards for such paths.
 
     Where robots do not stay at their goals by themselves all steps count, and it is the task itself too.

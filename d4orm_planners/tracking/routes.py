@@ -53,7 +53,7 @@ class Routes(NamedTuple):
         return [slice(low, high) for low, high in pairwise(self.first)]
 
 
-class Stops(NamedTuple):
+class Corners(NamedTuple):
     """Corners of ways, one robot's after another's, each from its start on.
 
     Attributes:

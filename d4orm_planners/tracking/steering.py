@@ -137,7 +137,7 @@ def by_model(problem: Problem) -> Iterator[tuple[Model, list[int]]]:
 
 
 @dataclass(frozen=True)
-class Drives:
+class Rollouts:
     """Ways that robots could take, each robot alone: ``R`` robots, ``V`` ways each.
 
     Attributes:
@@ -160,7 +160,7 @@ class Drives:
 
 def drives(
     problem: Problem, states: FloatArray, controls: FloatArray, switch_times: ArrayLike, vias: ArrayLike | None = None
-) -> Drives:
+) -> Rollouts:
     """Follow the controls up to a time, and from there drive straight from point to point and on to the goal.
 
     At :data:`NEAR_VIA` from a point a robot turns to the next one.
@@ -174,7 +174,7 @@ def drives(
     """
     # Here, because importing numba takes long.
     from d4orm_env.engine.threads import Threads, available_cores
-    from d4orm_planners.tracking.straight_drives import DrivenWays, DriveRules, drive_kernel
+    from d4orm_planners.tracking.straight_drives import DriveOutputs, DriveRules, drive_kernel
 
     switch, arrays = np.asarray(switch_times, np.int64), problem.arrays
     num_steps, dimension = problem.horizon, problem.dimension
@@ -186,12 +186,12 @@ def drives(
     near = NEAR_VIA * problem.team.largest_radius
     rules = DriveRules(arrays.time_step, docking, arrays.docks, np.float32(near * near))
     given_x, given_u = (np.ascontiguousarray(rows.swapaxes(0, 1), np.float32) for rows in (states, controls))
-    ways = DrivenWays(arrays.limits, problem.goal, given_x, given_u, switch, np.ascontiguousarray(points))
+    ways = DriveOutputs(arrays.limits, problem.goal, given_x, given_u, switch, np.ascontiguousarray(points))
     threads = Threads(available_cores())
     for model, robots in by_model(problem):
         kernel, index = drive_kernel(model.name), np.array(robots)
         threads.over(len(index), lambda part: kernel(rules, ways, index[part[0] : part[1]], u, x, arrived))  # noqa: B023
-    return Drives(np.moveaxis(u, 2, 0), np.moveaxis(x, 2, 0), arrived, dimension)
+    return Rollouts(np.moveaxis(u, 2, 0), np.moveaxis(x, 2, 0), arrived, dimension)
 
 
 def prepare_drives(problem: Problem) -> None:
@@ -202,7 +202,7 @@ def prepare_drives(problem: Problem) -> None:
         straight_drives(problem)
 
 
-def straight_drives(problem: Problem) -> Drives:
+def straight_drives(problem: Problem) -> Rollouts:
     """Drive from the start straight to the goal: a single way for every robot."""
     return drives(problem, *standing(problem), np.zeros((problem.num_robots, 1), int))
 

@@ -38,7 +38,7 @@ class DriveRules(NamedTuple):
     near2: np.float32
 
 
-class LoneRobot(NamedTuple):
+class RobotSpec(NamedTuple):
     """A robot that drives as if nobody else were there.
 
     Attributes:
@@ -58,14 +58,14 @@ class LoneRobot(NamedTuple):
     start: FloatArray
 
     @classmethod
-    def of(cls, problem: Problem, robot: int) -> LoneRobot:
+    def of(cls, problem: Problem, robot: int) -> RobotSpec:
         """A robot of a team."""
         arrays, goal, start = problem.arrays, problem.goal[robot], problem.start[robot]
         docking = np.array([arrays.squared_goal_radius, arrays.squared_goal_speed])
         return cls(arrays.time_step, docking, arrays.docks, arrays.limits[robot], goal, start)
 
 
-class DrivenWays(NamedTuple):
+class DriveOutputs(NamedTuple):
     """``V`` ways of each of ``R`` robots: as given at first, then straight by points to the goal.
 
     Attributes:
@@ -86,7 +86,7 @@ class DrivenWays(NamedTuple):
 
 
 @cache
-def drive_kernel(name: str) -> Kernel[[DriveRules, DrivenWays, IntArray, FloatArray, FloatArray, BoolArray], None]:
+def drive_kernel(name: str) -> Kernel[[DriveRules, DriveOutputs, IntArray, FloatArray, FloatArray, BoolArray], None]:
     """The compiled drives of robots of the model with this name, each as if nobody else were there.
 
     The kernel fills, for robots of these numbers, controls ``u`` ``(R, V, H, m)``, left alone once docked,
@@ -100,7 +100,7 @@ def drive_kernel(name: str) -> Kernel[[DriveRules, DrivenWays, IntArray, FloatAr
 
     @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
     def drive(
-        rules: DriveRules, ways: DrivenWays, robots: IntArray, u: FloatArray, x: FloatArray, arrived: BoolArray
+        rules: DriveRules, ways: DriveOutputs, robots: IntArray, u: FloatArray, x: FloatArray, arrived: BoolArray
     ) -> None:
         dt, docking = rules.time_step, (rules.docking[0], rules.docking[1], rules.docks)
         h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])

@@ -17,8 +17,8 @@ from d4orm_env.engine.stepping import make_stepper, models_key
 from d4orm_planners.tracking import path_drives, pursuit
 from d4orm_planners.tracking.path_drives import RESERVE
 from d4orm_planners.tracking.pursuit import point_ahead, point_reached, square_to, steering
-from d4orm_planners.tracking.routes import Route, Stops
-from d4orm_planners.tracking.straight_drives import LoneRobot
+from d4orm_planners.tracking.routes import Corners, Route
+from d4orm_planners.tracking.straight_drives import RobotSpec
 
 SOURCES = path_drives.SOURCES + fingerprint((path_drives,))
 
@@ -82,10 +82,10 @@ def pace_to(route: Timed, step: int, at: int, corner: int, stop: float, dt: np.f
 
 
 @cache
-def timed_kernel(name: str) -> Kernel[[LoneRobot, Timed, bool, FloatArray, Floats], int]:
+def timed_kernel(name: str) -> Kernel[[RobotSpec, Timed, bool, FloatArray, Floats], int]:
     """The compiled drive of a robot of the model with this name along a :class:`Timed` route.
 
-    Args of the kernel: the :class:`~d4orm_planners.tracking.straight_drives.LoneRobot`, the route, whether the robot backs up, see
+    Args of the kernel: the :class:`~d4orm_planners.tracking.straight_drives.RobotSpec`, the route, whether the robot backs up, see
     :func:`~d4orm_planners.tracking.pursuit.gear_towards`, ``controls`` ``(T, m)`` and ``places`` ``(T + 1, 3)``,
     output. It returns the step of arrival, ``T + 1`` for none.
     """
@@ -94,7 +94,7 @@ def timed_kernel(name: str) -> Kernel[[LoneRobot, Timed, bool, FloatArray, Float
     n, m, d, num_limits = model.state_size, model.control_size, model.dimension, len(model.limit_names)
 
     @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
-    def drive(robot: LoneRobot, route: Timed, backs_up: bool, controls: FloatArray, places: Floats) -> int:
+    def drive(robot: RobotSpec, route: Timed, backs_up: bool, controls: FloatArray, places: Floats) -> int:
         dt, docks, rules = robot.time_step, robot.docks, (robot.docking[0], robot.docking[1], robot.docks)
         h, own = transition.TimeStep(dt[0], dt[1], dt[2], dt[3]), to_fixed_tuple(robot.limits, num_limits)
         goal, x = to_fixed_tuple(robot.goal, d), to_fixed_tuple(robot.start, n)
@@ -142,7 +142,7 @@ def drive_by_clock(
     problem: Problem,
     robot: int,
     route: Route,
-    stops: Stops,
+    stops: Corners,
     steps: int,
     *,
     hurrying: bool = False,
@@ -178,5 +178,5 @@ def drive_by_clock(
     )
     timed = Timed(route.points, arcs, paces, route.bends, arcs[at], departs, arrives, sight, np.float32(beyond), size)
     drive = timed_kernel(problem.team.models[robot])
-    arrival = drive(LoneRobot.of(problem, robot), timed, backs_up, controls, places)
+    arrival = drive(RobotSpec.of(problem, robot), timed, backs_up, controls, places)
     return controls, places, int(arrival)

@@ -11,7 +11,7 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.engine.types import Engine
 from d4orm_planners.base.candidate import Candidate
-from d4orm_planners.d_d4orm.evaluator import Judge
+from d4orm_planners.d_d4orm.evaluator import Evaluator
 from d4orm_planners.d_d4orm.node import Node, Task
 from d4orm_planners.d_d4orm.node_events import Event
 from d4orm_planners.d_d4orm.transport import Transport
@@ -97,7 +97,7 @@ class Round:
         nodes, own = len(agenda.members), agenda.members.index(robot)
         seed = derived_seed(self._mission.seed, Stream.TAKEOVER, agenda.takeover)
         task = Task(nodes, seed, agenda.guess, planning.selection, planning.k)
-        planner, judge = planning.node_planners(nodes)[own], Judge(self._engine, agenda.problem)
+        planner, judge = planning.node_planners(nodes)[own], Evaluator(self._engine, agenda.problem)
         return Node(own, task, planner, self._team, judge, sequence=SEQUENCE * agenda.number, observer=self._observe)
 
     def _observe(self, event: Event) -> None:

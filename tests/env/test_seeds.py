@@ -15,7 +15,7 @@ from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.scenarios.settings import Settings
 from d4orm_planners import make_policy, run_episode
 from d4orm_planners.base.planner_registry import make_planner
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d_d4orm.node import node_seed
 
 SEEDS = (0, 1, 2, 3, 2**31, 2**32, 2**32 + 1, 2**63 - 1, 2**64)
@@ -33,7 +33,7 @@ def test_no_two_searches_have_a_seed_in_common() -> None:
     problem, planner = hop_problem(1), make_planner("d4orm", engine="cpu")
     seeds: list[int] = []
     for solve, node in product(range(4), range(4)):
-        search = Search(planner, problem, node_seed(solve, node), None)
+        search = SolveRun(planner, problem, node_seed(solve, node), None)
         for search.iteration in range(6):
             seeds += [search.iteration_seed(stream, number) for stream in Stream for number in range(4)]
     assert len(set(seeds)) == len(seeds)
@@ -75,7 +75,7 @@ def test_control_loops_of_neighbouring_seeds_share_no_noise(monkeypatch: pytest.
 
 
 def test_repairs_of_one_iteration_start_apart() -> None:
-    search = Search(make_planner("d4orm-d", engine="cpu", random_start=True), hop_problem(2), 0, None)
+    search = SolveRun(make_planner("d4orm-d", engine="cpu", random_start=True), hop_problem(2), 0, None)
     base = np.zeros((30, 2, 2), np.float32)
     starts = [search.planner.start(search, base, search.problem.team, number) for number in range(3)]
     assert not any(np.allclose(a, b) for a, b in ((starts[0], starts[1]), (starts[1], starts[2])))

@@ -16,7 +16,7 @@ from d4orm_env.core.world import World
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
-from d4orm_planners.baselines.amswarm.alternation import Guess, Surroundings, alternate
+from d4orm_planners.baselines.amswarm.alternation import Guess, Neighbourhood, alternate
 from d4orm_planners.baselines.amswarm.bernstein import first_coefficients, sample_basis
 from d4orm_planners.baselines.amswarm.planner import AMSwarmConfig
 from d4orm_planners.baselines.amswarm.swarm import make_method
@@ -52,7 +52,7 @@ def test_the_first_coefficients_are_the_present_state() -> None:
 
 
 def plainly(
-    config: AMSwarmConfig, dt: float, bodies: Surroundings, limits: Any, goal: Any, begin: Any, guess: Guess
+    config: AMSwarmConfig, dt: float, bodies: Neighbourhood, limits: Any, goal: Any, begin: Any, guess: Guess
 ) -> Any:
     """The coefficients of robot 0 among discs, with all constraints as rows of one matrix, one axis at a time."""
     basis = sample_basis(config.degree, config.lookahead, dt)
@@ -95,7 +95,7 @@ def test_the_alternation_is_the_publications() -> None:
     dt, goal, limits = 0.2, np.array([3.0, 0.4]), np.array([1.0, 1.0])
     others = np.linspace([2.0, 0.3], [0.5, 0.1], 12)
     boxes = np.array([[0.9, -0.4, 0.9, -0.4, 0.25]])
-    bodies = Surroundings(
+    bodies = Neighbourhood(
         np.stack([others, others]), np.array([0.2, 0.3]), 0.05, boxes, np.full((2, 2), np.inf) * [[-1], [1]]
     )
     begin = first_coefficients(config.degree, 12 * dt, np.zeros(2), np.array([0.5, 0.1]), np.array([0.1, 0.0]))

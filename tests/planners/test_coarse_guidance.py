@@ -13,17 +13,17 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.base.plan import failed_robots
-from d4orm_planners.base.solve import Search
-from d4orm_planners.base.working_plan import TeamPaths
+from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.d4orm_c2f.coarse_plan import (
-    Guidance,
+    CoarsePlan,
     coarse_problem,
     interpolate,
     nearest_indices,
     rest_of,
     subgoal_indices,
 )
-from d4orm_planners.d4orm_c2f.following import STUCK_AFTER, STUCK_WITHIN, Patience, keep_time
+from d4orm_planners.d4orm_c2f.following import STUCK_AFTER, STUCK_WITHIN, StagnationMonitor, keep_time
 from d4orm_planners.d4orm_c2f.lookahead import LEAST, within_sight
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
@@ -95,11 +95,11 @@ def test_who_meets_whom_is_looked_for_at_intervals_too(interval: int, meets: boo
     apart = np.array([[0, 0], [0, 5], [0, 10]], np.float32)
     places = np.repeat(apart[None], 11, axis=0)
     places[[2, 4, 5], 1] = places[[2, 4, 5], 0] + [0.1, 0]
-    search = Search(D4ormD(D4ormDConfig(engine="cpu")), problem, 0, check_interval=interval)
+    search = SolveRun(D4ormD(D4ormDConfig(engine="cpu")), problem, 0, check_interval=interval)
     states = np.concatenate([places, np.zeros_like(places)], axis=2)
     home = np.ones((11, 3), bool)
     here = search.current.trajectory
-    team = TeamPaths(search, replace(here, states=states, positions=places, arrived=home))
+    team = WorkingPlan(search, replace(here, states=states, positions=places, arrived=home))
     faults, first = team.faults(np.arange(3))
     np.testing.assert_array_equal(faults, [meets, meets, 0])
     assert team.conflicts() == ((frozenset({1}), frozenset({0}), frozenset()) if meets else (frozenset(),) * 3)
@@ -134,7 +134,7 @@ def test_the_rest_begins_at_the_next_coarse_step(index: int, step: int) -> None:
     coarse = coarse_problem(problem, 2)
     controls = np.random.default_rng(1).uniform(-0.5, 0.5, (15, 2, 2)).astype(np.float32)
     plan = get_sampling_engine("cpu").rollout(coarse, controls)
-    guidance = Guidance(
+    guidance = CoarsePlan(
         problem=coarse,
         controls=plan.controls,
         states=plan.states,
@@ -186,7 +186,7 @@ def joint(problem: Any, states: Any, steps: int = 0) -> JointState:
 
 def test_who_does_not_get_on_is_stuck() -> None:
     problem = hop_problem(3)
-    patience, indices = Patience(joint(problem, problem.start)), np.zeros(3, int)
+    patience, indices = StagnationMonitor(joint(problem, problem.start)), np.zeros(3, int)
     for step in range(1, STUCK_AFTER + 2):
         indices[2] = step
         # The second one has to wait where it is, and the third one moves.

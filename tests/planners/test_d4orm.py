@@ -11,7 +11,7 @@ from planner_support import hop_problem, walled_in_problem
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.sampling_types import SamplingTask
 from d4orm_planners.engine.select import get_sampling_engine
 
@@ -134,7 +134,7 @@ def test_robot_credit_learns_faster_than_team_credit() -> None:
     gained = {}
     for credit in ("team", "robot"):
         planner = make_planner("d4orm", engine="cpu", num_samples=256, num_steps=20, credit=credit)
-        search = Search(planner, problem, 0, None)
+        search = SolveRun(planner, problem, 0, None)
         task = SamplingTask(problem, search.current.controls, collisions=False, credit=credit)
         result = search.engine.denoise(task, planner.rules(), task.base, planner.noise_scale(), 256, 0)
         controls = search.engine.rollout(problem, task.base + result.mean)
@@ -158,7 +158,7 @@ def test_who_pays_for_both_sides_of_a_contact_makes_way() -> None:
 
 @pytest.mark.parametrize("name", ["d4orm", "i-mbd", "mbd", "mppi", "cem", "d4orm-d"])
 def test_a_violation_costs_what_is_asked(name: str) -> None:
-    search = Search(make_planner(name, engine="cpu", penalty=4.0), hop_problem(2), 0, None)
+    search = SolveRun(make_planner(name, engine="cpu", penalty=4.0), hop_problem(2), 0, None)
     # D4orm-D's is that of its repairs.
     assert search.planner.task(search, search.current.controls).penalty == (1.0 if name == "d4orm-d" else 4.0)
 

@@ -24,7 +24,7 @@ from d4orm_env.verify import verify
 from d4orm_planners import Episode, make_policy, run_episode
 from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.coarse_plan import coarse_problem
-from d4orm_planners.d4orm_c2f.coarse_plan_tracker import Guide
+from d4orm_planners.d4orm_c2f.coarse_plan_tracker import CoarsePlanTracker
 from d4orm_planners.d4orm_c2f.fine_plan import Window
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
@@ -323,14 +323,16 @@ def replanned(
 ) -> list[tuple[JointState, Any, int, Any, int]]:
     """Where it was replanned, from which controls and with how many iterations, and the guidance until then."""
     calls = []
-    plan = Guide.plan
+    plan = CoarsePlanTracker.plan
 
-    def coarse_plan(self: Guide, joint: JointState, docked: Any, initial: Any, iterations: int, *more: Any) -> Any:
+    def coarse_plan(
+        self: CoarsePlanTracker, joint: JointState, docked: Any, initial: Any, iterations: int, *more: Any
+    ) -> Any:
         if initial is not None:
             calls.append((joint, initial.copy(), iterations, self.guidance, self.index))
         return plan(self, joint, docked, initial, iterations, *more)
 
-    monkeypatch.setattr(Guide, "plan", coarse_plan)
+    monkeypatch.setattr(CoarsePlanTracker, "plan", coarse_plan)
     world = navigation_v0.parallel_env(**env)
     observations, _ = world.reset(seed=0)
     policy.reset(world, seed=0)

@@ -15,7 +15,7 @@ from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import make_planner
 from d4orm_planners.base.conflict_groups import conflicts, failure_groups, reconnected
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
 from d4orm_planners.engine.sampling_types import SamplingResult, SamplingTask
@@ -64,9 +64,9 @@ def test_groups_solve_a_circle(seed: int) -> None:
     assert_solves({"scenario": "circle", "num_robots": 12}, seed, decoupling="groups")
 
 
-def search_of(problem: Problem, iterations: int = 0, **config: Any) -> Search:
+def search_of(problem: Problem, iterations: int = 0, **config: Any) -> SolveRun:
     """A search after some iterations."""
-    search = Search(make_planner("d4orm-d", engine="cpu", **config), problem, 0, None)
+    search = SolveRun(make_planner("d4orm-d", engine="cpu", **config), problem, 0, None)
     for _ in range(iterations):
         search.advance()
     return search
@@ -137,7 +137,7 @@ def test_a_repair_that_makes_things_worse_is_not_taken_over() -> None:
     problem = Problem(Team(("holonomic2d",) * 2), start, [[4, 0], [1.5, 0]], World(circles=ring), horizon=60)
     controls = np.zeros((60, 2, 2), np.float32)
     controls[:, 1, 1] = 0.5
-    search = Search(make_planner("d4orm-d", engine="cpu"), problem, 0, controls, Astray())
+    search = SolveRun(make_planner("d4orm-d", engine="cpu"), problem, 0, controls, Astray())
     before = search.current
     assert before.failed.tolist() == [True, False]
     search.advance()
@@ -170,7 +170,7 @@ def test_robots_that_were_repaired_in_vain_are_repaired_jointly_and_every_other_
     engine = Recorded()
     towards = np.zeros((60, 2, 2), np.float32)
     towards[:, :, 0] = [0.2, -0.2]
-    search = Search(make_planner("d4orm-d", engine="cpu"), problem, 0, towards, engine)
+    search = SolveRun(make_planner("d4orm-d", engine="cpu"), problem, 0, towards, engine)
     for _ in range(7):
         search.advance()
         assert search.current.failed.all()
@@ -210,7 +210,7 @@ def test_given_controls_are_repaired_rather_than_thrown_away() -> None:
     assert drives.failed.any()
     assert not drives.failed.all()
     planner = make_planner("d4orm-d", engine="cpu", start="team", shorten=False)
-    search = Search(planner, problem, 0, drives.controls)
+    search = SolveRun(planner, problem, 0, drives.controls)
     search.advance()
     assert (search.current.controls == drives.controls).all(axis=(0, 2))[~drives.failed].all()
 

@@ -28,10 +28,10 @@ from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.base.candidate import evaluate_controls
 from d4orm_planners.base.planner import Iteration, Planner
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d_d4orm import evaluator as judge_module
 from d4orm_planners.d_d4orm import messages, node
-from d4orm_planners.d_d4orm.evaluator import Judge, Stopped
+from d4orm_planners.d_d4orm.evaluator import Evaluator, Stopped
 from d4orm_planners.d_d4orm.inbox import Inbox
 from d4orm_planners.d_d4orm.messages import KINDS, MAGIC, Message, MessageError, decode, encode
 from d4orm_planners.d_d4orm.node import Node, Task, node_seed
@@ -263,7 +263,7 @@ def test_collecting_waits_for_a_message_or_the_end() -> None:
 def inbox() -> tuple[Inbox, Any]:
     network = LocalNetwork()
     own, other = network.join(), network.join()
-    return Inbox(Judge(get_sampling_engine("cpu"), PROBLEM), own, 3, own=0), other
+    return Inbox(Evaluator(get_sampling_engine("cpu"), PROBLEM), own, 3, own=0), other
 
 
 def test_what_is_no_message_is_dropped_counted_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -306,7 +306,7 @@ def test_a_claim_is_false_where_either_of_its_parts_is(share: float, feasible: b
     assert found.solved
     network = LocalNetwork()
     own, other = network.join(), network.join()
-    box = Inbox(Judge(get_sampling_engine("cpu"), near), own, 2, own=0)
+    box = Inbox(Evaluator(get_sampling_engine("cpu"), near), own, 2, own=0)
     reward = float(found.trajectory.rewards.mean())
     other.publish(encode(message(controls=controls, reward=share * reward, feasible=feasible), near))
     (report,) = box.receive()
@@ -344,7 +344,7 @@ def test_what_is_told_again_is_not_judged_again(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_what_a_process_has_made_is_judged_once() -> None:
-    judge = Judge(get_sampling_engine("cpu"), PROBLEM, remembered=2)
+    judge = Evaluator(get_sampling_engine("cpu"), PROBLEM, remembered=2)
     made = [judge.own(message().controls * scale) for scale in (0.25, 0.5, 1.0)]
     assert judge.received(made[2].controls.copy()) is made[2]
     assert judge.received(made[1].controls) is made[1]
@@ -356,14 +356,14 @@ def test_what_a_process_has_made_is_judged_once() -> None:
     assert judge.received(changed).rank != made[2].rank
 
 
-def alone(planner: Planner, judge: Judge | None = None) -> Node:
+def alone(planner: Planner, judge: Evaluator | None = None) -> Node:
     """A network's only node."""
     task = Task(1, 0, None, "max", 1)
-    return Node(0, task, planner, LocalNetwork().join(), judge or Judge(get_sampling_engine("cpu"), PROBLEM))
+    return Node(0, task, planner, LocalNetwork().join(), judge or Evaluator(get_sampling_engine("cpu"), PROBLEM))
 
 
 def test_the_word_to_stop_ends_judging_and_denoising() -> None:
-    judge = Judge(get_sampling_engine("cpu"), PROBLEM, remembered=1)
+    judge = Evaluator(get_sampling_engine("cpu"), PROBLEM, remembered=1)
     judge.stop.set()
     with pytest.raises(Stopped):
         judge.own(message().controls)
@@ -380,10 +380,10 @@ def test_a_node_that_closes_lets_its_planner_finish() -> None:
     finished = []
 
     class Finishing(D4orm):
-        def init(self, search: Search) -> str:
+        def init(self, search: SolveRun) -> str:
             return "begun"
 
-        def finish(self, search: Search, state: str) -> None:
+        def finish(self, search: SolveRun, state: str) -> None:
             finished.append((search, state))
 
     node = alone(Finishing(D4ormConfig(num_samples=2, num_steps=1)))
@@ -422,11 +422,11 @@ def assert_verified(plan: Plan) -> None:
     assert verify(plan.problem, plan.controls).ok
 
 
-def spoil(monkeypatch: pytest.MonkeyPatch, seed: int, act: Callable[[Search], Any]) -> None:
+def spoil(monkeypatch: pytest.MonkeyPatch, seed: int, act: Callable[[SolveRun], Any]) -> None:
     """Have node 1 of solves with this seed do something before every iteration."""
     iterate = D4orm.iterate
 
-    def spoilt(self: D4orm, search: Search, state: Any) -> tuple[Any, Iteration]:
+    def spoilt(self: D4orm, search: SolveRun, state: Any) -> tuple[Any, Iteration]:
         if search.seed == node_seed(seed, 1):
             act(search)
         return iterate(self, search, state)
@@ -459,7 +459,7 @@ def test_a_single_node_is_the_planner_that_it_runs(preset: str | None) -> None:
 @pytest.mark.parametrize("clip", [True, False])
 def test_nodes_search_by_themselves_and_then_go_on_from_a_common_base(clip: bool) -> None:
     planner = distributed(nodes=3, selection="max", clip_between_iterations=clip)
-    search = Search(planner, walled_in_problem(), 0, None)
+    search = SolveRun(planner, walled_in_problem(), 0, None)
     search.advance()
     nodes = search.state.crew.alive
     made = [one.candidate for one in nodes]
@@ -487,7 +487,7 @@ def test_it_solves(mode: str, inner: str) -> None:
 def test_a_node_that_fails_does_not_take_the_others_down(
     mode: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def fail(search: Search) -> None:
+    def fail(search: SolveRun) -> None:
         raise ZeroDivisionError("the node is broken")
 
     spoil(monkeypatch, 5, fail)
@@ -503,7 +503,7 @@ def test_a_node_that_fails_does_not_take_the_others_down(
 
 @MODE
 def test_when_all_nodes_have_failed_the_error_says_so(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(self: D4orm, search: Search, state: Any) -> Any:
+    def fail(self: D4orm, search: SolveRun, state: Any) -> Any:
         raise ZeroDivisionError("broken")
 
     monkeypatch.setattr(D4orm, "iterate", fail)
@@ -648,7 +648,7 @@ def test_an_observer_is_told_what_a_node_does() -> None:
     planner = D4orm(D4ormConfig(engine="cpu", num_samples=64, num_steps=5))
     events: list[Event] = []
     controls = np.zeros((problem.horizon, 2, 2), np.float32)
-    task, judge = Task(2, 0, controls, "max", 1), Judge(get_sampling_engine("cpu"), problem)
+    task, judge = Task(2, 0, controls, "max", 1), Evaluator(get_sampling_engine("cpu"), problem)
     nodes = [
         Node(i, task, planner, network.join(), judge, observer=observer)
         for i, observer in enumerate((events.append, None))
@@ -671,7 +671,7 @@ def test_an_observer_is_told_what_a_node_does() -> None:
 def test_settling_says_whether_all_others_have_a_solution_as_good() -> None:
     problem, network = hop_problem(2), LocalNetwork()
     task = Task(2, 0, distributed().solve(problem).controls, "max", 1)
-    judge = Judge(get_sampling_engine("cpu"), problem)
+    judge = Evaluator(get_sampling_engine("cpu"), problem)
     first, second = (Node(i, task, cheap_planner("d4orm"), network.join(), judge) for i in range(2))
     assert not first.settle(0), "nobody has told it anything"
     assert second.settle(0)
@@ -683,7 +683,7 @@ def test_an_asynchronous_node_waits_once_for_one_that_is_silent(monkeypatch: pyt
     spoil(monkeypatch, 5, lambda search: release.wait(60))
     patience, enough = 3, 10
     planner = distributed(mode="async", patience=patience, num_steps=2)
-    search = Search(planner, walled_in_problem(), 5, None)
+    search = SolveRun(planner, walled_in_problem(), 5, None)
     try:
         search.advance()
         fast, silent = search.state.crew.alive
@@ -748,7 +748,7 @@ def test_the_paper_preset_is_algorithm_5_with_a_node_per_robot() -> None:
     assert (inner.num_samples, inner.num_steps, inner.credit, inner.random_start) == (2048, 100, "team", False)
     assert inner.penalty == 1.0
     assert inner.clip_between_iterations is False
-    search = Search(make_planner("d-d4orm", preset="paper", engine="cpu", num_steps=2), hop_problem(3), 0, None)
+    search = SolveRun(make_planner("d-d4orm", preset="paper", engine="cpu", num_steps=2), hop_problem(3), 0, None)
     search.advance()
     assert [one.search.planner.config.num_samples for one in search.state.crew.alive] == [683, 683, 682]
     with pytest.raises(ValueError, match="num_samples is 5 for 3 nodes together"):

@@ -14,9 +14,9 @@ from d4orm_env.core.team import Team
 from d4orm_planners import list_planners, make_planner
 from d4orm_planners.base.candidate import Candidate, evaluate_controls
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
-from d4orm_planners.base.solve import Search
-from d4orm_planners.base.working_plan import TeamPaths
-from d4orm_planners.tracking.steering import Drives, drives, standing, straight_drives
+from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.base.working_plan import WorkingPlan
+from d4orm_planners.tracking.steering import Rollouts, drives, standing, straight_drives
 
 FURTHER_IN = "d4orm_planners.base.solve.drive_further_in"
 
@@ -51,7 +51,7 @@ class Given(Planner):
 
     answer: FloatArray
 
-    def iterate(self, search: Search, state: Any) -> tuple[Any, Iteration]:
+    def iterate(self, search: SolveRun, state: Any) -> tuple[Any, Iteration]:
         return state, Iteration(self.answer)
 
 
@@ -62,7 +62,7 @@ def given(controls: FloatArray) -> Given:
 
 
 def judged(problem: Problem, controls: FloatArray) -> Candidate:
-    return evaluate_controls(Search(given(controls), problem, 0).engine, problem, controls)
+    return evaluate_controls(SolveRun(given(controls), problem, 0).engine, problem, controls)
 
 
 def test_a_candidate_knows_whom_verify_refuses() -> None:
@@ -135,7 +135,7 @@ def test_robots_that_leap_through_each_other_are_both_to_blame() -> None:
 def test_who_is_refused_is_at_fault_until_it_moves() -> None:
     problem, controls = leap()
     candidate = judged(problem, controls)
-    team = TeamPaths(Search(given(controls), problem, 0), candidate.trajectory, candidate.report)
+    team = WorkingPlan(SolveRun(given(controls), problem, 0), candidate.trajectory, candidate.report)
     faults, first = team.faults([0, 1])
     assert faults.tolist() == [1, 1]
     assert first.tolist() == [2, 2]  # they meet within the second step
@@ -144,7 +144,7 @@ def test_who_is_refused_is_at_fault_until_it_moves() -> None:
     assert team.faults([0, 1])[0].tolist() == [0, 1]
     # What it does already is no other way.
     before = team.controls.copy()
-    team.take_best([1], Drives(controls[:, [1], None], team.states[:, [1], None], np.ones((1, 1), bool), 2))
+    team.take_best([1], Rollouts(controls[:, [1], None], team.states[:, [1], None], np.ones((1, 1), bool), 2))
     assert team.faults([0, 1])[0].tolist() == [0, 1]
     np.testing.assert_array_equal(team.controls, before)
 

@@ -16,14 +16,14 @@ from d4orm_env import Problem, Team, World, make_problem, verify
 from d4orm_env.dynamics.models import MODELS
 from d4orm_planners import make_planner
 from d4orm_planners.engine.select import get_sampling_engine
-from d4orm_planners.mapf.lacam import Moves, find_moves
-from d4orm_planners.mapf.planner import leads_round
+from d4orm_planners.mapf.lacam import TeamMoves, find_moves
+from d4orm_planners.mapf.planner import needs_detour
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
 from d4orm_planners.mapf.replanning import Others, Trip, find_way
 from d4orm_planners.mapf.roadmap import Roadmap, lay_roadmap
-from d4orm_planners.mapf.roadmap_team import Driven, Replanning, drive_moves
+from d4orm_planners.mapf.roadmap_team import Replanning, TeamRollout, drive_moves
 from d4orm_planners.tracking.pursuit import gear_towards
-from d4orm_planners.tracking.routes import Stops
+from d4orm_planners.tracking.routes import Corners
 from d4orm_planners.tracking.timed_path import drive_by_clock
 
 
@@ -44,14 +44,14 @@ def corridor_with_bay(right: float = 2.0) -> Problem:
     return walled([[-2, 0], [right, 0]], [[2, 0], [-2, 0]], boxes, bounds)
 
 
-def found(problem: Problem, fineness: float = 1.0, seed: int = 0) -> tuple[Roadmap, Moves]:
+def found(problem: Problem, fineness: float = 1.0, seed: int = 0) -> tuple[Roadmap, TeamMoves]:
     roadmap = lay_roadmap(problem, fineness)
     moves = find_moves(problem, roadmap, seed, lambda: False, 3000)
     assert moves is not None
     return roadmap, moves
 
 
-def assert_moves_keep_clear(problem: Problem, roadmap: Roadmap, moves: Moves) -> None:
+def assert_moves_keep_clear(problem: Problem, roadmap: Roadmap, moves: TeamMoves) -> None:
     """One after another, each past all others where they stand at that moment."""
     at, radius = roadmap.starts.copy(), np.asarray(problem.team.radius, float)
     for robot, edge in moves.moves:
@@ -232,7 +232,7 @@ def test_a_car_follows_a_route_from_every_heading(way: Any, heading: float) -> N
     problem = Problem(Team(("car",)), start, [way[-1]], World(dimension=2), horizon=400)
     corners = np.hstack([np.array(way, float), np.zeros((len(way), 1))])
     times = np.arange(len(way)) * 40.0
-    stops = Stops(corners, np.array([0, len(way)]), np.append(-1.0, times[:-1]), times)
+    stops = Corners(corners, np.array([0, len(way)]), np.append(-1.0, times[:-1]), times)
     (route,) = make_routes(problem, stops, [0], 0.1)
     turning = problem.team.turning_radius[0]
     assert (route.bends > turning - 1e-6).all()
@@ -302,7 +302,7 @@ def test_ways_one_by_one_displace_those_in_the_way() -> None:
     problem = corridor_with_bay(right=1.0)
     replanning = Replanning(problem, lay_roadmap(problem))
     driven = replanning.one_by_one(np.random.default_rng(0), lambda: False, 200)
-    assert isinstance(driven, Driven)
+    assert isinstance(driven, TeamRollout)
     assert driven.cost(problem.horizon)[0] == 0
     assert verify(problem, driven.until(problem.horizon)).ok
 
@@ -344,7 +344,7 @@ def test_a_goal_without_a_way_is_named_at_once() -> None:
 
 @pytest.mark.parametrize(("scenario", "guided"), [("circle", False), ("four_obstacles", False), ("maze", True)])
 def test_teams_are_guided_where_obstacles_lead_far_round(scenario: str, guided: bool) -> None:
-    assert leads_round(make_problem(scenario, num_robots=8, seed=0)) == guided
+    assert needs_detour(make_problem(scenario, num_robots=8, seed=0)) == guided
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -27,7 +27,7 @@ from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.base.planner import Callback, Iteration
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d_d4orm import messages as message_module
 from d4orm_planners.d_d4orm.messages import KINDS, Message, encode
 from d4orm_planners.d_d4orm.node import node_seed
@@ -195,7 +195,7 @@ def hold(monkeypatch: pytest.MonkeyPatch, node: int) -> threading.Event:
     """A node begins no iteration before this event."""
     iterate, go = D4orm.iterate, threading.Event()
 
-    def held(self: D4orm, search: Search, state: Any) -> tuple[Any, Iteration]:
+    def held(self: D4orm, search: SolveRun, state: Any) -> tuple[Any, Iteration]:
         if search.seed == node_seed(SEED, node):
             go.wait()
         return iterate(self, search, state)
@@ -260,7 +260,7 @@ def test_what_arrives_while_a_node_hangs_is_not_lost(monkeypatch: pytest.MonkeyP
 def test_what_has_arrived_is_not_lost_with_the_planner_here(heard: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     iterate, go = D4orm.iterate, threading.Event()
 
-    def broken(self: D4orm, search: Search, state: Any) -> tuple[Any, Iteration]:
+    def broken(self: D4orm, search: SolveRun, state: Any) -> tuple[Any, Iteration]:
         if search.seed != node_seed(SEED, 1):
             return iterate(self, search, state)
         go.wait()

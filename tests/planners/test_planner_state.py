@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from planner_support import cheap_planner, hop_problem, walled_in_problem
 
-from d4orm_planners import Iteration, Planner, PlannerConfig, Search, list_planners
+from d4orm_planners import Iteration, Planner, PlannerConfig, SolveRun, list_planners
 
 
 class Counting(Planner):
@@ -20,17 +20,17 @@ class Counting(Planner):
         self.calls: list[Any] = []
         self._fails_at, self._error = fails_at, error
 
-    def init(self, search: Search) -> int:
+    def init(self, search: SolveRun) -> int:
         self.calls.append("init")
         return 0
 
-    def iterate(self, search: Search, state: int) -> tuple[int, Iteration]:
+    def iterate(self, search: SolveRun, state: int) -> tuple[int, Iteration]:
         self.calls.append(state)
         if state == self._fails_at:
             raise self._error
         return state + 1, Iteration(np.zeros_like(search.current.controls))
 
-    def finish(self, search: Search, state: int) -> None:
+    def finish(self, search: SolveRun, state: int) -> None:
         self.calls.append(("finish", state))
 
 
@@ -66,7 +66,7 @@ def test_what_needs_no_iteration_begins_nothing(solved: bool) -> None:
 
 @pytest.mark.parametrize("name", [name for name in list_planners() if name != "ipopt"])
 def test_states_are_data_that_nobody_changes(name: str) -> None:
-    search = Search(cheap_planner(name), hop_problem(2), 0)
+    search = SolveRun(cheap_planner(name), hop_problem(2), 0)
     try:
         search.advance()
         before = search.state

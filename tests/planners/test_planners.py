@@ -27,7 +27,7 @@ from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import IterationRecord, Plan, list_planners, make_planner
 from d4orm_planners.base.planner_registry import PLANNERS, describe_planner
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
 from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.sampling.loop import SamplingPlanner, standard_normal
@@ -164,7 +164,7 @@ def test_another_seed_gives_another_plan(name: str) -> None:
 
 @ALL
 def test_every_iteration_draws_its_own_numbers(name: str) -> None:
-    search = Search(cheap_planner(name), hop_problem(), 0, None)
+    search = SolveRun(cheap_planner(name), hop_problem(), 0, None)
     seeds = {search.iteration_seed(stream) for stream in Stream}
     search.advance()
     search.close()
@@ -233,7 +233,7 @@ def test_an_interrupt_within_an_iteration_returns_the_best_plan_too(name: str, m
     planner = cheap_planner(name)
     iterate = planner.iterate
 
-    def interrupted(search: Search, state: Any) -> Any:
+    def interrupted(search: SolveRun, state: Any) -> Any:
         if search.iteration == 1:
             raise KeyboardInterrupt
         return iterate(search, state)
@@ -300,7 +300,7 @@ def test_samples_that_were_left_out_are_in_the_history(name: str, monkeypatch: p
 def test_the_search_starts_from_the_controls_given(name: str) -> None:
     problem = walled_in_problem()
     given = straight_ahead(problem, 0.1)
-    search = Search(cheap_planner(name), problem, 0, given)
+    search = SolveRun(cheap_planner(name), problem, 0, given)
     base, mean = search.planner.initial(search)
     np.testing.assert_array_equal(base, given)
     assert not mean.any()
@@ -541,12 +541,12 @@ def method(name: str, **config: Any) -> Any:
     return make_planner(name, **{key: value for key, value in shared.items() if key in known}, **config)
 
 
-def start_of(name: str, problem: Problem, **config: Any) -> Search:
+def start_of(name: str, problem: Problem, **config: Any) -> SolveRun:
     given = np.random.default_rng(7).normal(0, 0.5, (problem.horizon, problem.num_robots, problem.control_size))
-    return Search(method(name, **config), problem, 11, given)
+    return SolveRun(method(name, **config), problem, 11, given)
 
 
-def rewards_of(search: Search, base: np.ndarray) -> Any:
+def rewards_of(search: SolveRun, base: np.ndarray) -> Any:
     """Rewards of samples by rolling each of them out alone: the team's for team credit, else every robot's."""
     engine, problem = get_sampling_engine("cpu"), search.problem
 
@@ -558,12 +558,12 @@ def rewards_of(search: Search, base: np.ndarray) -> Any:
     return reward
 
 
-def draws_of(search: Search) -> Any:
+def draws_of(search: SolveRun) -> Any:
     seed = search.iteration_seed()
     return lambda step: engine_noise(search.problem, seed, step, SAMPLES).astype(np.float64)
 
 
-def assert_controls(search: Search, expected: np.ndarray) -> None:
+def assert_controls(search: SolveRun, expected: np.ndarray) -> None:
     _, got = search.planner.iterate(search, None)
     assert got.denoising_steps == STEPS
     # Chance hides nothing here: the planned change is a thousand times larger than what is tolerated.
@@ -619,7 +619,7 @@ def test_late_steps_go_on_with_fewer_samples(late: Any, parts: Any, monkeypatch:
 
     monkeypatch.setattr(CpuSamplingEngine, "denoise", recorded)
     planner = make_planner("d4orm", num_samples=40, num_steps=10, **late)
-    search = Search(planner, walled_in_problem(), 0, None)
+    search = SolveRun(planner, walled_in_problem(), 0, None)
     _, iteration = planner.iterate(search, None)
     assert [(len(scale), num_samples) for _, scale, num_samples, _, _ in calls] == parts
     np.testing.assert_array_equal(np.concatenate([call[1] for call in calls]), planner.noise_scale())
@@ -675,7 +675,7 @@ def test_an_iteration_starts_from_the_controls_as_planned_or_as_executed(name: s
     settings = {} if clip is None else {"clip_between_iterations": clip}
     silent = {"beta_start": 1e-12, "beta_end": 1e-12} if name in ("d4orm", "i-mbd") else {"sigma": 1e-5}
     planner = make_planner(name, engine="cpu", num_samples=2, num_steps=1, **silent, **settings)
-    search = Search(planner, hop_problem(2), 0, given)
+    search = SolveRun(planner, hop_problem(2), 0, given)
     search.iteration = 1
     assert search.current.trajectory.arrived[docks, 0]
     got = planner.iterate(search, None)[1].controls[:, :, 0]
@@ -689,7 +689,7 @@ def test_controls_that_are_scaled_up_for_ever_stay_finite() -> None:
     # By 1.66 in every iteration: 200 of them would be more than a float32 holds.
     plan = cheap_planner("i-mbd", num_samples=2, num_steps=1).solve(walled_in_problem(), max_iterations=200)
     assert plan.iterations == 200
-    search = Search(cheap_planner("i-mbd"), hop_problem(1), 0, np.full((30, 1, 2), 1e17))
+    search = SolveRun(cheap_planner("i-mbd"), hop_problem(1), 0, np.full((30, 1, 2), 1e17))
     assert search.current.planned.max() == np.float32(1e12)
     assert np.abs(search.current.controls).max() <= 1
 
@@ -751,7 +751,7 @@ def test_credit_by_groups_is_that_of_those_in_conflict(name: str) -> None:
     for start, same in ((None, "robot"), (drives, "team")):
         controls = []
         for credit in ("group", same):
-            search = Search(cheap_planner(name, credit=credit), problem, 0, start)
+            search = SolveRun(cheap_planner(name, credit=credit), problem, 0, start)
             search.advance()
             controls.append(search.current.controls)
         np.testing.assert_allclose(*controls, atol=1e-3)

@@ -14,27 +14,27 @@ from d4orm_env.engine.threads import Threads
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import make_planner
-from d4orm_planners.base.solve import Search
-from d4orm_planners.base.working_plan import TeamPaths
+from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine import path_index
 from d4orm_planners.mapf import beams
 from d4orm_planners.mapf.beam_search import BeamRules
-from d4orm_planners.mapf.beams import Company, Manner, find_ways
-from d4orm_planners.mapf.lns import shorten_ways
+from d4orm_planners.mapf.beams import MotionPrimitives, OtherAgents, find_ways
+from d4orm_planners.mapf.lns import improve_paths
 from d4orm_planners.tracking.steering import straight_drives
 
-STRAIGHT, STRICT = Manner((45.0, 90.0), (1.0, 0.5, 0.0)), BeamRules(32, 1e6, 0.1)
+STRAIGHT, STRICT = MotionPrimitives((45.0, 90.0), (1.0, 0.5, 0.0)), BeamRules(32, 1e6, 0.1)
 
 
-def solved_team(problem: Problem, seed: int = 0) -> TeamPaths:
+def solved_team(problem: Problem, seed: int = 0) -> WorkingPlan:
     """A first solution, as it was found."""
-    search = Search(make_planner("d4orm-d", engine="cpu", shorten=False), problem, seed)
+    search = SolveRun(make_planner("d4orm-d", engine="cpu", shorten=False), problem, seed)
     while not search.best.solved:
         search.advance()
-    return TeamPaths(search, search.best.trajectory)
+    return WorkingPlan(search, search.best.trajectory)
 
 
-def travel_time(team: TeamPaths) -> float:
+def travel_time(team: WorkingPlan) -> float:
     arrived = team.search.engine.rollout(team.problem, team.controls).arrived
     assert arrived[-1].all()
     return float((~arrived).sum(axis=0).mean() * team.problem.dt)
@@ -44,7 +44,7 @@ def travel_time(team: TeamPaths) -> float:
 def test_ways_become_shorter_and_stay_free(model: str) -> None:
     team = solved_team(make_problem("random", num_robots=10, model=model, seed=1))
     before = travel_time(team)
-    shorten_ways(team, seed=0, rounds=6, temperature=0.0)
+    improve_paths(team, seed=0, rounds=6, temperature=0.0)
     assert travel_time(team) <= before
     assert verify(team.problem, team.controls).ok
 
@@ -52,7 +52,7 @@ def test_ways_become_shorter_and_stay_free(model: str) -> None:
 def test_ways_among_obstacles_become_shorter() -> None:
     team = solved_team(make_problem("four_obstacles", num_robots=12))
     before = travel_time(team)
-    shorten_ways(team, seed=0, rounds=6, temperature=0.0)
+    improve_paths(team, seed=0, rounds=6, temperature=0.0)
     assert travel_time(team) < before - 0.1
     assert verify(team.problem, team.controls).ok
 
@@ -63,7 +63,7 @@ def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
         for module in (path_index, beams):
             monkeypatch.setattr(module, "Threads", lambda _, threads=threads: Threads(threads))
         team = solved_team(problem)
-        found.append(shorten_ways(team, seed=0, rounds=4))
+        found.append(improve_paths(team, seed=0, rounds=4))
     np.testing.assert_array_equal(*found)
 
 
@@ -80,12 +80,12 @@ def test_a_plan_is_never_worse_than_what_it_began_with(planner: str) -> None:
     assert better.metrics["travel_time"] <= first.metrics["travel_time"]
 
 
-def crossing() -> TeamPaths:
+def crossing() -> WorkingPlan:
     """Robot 0 drives to the right, and robot 1 stands in its way."""
     start = [[0, 0, 0, 0], [1.5, 0, 0, 0]]
     problem = Problem(Team(("holonomic2d",) * 2), start, [[3, 0], [1.5, 2.0]], horizon=80)
-    search = Search(make_planner("d4orm-d", engine="cpu"), problem, 0)
-    return TeamPaths(search, search.current.trajectory)
+    search = SolveRun(make_planner("d4orm-d", engine="cpu"), problem, 0)
+    return WorkingPlan(search, search.current.trajectory)
 
 
 def arrival(ways: Any) -> int:
@@ -98,13 +98,13 @@ def test_a_robot_minds_whom_it_is_told_to() -> None:
     team, me = crossing(), np.array([0])
     straight = straight_drives(team.problem.select([0]))
     nobody = np.zeros((1, 0, 81, 2), np.float32)
-    alone = find_ways(team, me, 0, STRAIGHT, STRICT, company=Company(np.array([[0, 1]]), nobody, np.zeros((1, 0))))
+    alone = find_ways(team, me, 0, STRAIGHT, STRICT, company=OtherAgents(np.array([[0, 1]]), nobody, np.zeros((1, 0))))
     around = find_ways(team, me, 0, STRAIGHT, STRICT)
     assert arrival(alone) == arrival(straight)
     assert arrival(around) > arrival(alone)
     # Somebody who is not in the team stands where robot 1 does.
     there = np.broadcast_to(np.float32([1.5, 0]), (1, 1, 81, 2)).copy()
-    company = Company(np.array([[0, 1]]), there, np.array([[0.15]]))
+    company = OtherAgents(np.array([[0, 1]]), there, np.array([[0.15]]))
     np.testing.assert_array_equal(find_ways(team, me, 0, STRAIGHT, STRICT, company=company).states, around.states)
 
 

@@ -10,7 +10,7 @@ import pytest
 from d4orm_env import Problem, Team, World, make_problem, navigation_v0
 from d4orm_env.core.arrays import FloatArray
 from d4orm_planners import make_policy, run_episode
-from d4orm_planners.mapf.planner import compile_guidance
+from d4orm_planners.mapf.planner import compile_path_finding
 from d4orm_planners.mapf.relay import LINGER, relay_ways
 from d4orm_planners.mapf.roadmap import lay_roadmap
 from d4orm_planners.mapf.roadmap_team import Replanning
@@ -75,7 +75,7 @@ def test_a_goal_can_be_passed_once_who_arrived_has_gone_on() -> None:
     first, second = arrivals(problem, ways)
     assert first < second < problem.horizon
     # Nobody gets past a robot that stays for good.
-    compile_guidance(problem)
+    compile_path_finding(problem)
     staying = Replanning(problem, lay_roadmap(problem))
     assert staying.one_by_one(np.random.default_rng(0), lambda: False, 20) is None
 

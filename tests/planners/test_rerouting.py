@@ -17,23 +17,23 @@ from d4orm_env.engine.threads import Threads
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import make_planner
-from d4orm_planners.base.solve import Search
-from d4orm_planners.base.working_plan import TeamPaths
+from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine import path_index
 from d4orm_planners.mapf import beams
 from d4orm_planners.tracking.steering import straight_drives
 
 
-def rerouted(problem: Problem, seed: int = 0) -> TeamPaths:
+def rerouted(problem: Problem, seed: int = 0) -> WorkingPlan:
     """A team that sets off straight, after one call."""
     planner: Any = make_planner("d4orm-d", engine="cpu")
-    search = Search(planner, problem, seed, straight_drives(problem).controls[:, :, 0])
-    team = TeamPaths(search, search.current.trajectory)
+    search = SolveRun(planner, problem, seed, straight_drives(problem).controls[:, :, 0])
+    team = WorkingPlan(search, search.current.trajectory)
     reroute(team)
     return team
 
 
-def assert_executed(team: TeamPaths) -> None:
+def assert_executed(team: WorkingPlan) -> None:
     """What the team says of itself is what the engine makes of its controls."""
     rollout = cpu.CpuEngine().rollout(team.problem, team.controls)
     np.testing.assert_allclose(rollout.states, team.states, atol=1e-4)
@@ -46,7 +46,7 @@ def assert_executed(team: TeamPaths) -> None:
 @pytest.mark.parametrize("model", MODEL_NAMES)
 def test_a_crossing_is_resolved(model: str) -> None:
     problem = make_problem("random", num_robots=10, model=model, seed=1)
-    assert TeamPaths.faults(rerouted(problem), np.arange(10))[0].tolist() == [0] * 10
+    assert WorkingPlan.faults(rerouted(problem), np.arange(10))[0].tolist() == [0] * 10
     assert_executed(rerouted(problem))
 
 

@@ -15,7 +15,7 @@ from d4orm_env import navigation_v0
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances import Dropout, LimitMismatch, Push, Stall, StateNoise
 from d4orm_env.scenarios import make_problem
-from d4orm_planners import Search, make_planner, make_policy, run_episode
+from d4orm_planners import SolveRun, make_planner, make_policy, run_episode
 from d4orm_planners.base.names import PLANNERS, POLICIES
 from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.tracking.steering import straight_drives
@@ -133,7 +133,7 @@ def outcomes(name: str, settings: dict[str, Any]) -> Generator[Any]:
     # The first plan of four robots that are guided is hard to make better, and the first batch holds one for them.
     crowd = {"guided": (8,), "mmd": (8, 2)}.get(name, (4,))
     short = make_problem("circle", num_robots=2, diameter=0.8)  # all else are long
-    search = Search(make_planner(name, **settings), crossing(*crowd) if settings["improve"] else short, 1)
+    search = SolveRun(make_planner(name, **settings), crossing(*crowd) if settings["improve"] else short, 1)
     try:
         for _ in range(settings["max_iterations"]):
             record = search.advance()
@@ -158,7 +158,7 @@ def test_every_setting_of_a_planner_changes_something(name: str, setting: str) -
         file, test = ELSEWHERE[setting]
         assert f"def {test}(" in (TESTS / file).read_text()
     elif setting == "engine":
-        engine = Search(make_planner(name, engine="jax"), crossing(), 0).engine
+        engine = SolveRun(make_planner(name, engine="jax"), crossing(), 0).engine
         assert type(engine) is type(get_sampling_engine("jax"))
     elif setting == "improve":
         solution = straight_drives(lone()).controls[:, :, 0]

@@ -9,7 +9,7 @@ import pytest
 
 from d4orm_env import World, make_problem
 from d4orm_env.core.problem import Problem
-from d4orm_planners import Search, make_planner
+from d4orm_planners import SolveRun, make_planner
 from d4orm_planners.base.names import PLANNERS
 from d4orm_planners.engine.sampling_types import SamplingTask
 from d4orm_planners.sampling.short_paths import drive_times, on_short_paths
@@ -25,7 +25,7 @@ CLOSE = {
 
 def looked_at(problem: Problem, iterations: int = 0) -> tuple[SamplingTask, SamplingTask]:
     """The task of the whole problem, and what is made of it."""
-    search = Search(make_planner("d4orm", engine="cpu"), problem, 0)
+    search = SolveRun(make_planner("d4orm", engine="cpu"), problem, 0)
     search.iteration = iterations
     task = SamplingTask(problem, search.current.planned)
     return task, on_short_paths(task, search)

@@ -12,7 +12,7 @@ from env_support import line_problem, mixed_problem
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
-from d4orm_planners.tracking.steering import Drives, drives
+from d4orm_planners.tracking.steering import Rollouts, drives
 
 CPU = CpuSamplingEngine()
 SWITCH_TIMES = (0, 3, 10, 25, 79)
@@ -25,7 +25,7 @@ def problem_of(model: str, **changes: Any) -> Problem:
     return line_problem([1.0, 2.0, 3.0], model, horizon=80, **changes)
 
 
-def closing(problem: Problem, controls: np.ndarray, times: Any = SWITCH_TIMES) -> tuple[Trajectory, Drives]:
+def closing(problem: Problem, controls: np.ndarray, times: Any = SWITCH_TIMES) -> tuple[Trajectory, Rollouts]:
     """The engine's rollout of the controls, and every robot's stretches at the same times."""
     trajectory = CPU.rollout(problem, controls)
     switch = np.tile(times, (problem.num_robots, 1))

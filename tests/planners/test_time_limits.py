@@ -12,7 +12,7 @@ from planner_support import cheap_planner, hop_problem, walled_in_problem
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import Plan, list_planners, make_planner
 from d4orm_planners.base.planner_registry import PLANNERS
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.stopwatch import Stopwatch
 from d4orm_planners.baselines.collocation import ABANDONED
 from d4orm_planners.baselines.ipopt import OUT_OF_TIME
@@ -104,7 +104,7 @@ def test_a_limit_that_is_not_reached_changes_nothing(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["d4orm", "d4orm-d", "mbd"])
 def test_a_search_that_is_cancelled_leaves_its_iteration(name: str) -> None:
-    search = Search(long_winded(name), walled_in_problem(), 0, None)
+    search = SolveRun(long_winded(name), walled_in_problem(), 0, None)
     search.cancelled.set()
     assert search.advance().denoising_steps == 0
 

@@ -25,7 +25,7 @@ from d4orm_env.scenarios.problem_files import scenario_text
 from d4orm_planners.base.escaping import markdown_text
 from d4orm_planners.baselines.go_to_goal import GoToGoal
 from d4orm_planners.play import edits
-from d4orm_planners.play.proxy import Gate
+from d4orm_planners.play.proxy import AuthenticatingProxy
 from d4orm_planners.play.scene_frame import closest_approach
 from d4orm_planners.play.session import Session
 
@@ -437,7 +437,7 @@ def test_messages_are_shown_as_they_are() -> None:
 
 
 @pytest.fixture
-def gate() -> Iterator[Gate]:
+def gate() -> Iterator[AuthenticatingProxy]:
     """A gate before something that echoes the first line."""
     with socket.create_server(("127.0.0.1", 0)) as behind:
 
@@ -452,12 +452,12 @@ def gate() -> Iterator[Gate]:
                     connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n%s" % (len(line), line))
 
         threading.Thread(target=answer, daemon=True).start()
-        gate = Gate("127.0.0.1", 0, behind.getsockname()[1])
+        gate = AuthenticatingProxy("127.0.0.1", 0, behind.getsockname()[1])
         yield gate
         gate.close()
 
 
-def asked(gate: Gate, path: str, **headers: str) -> tuple[int, str, str]:
+def asked(gate: AuthenticatingProxy, path: str, **headers: str) -> tuple[int, str, str]:
     """Status, cookie and body of an answer."""
     connection = http.client.HTTPConnection("127.0.0.1", gate.port, timeout=PATIENCE)
     connection.request("GET", path, headers=headers)
@@ -467,7 +467,7 @@ def asked(gate: Gate, path: str, **headers: str) -> tuple[int, str, str]:
     return answer.status, answer.getheader("Set-Cookie") or "", body
 
 
-def test_only_who_has_the_token_comes_in(gate: Gate) -> None:
+def test_only_who_has_the_token_comes_in(gate: AuthenticatingProxy) -> None:
     assert asked(gate, "/")[0] == 403
     assert asked(gate, "/?token=guess")[0] == 403
     assert asked(gate, "/", Cookie=f"d4orm_play_{gate.port}=guess")[0] == 403
@@ -478,13 +478,13 @@ def test_only_who_has_the_token_comes_in(gate: Gate) -> None:
     assert asked(gate, "/page", Cookie=shown) == (200, "", "GET /page HTTP/1.1")
 
 
-def test_pages_of_others_do_not_come_in_with_the_token(gate: Gate) -> None:
+def test_pages_of_others_do_not_come_in_with_the_token(gate: AuthenticatingProxy) -> None:
     cookie = f"d4orm_play_{gate.port}={gate.token}"
     assert asked(gate, "/", Cookie=cookie, Origin="http://elsewhere.example")[0] == 403
     assert asked(gate, "/", Cookie=cookie, Origin=f"http://127.0.0.1:{gate.port}")[0] == 200
 
 
-def test_nonsense_is_hung_up_on(gate: Gate) -> None:
+def test_nonsense_is_hung_up_on(gate: AuthenticatingProxy) -> None:
     with socket.create_connection(("127.0.0.1", gate.port), timeout=PATIENCE) as connection:
         connection.sendall(b"x" * 40_000)
         with suppress(ConnectionError):
@@ -492,8 +492,8 @@ def test_nonsense_is_hung_up_on(gate: Gate) -> None:
     assert asked(gate, "/")[0] == 403, "and it goes on"
 
 
-def test_a_closed_gate_leaves_no_port(gate: Gate) -> None:
-    other = Gate("127.0.0.1", 0, gate.port)
+def test_a_closed_gate_leaves_no_port(gate: AuthenticatingProxy) -> None:
+    other = AuthenticatingProxy("127.0.0.1", 0, gate.port)
     other.close()
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", other.port), timeout=PATIENCE)

@@ -39,7 +39,7 @@ from d4orm_planners.baselines.go_to_goal import GoToGoal
 from d4orm_planners.play import edits, panel
 from d4orm_planners.play.command_queue import MOST_WAITING
 from d4orm_planners.play.playground import Playground
-from d4orm_planners.play.proxy import Gate
+from d4orm_planners.play.proxy import AuthenticatingProxy
 from d4orm_planners.play.session import Session
 from d4orm_planners.play.validation import LARGEST_UPLOAD
 
@@ -361,7 +361,7 @@ REQUESTS = [
 ]
 
 
-def answers(gate: Gate, sent: bytes) -> bytes:
+def answers(gate: AuthenticatingProxy, sent: bytes) -> bytes:
     """All that a gate says to a request."""
     heard = b""
     with reached(gate.port) as raw:
@@ -374,32 +374,34 @@ def answers(gate: Gate, sent: bytes) -> bytes:
 
 
 @pytest.fixture
-def gate() -> Iterator[Gate]:
+def gate() -> Iterator[AuthenticatingProxy]:
     with socket.create_server(("127.0.0.1", 0)) as behind:
-        gate = Gate("127.0.0.1", 0, behind.getsockname()[1])
+        gate = AuthenticatingProxy("127.0.0.1", 0, behind.getsockname()[1])
         yield gate
         gate.close()
 
 
 @pytest.mark.parametrize("sent", REQUESTS)
 def test_a_request_that_cannot_be_read_is_forbidden_in_silence(
-    gate: Gate, sent: bytes, caplog: pytest.LogCaptureFixture
+    gate: AuthenticatingProxy, sent: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert answers(gate, sent).startswith(b"HTTP/1.1 403 Forbidden\r\n")
     assert not caplog.records
 
 
 @pytest.mark.parametrize("sent", [b"", b"GET / HT", b"x" * 100_000])
-def test_a_request_without_an_end_is_hung_up_on(gate: Gate, sent: bytes, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_request_without_an_end_is_hung_up_on(
+    gate: AuthenticatingProxy, sent: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
     assert answers(gate, sent)[:12] in (b"", b"HTTP/1.1 403")
     assert not caplog.records
 
 
-def test_cookies_of_other_pages_do_not_hide_the_gate_s_own(gate: Gate) -> None:
+def test_cookies_of_other_pages_do_not_hide_the_gate_s_own(gate: AuthenticatingProxy) -> None:
     assert gate._answer(f"GET / HTTP/1.1\r\nCookie: a[b]=c; d4orm_play_{gate.port}={gate.token}".encode()) == b""
 
 
-def test_many_who_say_nothing_keep_nobody_out(gate: Gate) -> None:
+def test_many_who_say_nothing_keep_nobody_out(gate: AuthenticatingProxy) -> None:
     silent = [reached(gate.port) for _ in range(300)]
     try:
         until(lambda: gate._waiting > 0)

@@ -166,10 +166,10 @@ def test_a_clearing_keeps_its_obstacles_and_leaves_room_at_starts_and_goals() ->
 
 pytest.importorskip("stable_baselines3")
 from d4orm_planners.rl.algorithms import ALGORITHMS  # noqa: E402
-from d4orm_planners.rl.curriculum import Lesson  # noqa: E402
+from d4orm_planners.rl.curriculum import Stage  # noqa: E402
 from d4orm_planners.rl.curve import evaluate_network  # noqa: E402
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv  # noqa: E402
-from d4orm_planners.rl.task_mixture import MIXTURES, Exercise, MixedVecEnv, parse_mixture  # noqa: E402
+from d4orm_planners.rl.task_mixture import MIXTURES, MixedVecEnv, TrainTask, parse_mixture  # noqa: E402
 from d4orm_planners.rl.training import TrainingSettings, train  # noqa: E402
 
 TINY = TrainingSettings(
@@ -268,7 +268,7 @@ def test_a_policy_of_robots_that_turn_says_along_what_it_sees_and_learns_on_from
 
 def test_every_part_of_a_mixture_has_its_worlds_robots_and_sight() -> None:
     parts = TINY.exercises
-    assert parts == (Exercise("random", 2, {"size": 4}), Exercise("circle", 4, {}, sight=1))
+    assert parts == (TrainTask("random", 2, {"size": 4}), TrainTask("circle", 4, {}, sight=1))
     assert TINY.worlds_of_exercises == (5, 2)
     assert TINY.batch == 18
     env = TINY.worlds(None)  # type: ignore[arg-type] # a mixture is the same in every lesson
@@ -334,11 +334,11 @@ def test_instances_with_ways_last_for_some_time(ways: bool, kept: int) -> None:
 
 
 def test_a_part_of_a_mixture_may_be_disturbed() -> None:
-    part = Exercise.parse("circle 2 disturb.delay=2 disturb.push.speed=0.5 sight=1")
-    assert part == Exercise("circle", 2, {}, sight=1, disturbances={"delay": 2, "push.speed": 0.5})
+    part = TrainTask.parse("circle 2 disturb.delay=2 disturb.push.speed=0.5 sight=1")
+    assert part == TrainTask("circle", 2, {}, sight=1, disturbances={"delay": 2, "push.speed": 0.5})
     env = part.validation(3, 1)
     assert env.num_worlds == 3, "what goes wrong differs, though places do not"
-    assert Exercise.parse("circle 2").validation(3, 1).num_worlds == 1
+    assert TrainTask.parse("circle 2").validation(3, 1).num_worlds == 1
     env.reset()
     features = [env.step(np.full((6, 2), 1, np.float32))[0] for _ in range(2)]
     # Nothing has been obeyed yet, but somebody may have been pushed.
@@ -350,7 +350,7 @@ def test_a_part_of_a_mixture_may_be_disturbed() -> None:
         ("circle 2 disturb.delay=soon", "mixture has .*delay"),
     ):
         with pytest.raises(ValueError, match=complaint):
-            Exercise.parse(text)
+            TrainTask.parse(text)
 
 
 def test_a_mixture_steps_its_parts_as_each_alone() -> None:
@@ -391,7 +391,7 @@ def test_parts_of_different_models_are_refused() -> None:
 
 def test_named_mixtures_are_what_they_stand_for() -> None:
     for name, texts in MIXTURES.items():
-        assert parse_mixture((name, "circle 3")) == (*map(Exercise.parse, texts), Exercise("circle", 3, {}))
+        assert parse_mixture((name, "circle 3")) == (*map(TrainTask.parse, texts), TrainTask("circle", 3, {}))
         for exercise in parse_mixture((name,)):
             make_problem(exercise.scenario, num_robots=exercise.num_robots, **exercise.settings)
 
@@ -420,7 +420,7 @@ def test_rewards_are_those_asked_for() -> None:
     settings = replace(TINY, reward_settings={"arrival": 7.5, "contact": "4"})
     assert (settings.reward.arrival, settings.reward.contact, settings.reward.time) == (7.5, 4, 0.05)
     flat = TrainingSettings(scenario="circle", num_robots=2, num_envs=2, reward_settings={"time": 1})
-    for env in (settings.worlds(None), flat.worlds(Lesson(2, "circle", 1))):  # type: ignore[arg-type]
+    for env in (settings.worlds(None), flat.worlds(Stage(2, "circle", 1))):  # type: ignore[arg-type]
         env.reset()
         env.step_async(np.zeros((env.num_envs, 2), np.float32))
         _, rewards, *_ = env.step_wait()

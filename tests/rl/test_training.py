@@ -19,7 +19,7 @@ import pytest
 from d4orm_env import make_problem, navigation_v0
 from d4orm_planners import make_policy, run_episode
 from d4orm_planners.cli import app as cli
-from d4orm_planners.rl.curriculum import Lesson, common_batch, make_lessons, team_sizes
+from d4orm_planners.rl.curriculum import Stage, common_batch, make_lessons, team_sizes
 from d4orm_planners.rl.network import MAX_BYTES, load_network
 
 
@@ -38,7 +38,7 @@ def test_a_batch_makes_whole_worlds_of_every_size() -> None:
 def test_lessons_grow_and_mix_scenarios() -> None:
     lessons = make_lessons(4, "circle", steps=800, unit=100, count=8, gradual=True)
     assert lessons == tuple(
-        Lesson(robots, scenario, 100)
+        Stage(robots, scenario, 100)
         for robots, scenario in [
             (1, "random"), (2, "random"), (2, "random"), (4, "random"),
             (4, "circle"), (4, "random"), (4, "circle"), (4, "random"),

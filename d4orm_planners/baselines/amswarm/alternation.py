@@ -54,7 +54,7 @@ class Method(NamedTuple):
     tolerance: float
 
 
-class Surroundings(NamedTuple):
+class Neighbourhood(NamedTuple):
     """What a team keeps clear of.
 
     Attributes:
@@ -91,7 +91,7 @@ class Targets(NamedTuple):
 @cached_kernel(fingerprint((compiling,)), **OPTIONS)
 def alternate(
     method: Method,
-    bodies: Surroundings,
+    bodies: Neighbourhood,
     robot: Whole,
     limits: Floats,
     goal: Floats,
@@ -103,7 +103,7 @@ def alternate(
 
     Args:
         method: :class:`Method`.
-        bodies: :class:`Surroundings`.
+        bodies: :class:`Neighbourhood`.
         robot: Its number among them.
         limits: ``(2,)`` of speed and acceleration [m/s, m/s^2], infinite where there is none.
         goal: ``(d,)`` [m].
@@ -153,7 +153,7 @@ def _raise_multiplier(squares: Floats, motion: Floats, right: Floats, penalty: f
 
 
 @compiled
-def _mind(method: Method, bodies: Surroundings, robot: Whole, guess: Guess, minded: BoolArray) -> int:
+def _mind(method: Method, bodies: Neighbourhood, robot: Whole, guess: Guess, minded: BoolArray) -> int:
     """Mark the bodies that come near the guess; how many there are."""
     robots, d, count = len(bodies.radius), bodies.paths.shape[2], 0
     for body in range(len(minded)):
@@ -183,7 +183,7 @@ def _mind(method: Method, bodies: Surroundings, robot: Whole, guess: Guess, mind
 @compiled
 def _project(
     method: Method,
-    bodies: Surroundings,
+    bodies: Neighbourhood,
     robot: Whole,
     limits: Floats,
     minded: BoolArray,
@@ -195,7 +195,7 @@ def _project(
 
     Args:
         method: :class:`Method`.
-        bodies: :class:`Surroundings`.
+        bodies: :class:`Neighbourhood`.
         robot: Its number among them.
         limits: ``(2,)``.
         minded: ``(K + B,)`` bool.

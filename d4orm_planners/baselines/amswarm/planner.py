@@ -12,7 +12,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig, State
 from d4orm_planners.base.settings import Count, NotNegative, Number, Positive, Share, Steps
-from d4orm_planners.base.solve import Search
+from d4orm_planners.base.solve import SolveRun
 
 Degree = Annotated[Count, Field(ge=5, le=30)]
 Lookahead = Annotated[Count, Field(ge=2, le=1000)]
@@ -86,7 +86,7 @@ class AMSwarm(Planner):
     }
     config: AMSwarmConfig
 
-    def iterate(self, search: Search, state: State) -> tuple[State, Iteration]:
+    def iterate(self, search: SolveRun, state: State) -> tuple[State, Iteration]:
         """See :meth:`Planner.iterate`: a run of the whole team."""
         from d4orm_planners.baselines.amswarm.swarm import Swarm
 
@@ -99,7 +99,7 @@ class AMSwarm(Planner):
         controls = swarm.run(search.engine, search.should_stop)
         return state, Iteration(controls, note=f"largest violation planned: {swarm.violation:.3f}")
 
-    def _compile(self, search: Search) -> None:
+    def _compile(self, search: SolveRun) -> None:
         """Compile the alternation and the step of such a team, if they are not yet."""
         from d4orm_planners.baselines.amswarm.alternation import alternate
         from d4orm_planners.baselines.amswarm.swarm import Swarm

@@ -11,7 +11,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine.types import Engine
-from d4orm_planners.baselines.amswarm.alternation import Guess, Method, Surroundings, alternate
+from d4orm_planners.baselines.amswarm.alternation import Guess, Method, Neighbourhood, alternate
 from d4orm_planners.baselines.amswarm.bernstein import first_coefficients, sample_basis
 from d4orm_planners.tracking.steering import present_velocities, track_velocities
 
@@ -80,7 +80,7 @@ class Swarm:
         places, duration = states[:, : problem.dimension].astype(np.float64), config.lookahead * problem.dt
         moved = self._random.uniform(-self._perturbation, self._perturbation, self._guesses.place.shape)
         predicted = np.where(stands[:, None, None], places[:, None], self._guesses.place)
-        bodies = Surroundings(predicted, self._radius, problem.margin + self._clearance, self._boxes, self._bounds)
+        bodies = Neighbourhood(predicted, self._radius, problem.margin + self._clearance, self._boxes, self._bounds)
         begins = first_coefficients(config.degree, duration, places, velocities, self._accelerations)
         guesses = Guess(predicted + moved, self._guesses.velocity.copy(), self._guesses.acceleration.copy())
         for robot in np.flatnonzero(~stands):

@@ -58,7 +58,7 @@ class Motion:
 
 
 @dataclass(frozen=True, order=True)
-class Node:
+class TreeNode:
     """A node of the tree; the one to be expanded next is the least.
 
     Attributes:
@@ -98,10 +98,10 @@ class Tree:
 
     frames: tuple[WayFrame, ...]
     space: Space
-    nodes: tuple[Node, ...]
+    nodes: tuple[TreeNode, ...]
     made: int
 
-    def with_nodes(self, added: list[Node]) -> Tree:
+    def with_nodes(self, added: list[TreeNode]) -> Tree:
         """The tree with its best node expanded to these."""
         nodes = list(self.nodes[1:])
         for node in added:
@@ -132,22 +132,24 @@ class Planning:
         self._distances: Floats = radius[:, None] + radius + problem.margin + self._spare
         self.steps = 0
 
-    def root(self, seeds: list[int]) -> Node:
+    def root(self, seeds: list[int]) -> TreeNode:
         """Everybody's motion, one robot after another around those that have planned (soft constraints only)."""
         motions: list[Motion] = []
         for robot, seed in enumerate(seeds):
             motions.append(self._plan(robot, motions, list(range(robot)), (), seed, None))
         return self.node(0, tuple(motions), ((),) * len(seeds))
 
-    def node(self, number: int, motions: tuple[Motion, ...], constraints: tuple[tuple[Constraint, ...], ...]) -> Node:
+    def node(
+        self, number: int, motions: tuple[Motion, ...], constraints: tuple[tuple[Constraint, ...], ...]
+    ) -> TreeNode:
         """A node with its conflicts counted and the first one found."""
         places = np.stack([motion.places for motion in motions])
         pairs, step, one, another = first_conflict(places, self._distances)
         failing = sum(motion.fails for motion in motions)
         cost = sum(motion.cost for motion in motions)
-        return Node(int(pairs) + failing, cost, number, motions, constraints, (int(one), int(another)), int(step))
+        return TreeNode(int(pairs) + failing, cost, number, motions, constraints, (int(one), int(another)), int(step))
 
-    def children(self, node: Node, number: int, seeds: list[int], unlucky: int) -> list[Node]:
+    def children(self, node: TreeNode, number: int, seeds: list[int], unlucky: int) -> list[TreeNode]:
         """What follows from a node: for each of two robots in conflict, one in which it keeps clear of where they met.
 
         In a node without a pair in conflict a robot that fails plans anew, or if none does, ``unlucky``.
@@ -164,8 +166,8 @@ class Planning:
         return added
 
     def _child(
-        self, node: Node, number: int, robot: int, own: tuple[Constraint, ...], seed: int, *, anew: bool
-    ) -> Node:
+        self, node: TreeNode, number: int, robot: int, own: tuple[Constraint, ...], seed: int, *, anew: bool
+    ) -> TreeNode:
         others = [other for other in range(len(node.motions)) if other != robot]
         before = None if anew or self._config.reuse_steps is None else node.motions[robot].motions
         motion = self._plan(robot, list(node.motions), others, own, seed, before)
@@ -173,7 +175,7 @@ class Planning:
         constraints = tuple(own if k == robot else kept for k, kept in enumerate(node.constraints))
         return self.node(number, motions, constraints)
 
-    def _constraint(self, node: Node, robot: int, other: int) -> Constraint:
+    def _constraint(self, node: TreeNode, robot: int, other: int) -> Constraint:
         """To keep out of a sphere about the middle between two robots for a while."""
         middle = (node.motions[robot].places[node.step] + node.motions[other].places[node.step]) / 2
         radius = self._config.constraint_radius * self._distances[robot, other]

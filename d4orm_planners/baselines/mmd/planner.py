@@ -12,8 +12,8 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
 from d4orm_planners.base.settings import Count, NotNegative, Number, Samples, ShareOrNone, Steps
-from d4orm_planners.base.solve import Search
-from d4orm_planners.mapf.planner import NoWays
+from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.mapf.planner import NoPaths
 
 if TYPE_CHECKING:
     from d4orm_planners.baselines.mmd.constraint_tree import Tree
@@ -78,7 +78,7 @@ class MMD(Planner):
     presets: ClassVar = {"paper": {"num_samples": 64, "guide_steps": 20, "soft_pull": 0.1, "slowest": 1.1}}
     config: MMDConfig
 
-    def iterate(self, search: Search, state: Tree | NoWays | None) -> tuple[Tree | NoWays, Iteration]:
+    def iterate(self, search: SolveRun, state: Tree | NoPaths | None) -> tuple[Tree | NoPaths, Iteration]:
         """See :meth:`Planner.iterate`: everybody's motion at first, then an expansion of the best node."""
         from d4orm_planners.baselines.mmd.constraint_tree import Planning
         from d4orm_planners.baselines.mmd.reverse_process import Denoiser
@@ -87,7 +87,7 @@ class MMD(Planner):
             with search.watch.paused():
                 compile_mmd(search.problem)
             state = _begin(search)
-        if isinstance(state, NoWays):
+        if isinstance(state, NoPaths):
             return state, state.explained(Iteration(search.current.controls))
         problem = search.problem
         denoiser = Denoiser(problem, self.config, search.should_stop)
@@ -103,13 +103,13 @@ class MMD(Planner):
         return state.with_nodes(added), Iteration(best.controls, planning.steps, note=note)
 
 
-def _begin(search: Search) -> Tree | NoWays:
+def _begin(search: SolveRun) -> Tree | NoPaths:
     """The tree before its root."""
     from d4orm_planners.baselines.mmd.constraint_tree import Tree
     from d4orm_planners.baselines.mmd.way_frame import make_frame, world_space
 
     problem, space = search.problem, world_space(search.problem)
-    reason = NoWays.unless_reachable(problem)
+    reason = NoPaths.unless_reachable(problem)
     if reason is not None:
         return reason
     # The first numbers are the robots'.
@@ -118,7 +118,7 @@ def _begin(search: Search) -> Tree | NoWays:
     return Tree(tuple(frame for frame in frames if frame is not None), space, (), 0)
 
 
-def _seeds(search: Search, count: int) -> list[int]:
+def _seeds(search: SolveRun, count: int) -> list[int]:
     return [search.iteration_seed(Stream.SAMPLES, number) for number in range(count)]
 
 

@@ -22,7 +22,7 @@ from d4orm_planners.baselines.mmd.prior import (
     posterior,
     predict,
 )
-from d4orm_planners.baselines.mmd.tracking import Tracked, drive_along
+from d4orm_planners.baselines.mmd.tracking import TrackedMotions, drive_along
 from d4orm_planners.baselines.mmd.way_frame import WayFrame, sine_table
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class Batch:
 
     motions: FloatArray
     durations: Floats
-    driven: Tracked
+    driven: TrackedMotions
     steps: int
 
 

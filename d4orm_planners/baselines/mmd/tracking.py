@@ -21,7 +21,7 @@ from d4orm_env.paths.wavefront import Space, clearance_at
 from d4orm_planners.baselines.mmd import clock, way_frame
 from d4orm_planners.baselines.mmd.clock import fill_clock
 from d4orm_planners.baselines.mmd.way_frame import WayFrame, trace
-from d4orm_planners.tracking.straight_drives import LoneRobot
+from d4orm_planners.tracking.straight_drives import RobotSpec
 
 SOURCES = fingerprint((robot_model, transition, *stepping.PARTS, stepping, wavefront, clock, way_frame))
 
@@ -29,7 +29,7 @@ GAIN = np.float32(1.5)
 """Share of its distance from the motion that a robot makes up for in a second [1/s]."""
 
 
-class Tracked(NamedTuple):
+class TrackedMotions(NamedTuple):
     """What came of driving along ``B`` motions.
 
     Attributes:
@@ -60,7 +60,7 @@ def _catch_up(
 @cache
 def tracking_kernel(
     name: str,
-) -> Kernel[[LoneRobot, WayFrame, Floats, Floats, Space, Floats, FloatArray, Tracked], None]:
+) -> Kernel[[RobotSpec, WayFrame, Floats, Floats, Space, Floats, FloatArray, TrackedMotions], None]:
     """The compiled drives of a robot of the model with this name; see :func:`drive_along`."""
     model = MODELS[name]
     move, dock = make_stepper(model)
@@ -70,14 +70,14 @@ def tracking_kernel(
 
     @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
     def drive(
-        robot: LoneRobot,
+        robot: RobotSpec,
         frame: WayFrame,
         sines: Floats,
         deviation: Floats,
         space: Space,
         durations: Floats,
         motions: FloatArray,
-        driven: Tracked,
+        driven: TrackedMotions,
     ) -> None:
         dt, docks, docking = robot.time_step, robot.docks, (robot.docking[0], robot.docking[1], robot.docks)
         h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])
@@ -129,7 +129,7 @@ def drive_along(
     space: Space,
     durations: Floats,
     motions: FloatArray,
-) -> Tracked:
+) -> TrackedMotions:
     """Drive a robot along each of some motions, as if it were alone: by the clock, and then straight to its goal.
 
     Args:
@@ -143,12 +143,12 @@ def drive_along(
         motions: ``(B, 2 MODES)`` float32 whitened modes.
     """
     count, horizon = len(motions), problem.horizon
-    driven = Tracked(
+    driven = TrackedMotions(
         np.zeros((count, horizon, problem.control_size), np.float32),
         np.empty((count, horizon + 1, 3)),
         np.empty(count, np.int64),
         np.empty(count),
     )
     kernel = tracking_kernel(problem.team.models[robot])
-    kernel(LoneRobot.of(problem, robot), frame, sines, deviation, space, durations, motions, driven)
+    kernel(RobotSpec.of(problem, robot), frame, sines, deviation, space, durations, motions, driven)
     return driven

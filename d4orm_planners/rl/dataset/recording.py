@@ -13,7 +13,7 @@ from d4orm_env.core.errors import describe
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.engine.threads import available_cores
 from d4orm_planners.base.import_paths import check_sendable
-from d4orm_planners.evaluation.pool import Lost, ProcessPool, Sign
+from d4orm_planners.evaluation.pool import JobEvent, ProcessPool, WorkerLost
 from d4orm_planners.rl.dataset.demonstrations import Demonstrations
 from d4orm_planners.rl.dataset.recorded_episode import RecordedEpisode
 
@@ -146,11 +146,11 @@ def _in_processes(tasks: Iterable[_Task], size: int) -> Generator[tuple[int, str
                 task = waiting.popleft()
                 running[pool.start(task)] = task
             for ticket, content in pool.wait(None):
-                if isinstance(content, Lost):
+                if isinstance(content, WorkerLost):
                     yield running.pop(ticket).seed, content.reason
                 elif isinstance(content, str):
                     yield running[ticket].seed, content
-                elif content is Sign.ENDED:
+                elif content is JobEvent.ENDED:
                     del running[ticket]
 
 
