@@ -38,7 +38,8 @@ class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
     Args:
         scenario: As in :class:`~d4orm_env.envs.options.EnvOptions`, like all others.
         num_robots: Size of the team.
-        **options: Further attributes of :class:`~d4orm_env.envs.options.EnvOptions`, and arguments of the scenario, such as
+        **options: Further attributes of :class:`~d4orm_env.envs.options.EnvOptions`, and arguments of the scenario,
+        such as
             ``model`` or ``seed``. ``max_cycles`` may be assigned later too.
 
     Raises:

@@ -51,7 +51,7 @@ def hop_problem(num_robots: int = 3, **changes: Any) -> Problem:
 
 def walled_in_problem() -> Problem:
     """One robot whose goal stands inside a ring of circles with gaps so little too narrow that no proof sees it."""
-    return _ringed(6, 0.88)
+    return _ringed(6, 0.794)
 
 
 def sealed_problem() -> Problem:

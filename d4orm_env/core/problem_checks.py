@@ -140,7 +140,7 @@ def check_places(team: Team, world: World, what: str, places: FloatArray, margin
 
 
 def _near_pairs(points: Floats, radius: Floats, margin: float) -> tuple[IntArray, IntArray, Floats]:
-    """Pairs of robots at ``points`` ``(K, d)`` within the margin: the first, the second, and the gap between them [m]."""
+    """Pairs of robots at ``points`` ``(K, d)`` within the margin: the first, the second, and their gap [m]."""
     axis = int(np.argmax(np.ptp(points, axis=0)))
     order = np.argsort(points[:, axis], kind="stable")
     along, reach = points[order, axis], 2 * radius.max() + margin

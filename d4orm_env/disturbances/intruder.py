@@ -31,8 +31,8 @@ class Courses(NamedTuple):
 class Intruder(Disturbance[Courses]):
     """Bodies, discs or balls, that cross the team's area on straight lines at constant speed, one after another.
 
-    Robots see them as they see robots, and ``env.state()`` ends with them, see :mod:`d4orm_env.envs.joint_state`. Touching
-    one is a collision, and the paper's reward of a robot within the margin of one is 1 less.
+    Robots see them as they see robots, and ``env.state()`` ends with them, see :mod:`d4orm_env.envs.joint_state`.
+    Touching one is a collision, and the paper's reward of a robot within the margin of one is 1 less.
 
     The area is the ball round all starts and goals, and there are always ``count`` of them in it: who has left enters
     anew somewhere else, and at first they are anywhere on their lines. Obstacles and walls do not stop them. A line

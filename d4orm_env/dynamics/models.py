@@ -1,4 +1,4 @@
-"""The robot models by name: those that come with the package, one file each in :mod:`d4orm_env.dynamics`, and users'."""
+"""Robot models by name: those that come with the package, one file each beside this one, and users'."""
 
 from __future__ import annotations
 

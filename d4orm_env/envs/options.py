@@ -45,7 +45,8 @@ class EnvOptions:
         reward: ``"paper"``, ``"training"`` (:class:`~d4orm_env.envs.rewards.TrainingReward`), or a function from a
             :class:`~d4orm_env.envs.rewards.RewardInput` to the rewards ``(..., K)`` of all robots.
         progress: What the distances of rewards are, the paper's among them: ``"straight"``, or the length of the
-            shortest free ``"way"``, see :mod:`d4orm_env.paths.shortest_paths`; the same in a world without obstacles. Not for
+            shortest free ``"way"``, see :mod:`d4orm_env.paths.shortest_paths`; the same in a world without obstacles.
+            Not for
             ``lifelong``.
         observed_way: Whether an observation ends with direction and length of the shortest free way. Not for
             ``lifelong``.

@@ -57,8 +57,8 @@ class WorldIndex(NamedTuple):
             rounding included.
         clearance: ``(C,)`` float32 at the centres [m], negative inside an obstacle.
         first: ``(levels C + 1,)`` int32 where each cell's part of ``items`` begins.
-        items: int32 numbers of the obstacles, as in :class:`~d4orm_env.geometry.shapes.Shapes`, those of a cell by their
-            distance from its centre.
+        items: int32 numbers of the obstacles, as in :class:`~d4orm_env.geometry.shapes.Shapes`, those of a cell by
+            their distance from its centre.
         longest: ``()`` int32 the most obstacles of any cell.
         nearest: ``()`` int32 how many of the nearest obstacles of any of its points a cell is sure to have.
         levels: ``()`` int32 for how many grids, one round the other, there are lists: each has ``C`` cells about the

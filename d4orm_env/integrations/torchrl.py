@@ -48,8 +48,8 @@ class TorchRLNavigation(EnvBase):
 
     Args:
         num_worlds: ``B``.
-        scenario: As for :class:`~d4orm_env.envs.vector_env.NavigationVectorEnv`, like all others but for its auto-reset,
-            which is TorchRL's.
+        scenario: As for :class:`~d4orm_env.envs.vector_env.NavigationVectorEnv`, like all others but for its
+            auto-reset, which is TorchRL's.
         num_robots: ``K``.
         seed: Of the first world; the others have the numbers that follow.
         device: Where tensors are. The worlds are stepped on the CPU.

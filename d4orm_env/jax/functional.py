@@ -98,8 +98,8 @@ def step(
         problem: The problem.
         state: Where the team is.
         controls: ``(K, m)``, clipped here.
-        reward: ``"paper"``, ``"training"``, or a function of a :class:`~d4orm_env.envs.rewards.RewardInput` that JAX can
-            trace; static.
+        reward: ``"paper"``, ``"training"``, or a function of a :class:`~d4orm_env.envs.rewards.RewardInput` that JAX
+            can trace; static.
 
     Returns:
         The next state and what happened.

@@ -7,7 +7,7 @@ import math
 import warnings
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
@@ -118,7 +118,7 @@ def _mode(value: object) -> Mode:
     """As nav2 reads it: in letters of either case."""
     for mode in get_args(Mode):
         if isinstance(value, str) and value.lower() == mode:
-            return mode  # type: ignore[no-any-return] # of its own values
+            return mode
     raise ValueError(f"mode is {shown(value)}; it must be one of {', '.join(get_args(Mode))}")
 
 
@@ -132,7 +132,7 @@ def _numbers(origin: object) -> list[float]:
     Some saved maps have ``-nan`` as their yaw, where a mapper sent no valid orientation. Nothing in ROS's navigation
     uses a yaw, and its maintainers advise to write zero there (ros-planning/navigation, issue 993): it is read as zero.
     """
-    numbers = origin if isinstance(origin, list) and len(origin) == 3 else [None]
+    numbers: list[Any] = origin if isinstance(origin, list) and len(origin) == 3 else [None]
     if str(numbers[-1]).lower().lstrip("+-.") == "nan":
         numbers = [*numbers[:2], 0.0]
     if not all(isinstance(value, int | float) and math.isfinite(value) for value in numbers):

@@ -136,12 +136,12 @@ class WorldEntry(Entry):
     """Obstacles and bounds; an open world without bounds."""
 
     bounds: BoxEntry | None = None
-    origin: Place | None = None
     circles: list[RoundEntry] = []
     spheres: list[SphereEntry] = []
     cylinders: list[RoundEntry] = []
     boxes: list[BoxEntry] = []
     polygons: list[PolygonEntry] = []
+    origin: Place | None = None
 
     def build(self, dimension: int) -> World:
         rows = {

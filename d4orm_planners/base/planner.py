@@ -49,8 +49,8 @@ class Iteration:
         denoising_steps: Sample-score-update steps spent.
         excluded: Samples left out because their reward was not finite.
         note: What the method itself says of how the iteration ended, where it has a word for it.
-        judged: What :func:`~d4orm_planners.base.candidate.evaluate_controls` made of these controls, if the iteration asked;
-            else the loop does.
+        judged: What :func:`~d4orm_planners.base.candidate.evaluate_controls` made of these controls, if the iteration
+            asked; else the loop does.
         unreachable: Robots for which path finding found no way to their goals.
     """
 
@@ -111,7 +111,8 @@ class Planner(ABC):
     ) -> Plan:
         """Plan until a solution is found (or on, with ``improve``), the budget is used up, or Ctrl-C is pressed.
 
-        A problem that :func:`~d4orm_planners.base.infeasibility.prove_infeasible` proves to have no solution ends at once.
+        A problem that :func:`~d4orm_planners.base.infeasibility.prove_infeasible` proves to have no solution ends at
+        once.
 
         Args:
             problem: What to solve.
@@ -123,8 +124,8 @@ class Planner(ABC):
             callback: Called with an :class:`IterationRecord` after every iteration, with the candidate that came of it;
                 returning ``True`` stops.
             initial_controls: ``(H, K, m)`` to start from, zeros by default.
-            watcher: Called with a :class:`~d4orm_planners.engine.sampling_types.DenoisingStep` after every denoising step, by the CPU
-                engine only. It changes nothing, and its time is not counted.
+            watcher: Called with a :class:`~d4orm_planners.engine.sampling_types.DenoisingStep` after every denoising
+                step, by the CPU engine only. It changes nothing, and its time is not counted.
 
         Returns:
             The best plan found: a solved one with the most reward, else the one with the fewest robots failing.

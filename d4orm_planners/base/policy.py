@@ -39,8 +39,8 @@ class Policy(ABC):
 
     Attributes:
         problem: Problem of the present episode, from the reset on.
-        config_class: :class:`~d4orm_planners.base.settings.CheckedSettings` of the policy, of which the constructor then
-            takes an instance. Without one, settings are keyword arguments of the constructor.
+        config_class: :class:`~d4orm_planners.base.settings.CheckedSettings` of the policy, of which the constructor
+            then takes an instance. Without one, settings are keyword arguments of the constructor.
         presets: By name, settings of ``config_class`` for :func:`~d4orm_planners.make_policy`.
     """
 

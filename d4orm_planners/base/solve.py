@@ -127,7 +127,7 @@ class SolveRun:
         num_samples: int,
         seed: int,
     ) -> SamplingResult:
-        """See :meth:`d4orm_planners.engine.sampling_types.SamplingEngine.denoise`; compiling is not counted, and time may end it."""
+        """See :meth:`SamplingEngine.denoise`; compiling is not counted, and time may end it."""
         with self.watch.paused():
             self.engine.prepare(task, rules, noise_scale, num_samples)
         # Engines of others need not know of watchers.

@@ -320,7 +320,7 @@ class CoarsePlanTracker:
 
 
 def _coarse_planner(config: D4ormC2FConfig, reroute: bool) -> Planner:
-    """The hybrid planner, with or without search for paths around all others; with a preset D4orm-D, as it plans coarsely."""
+    """The planner of coarse plans: hybrid, with or without rerouting, or D4orm-D with its preset."""
     given: dict[str, Any] = {
         "engine": config.engine,
         "num_samples": config.coarse_samples,

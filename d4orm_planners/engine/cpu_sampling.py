@@ -30,7 +30,7 @@ class CpuSamplingEngine(CpuEngine):
     """The CPU engine that samples as well. Stateless: all instances are alike."""
 
     def prepare(self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int) -> None:
-        """See :meth:`d4orm_planners.engine.sampling_types.SamplingEngine.prepare`; one compilation serves all teams of the same models."""
+        """See :meth:`SamplingEngine.prepare`; one compilation serves all teams of the same models."""
         del noise_scale, num_samples
         if not (score.score_kernel(task.problem.team.models).signatures and average.average_noise.signatures):
             self.denoise(task, rules, task.base, np.ones(1, np.float32), TILE, 0)

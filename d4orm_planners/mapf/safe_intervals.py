@@ -1,4 +1,4 @@
-"""When nobody is near each node of a roadmap, compiled with numba: safe intervals, kept only where somebody comes by."""
+"""Safe intervals of a roadmap's nodes, compiled with numba; kept only where somebody comes by."""
 
 from __future__ import annotations
 

@@ -13,7 +13,8 @@ class Dial(NamedTuple):
     """A slider of one disturbance.
 
     Attributes:
-        name: The disturbance and its attribute, as :func:`~d4orm_env.disturbances.disturbance_registry.find_level` knows them.
+        name: The disturbance and its attribute, as :func:`~d4orm_env.disturbances.disturbance_registry.find_level`
+            knows them.
         label: What the page calls it, with its unit.
         low: Least level.
         high: Greatest level.

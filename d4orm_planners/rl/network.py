@@ -44,8 +44,8 @@ class Header(BaseModel):
         activation: Between the layers.
         squashed: Whether the output goes through tanh.
         layers: Number of layers; those of sets come before them and are not counted.
-        encoder: ``"sets"`` if neighbours and obstacles are pooled first, see :mod:`d4orm_planners.rl.set_network`. Such a
-            policy acts for any number of observed robots.
+        encoder: ``"sets"`` if neighbours and obstacles are pooled first, see :mod:`d4orm_planners.rl.set_network`. Such
+            a policy acts for any number of observed robots.
         frame: Where the first axis of a robot's frame points; ``None`` is to the goal.
         ways: Whether it heads along the shortest free ways, see :meth:`Features.along`; ``None`` is straight.
         training: The command and its settings, for people, and the ``training_time`` [s].

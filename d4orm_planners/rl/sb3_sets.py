@@ -1,4 +1,4 @@
-"""A network of sets as a features extractor of Stable-Baselines3; :mod:`d4orm_planners.rl.set_network` says what it does."""
+"""A network of sets (:mod:`d4orm_planners.rl.set_network`) as a features extractor of Stable-Baselines3."""
 
 from __future__ import annotations
 

@@ -71,11 +71,12 @@ class TrainingSettings(TrainConfig):
         learning_rate: At the beginning; ``None`` is the algorithm's own. It falls linearly to a tenth.
         learner_settings: Further settings of the algorithm, as Stable-Baselines3 calls them, where they are others than
             those of :mod:`d4orm_planners.rl.algorithms`: ``{"gradient_steps": 8}``.
-        reward_settings: Weights of the :class:`~d4orm_env.envs.rewards.TrainingReward` to learn from, where they are others.
+        reward_settings: Weights of the :class:`~d4orm_env.envs.rewards.TrainingReward` to learn from, where they are
+            others.
         mixture: Scenarios and team sizes to be practised all at once, in place of ``scenario`` and ``num_robots``:
             texts as :meth:`~d4orm_planners.rl.task_mixture.TrainTask.parse` takes them, or names of
-            :data:`~d4orm_planners.rl.task_mixture.MIXTURES`. Each has as many robots, as nearly as whole worlds allow, and
-            as many validation worlds as any other.
+            :data:`~d4orm_planners.rl.task_mixture.MIXTURES`. Each has as many robots, as nearly as whole worlds allow,
+            and as many validation worlds as any other.
 
     Raises:
         ValueError: If a value makes no sense; the message names it.

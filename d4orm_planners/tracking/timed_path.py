@@ -85,9 +85,9 @@ def pace_to(route: Timed, step: int, at: int, corner: int, stop: float, dt: np.f
 def timed_kernel(name: str) -> Kernel[[RobotSpec, Timed, bool, FloatArray, Floats], int]:
     """The compiled drive of a robot of the model with this name along a :class:`Timed` route.
 
-    Args of the kernel: the :class:`~d4orm_planners.tracking.straight_drives.RobotSpec`, the route, whether the robot backs up, see
-    :func:`~d4orm_planners.tracking.pursuit.gear_towards`, ``controls`` ``(T, m)`` and ``places`` ``(T + 1, 3)``,
-    output. It returns the step of arrival, ``T + 1`` for none.
+    Args of the kernel: the :class:`~d4orm_planners.tracking.straight_drives.RobotSpec`, the route, whether the robot
+    backs up, see :func:`~d4orm_planners.tracking.pursuit.gear_towards`, ``controls`` ``(T, m)`` and ``places`` ``(T +
+    1, 3)``, output. It returns the step of arrival, ``T + 1`` for none.
     """
     model = MODELS[name]
     (move, dock), steer = make_stepper(model), steering(name)

@@ -89,9 +89,10 @@ def test_all_names_resolve() -> None:
 
 
 PUBLIC = (
-    "d4orm_env", "d4orm_env.jax.functional", "d4orm_env.envs.joint_state",
-    "d4orm_env.dynamics", "d4orm_env.navigation_v0", "d4orm_env.envs.options", "d4orm_env.render", "d4orm_env.envs.rewards",
-    "d4orm_env.scenarios", "d4orm_env.verify", "d4orm_env.envs.wrappers", "d4orm_planners", "d4orm_planners.base.adapters",
+    "d4orm_env", "d4orm_env.jax.functional", "d4orm_env.envs.joint_state", "d4orm_env.dynamics",
+    "d4orm_env.navigation_v0", "d4orm_env.envs.options", "d4orm_env.render", "d4orm_env.envs.rewards",
+    "d4orm_env.scenarios", "d4orm_env.verify", "d4orm_env.envs.wrappers", "d4orm_planners",
+    "d4orm_planners.base.adapters",
 )  # fmt: skip
 
 

@@ -76,7 +76,8 @@ def worlds(draw: st.DrawFn, dimension: int, width: float) -> World:
         kinds = {"cylinders": rows, "spheres": [(x, y, z, radius) for (x, y, radius), z in zip(rows, (0.0, -0.0, 1e6))]}
     if bounds is not None:
         kinds |= {"lower": [-bounds] * dimension, "upper": [bounds + width] * dimension}
-    return World(dimension, boxes=boxes, **kinds)
+    origin = draw(st.none() | st.tuples(*[st.floats(-1e9, 1e9)] * dimension))
+    return World(dimension, boxes=boxes, origin=origin, **kinds)
 
 
 @st.composite
@@ -124,7 +125,7 @@ def test_any_problem_comes_back_to_the_bit(problem: Problem) -> None:
     again = saved_and_loaded(problem)
     assert again == problem
     assert again.name == problem.name
-    for name in ("start", "goal"):
+    for name in ("start", "goal", "origin"):
         assert getattr(again, name).tobytes() == getattr(problem, name).tobytes()
 
 
