@@ -47,7 +47,7 @@ ROBOTS = 8
 FIRST_SEED = 1000
 """Seeds 0 to 49 were looked at while D4orm-C2F was improved."""
 SCENARIOS = ("circle", "random", "rooms")
-POLICIES: dict[str, dict[str, Any]] = {"d4orm-c2f": {"refine": "sync"}, "d4orm-d": {}, "orca": {}, "ppo": {}}
+POLICIES: dict[str, dict[str, Any]] = {"d4orm-c2f": {"refine": "sync"}, "hybrid": {}, "orca": {}, "ppo": {}}
 DISTURBANCES: dict[str, Disturbance[Any]] = {
     "noise 0.3": ControlNoise(0.3),
     "correlated noise 0.2, 1 s": CorrelatedNoise(0.2, 1.0),

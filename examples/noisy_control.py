@@ -18,7 +18,7 @@ from d4orm_env import Problem, navigation_v0
 from d4orm_env.envs.joint_state import split_state
 from d4orm_planners import make_policy
 
-POLICIES = {"d4orm-d": "open loop: the plan of D4orm-D", "d4orm-c2f": "closed loop: D4orm-C2F"}
+POLICIES = {"hybrid": "open loop: the plan of the hybrid planner", "d4orm-c2f": "closed loop: D4orm-C2F"}
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def draw(problem: Problem, executions: dict[str, Execution], noise: float, out: 
         ax.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xlabel="x [m]")
     axes[0].set_ylabel("y [m]")
     marks: list[tuple[str, dict[str, Any]]] = [
-        ("goal", {"marker": "D", "mfc": "none", "mec": "0.3", "ms": 8}),
+        ("go-to-goal", {"marker": "D", "mfc": "none", "mec": "0.3", "ms": 8}),
         ("end, arrived", {"marker": "o", "mfc": "0.5", "mec": "0.3", "ms": 9}),
         ("end, not arrived", {"marker": "o", "mfc": "white", "mec": "0.3", "ms": 9}),
         ("contact begins", {"marker": "*", "mfc": COLOURS["mppi"], "mec": "black", "ms": 10}),

@@ -41,7 +41,7 @@ def draw(rows: list[dict[str, Any]], out: Any) -> None:
 
 def measure(sizes: Sequence[int], seeds: int, time_limit: float) -> list[dict[str, Any]]:
     """A row per team size and problem."""
-    planner = make_planner("d4orm-d", max_iterations=1000)
+    planner = make_planner("hybrid", max_iterations=1000)
     rows = []
     for robots in sizes:
         for seed in range(seeds):

@@ -27,7 +27,7 @@ def main() -> int:
     size = 10.0 * (num_robots / 64) ** 0.5
     problem = make_problem("random", num_robots=num_robots, seed=arguments.seed, size=size)
 
-    plan = make_planner("d4orm-d").solve(problem, seed=arguments.seed, time_limit=arguments.time_limit)
+    plan = make_planner("hybrid").solve(problem, seed=arguments.seed, time_limit=arguments.time_limit)
     rows = [
         {
             "iteration": record.iteration,

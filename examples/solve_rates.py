@@ -3,7 +3,7 @@
     python examples/solve_rates.py --seeds 20
     python examples/solve_rates.py --seeds 5 --sets few --planner mmd
     python examples/solve_rates.py --seeds 20 --sets paper --planner d4orm --preset paper
-    python examples/solve_rates.py --sets big --planner d4orm-d --improve 3
+    python examples/solve_rates.py --sets big --planner hybrid --improve 3
 
 Random instances differ by seed; those of the AMSwarm comparison have their starts jittered by 5 mm. Every plan that
 counts as solved has passed ``verify()``. Iterations and seconds are those to the first solution, compilation not
@@ -56,7 +56,7 @@ SETS: Mapping[str, Cases] = {
         Case("circle in space, 8", "circle", {"num_robots": 8, "model": "holonomic3d"}),
         Case("circle in space, 12", "circle", {"num_robots": 12, "model": "holonomic3d"}),
     )),
-    "big": Cases(("d4orm-d",), 200, (
+    "big": Cases(("hybrid",), 200, (
         Case("circle, 16", "circle", {"num_robots": 16}),
         Case("four obstacles, 16", "four_obstacles", {"num_robots": 16}),
         Case("random, 64 on 8 x 8 m", "random", {"num_robots": 64, "size": 8.0}),
@@ -66,7 +66,7 @@ SETS: Mapping[str, Cases] = {
         Case("sphere, 64", "sphere", {"num_robots": 64}),
         *(Case(f"AMSwarm {i}, 10", f"amswarm_{i}", {"num_robots": 10}) for i in range(1, 6)),
     )),
-    "canonical": Cases(("d4orm-d",), 60, (
+    "canonical": Cases(("hybrid",), 60, (
         Case("circle, 16", "paper_circle", {"num_robots": 16}),
         Case("sphere, 16", "paper_sphere", {"num_robots": 16}),
         Case("heterogeneous, 16", "paper_heterogeneous", {"num_robots": 16}),
@@ -74,7 +74,7 @@ SETS: Mapping[str, Cases] = {
         Case("random, 16", "paper_random", {"num_robots": 16}),
         Case("random, 64", "paper_random", {"num_robots": 64}),
     )),
-    "walls": Cases(("d4orm-d",), 200, (
+    "walls": Cases(("hybrid",), 200, (
         *(Case(f"map of 32 x 32 cells, {k}", "map", {"num_robots": k, "cell": 0.6}) for k in (10, 40, 80)),
         *(Case(f"rooms, {k}", "rooms", {"num_robots": k}) for k in (10, 20, 40)),
         *(Case(f"maze, {k}", "maze", {"num_robots": k}) for k in (10, 20)),
@@ -84,7 +84,7 @@ SETS: Mapping[str, Cases] = {
         Case("forest in space, 16", "forest", {"num_robots": 16, "model": "holonomic3d"}),
         Case("forest, 16 differential drives", "forest", {"num_robots": 16, "model": "differential_drive"}),
     )),
-    "few": Cases(("mmd", "d4orm-d", "guided"), 60, (
+    "few": Cases(("mmd", "hybrid", "mapf"), 60, (
         Case("circle, 8", "circle", {"num_robots": 8}),
         Case("random with 4 obstacles, 8", "random", {"num_robots": 8, "num_obstacles": 4}),
         Case("random with 4 obstacles, 16", "random", {"num_robots": 16, "num_obstacles": 4}),
@@ -94,7 +94,7 @@ SETS: Mapping[str, Cases] = {
         Case("rooms, 4", "rooms", {"num_robots": 4}),
         Case("rooms, 8", "rooms", {"num_robots": 8}),
     )),
-    "mmd": Cases(("mmd", "d4orm-d", "guided"), 300, tuple(
+    "mmd": Cases(("mmd", "hybrid", "mapf"), 300, tuple(
         Case(f"{name}, {k}", f"mmd_{name.replace(' ', '_')}", {"num_robots": k})
         for name in ("conveyor", "highways", "drop region") for k in (6, 12, 20)
     )),

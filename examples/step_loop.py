@@ -44,7 +44,7 @@ def main() -> None:
     noises = (0.0, 0.5) if arguments.quick else (0.0, 0.1, 0.2, 0.5, 1.0)
     rows = []
     for noise in noises:
-        for name in ("d4orm", "goal"):
+        for name in ("d4orm", "go-to-goal"):
             episodes = [run(name, num_robots, noise, seed) for seed in seeds]
             robots = num_robots * len(episodes)
             success = sum(arrived == num_robots and touched == 0 for arrived, touched, _ in episodes)

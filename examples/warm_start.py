@@ -21,7 +21,7 @@ from d4orm_env import Problem, make_problem, navigation_v0
 from d4orm_planners import make_planner, make_policy, run_episode
 
 CASES = (("random", 8), ("random", 16), ("circle", 8), ("circle", 16))
-PLANNERS = ("d4orm-d", "d4orm", "d4orm-c2f")
+PLANNERS = ("hybrid", "d4orm", "d4orm-c2f")
 GUESSES = (None, "ppo")
 LIMIT = 5.0
 """Of planning [s]."""
@@ -91,7 +91,7 @@ def main() -> None:
     arguments = parser.parse_args()
     chosen: tuple[Any, ...] = PLANNERS, CASES, arguments.seeds
     if arguments.quick:
-        chosen = ("d4orm-d", "d4orm-c2f"), (("random", 4),), 2
+        chosen = ("hybrid", "d4orm-c2f"), (("random", 4),), 2
     rows = measured(arguments.trials, partial(measure, *chosen), arguments.out / "warm_start.parquet")
     save_table(summary(rows), arguments.out / "warm_start.csv")
 

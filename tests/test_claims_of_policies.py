@@ -812,7 +812,7 @@ def test_mmd_solves_teams_that_others_do_not_and_the_reverse() -> None:
     crowd, rooms = "random with 4 obstacles, 16", "rooms, 8"
     for team in teams("few"):
         more = {crowd: 1, rooms: -1}.get(team, 0)
-        assert found["mmd", team] - found["d4orm-d", team] == found["mmd", team] - found["guided", team] == more
+        assert found["mmd", team] - found["d4orm-d", team] == found["mmd", team] - found["mapf", team] == more
     most = max(row["iterations"] for own in solves("few").values() for row in own)
     says(
         MMD,
@@ -824,7 +824,7 @@ def test_mmd_solves_teams_that_others_do_not_and_the_reverse() -> None:
 
 def test_path_finding_is_faster_than_mmd_but_for_a_few() -> None:
     found = solves("few")
-    pairs = {team: list(zip(found["guided", team], found["mmd", team], strict=True)) for team in teams("few")}
+    pairs = {team: list(zip(found["mapf", team], found["mmd", team], strict=True)) for team in teams("few")}
     ratios = [np.median([other["seconds"] / one["seconds"] for one, other in own]) for own in pairs.values()]
     slow = [one for own in pairs.values() for one, other in own if one["seconds"] > other["seconds"]]
     assert sum(not one["solved"] for one in slow) == 1
@@ -852,7 +852,7 @@ def test_mmd_on_its_own_maps() -> None:
 
 
 def test_others_solve_all_of_mmds_maps_sooner_and_shorter() -> None:
-    for other in ("d4orm-d", "guided"):
+    for other in ("d4orm-d", "mapf"):
         assert sum(solved(own) for (planner, _), own in solves("mmd").items() if planner == other) == 180
         assert all(one < two for one, two in zip(medians("mmd", other), medians("mmd", "mmd"), strict=True))
     says(

@@ -31,7 +31,7 @@ POLICIES = {
     "orca": "ORCA",
     "ppo": "PPO",
     "sac": "SAC",
-    "goal": "straight",
+    "go-to-goal": "straight",
     "hybrid": "open loop: hybrid",
     "mapf": "open loop: path finding",
 }

@@ -101,7 +101,7 @@ def _big_teams() -> Figure:
         "d4orm": PAPER,
         "d4orm, defaults": {"policy": "d4orm"},
         "d4orm-d": PAPER,
-        "d4orm-d, defaults": {"policy": "d4orm-d"},
+        "hybrid": {"policy": "hybrid"},
         "d4orm-c2f": C2F,
     }
     paper = {
@@ -139,7 +139,7 @@ def _big_teams() -> Figure:
 
 
 def _robustness() -> Figure:
-    policies = {"d4orm-c2f": C2F, "d4orm-d": PAPER, "d4orm-d, defaults": {"policy": "d4orm-d"}}
+    policies = {"d4orm-c2f": C2F, "d4orm-d": PAPER, "hybrid": {"policy": "hybrid"}}
     levels = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0)
     return Figure(
         name="robustness",
@@ -227,7 +227,7 @@ def _amswarm() -> Figure:
                     "d4orm": PAPER,
                     "d4orm, defaults": {"policy": "d4orm"},
                     "d4orm-d": PAPER,
-                    "d4orm-d, defaults": {"policy": "d4orm-d"},
+                    "hybrid": {"policy": "hybrid"},
                     "amswarm": {},
                 },
                 scenarios=scenarios,

@@ -89,7 +89,7 @@ class Mission:
     def planning(self) -> DD4ormConfig:
         """The settings of D-D4orm."""
         # Search for shorter ways takes a second an iteration where a round has less.
-        samples = D4ormConfig(num_samples=self.samples, num_steps=self.denoising_steps, shorten=False)
+        samples = D4ormConfig(num_samples=self.samples, num_steps=self.denoising_steps)
         return DD4ormConfig(nodes=self.robots, refinement=samples, engine="cpu", improve=True)
 
     def join(self, part: str, listen: bool) -> ZenohTransport:

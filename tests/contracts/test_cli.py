@@ -38,7 +38,7 @@ def test_plan_writes_a_replay(d4orm, tmp_path: Path) -> None:
     outcome = d4orm("plan", "--num-robots", "2", "--out", "plan.html")
     assert outcome.status == 0, outcome.err
     assert "wrote plan.html" in outcome.out
-    assert "circle, 2 robots by d4orm-d" in (tmp_path / "plan.html").read_text(encoding="utf-8")
+    assert "circle, 2 robots by hybrid" in (tmp_path / "plan.html").read_text(encoding="utf-8")
 
 
 def test_planning_and_running_take_the_recommended_planner(d4orm) -> None:
@@ -53,14 +53,14 @@ def test_run_compares_policies_side_by_side(d4orm, tmp_path: Path) -> None:
     outcome = d4orm("run", "--num-robots", "2", "--compare", "goal, random", "--out", "compare.html")
     assert outcome.status == 0, outcome.err
     page = (tmp_path / "compare.html").read_text(encoding="utf-8")
-    assert page.index('"title": "goal"') < page.index('"title": "random"')
+    assert page.index('"title": "go-to-goal"') < page.index('"title": "random"')
 
 
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
         (("--compare", "goal,random"), "--compare needs --out"),
-        (("--compare", "goal", "--policy", "d4orm", "--out", "a.html"), "--policy does not go with --compare goal"),
+        (("--compare", "go-to-goal", "--policy", "d4orm", "--out", "a.html"), "--policy does not go with --compare goal"),
         (("--compare", "goal,nobody", "--out", "a.html"), "nobody"),
         (("--out", "a.htm"), "must end in .html"),
     ],
@@ -80,7 +80,7 @@ def test_run_executes_a_plan_file(d4orm) -> None:
 
 
 def test_run_of_a_policy_that_collides_exits_with_one(d4orm) -> None:
-    outcome = d4orm("run", "--policy", "goal", "--num-robots", "2")
+    outcome = d4orm("run", "--policy", "go-to-goal", "--num-robots", "2")
     assert outcome.status == 1
     assert "robots in contact" in outcome.out
 
@@ -142,7 +142,7 @@ def test_lists(d4orm, command: str) -> None:
         ("cem", {"sigma", "elite_fraction"}, "temperature"),
         ("d-d4orm", {"planner", "nodes", "late_samples"}, "repair_steps"),
         ("d4orm-c2f", {"weight_cutoff", "deadline"}, "nodes"),
-        ("goal", {"no settings"}, "sigma"),
+        ("go-to-goal", {"no settings"}, "sigma"),
     ],
 )
 def test_the_settings_of_one_are_listed(d4orm, name: str, listed: set[str], missing: str) -> None:
@@ -324,7 +324,7 @@ def test_without_a_place_for_complaints_the_status_says_it() -> None:
 
 
 def test_a_character_that_the_output_lacks_ends_nothing(tmp_path: Path) -> None:
-    options = ("--policy", "goal", "--num-robots", "2", "--out", str(tmp_path / "\u00e4\u4e2d.html"))
+    options = ("--policy", "go-to-goal", "--num-robots", "2", "--out", str(tmp_path / "\u00e4\u4e2d.html"))
     outcome = command_line("run", *options, PYTHONIOENCODING="latin-1:strict")
     assert (outcome.returncode, outcome.stderr) in ((0, ""), (1, ""))
     assert outcome.stdout.rstrip().endswith("\\u4e2d.html")

@@ -171,7 +171,7 @@ def test_the_command_line_takes_an_import_path(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", [*__import__("sys").path])
     with pytest.raises(SystemExit) as end:
-        main(["run", "--scenario", "brought:pair", "--num-robots", "2", "--policy", "goal", "--quiet"])
+        main(["run", "--scenario", "brought:pair", "--num-robots", "2", "--policy", "go-to-goal", "--quiet"])
     assert end.value.code in (0, 1)
     with pytest.raises(SystemExit) as end:
         main(["plan", "--scenario", "brought:trio"])
@@ -183,7 +183,7 @@ def test_the_command_line_takes_an_import_path(
 
 def test_evaluate_takes_callables(tmp_path: Path) -> None:
     (row,) = evaluate(
-        policies=["goal"], scenarios=[still], num_robots=[2], seeds=range(2), out=tmp_path / "store", workers=1
+        policies=["go-to-goal"], scenarios=[still], num_robots=[2], seeds=range(2), out=tmp_path / "store", workers=1
     )
     assert (row.scenario, row.num_robots, row.trials, row.errors, row.rate) == ("still", 2, 2, 0, 1.0)
 

@@ -45,7 +45,7 @@ def plan(request: pytest.FixtureRequest) -> Plan:
 @pytest.fixture(scope="module")
 def episode() -> Episode:
     env = navigation_v0.parallel_env("circle", num_robots=3, lifelong=True, max_cycles=60)
-    return run_episode(env, "goal", seed=0)
+    return run_episode(env, "go-to-goal", seed=0)
 
 
 def test_texts_are_short(plan: Plan, episode: Episode) -> None:
@@ -128,7 +128,7 @@ def test_changing_goals_are_shown(episode: Episode) -> None:
 
 def test_a_replay_shows_what_moves_among_the_robots_and_is_none() -> None:
     env = navigation_v0.parallel_env("circle", num_robots=2, disturbances=[Intruder(3, radius=0.2)], max_cycles=8)
-    episode = run_episode(env, "goal", seed=0)
+    episode = run_episode(env, "go-to-goal", seed=0)
     bodies = content(episode.animate().html)["scenes"][0]["bodies"]
     assert bodies["count"] == 3
     raw = np.frombuffer(base64.b64decode(bodies["data"]), "<u2").reshape(-1, 3, 3)

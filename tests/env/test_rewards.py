@@ -93,7 +93,7 @@ def test_a_reset_world_gets_nothing_and_the_metrics_begin_anew(mode: str) -> Non
 
 def test_an_episode_records_the_reward_of_all_robots() -> None:
     env = navigation_v0.parallel_env(problem=line_problem([0.1, 0.5]), reward=lambda step: step.arrived + 0.25)
-    episode = run_episode(env, make_policy("goal"))
+    episode = run_episode(env, make_policy("go-to-goal"))
     np.testing.assert_allclose(episode.trajectory.rewards[0], [1.25, 0.25])
     np.testing.assert_allclose(episode.trajectory.rewards[:, 0], 1.25)
     np.testing.assert_allclose(episode.trajectory.rewards.mean(), episode.metrics["reward"], rtol=1e-6)

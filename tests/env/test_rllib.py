@@ -36,7 +36,7 @@ def test_steps_are_those_of_pettingzoo() -> None:
 def test_an_episode_ends_for_all(robots: int, cycles: int, terminated: bool) -> None:
     env = RLlibNavigation(WORLD | {"num_robots": robots, "max_cycles": cycles})
     observations, _ = env.reset(seed=0)
-    policy = make_policy("goal")
+    policy = make_policy("go-to-goal")
     policy.reset(env.env, seed=0)
     over = False
     while not over:
@@ -48,7 +48,7 @@ def test_an_episode_ends_for_all(robots: int, cycles: int, terminated: bool) -> 
 
 
 def test_a_robot_that_arrives_when_time_is_up_for_another_ends_the_episode() -> None:
-    policy, env = make_policy("goal"), RLlibNavigation(WORLD | {"scenario": "random", "num_robots": 2, "seed": 0})
+    policy, env = make_policy("go-to-goal"), RLlibNavigation(WORLD | {"scenario": "random", "num_robots": 2, "seed": 0})
     observations, _ = env.reset(seed=0)
     policy.reset(env.env, seed=0)
     steps = 0

@@ -78,7 +78,7 @@ def test_instances_are_levels_too() -> None:
 )
 def test_what_makes_no_sense_is_refused_before_anything_runs(tmp_path: Path, disturbances: Any, complaint: str) -> None:
     with pytest.raises(ValueError, match=complaint):
-        evaluate("goal", line_problem([1.0]), out=tmp_path / "out", disturbances=disturbances)
+        evaluate("go-to-goal", line_problem([1.0]), out=tmp_path / "out", disturbances=disturbances)
     assert not (tmp_path / "out").exists()
 
 
@@ -89,7 +89,7 @@ def test_every_trial_is_stored_with_its_disturbance_and_run_once(tmp_path: Path)
         "out": tmp_path,
         "progress": lambda what, done, total: counts.append((done, total)),
     }
-    rows = evaluate("goal", disturbances={"delay": [0, 1], "push.speed": [0.0, 0.4]}, **study)
+    rows = evaluate("go-to-goal", disturbances={"delay": [0, 1], "push.speed": [0.0, 0.4]}, **study)
     assert [(row.disturbance, row.level, row.trials) for row in rows] == [
         ("delay", 0, 2), ("delay", 1, 2), ("push.speed", 0, 2), ("push.speed", 0.4, 2)
     ]  # fmt: skip
@@ -101,18 +101,18 @@ def test_every_trial_is_stored_with_its_disturbance_and_run_once(tmp_path: Path)
     ]  # fmt: skip
     assert {row.disturbances: row.verified is None for row in stored}['[["push", {"rate": 0.2, "speed": 0.4}]]']
     counts.clear()
-    more = evaluate("goal", disturbances={"delay": [0, 1, 2]}, **study)
+    more = evaluate("go-to-goal", disturbances={"delay": [0, 1, 2]}, **study)
     assert counts[0] == (4, 6)
     assert more[:2] == rows[:2]
-    assert all(row.disturbance == "" and row.trials == 2 for row in evaluate("goal", **study))
+    assert all(row.disturbance == "" and row.trials == 2 for row in evaluate("go-to-goal", **study))
     assert "delay steps=1" in leaderboard(TrialStore.existing(tmp_path).trials())
 
 
 def test_trials_are_those_of_the_environment(tmp_path: Path) -> None:
     problem, disturbances = line_problem([1.0, 1.5], "holonomic2d"), [Delay(2), Intruder(2)]
-    ((group,), _) = (run_study(Study(policies="goal", scenarios=problem, seeds=[4], disturbances={"x": [one]}),
+    ((group,), _) = (run_study(Study(policies="go-to-goal", scenarios=problem, seeds=[4], disturbances={"x": [one]}),
                      tmp_path, workers=1) for one in (disturbances, disturbances))  # fmt: skip
-    episode = run_episode(navigation_v0.parallel_env(problem=problem, disturbances=disturbances), "goal", seed=4)
+    episode = run_episode(navigation_v0.parallel_env(problem=problem, disturbances=disturbances), "go-to-goal", seed=4)
     (row,) = group.trials
     assert (row.travel_time, row.collided) == (episode.metrics["travel_time"], episode.metrics["collided"])
 
@@ -120,13 +120,13 @@ def test_trials_are_those_of_the_environment(tmp_path: Path) -> None:
 def test_the_same_trial_in_another_physics_is_another_one(tmp_path: Path) -> None:
     problem = line_problem([1.0, 1.5], "differential_drive")
     for physics in ("model", "mujoco", "mujoco"):
-        evaluate("goal", problem, seeds=[4], workers=1, out=tmp_path, physics=physics)
+        evaluate("go-to-goal", problem, seeds=[4], workers=1, out=tmp_path, physics=physics)
     ours, theirs = TrialStore.existing(tmp_path).trials()
     assert (ours.physics, theirs.physics) == ("model", "mujoco")
     assert ours.key == theirs.key._replace(physics="model")
     assert ours.verified
     assert theirs.verified is None
-    episode = run_episode(mujoco.parallel_env(problem=problem), "goal", seed=4)
+    episode = run_episode(mujoco.parallel_env(problem=problem), "go-to-goal", seed=4)
     assert (theirs.travel_time, theirs.reward) == (episode.metrics["travel_time"], episode.metrics["reward"])
     assert theirs.reward != ours.reward
     assert "custom, 2 robots, differential_drive, in mujoco" in leaderboard([ours, theirs], [1.0])
@@ -135,23 +135,23 @@ def test_the_same_trial_in_another_physics_is_another_one(tmp_path: Path) -> Non
 @pytest.mark.parametrize(("physics", "complaint"), [("bullet", "physics is 'bullet'"), ("mujoco", "robot_0 is a car")])
 def test_a_physics_that_cannot_be_is_refused_before_anything_runs(tmp_path: Path, physics: str, complaint: str) -> None:
     with pytest.raises(ValueError, match=complaint):
-        evaluate("goal", line_problem([1.0], "car"), out=tmp_path / "out", physics=physics)
+        evaluate("go-to-goal", line_problem([1.0], "car"), out=tmp_path / "out", physics=physics)
     assert not (tmp_path / "out").exists()
 
 
 def test_the_physics_on_the_command_line(tmp_path: Path, d4orm: Call) -> None:
-    options = ["-k", "2", "--physics", "mujoco", "--policy", "goal"]
+    options = ["-k", "2", "--physics", "mujoco", "--policy", "go-to-goal"]
     assert d4orm("run", *options, "--model", "differential_drive")[0] in (0, 1)
     assert d4orm("evaluate", *options, "-n", "1", "-j", "1", "-o", str(tmp_path))[0] == 0
     assert [trial.physics for trial in TrialStore.existing(tmp_path).trials()] == ["mujoco"]
     for command in (["run"], ["evaluate", "-o", str(tmp_path)]):
-        status, _, complaint = d4orm(*command, *options[:2], "--policy", "goal", "--physics", "bullet")
+        status, _, complaint = d4orm(*command, *options[:2], "--policy", "go-to-goal", "--physics", "bullet")
         assert (status, complaint) == (2, "d4orm: physics is 'bullet'; choose one of model, mujoco\n")
 
 
 def test_a_stalled_robot_does_not_spoil_the_trial(tmp_path: Path) -> None:
     problem = line_problem([2.0] * 3, horizon=60)
-    (rate,) = evaluate("goal", problem, out=tmp_path, seeds=range(4), workers=1,
+    (rate,) = evaluate("go-to-goal", problem, out=tmp_path, seeds=range(4), workers=1,
                        disturbances={"one stalls": [Stall(1.0, robots=1)]})  # fmt: skip
     assert rate.successes == 4
     assert rate.late > 0
@@ -223,7 +223,7 @@ def test_the_command_line(d4orm: Call, tmp_path: Path) -> None:
 
 
 def test_robustness_is_a_study_of_all(d4orm: Call, tmp_path: Path) -> None:
-    status, out, _ = d4orm("robustness", "--policy", "goal", "-k", "2", "--seeds", "1", "--workers", "1")
+    status, out, _ = d4orm("robustness", "--policy", "go-to-goal", "-k", "2", "--seeds", "1", "--workers", "1")
     assert status == 0
     assert "limit_mismatch 0.7" in out
     stored = TrialStore.existing(tmp_path / "robustness" / STORE).trials()
@@ -232,7 +232,7 @@ def test_robustness_is_a_study_of_all(d4orm: Call, tmp_path: Path) -> None:
 
 
 def test_an_episode_with_disturbances(d4orm: Call) -> None:
-    quiet = ("run", "--policy", "goal", "-k", "1", "--seed", "3")
+    quiet = ("run", "--policy", "go-to-goal", "-k", "1", "--seed", "3")
     outputs = {d4orm(*quiet, *more)[1] for more in ((), ("--disturb", "delay=0"), ("--disturb", "limit_mismatch=0.5"))}
     assert len(outputs) == 2
 

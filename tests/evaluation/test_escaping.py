@@ -111,7 +111,7 @@ def test_a_picture_has_no_formulas_of_others(tmp_path: Path) -> None:
 def test_a_scenario_file_may_have_a_bar_in_its_name(tmp_path: Path) -> None:
     path = tmp_path / "a|b.yaml"
     save_problem(make_problem("circle", num_robots=2).replace(name="custom"), path)
-    rates = evaluate(policies=["goal"], scenarios=[path], seeds=[0], out=tmp_path / "out", workers=1)
+    rates = evaluate(policies=["go-to-goal"], scenarios=[path], seeds=[0], out=tmp_path / "out", workers=1)
     write_results(tmp_path / "out", rates)
     assert "### a\\|b, 2 robots, holonomic2d\n" in (tmp_path / "out" / "table.md").read_text(encoding="utf-8")
 

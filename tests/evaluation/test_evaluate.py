@@ -80,13 +80,13 @@ def test_a_planners_trial_says_everything(tmp_path: Path) -> None:
 
 
 def test_the_time_of_a_controller_is_that_of_its_preparation_and_of_its_steps(tmp_path: Path) -> None:
-    evaluate({"goal": {}}, out=tmp_path, num_robots=2, seeds=[4], workers=1)
+    evaluate({"go-to-goal": {}}, out=tmp_path, num_robots=2, seeds=[4], workers=1)
     (stored,) = TrialStore(tmp_path / STORE).trials()
     assert 0 < stored.preparation < stored.wall_time < stored.elapsed  # type: ignore[operator]
 
 
 def test_the_judge_sees_what_was_executed(tmp_path: Path) -> None:
-    evaluate(["goal", "orca"], out=tmp_path, control_noise_std=[0.0, 0.2], **TINY)
+    evaluate(["go-to-goal", "orca"], out=tmp_path, control_noise_std=[0.0, 0.2], **TINY)
     stored = TrialStore(tmp_path / STORE).trials()
     assert len(stored) == 8
     for row in stored:
@@ -114,7 +114,7 @@ def test_two_configurations_of_one_policy_and_problems_of_all_kinds(tmp_path: Pa
 
 def test_scenarios_with_other_arguments_are_other_trials(tmp_path: Path) -> None:
     for diameter in (6.0, 7.0):
-        evaluate("goal", out=tmp_path, **TINY, scenario_settings={"diameter": diameter})
+        evaluate("go-to-goal", out=tmp_path, **TINY, scenario_settings={"diameter": diameter})
     stored = TrialStore(tmp_path / STORE).trials()
     assert len(stored) == 4
     assert {(row.scenario, row.problem) for row in stored} == {
@@ -139,7 +139,7 @@ def test_a_problem_with_two_names_runs_once(tmp_path: Path) -> None:
     problem = make_problem("circle", num_robots=2)
     counts: list[tuple[int, int]] = []
     rows = evaluate(
-        "goal",
+        "go-to-goal",
         [problem, "circle"],
         out=tmp_path,
         **TINY,
@@ -150,10 +150,10 @@ def test_a_problem_with_two_names_runs_once(tmp_path: Path) -> None:
 
 
 def test_the_time_limit_reaches_planners_without_one(tmp_path: Path) -> None:
-    policies = {"d4orm": {**QUICK, "improve": True, "max_iterations": 10_000}, "goal": {}}
+    policies = {"d4orm": {**QUICK, "improve": True, "max_iterations": 10_000}, "go-to-goal": {}}
     rows = evaluate(policies, out=tmp_path, time_limit=0.05, **TINY)
     limits = {row.policy: json.loads(row.config).get("time_limit") for row in TrialStore(tmp_path / STORE).trials()}
-    assert limits == {"d4orm": 0.05, "goal": None}
+    assert limits == {"d4orm": 0.05, "go-to-goal": None}
     assert rows[0].errors == 0
     stored = [row for row in TrialStore(tmp_path / STORE).trials() if row.policy == "d4orm"]
     assert {row.status for row in stored} == {"time_limit"}
@@ -236,7 +236,7 @@ if __name__ == "__main__":
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
 def test_what_crashes_dies_or_hangs_is_a_row_and_the_rest_goes_on(tmp_path: Path) -> None:
-    result = program(tmp_path, TROUBLE + EVALUATE.format(policies='"goal"', arguments="workers=2, trial_timeout=8"))
+    result = program(tmp_path, TROUBLE + EVALUATE.format(policies='"go-to-goal"', arguments="workers=2, trial_timeout=8"))
     assert result.stdout == "(6, 3) (6, 3)\n", result.stderr
     stored = TrialStore(tmp_path / "out" / STORE).trials()
     errors = {(row.seed, row.control_noise_std): row.error for row in stored}
@@ -250,7 +250,7 @@ def test_what_crashes_dies_or_hangs_is_a_row_and_the_rest_goes_on(tmp_path: Path
     assert {row.verified for row in stored if row.error} == {None}
     # Without the trouble the same call runs again what failed, and nothing else.
     before = {row.key: row for row in stored if not row.error}
-    result = program(tmp_path, EVALUATE.format(policies='"goal"', arguments="workers=2"))
+    result = program(tmp_path, EVALUATE.format(policies='"go-to-goal"', arguments="workers=2"))
     assert result.stdout == "(6, 0) (6, 0)\n", result.stderr
     after = {row.key: row for row in TrialStore(tmp_path / "out" / STORE).trials()}
     assert len(after) == 12
@@ -271,7 +271,7 @@ def test_a_plan_that_cannot_be_made_fails_at_all_levels_at_once(tmp_path: Path) 
 
 @pytest.mark.slow
 def test_a_program_without_a_guard_is_told_so(tmp_path: Path) -> None:
-    body = EVALUATE.format(policies='"goal"', arguments="workers=2").replace('if __name__ == "__main__":', "if True:")
+    body = EVALUATE.format(policies='"go-to-goal"', arguments="workers=2").replace('if __name__ == "__main__":', "if True:")
     result = program(tmp_path, body)
     assert result.returncode == 1
     last = result.stderr.strip().splitlines()[-1]
@@ -283,7 +283,7 @@ def test_a_program_without_a_guard_is_told_so(tmp_path: Path) -> None:
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
 def test_a_killed_evaluation_goes_on_where_it_was(tmp_path: Path) -> None:
     """Killed in the middle; ``tests/test_robustness.py`` kills at once."""
-    arguments = ["-p", "goal", "-k", "8", "-n", "60", "--control-noise-std", "0,0.1", "-j2", "-q", "-o", str(tmp_path)]
+    arguments = ["-p", "go-to-goal", "-k", "8", "-n", "60", "--control-noise-std", "0,0.1", "-j2", "-q", "-o", str(tmp_path)]
     command = [sys.executable, "-m", "d4orm_planners.cli.app", "evaluate", *arguments]
     process = subprocess.Popen(command)
     deadline = time.monotonic() + 120
@@ -308,7 +308,7 @@ def test_a_killed_evaluation_goes_on_where_it_was(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_two_evaluations_may_share_a_store(tmp_path: Path) -> None:
-    arguments = ["-p", "goal", "-k", "4", "--control-noise-std", "0,0.1", "-q", "-o", str(tmp_path)]
+    arguments = ["-p", "go-to-goal", "-k", "4", "--control-noise-std", "0,0.1", "-q", "-o", str(tmp_path)]
     command = [sys.executable, "-m", "d4orm_planners.cli.app", "evaluate", *arguments]
     both = [subprocess.Popen([*command, "-n", seeds, "-j", "1"]) for seeds in ("0-29", "10-39")]
     assert [process.wait() for process in both] == [0, 0]
@@ -333,7 +333,7 @@ def test_a_full_disk_is_one_line_and_the_store_stays_whole(
         return connection
 
     monkeypatch.setattr("d4orm_planners.evaluation.store.sqlite3.connect", full)
-    arguments = ("evaluate", "-p", "goal", "-k", "2", "-n", "40", "-j", "1", "-o", "out")
+    arguments = ("evaluate", "-p", "go-to-goal", "-k", "2", "-n", "40", "-j", "1", "-o", "out")
     status, _, err = d4orm(*arguments)
     assert status == 2
     assert err.count("\n") == 1
@@ -352,13 +352,13 @@ def test_a_full_disk_is_one_line_and_the_store_stays_whole(
 def test_the_files_equal_the_store(d4orm, tmp_path: Path) -> None:
     pandas = pytest.importorskip("pandas")
     pytest.importorskip("pyarrow")
-    arguments = ("-p", "goal", "-p", "orca:time_horizon=2", "-s", "circle,random", "-k", "2,3", "-n", "2")
+    arguments = ("-p", "go-to-goal", "-p", "orca:time_horizon=2", "-s", "circle,random", "-k", "2,3", "-n", "2")
     status, out, err = d4orm("evaluate", *arguments, "--control-noise-std", "0,0.1", "-j", "1", "-o", "here")
     assert (status, err) == (0, "")
     folder = tmp_path / "here"
     stored = TrialStore(folder / STORE).trials()
     assert len(stored) == 2 * 2 * 2 * 2 * 2
-    assert {row.label for row in stored} == {"goal", "orca:time_horizon=2"}
+    assert {row.label for row in stored} == {"go-to-goal", "orca:time_horizon=2"}
     parquet = pandas.read_parquet(folder / "trials.parquet")
     assert list(parquet.columns) == [field.name for field in fields(Trial)]
     assert parquet.astype(object).where(parquet.notna(), None).to_dict("records") == [asdict(row) for row in stored]
@@ -411,7 +411,7 @@ def test_without_pyarrow_there_is_csv_and_a_word_about_it(
     d4orm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    status, _, err = d4orm("evaluate", "-p", "goal", "-k", "2", "-n", "1", "-j", "1", "-q")
+    status, _, err = d4orm("evaluate", "-p", "go-to-goal", "-k", "2", "-n", "1", "-j", "1", "-q")
     assert status == 0
     assert (
         err == 'trials.parquet is not written, which needs pyarrow; install it with pip install "d4orm-env[evaluate]"\n'
@@ -420,7 +420,7 @@ def test_without_pyarrow_there_is_csv_and_a_word_about_it(
     assert "trials.csv" in written
     assert "trials.parquet" not in written
     with pytest.warns(UserWarning, match=r"pip install \"d4orm-env\[evaluate\]\""):
-        evaluate("goal", out=tmp_path / "evaluation", **TINY)
+        evaluate("go-to-goal", out=tmp_path / "evaluation", **TINY)
 
 
 def test_a_disk_that_fills_up_while_exporting_is_one_line(
@@ -430,7 +430,7 @@ def test_a_disk_that_fills_up_while_exporting_is_one_line(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(tables, "replaced_when_done", full)
-    status, _, err = d4orm("evaluate", "-p", "goal", "-k", "2", "-n", "1", "-j", "1", "-q", "-o", "here")
+    status, _, err = d4orm("evaluate", "-p", "go-to-goal", "-k", "2", "-n", "1", "-j", "1", "-q", "-o", "here")
     assert status == 2
     assert err.count("\n") == 1
     assert "table.md cannot be written: No space left on device; free some space" in err
@@ -494,7 +494,7 @@ def test_the_leaderboard_holds_everything_in_the_store(d4orm, tmp_path: Path) ->
     assert write_parquet(tmp_path / "trials.parquet", store.trials())
     assert d4orm("leaderboard", "trials.parquet", "-o", "same.md", "--deadlines", "0.2,1")[0] == 0
     assert (tmp_path / "same.md").read_text() == page
-    TrialStore(tmp_path / "more.sqlite").add(trial(0, policy="goal", label="goal"))
+    TrialStore(tmp_path / "more.sqlite").add(trial(0, policy="go-to-goal", label="go-to-goal"))
     assert d4orm("leaderboard", "trials.parquet", "more.sqlite", "-o", "both.md")[0] == 0
     assert "- 6 trials" in (tmp_path / "both.md").read_text()
 
@@ -547,7 +547,7 @@ SPELLINGS: tuple[dict[str, Any], ...] = (
 
 def test_several_models_meet_every_scenario_and_team_size(tmp_path: Path) -> None:
     models = ["velocity2d", None, "differential_drive"]
-    rows = evaluate("goal", ["circle", "random"], out=tmp_path, model=models, num_robots=[1, 2], seeds=[0], workers=1)
+    rows = evaluate("go-to-goal", ["circle", "random"], out=tmp_path, model=models, num_robots=[1, 2], seeds=[0], workers=1)
     named = ("velocity2d", "holonomic2d", "differential_drive")
     expected = [(name, model, size) for name in ("circle", "random") for model in named for size in (1, 2)]
     assert [(row.scenario, row.model, row.num_robots) for row in rows] == expected
@@ -582,7 +582,7 @@ BAD = [
     (("-n", "0-1000000"), "--seeds '0-1000000' asks for more than"),
     (("-j", "0"), "workers is 0"),
     (("--time-limit", "0"), "time_limit is 0"),
-    (("--time-limit", "1", "-p", "goal"), "none of the policies is one"),
+    (("--time-limit", "1", "-p", "go-to-goal"), "none of the policies is one"),
     (("--trial-timeout", "-1"), "trial_timeout is -1"),
     (("--trial-timeout", "1e17"), "trial_timeout is 1e+17; it must be at most 1e+06"),
     (("--time-limit", "1e17"), "time_limit is 1e+17; it must be at most 1e+06"),
@@ -615,7 +615,7 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
         ({"policies": {"mine": object()}}, r"policies\['mine'\] is <object .*; give the settings of a policy, as {}"),
         ({"policies": {"mine": "d4orm"}}, r"policies\['mine'\] is 'd4orm'; give the settings"),
         ({"policies": object()}, "policy <object object at .* is no name; give one of d4orm"),
-        ({"policies": [{"policy": "goal"}]}, "policy {'policy': 'goal'} is no name"),
+        ({"policies": [{"policy": "go-to-goal"}]}, "policy {'policy': 'go-to-goal'} is no name"),
         ({"policies": {3: {}}}, "policy 3 is no name"),
         ({"scenarios": []}, "scenarios, num_robots or model is empty"),
         ({"num_robots": []}, "scenarios, num_robots or model is empty"),
@@ -628,7 +628,7 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
 )
 def test_bad_arguments(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        evaluate(**{"policies": "goal", "out": tmp_path / "out", **TINY, **changes})
+        evaluate(**{"policies": "go-to-goal", "out": tmp_path / "out", **TINY, **changes})
     assert not (tmp_path / "out").exists()
 
 
@@ -637,17 +637,17 @@ def test_bad_arguments(tmp_path: Path, changes: dict[str, Any], message: str) ->
 
 def test_without_ray_the_error_says_what_to_install(d4orm, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    status, _, err = d4orm("evaluate", "-p", "goal", "-k", "2", "-n", "1", "--ray", "auto")
+    status, _, err = d4orm("evaluate", "-p", "go-to-goal", "-k", "2", "-n", "1", "--ray", "auto")
     assert status == 2
     assert err == 'd4orm: running on a cluster needs ray; install it with pip install "d4orm-env[distributed]"\n'
 
 
 @pytest.mark.slow
 def test_a_cluster_gives_the_same_rows(tmp_path: Path) -> None:
-    body = EVALUATE.format(policies='["goal", "orca"]', arguments='ray="local"')
+    body = EVALUATE.format(policies='["go-to-goal", "orca"]', arguments='ray="local"')
     result = program(tmp_path, body)
     assert "(6, 0) (6, 0) (6, 0) (6, 0)" in result.stdout.splitlines(), result.stderr
-    study = Study(policies=["goal", "orca"], seeds=range(6), num_robots=2, control_noise_std=[0, 0.1])
+    study = Study(policies=["go-to-goal", "orca"], seeds=range(6), num_robots=2, control_noise_std=[0, 0.1])
     run_study(study, tmp_path / "here", workers=1)
     changes: dict[str, Any] = {"wall_time": None, "preparation": None, "elapsed": None, "date": "", "machine": ""}
     there, here = (
@@ -665,7 +665,7 @@ def test_a_worker_lost_on_a_cluster_is_a_row(tmp_path: Path) -> None:
     options = "num_cpus=2, log_to_driver=False, runtime_env={'worker_process_setup_hook': 'trouble.hook'}"
     start = f"import ray\nray.init(address='local', {options})\n"
     # A worker that takes the place of a lost one has to start within it too.
-    body = start + EVALUATE.format(policies='"goal"', arguments='ray="auto", trial_timeout=45')
+    body = start + EVALUATE.format(policies='"go-to-goal"', arguments='ray="auto", trial_timeout=45')
     result = program(tmp_path, body)
     # Ray may have something to say before and after.
     assert "(6, 3) (6, 3)" in result.stdout.splitlines(), result.stderr
@@ -687,6 +687,6 @@ def test_an_unreachable_cluster_is_one_line(d4orm, address: str, message: str, m
     # Other tests start instances meanwhile, which come and go.
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setattr("ray._private.services.find_gcs_addresses", lambda: set())
-    status, _, err = d4orm("evaluate", "-p", "goal", "-k", "2", "-n", "1", "--ray", address)
+    status, _, err = d4orm("evaluate", "-p", "go-to-goal", "-k", "2", "-n", "1", "--ray", address)
     assert (status, err.count("\n")) == (2, 1)
     assert message in err

@@ -16,7 +16,7 @@ from d4orm_planners.evaluation.store import Trial, checked_trial
 from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 
 NESTED = "[" * 100_000
-TRIAL = Trial(policy="goal", config="{}", problem="p", control_noise_std=0.0, seed=1, label="goal", scenario="circle",
+TRIAL = Trial(policy="go-to-goal", config="{}", problem="p", control_noise_std=0.0, seed=1, label="go-to-goal", scenario="circle",
               num_robots=2, model="holonomic2d", dt=0.1)  # fmt: skip
 
 
@@ -116,7 +116,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     folder = tmp_path_factory.mktemp("dataset")
     environment = {"scenario": "circle", "num_robots": 2, "max_cycles": 5}
-    write_dataset(Demonstrations(policy="goal", environment=environment, seeds=[0]), folder, workers=1)
+    write_dataset(Demonstrations(policy="go-to-goal", environment=environment, seeds=[0]), folder, workers=1)
     return folder
 
 

@@ -48,14 +48,14 @@ def rates_of(
 
 def trial(seed: int = 0, **changes: Any) -> Trial:
     values = {
-        "policy": "goal",
+        "policy": "go-to-goal",
         "config": "{}",
         "problem": "abc",
         "control_noise_std": 0.1,
         "scenario": "circle",
         "num_robots": 2,
     }
-    values |= {"label": "goal", "dt": 0.1}
+    values |= {"label": "go-to-goal", "dt": 0.1}
     outcome = {"success": True, "arrived": 2, "travel_time": 5.0, "makespan": 6.0, "steps": 60, "wall_time": 0.5}
     return Trial(**{**values, "model": "holonomic2d", "versions": "{}", **outcome, "seed": seed, **changes})
 
@@ -352,7 +352,7 @@ def later_version(path: Path) -> None:
 def test_a_file_that_is_not_ours_is_refused_and_left_alone(d4orm, tmp_path: Path, make: Callable[..., None]) -> None:
     make(tmp_path / STORE)
     before = (tmp_path / STORE).read_bytes()
-    status, _, err = d4orm("--out", ".", "--policies", "goal")
+    status, _, err = d4orm("--out", ".", "--policies", "go-to-goal")
     assert status == 2
     assert err.count("\n") == 1
     assert "is no store of trials" in err
@@ -364,10 +364,10 @@ def test_a_file_that_is_not_ours_is_refused_and_left_alone(d4orm, tmp_path: Path
 
 
 def test_success_and_failure_are_counted(tmp_path: Path) -> None:
-    rates = rates_of(["goal", "orca"], tmp_path, **TINY)
+    rates = rates_of(["go-to-goal", "orca"], tmp_path, **TINY)
     assert [(row.policy, row.control_noise_std, row.trials, row.successes, row.contacts) for row in rates] == [
-        ("goal", 0.0, 2, 0, 2),
-        ("goal", 0.3, 2, 0, 2),
+        ("go-to-goal", 0.0, 2, 0, 2),
+        ("go-to-goal", 0.3, 2, 0, 2),
         ("orca", 0.0, 2, 2, 0),
         ("orca", 0.3, 2, 2, 0),
     ]
@@ -378,7 +378,7 @@ def test_success_and_failure_are_counted(tmp_path: Path) -> None:
 
 
 def test_random_problems_differ_by_seed_and_noise_too(tmp_path: Path) -> None:
-    rates_of(["goal"], tmp_path, scenarios=["random"], **TINY)
+    rates_of(["go-to-goal"], tmp_path, scenarios=["random"], **TINY)
     stored = TrialStore(tmp_path / STORE).trials()
     assert len({row.problem for row in stored}) == 2
     assert len({row.travel_time for row in stored}) == 4
@@ -402,7 +402,7 @@ def test_a_plan_is_made_once_for_all_levels_of_noise(tmp_path: Path, monkeypatch
 
 
 def test_resuming_runs_only_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    rates_of(["goal"], tmp_path, **TINY)
+    rates_of(["go-to-goal"], tmp_path, **TINY)
     ran: list[tuple[int, tuple[float, ...]]] = []
 
     def levels(job: Job) -> tuple[float, ...]:
@@ -410,16 +410,16 @@ def test_resuming_runs_only_what_is_missing(tmp_path: Path, monkeypatch: pytest.
 
     run_job = pool_module.run_job
     monkeypatch.setattr(pool_module, "run_job", lambda job: (ran.append((job.seed, levels(job))), run_job(job))[1])
-    before = rates_of(["goal"], tmp_path, **TINY)
+    before = rates_of(["go-to-goal"], tmp_path, **TINY)
     assert ran == []
     counts: list[tuple[int, int]] = []
     more = {**TINY, "control_noise_std": [0.0, 0.3, 0.5], "seeds": range(3)}
-    rates = rates_of(["goal"], tmp_path, **more, progress=lambda what, done, total: counts.append((done, total)))
+    rates = rates_of(["go-to-goal"], tmp_path, **more, progress=lambda what, done, total: counts.append((done, total)))
     assert ran == [(0, (0.5,)), (1, (0.5,)), (2, (0.0, 0.3, 0.5))]
     assert counts == [(4, 9), (5, 9), (6, 9), (7, 9), (8, 9), (9, 9)]
     assert [row.trials for row in rates] == [3, 3, 3]
     # Trials beyond those asked for are in the store and not in the rates.
-    again = rates_of(["goal"], tmp_path, **TINY)
+    again = rates_of(["go-to-goal"], tmp_path, **TINY)
     assert again == before
     # Other settings are other trials.
     ran.clear()
@@ -438,11 +438,11 @@ class Unlucky(GoToGoal):
 
 def test_an_error_is_a_row_and_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trials_module, "make_policy", lambda name, **settings: Unlucky())
-    rates = rates_of(["goal"], tmp_path, **TINY)
+    rates = rates_of(["go-to-goal"], tmp_path, **TINY)
     assert [(row.trials, row.errors, row.error) for row in rates] == [(2, 1, "RuntimeError: out of luck")] * 2
     assert "- `goal`: RuntimeError: out of luck" in markdown(rates)
     monkeypatch.undo()
-    rates = rates_of(["goal"], tmp_path, **TINY)
+    rates = rates_of(["go-to-goal"], tmp_path, **TINY)
     assert [(row.trials, row.errors) for row in rates] == [(2, 0)] * 2
 
 
@@ -457,7 +457,7 @@ def test_ctrl_c_keeps_what_was_done(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(pool_module, "run_job", interrupted)
     arguments = [
         "--policies",
-        "goal",
+        "go-to-goal",
         "--num-robots",
         "2",
         "--seeds",
@@ -476,7 +476,7 @@ def test_ctrl_c_keeps_what_was_done(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 @pytest.mark.slow
 def test_the_number_of_workers_makes_no_difference(tmp_path: Path) -> None:
     alone, together = (
-        rates_of(["goal", "orca"], tmp_path / str(workers), **{**TINY, "workers": workers}) for workers in (1, 2)
+        rates_of(["go-to-goal", "orca"], tmp_path / str(workers), **{**TINY, "workers": workers}) for workers in (1, 2)
     )
     times = ("wall_time", "decision", "compute", "compute_lower", "compute_upper")
     untimed: dict[str, Any] = dict.fromkeys(times)
@@ -526,12 +526,12 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, workers: int) -> None
 
 @pytest.mark.slow
 def test_closed_loop_survives_noise_that_open_loop_does_not(tmp_path: Path) -> None:
-    policies = {"d4orm-c2f": {"refine": "sync"}, "d4orm-d": {}, "goal": {}}
+    policies = {"d4orm-c2f": {"refine": "sync"}, "hybrid": {}, "go-to-goal": {}}
     rates = rates_of(policies, tmp_path, **{**TINY, "num_robots": 4, "control_noise_std": (0.0, 0.5)})
     rows = {(row.policy, row.control_noise_std): row for row in rates}
-    assert rows["d4orm-d", 0.0].successes == rows["d4orm-c2f", 0.5].successes == 2
-    assert rows["d4orm-d", 0.5].successes == 0
-    assert rows["goal", 0.0].contacts == 2
+    assert rows["hybrid", 0.0].successes == rows["d4orm-c2f", 0.5].successes == 2
+    assert rows["hybrid", 0.5].successes == 0
+    assert rows["go-to-goal", 0.0].contacts == 2
 
 
 # What is written.
@@ -547,7 +547,7 @@ def test_the_files(d4orm, tmp_path: Path) -> None:
     with (tmp_path / "here" / "robustness.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 2 * 2 * 2 * 2
-    assert rows[0]["policy"] == "goal"
+    assert rows[0]["policy"] == "go-to-goal"
     assert float(rows[0]["rate"]) == 0
     text = (tmp_path / "here" / "robustness.md").read_text()
     assert "### random, 3 robots, holonomic2d" in text
@@ -630,7 +630,7 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
     (tmp_path / "file").write_text("")
     if arguments[-1].startswith("/proc") and not Path("/proc").is_dir():
         pytest.skip("needs a folder that not even root can write to")
-    status, _, err = d4orm("--policies", "goal", *arguments)
+    status, _, err = d4orm("--policies", "go-to-goal", *arguments)
     assert status == 2
     assert err.count("\n") == 1
     assert err.startswith("d4orm: ")
@@ -651,6 +651,6 @@ def test_a_library_that_is_missing_is_named_before_anything_runs(d4orm, monkeypa
     ids=lambda given: given[0],
 )
 def test_nothing_to_do_is_refused(d4orm, tmp_path: Path, options: tuple[str, str]) -> None:
-    status, _, err = d4orm("--policies", "goal", *options)
+    status, _, err = d4orm("--policies", "go-to-goal", *options)
     assert (status, err.count("\n")) == (2, 1)
     assert not list(tmp_path.rglob("*.sqlite"))

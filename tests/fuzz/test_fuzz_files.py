@@ -181,11 +181,11 @@ def test_a_plan_file_with_other_members_is_refused(tmp_path: Path, plan: bytes, 
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("store") / "trials.sqlite"
     common: dict[str, Any] = {
-        "policy": "goal",
+        "policy": "go-to-goal",
         "config": "{}",
         "problem": "abc",
         "control_noise_std": 0.0,
-        "label": "goal",
+        "label": "go-to-goal",
     }
     common |= {"scenario": "circle", "num_robots": 2, "model": "holonomic2d", "dt": 0.1, "success": True, "steps": 60}
     TrialStore(path).add(*(Trial(seed=seed, **common) for seed in range(3)))

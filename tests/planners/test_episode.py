@@ -112,7 +112,7 @@ def test_a_docked_robot_that_is_run_into_counts_too() -> None:
 @pytest.mark.parametrize("num_robots", [1, 4])
 def test_shapes(num_robots: int) -> None:
     env = navigation_v0.parallel_env(scenario="circle", num_robots=num_robots, model="differential_drive")
-    episode = run_episode(env, make_policy("goal"))
+    episode = run_episode(env, make_policy("go-to-goal"))
     trajectory = episode.trajectory
     steps = len(trajectory.controls)
     assert trajectory.states.shape == (steps + 1, num_robots, 4)
@@ -142,7 +142,7 @@ def test_the_executed_controls_are_recorded_not_the_wanted_ones() -> None:
 def test_rolling_the_executed_controls_out_again_gives_the_episode() -> None:
     env = navigation_v0.parallel_env(scenario="four_obstacles", num_robots=6, control_noise_std=0.3)
     problem = env.unwrapped.problem
-    episode = run_episode(env, make_policy("goal"), seed=8)
+    episode = run_episode(env, make_policy("go-to-goal"), seed=8)
     steps = len(episode.trajectory.controls)
     again = get_sampling_engine("cpu").rollout(problem.replace(horizon=steps), episode.trajectory.controls)
     np.testing.assert_allclose(again.states, episode.trajectory.states, atol=1e-4)
@@ -162,7 +162,7 @@ def test_every_episode_of_random_instances_is_of_its_own_problem() -> None:
     env = navigation_v0.parallel_env(scenario="random", num_robots=3, randomize_instance=True)
     starts = []
     for seed in (0, 1, 0):
-        episode = run_episode(env, make_policy("goal"), seed=seed)
+        episode = run_episode(env, make_policy("go-to-goal"), seed=seed)
         np.testing.assert_array_equal(episode.trajectory.states[0], env.unwrapped.problem.start)
         starts.append(episode.trajectory.states[0])
     np.testing.assert_array_equal(starts[0], starts[2])
@@ -174,7 +174,7 @@ def test_lifelong_metrics_count_goals_and_nothing_that_has_no_meaning_there() ->
     env = navigation_v0.parallel_env(
         scenario="random", num_robots=2, size=3.0, model="velocity2d", lifelong=True, max_cycles=300
     )
-    metrics = run_episode(env, make_policy("goal"), seed=0).metrics
+    metrics = run_episode(env, make_policy("go-to-goal"), seed=0).metrics
     assert metrics["steps"] == 300
     assert metrics["goals_reached"] >= 10
     assert metrics["goals_per_robot_minute"] == pytest.approx(metrics["goals_reached"] / (2 * 30 / 60))
@@ -194,7 +194,7 @@ def test_a_plan_of_a_lifelong_problem_runs_out_and_the_episode_goes_on() -> None
 def test_a_bad_seed_is_refused(seed: Any) -> None:
     env = navigation_v0.parallel_env(problem=make_problem("circle", num_robots=2))
     with pytest.raises(ValueError, match="seed"):
-        run_episode(env, make_policy("goal"), seed=seed)
+        run_episode(env, make_policy("go-to-goal"), seed=seed)
 
 
 @pytest.mark.parametrize("cycles", [None, 20])
@@ -202,7 +202,7 @@ def test_executed_controls_begin_a_plan(cycles: int | None) -> None:
     problem = line_problem([0.35, 1.5])
     horizon = problem.horizon if cycles is None else min(problem.horizon, cycles)
     env = navigation_v0.parallel_env(problem=problem, max_cycles=cycles)
-    episode = run_episode(env, "goal")
+    episode = run_episode(env, "go-to-goal")
     steps = min(len(episode.trajectory.controls), horizon)
     assert episode.controls.shape == (problem.horizon, 2, problem.control_size)
     np.testing.assert_array_equal(episode.controls[:steps], episode.trajectory.controls[:steps])

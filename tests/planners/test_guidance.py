@@ -251,7 +251,7 @@ def test_a_car_follows_a_route_from_every_heading(way: Any, heading: float) -> N
 )
 def test_a_car_alone_finds_its_way_among_walls(scenario: str, seed: int) -> None:
     problem = make_problem(scenario, num_robots=1, seed=seed, model="car")
-    plan = make_planner("guided").solve(problem, seed=0, max_iterations=4)
+    plan = make_planner("mapf").solve(problem, seed=0, max_iterations=4)
     assert plan.solved
     assert verify(problem, plan.controls).ok
 
@@ -319,10 +319,10 @@ def test_ways_one_by_one_displace_those_in_the_way() -> None:
         ("rooms", 4, {"model": "car"}), ("warehouse", 6, {"model": "car"}),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("name", ["guided", "d4orm-d", "d4orm"])
+@pytest.mark.parametrize("name", ["mapf", "hybrid"])
 def test_teams_among_walls_are_guided(name: str, scenario: str, num_robots: int, arguments: dict[str, Any]) -> None:
     problem = make_problem(scenario, num_robots=num_robots, seed=3, **arguments)
-    settings = {} if name == "guided" else {"start": "guided"}
+    settings = {} if name == "mapf" else {"start": "mapf"}
     plan = make_planner(name, **settings).solve(problem, seed=1, max_iterations=30)
     assert plan.solved
     assert verify(problem, plan.controls).ok
@@ -330,19 +330,19 @@ def test_teams_among_walls_are_guided(name: str, scenario: str, num_robots: int,
 
 def test_improving_never_makes_it_worse_and_mostly_better() -> None:
     problem = make_problem("rooms", num_robots=12, seed=0)
-    plan = make_planner("guided", improve=True).solve(problem, max_iterations=6)
+    plan = make_planner("mapf", improve=True).solve(problem, max_iterations=6)
     rewards = [record.best_reward for record in plan.history]
     assert rewards == sorted(rewards)
     assert rewards[-1] > rewards[0]
 
 
 def test_a_goal_without_a_way_is_named_at_once() -> None:
-    plan = make_planner("guided").solve(walled_in_problem(), max_iterations=2)
+    plan = make_planner("mapf").solve(walled_in_problem(), max_iterations=2)
     assert not plan.solved
     assert plan.history[0].note.startswith("robot_0 has no way from start to goal")
 
 
-@pytest.mark.parametrize(("scenario", "guided"), [("circle", False), ("four_obstacles", False), ("maze", True)])
+@pytest.mark.parametrize(("scenario", "mapf"), [("circle", False), ("four_obstacles", False), ("maze", True)])
 def test_teams_are_guided_where_obstacles_lead_far_round(scenario: str, guided: bool) -> None:
     assert needs_detour(make_problem(scenario, num_robots=8, seed=0)) == guided
 
@@ -351,7 +351,7 @@ def test_teams_are_guided_where_obstacles_lead_far_round(scenario: str, guided: 
 def test_who_is_alone_drives_about_as_fast_as_it_can(seed: int) -> None:
     """Along its shortest way at full speed, and as long again as it takes to get to that."""
     problem = make_problem("rooms", num_robots=4, seed=seed).select([0])
-    plan = make_planner("guided").solve(problem, seed=0)
+    plan = make_planner("mapf").solve(problem, seed=0)
     speed, acceleration = problem.team.limits[0, :2]
     assert plan.solved
     assert plan.metrics["travel_time"] < 1.3 * (problem.ways.length[0] / speed + 0.5 * speed / acceleration)

@@ -55,7 +55,7 @@ def test_a_file_that_calls_a_problem_infeasible_is_not_believed(tmp_path: Path) 
         replace(solved, status="infeasible")
 
 
-@pytest.mark.parametrize("name", ["d4orm", "d4orm-d", "guided", "mmd"])
+@pytest.mark.parametrize("name", ["d4orm", "d4orm-d", "mapf", "mmd"])
 def test_a_reason_that_proves_nothing_is_kept(name: str) -> None:
     few = {"num_samples": 64, "num_steps": 5, "repair_samples": 64, "repair_steps": 5}
     known = make_planner(name).config.setting_names()
@@ -68,7 +68,7 @@ def test_a_reason_that_proves_nothing_is_kept(name: str) -> None:
 
 
 def test_what_path_finding_knew_is_in_a_plans_file(tmp_path: Path) -> None:
-    plan = make_planner("guided").solve(walled_in_problem(), max_iterations=1)
+    plan = make_planner("mapf").solve(walled_in_problem(), max_iterations=1)
     plan.save(tmp_path / "plan.npz")
     loaded = Plan.load(tmp_path / "plan.npz")
     assert loaded.history == plan.history

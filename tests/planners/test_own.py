@@ -191,7 +191,7 @@ def test_taken_names_and_bad_ones_are_refused() -> None:
     register_policy("path", ":".join(["test_own", "push"]))
     with pytest.raises(ValueError, match="'path' is taken"):
         register_policy("path", "test_own:push_one")
-    for register, name in ((register_policy, "push"), (register_policy, "d4orm"), (register_planner, "goal"),
+    for register, name in ((register_policy, "push"), (register_policy, "d4orm"), (register_planner, "go-to-goal"),
                            (register_planner, "mppi")):  # fmt: skip
         with pytest.raises(ValueError, match=f"{name!r} .*register yours under another"):
             register(name, Ahead)
@@ -223,8 +223,8 @@ def test_entry_points_are_found_and_loaded_when_asked_for(
     np.testing.assert_array_equal(controls("theirs"), controls("theirs-planner"))
     with pytest.raises(ValueError, match="policy 'broken': 'theirs_module:nothing' names nothing"):
         make_policy("broken")
-    with pytest.raises(ValueError, match=r"policy name 'goal' is claimed by .*GoToGoal and theirs_module:Theirs"):
-        make_policy("goal")
+    with pytest.raises(ValueError, match=r"policy name 'go-to-goal' is claimed by .*GoToGoal and theirs_module:Theirs"):
+        make_policy("go-to-goal")
     with pytest.raises(SystemExit, match="0"):
         cli.main(["planners"])
     listing = capsys.readouterr().out
@@ -259,14 +259,14 @@ def compare(policies: Any, out: Path, **settings: Any) -> list[Any]:
 
 def test_a_comparison_takes_a_mixture(tmp_path: Path) -> None:
     policies = {
-        "mine": Push(), "weak": Push(0.5), "f": push, "class": {"policy": Push, "strength": 0.25}, "goal": {},
+        "mine": Push(), "weak": Push(0.5), "f": push, "class": {"policy": Push, "strength": 0.25}, "go-to-goal": {},
         "path": "test_own:Push", "duck": Duck(), "one": push_one,
     }  # fmt: skip
     rows = compare(policies, tmp_path)
     assert [row.label for row in rows] == list(policies)
     assert {row.errors for row in rows} == {0}
     stored = dict(rows_of(tmp_path))
-    assert stored["goal"] == {}
+    assert stored["go-to-goal"] == {}
     digest = stored["f"]["source"]
     assert len(digest) == 64
     assert stored["mine"] == {"strength": 1.0, "source": digest}
@@ -280,13 +280,13 @@ def test_a_comparison_takes_a_mixture(tmp_path: Path) -> None:
 
 
 def test_policies_without_labels_have_their_own_names(tmp_path: Path) -> None:
-    rows = compare([Push, push, Duck(), "goal"], tmp_path)
-    assert [row.label for row in rows] == ["Push", "push", "Duck", "goal"]
+    rows = compare([Push, push, Duck(), "go-to-goal"], tmp_path)
+    assert [row.label for row in rows] == ["Push", "push", "Duck", "go-to-goal"]
     assert [row.label for row in compare(push_one, tmp_path)] == ["push_one"]
     with pytest.raises(ValueError, match="two policies are called 'Push'; give a mapping"):
         compare([Push(), Push(2.0)], tmp_path)
-    with pytest.raises(ValueError, match=r"policies\['goal'\] has the name of another policy"):
-        compare({"goal": Push()}, tmp_path)
+    with pytest.raises(ValueError, match=r"policies\['go-to-goal'\] has the name of another policy"):
+        compare({"go-to-goal": Push()}, tmp_path)
     with pytest.raises(ValueError, match="setting that cannot be stored"):
         compare({"x": {"policy": Push, "strength": np.ones(2)}}, tmp_path)
 
@@ -331,7 +331,7 @@ def here(observation):
 if __name__ == "__main__":
     from written import f
     register_policy("registered", f)
-    policies = {{"a": Here(), "b": here, "c": "written:Mine", "registered": {{}}, "goal": {{}}}}
+    policies = {{"a": Here(), "b": here, "c": "written:Mine", "registered": {{}}, "go-to-goal": {{}}}}
     rows = evaluate(policies, out="out", seeds=range(2), num_robots=2, {arguments})
     print(*((row.label, row.errors, row.error) for row in rows))
 """
@@ -343,7 +343,7 @@ def test_other_processes_get_the_same_policies(tmp_path: Path, arguments: str) -
     if "ray" in arguments:
         pytest.importorskip("ray")
     (tmp_path / "written.py").write_text(WRITTEN)
-    labels = ("a", "b", "c", "registered", "goal")
+    labels = ("a", "b", "c", "registered", "go-to-goal")
     expected = " ".join(str((label, 0, "")) for label in labels)
     assert program(tmp_path, MIXTURE.format(arguments=arguments)).splitlines()[-1] == expected
 
@@ -389,7 +389,7 @@ def test_the_command_line_takes_import_paths(
     assert "'from_here:g' names nothing" in error
     assert "planner 'from_here:f' is <function f" in error
     assert [name for name, _ in rows_of(tmp_path / "evaluation")] == [
-        "from_here.py:Mine", "from_here:Mine", "from_here:f", "goal",
+        "from_here.py:Mine", "from_here:Mine", "from_here:f", "go-to-goal",
     ]  # fmt: skip
 
 

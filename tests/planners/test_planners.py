@@ -72,7 +72,7 @@ def test_solve_returns_a_plan(name: str) -> None:
     assert plan.status in ("solved", "iteration_limit")
     assert (plan.status == "solved") == plan.solved
     assert 1 <= plan.iterations == len(plan.history) <= 2
-    assert (plan.denoising_steps > 0) == (name not in ("ipopt", "guided", "amswarm"))
+    assert (plan.denoising_steps > 0) == (name not in ("ipopt", "mapf", "amswarm"))
     assert plan.wall_time > 0
     assert trajectory_metrics(problem, plan.trajectory).items() <= plan.metrics.items()
 
@@ -156,7 +156,7 @@ def test_another_seed_gives_another_plan(name: str) -> None:
     problem = make_problem("circle", num_robots=4)
     planner = cheap_planner(name)
     # Path finding knows some dozen plans for four robots, so that two seeds may well lead to the same one.
-    seeds = (0, 1, 2) if name == "guided" else (0, 1, 2**40)
+    seeds = (0, 1, 2) if name == "mapf" else (0, 1, 2**40)
     plans = [planner.solve(problem, seed=seed).controls for seed in seeds]
     assert not np.allclose(plans[0], plans[1], atol=1e-3)
     assert not np.allclose(plans[0], plans[2], atol=1e-3)
@@ -431,7 +431,7 @@ def test_an_unknown_preset_is_refused(name: str) -> None:
         make_planner(name, preset="papers")
 
 
-@pytest.mark.parametrize("name", ["d4orm-c2f", "goal", "ppo"])
+@pytest.mark.parametrize("name", ["d4orm-c2f", "go-to-goal", "ppo"])
 def test_a_policy_that_is_no_planner_is_pointed_to(name: str) -> None:
     with pytest.raises(ValueError, match=rf"'{name}' is no planner but a policy.*use make_policy\('{name}'\)"):
         make_planner(name)

@@ -206,7 +206,7 @@ def test_every_policy_is_described(name: str) -> None:
 
 def test_every_planner_is_a_policy() -> None:
     assert set(list_planners()) < set(list_policies())
-    assert {"goal", "random"} <= set(list_policies())
+    assert {"go-to-goal", "random"} <= set(list_policies())
     assert all(isinstance(cheap_policy(name), OpenLoop) for name in list_planners())
 
 
@@ -214,7 +214,7 @@ def test_every_planner_is_a_policy() -> None:
     ("name", "config", "message"),
     [
         ("gaol", {}, "policy 'gaol' is unknown; choose one of .*goal"),
-        ("goal", {"speed": 1}, "policy 'goal' takes no settings, but was given 'speed'"),
+        ("go-to-goal", {"speed": 1}, "policy 'go-to-goal' takes no settings, but was given 'speed'"),
         ("random", {"seed": 1}, "policy 'random' takes no settings"),
         ("orca", {"speed": 1}, "'speed' is no setting of policy 'orca'; it takes time_horizon"),
         ("orca", {"time_horizon": 0}, "time_horizon is 0"),
@@ -338,7 +338,7 @@ def test_a_policy_reads_the_time_from_the_state(plan: Plan) -> None:
 @pytest.mark.parametrize("model", ["holonomic2d", "velocity2d", "differential_drive"])
 def test_orca_crosses_the_circle_where_driving_straight_collides(model: str) -> None:
     env = navigation_v0.parallel_env(scenario="circle", num_robots=4, model=model)
-    assert run_episode(env, make_policy("goal"), seed=0).metrics["collided"] == 4
+    assert run_episode(env, make_policy("go-to-goal"), seed=0).metrics["collided"] == 4
     episode = run_episode(env, make_policy("orca"), seed=0)
     assert episode.metrics["success"] == 1
     assert episode.metrics["makespan"] < 8
@@ -349,7 +349,7 @@ def test_orca_goes_around_obstacles_and_docked_robots_and_stays_in_bounds() -> N
     # The second robot stands at its goal from the start, in the way of the first.
     start = [[0, 0, 0, 0], [4.0, 0, 0, 0]]
     problem = Problem(Team(("holonomic2d",) * 2), start, [[5.0, 0], [4.0, 0]], world)
-    assert run_episode(navigation_v0.parallel_env(problem=problem), make_policy("goal")).metrics["collided"]
+    assert run_episode(navigation_v0.parallel_env(problem=problem), make_policy("go-to-goal")).metrics["collided"]
     episode = run_episode(navigation_v0.parallel_env(problem=problem), make_policy("orca"), seed=0)
     assert episode.metrics["success"] == 1
 
@@ -451,7 +451,7 @@ def test_driving_to_the_goal_reaches_it_alone(model: str, start: list[float], go
     # A first-order robot has no speed but the one it is told, and is told to stop at the goal, not before it.
     goal_speed = None if model == "velocity2d" else goal_speed
     problem = Problem(Team((model,), max_speed=1.0), [start], [goal], goal_speed=goal_speed)
-    episode = run_episode(navigation_v0.parallel_env(problem=problem), make_policy("goal"))
+    episode = run_episode(navigation_v0.parallel_env(problem=problem), make_policy("go-to-goal"))
     assert episode.metrics["success"] == 1
     assert episode.metrics["makespan"] < 7
 
@@ -460,21 +460,21 @@ def test_a_full_turn_of_the_heading_makes_no_difference() -> None:
     times = []
     for heading in (0.5, 0.5 + 2 * np.pi, 0.5 - 4 * np.pi):
         problem = Problem(Team(("differential_drive",)), [[0, 0, heading, 0]], [[2.0, 1.0]])
-        times.append(run_episode(navigation_v0.parallel_env(problem=problem), make_policy("goal")).metrics["makespan"])
+        times.append(run_episode(navigation_v0.parallel_env(problem=problem), make_policy("go-to-goal")).metrics["makespan"])
     assert times == pytest.approx([times[0]] * 3)
 
 
 def test_driving_to_the_goal_is_nearly_as_quick_as_can_be() -> None:
     problem = hop_problem(1, horizon=100)
     far = problem.replace(goal=[[5.0, 0]])
-    episode = run_episode(navigation_v0.parallel_env(problem=far), make_policy("goal"))
+    episode = run_episode(navigation_v0.parallel_env(problem=far), make_policy("go-to-goal"))
     # 1 s to reach 1 m/s within half a metre, 4.5 m at full speed; braking costs at most another half second.
     assert 5.4 <= episode.metrics["makespan"] <= 6.0
 
 
 def test_driving_to_the_goal_does_not_look_at_the_others() -> None:
     problem = make_problem("circle", num_robots=2)
-    episode = run_episode(navigation_v0.parallel_env(problem=problem), make_policy("goal"))
+    episode = run_episode(navigation_v0.parallel_env(problem=problem), make_policy("go-to-goal"))
     assert episode.metrics["collided"] == 2
     assert episode.metrics["success"] == 0
 
@@ -493,7 +493,7 @@ def test_random_controls_differ_by_seed_and_fill_the_limits() -> None:
 
 def test_driving_to_the_goal_goes_on_in_lifelong_mode() -> None:
     env = navigation_v0.parallel_env(scenario="random", num_robots=3, size=4.0, lifelong=True, max_cycles=300)
-    episode = run_episode(env, make_policy("goal"), seed=0)
+    episode = run_episode(env, make_policy("go-to-goal"), seed=0)
     steps = len(episode.trajectory.controls)
     assert steps == 300
     reached = episode.metrics["goals_reached"]
@@ -504,7 +504,7 @@ def test_driving_to_the_goal_goes_on_in_lifelong_mode() -> None:
     assert sum(info[agent]["arrived"] for info in episode.infos for agent in info) == reached
 
 
-@pytest.mark.parametrize("name", ["goal", "random", lambda observations, state: {}, lambda observation: observation])
+@pytest.mark.parametrize("name", ["go-to-goal", "random", lambda observations, state: {}, lambda observation: observation])
 def test_acting_before_the_reset_says_what_to_do(name: Any) -> None:
     with pytest.raises(RuntimeError, match=r"call reset\(env\) before act"):
         make_policy(name).act({}, np.zeros(1, np.float32))
@@ -518,7 +518,7 @@ def test_a_shipped_policy_solves_random_instances_that_driving_straight_does_not
     env = navigation_v0.parallel_env(scenario="random", num_robots=4, randomize_instance=True)
     learned, straight = (
         sum(bool(run_episode(env, make_policy(policy), seed=seed).metrics["success"]) for seed in range(12))
-        for policy in (name, "goal")
+        for policy in (name, "go-to-goal")
     )
     assert learned >= 7
     assert learned > straight

@@ -28,7 +28,7 @@ STRAIGHT, STRICT = MotionPrimitives((45.0, 90.0), (1.0, 0.5, 0.0)), BeamRules(32
 
 def solved_team(problem: Problem, seed: int = 0) -> WorkingPlan:
     """A first solution, as it was found."""
-    search = SolveRun(make_planner("d4orm-d", engine="cpu", shorten=False), problem, seed)
+    search = SolveRun(make_planner("hybrid", engine="cpu", improver="denoising"), problem, seed)
     while not search.best.solved:
         search.advance()
     return WorkingPlan(search, search.best.trajectory)
@@ -67,7 +67,7 @@ def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_array_equal(*found)
 
 
-@pytest.mark.parametrize("planner", ["d4orm", "d4orm-d"])
+@pytest.mark.parametrize("planner", ["d4orm", "hybrid"])
 def test_a_plan_is_never_worse_than_what_it_began_with(planner: str) -> None:
     problem = make_problem("circle", num_robots=8)
     first = make_planner(planner, engine="cpu").solve(problem, seed=0)
@@ -84,7 +84,7 @@ def crossing() -> WorkingPlan:
     """Robot 0 drives to the right, and robot 1 stands in its way."""
     start = [[0, 0, 0, 0], [1.5, 0, 0, 0]]
     problem = Problem(Team(("holonomic2d",) * 2), start, [[3, 0], [1.5, 2.0]], horizon=80)
-    search = SolveRun(make_planner("d4orm-d", engine="cpu"), problem, 0)
+    search = SolveRun(make_planner("hybrid", engine="cpu"), problem, 0)
     return WorkingPlan(search, search.current.trajectory)
 
 

@@ -26,7 +26,7 @@ from d4orm_planners.tracking.steering import straight_drives
 
 def rerouted(problem: Problem, seed: int = 0) -> WorkingPlan:
     """A team that sets off straight, after one call."""
-    planner: Any = make_planner("d4orm-d", engine="cpu")
+    planner: Any = make_planner("hybrid", engine="cpu")
     search = SolveRun(planner, problem, seed, straight_drives(problem).controls[:, :, 0])
     team = WorkingPlan(search, search.current.trajectory)
     reroute(team)
@@ -70,7 +70,7 @@ def test_who_cannot_pass_waits() -> None:
 def test_two_that_face_each_other_make_way_together() -> None:
     """Robots 0 and 1 start 4 mm apart: nothing that one of them does helps while the other comes on at once."""
     problem = make_problem("random", num_robots=16, model="differential_drive", seed=4)
-    plan = make_planner("d4orm-d", engine="cpu").solve(problem, seed=4, max_iterations=10)
+    plan = make_planner("hybrid", engine="cpu").solve(problem, seed=4, max_iterations=10)
     assert plan.solved
 
 
@@ -88,7 +88,7 @@ def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("num_robots", [100, pytest.param(500, marks=pytest.mark.slow)])
 def test_a_big_team_is_solved_without_sampling(num_robots: int) -> None:
     problem = make_problem("random", num_robots=num_robots, seed=0)
-    plan = make_planner("d4orm-d").solve(problem, seed=0, max_iterations=4)
+    plan = make_planner("hybrid").solve(problem, seed=0, max_iterations=4)
     assert plan.solved
     assert verify(problem, plan.controls).ok
     assert plan.denoising_steps <= 100

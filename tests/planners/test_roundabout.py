@@ -60,7 +60,7 @@ def test_there_is_none_in_space_nor_where_somebody_begins_within() -> None:
 
 def test_improving_a_crossing_ends_in_it_or_better() -> None:
     problem = make_problem("circle", num_robots=6)
-    plan = make_planner("d4orm-d", improve=True).solve(problem, seed=1, max_iterations=3)
+    plan = make_planner("hybrid", improve=True).solve(problem, seed=1, max_iterations=3)
     controls = drive_roundabout(problem, get_sampling_engine("cpu"), 1)
     assert controls is not None
     assert plan.metrics["reward"] >= rollout(problem, controls).rewards.mean() - 1e-6

@@ -53,7 +53,7 @@ def test_plans_are_the_same_in_other_units(name: str, where: str, factor: float)
 
 
 POLICIES: dict[str, dict[str, Any]] = {
-    "goal": {},
+    "go-to-goal": {},
     "random": {},
     "orca": {},
     "d4orm-c2f": {"engine": "cpu", "refine": "sync", "num_samples": 32, "num_steps": 5, "coarse_iterations": 2},

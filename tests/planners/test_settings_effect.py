@@ -71,7 +71,7 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "big_team": (1, TEAM),
     "decoupling": ("groups", REPAIRING),
     "reroute": (True, REPAIRING),
-    "start": ("guided", {"start": "team"}),
+    "start": ("mapf", {"start": "team"}),
     "neighbours": (1, {"max_iterations": 4}),
     "replannings": (1, {"max_iterations": 4}),
     "first_collisions": (False, TEAM),
@@ -131,7 +131,7 @@ def base_settings(name: str, setting: str) -> dict[str, Any]:
 def outcomes(name: str, settings: dict[str, Any]) -> Generator[Any]:
     """What each iteration of a solve gives and says, but for its time, and at last who worked on it."""
     # The first plan of four robots that are guided is hard to make better, and the first batch holds one for them.
-    crowd = {"guided": (8,), "mmd": (8, 2)}.get(name, (4,))
+    crowd = {"mapf": (8,), "mmd": (8, 2)}.get(name, (4,))
     short = make_problem("circle", num_robots=2, diameter=0.8)  # all else are long
     search = SolveRun(make_planner(name, **settings), crossing(*crowd) if settings["improve"] else short, 1)
     try:
@@ -197,7 +197,7 @@ POLICY_CHANGES: dict[str, dict[str, tuple[Any, dict[str, Any]]]] = {
         "coarse_steps": (6, {}),
         "coarse_repair_steps": (6, {}),
         "coarse_preset": ("paper", {}),
-        "first_guess": ("goal", {}),
+        "first_guess": ("go-to-goal", {}),
         "coarse_iterations": (1, {}),
         "max_lag": (0, {}),
         "sight": (False, {"scenario": "maze", "max_cycles": 60}),

@@ -67,7 +67,7 @@ def test_no_iteration_goes_on_beyond_the_limit(name: str, scenario: str, clock: 
         # Where there is no way, a quick solver may have found that out with its last iteration.
         found_out = ("Infeasible_Problem_Detected",) if scenario == "walled in" else ()
         assert plan.history[-1].note in ("User_Requested_Stop", ABANDONED, OUT_OF_TIME, *found_out)
-    elif name not in ("guided", "amswarm") and (name, scenario) != ("mmd", "walled in"):
+    elif name not in ("mapf", "amswarm") and (name, scenario) != ("mmd", "walled in"):
         assert plan.denoising_steps > 0
     assert plan.iterations == len(plan.history)
 

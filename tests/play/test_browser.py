@@ -245,7 +245,7 @@ def pause_and_drag(page: Page, playground: Any, tmp_path: Path) -> None:
 def test_obstacles_are_dragged_and_scenes_and_replays_saved(page: Page, tmp_path: Path) -> None:
     world = World(boxes=[[-0.2, -0.2, 0.2, 0.2]])
     problem = make_problem("circle", num_robots=2, seed=0)
-    with running(problem.resumed_at(problem.start, problem.goal, world=world), "goal") as playground:
+    with running(problem.resumed_at(problem.start, problem.goal, world=world), "go-to-goal") as playground:
         session = playground.session
         page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
         look_at(page, playground, "circle, 2 robots, goal")
@@ -266,7 +266,7 @@ def test_obstacles_are_dragged_and_scenes_and_replays_saved(page: Page, tmp_path
 
 @viser_leaves_loops
 def test_a_robot_that_is_dragged_with_shift_is_pushed(page: Page, tmp_path: Path) -> None:
-    with running(make_problem("circle", num_robots=3, seed=0), "goal") as playground:
+    with running(make_problem("circle", num_robots=3, seed=0), "go-to-goal") as playground:
         session = playground.session
         session.pause(True)
         look_at(page, playground, "circle, 3 robots, goal: paused")
@@ -286,7 +286,7 @@ def test_a_robot_that_is_dragged_with_shift_is_pushed(page: Page, tmp_path: Path
 
 @viser_leaves_loops
 def test_goals_are_dragged_in_space(page: Page) -> None:
-    with running(make_problem("sphere", num_robots=3, seed=0), "goal") as playground:
+    with running(make_problem("sphere", num_robots=3, seed=0), "go-to-goal") as playground:
         session = playground.session
         session.pause(True)
         look_at(page, playground, "sphere, 3 robots, goal: paused")
@@ -303,7 +303,7 @@ def test_goals_are_dragged_in_space(page: Page) -> None:
 
 @viser_leaves_loops
 def test_policies_are_ticked_and_drive_side_by_side(page: Page, tmp_path: Path) -> None:
-    with running(make_problem("circle", num_robots=3, seed=0), "goal") as playground:
+    with running(make_problem("circle", num_robots=3, seed=0), "go-to-goal") as playground:
         session = playground.session
         session.pause(True)  # nobody stands on a goal yet
         page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
@@ -311,7 +311,7 @@ def test_policies_are_ticked_and_drive_side_by_side(page: Page, tmp_path: Path) 
         wait_for(lambda: len(playground.clients) == 1)
         click(page, "Who drives")
         tick(page, "D4orm-C2F")
-        wait_for(lambda: session.policies == ("goal", "d4orm-c2f"))
+        wait_for(lambda: session.policies == ("go-to-goal", "d4orm-c2f"))
         page.until("document.body.textContent.includes('circle, 3 robots, goal, d4orm-c2f')")
         wait_for(lambda: len(playground._view._lanes) == 2)
         offset = playground._view._lanes[1]._nodes[""].position[:2]
@@ -330,7 +330,7 @@ def test_policies_are_ticked_and_drive_side_by_side(page: Page, tmp_path: Path) 
 
 @viser_leaves_loops
 def test_two_browsers_play_with_one_team(page: Page, tmp_path: Path) -> None:
-    with running(make_problem("circle", num_robots=3, seed=0), "goal") as playground:
+    with running(make_problem("circle", num_robots=3, seed=0), "go-to-goal") as playground:
         session = playground.session
         session.pause(True)
         look_at(page, playground, "circle, 3 robots, goal: paused")
@@ -373,7 +373,7 @@ def test_two_browsers_play_with_one_team(page: Page, tmp_path: Path) -> None:
 
 @viser_leaves_loops
 def test_a_slow_planner_does_not_freeze_the_page(page: Page) -> None:
-    with running(make_problem("circle", num_robots=3, seed=0), "goal") as playground:
+    with running(make_problem("circle", num_robots=3, seed=0), "go-to-goal") as playground:
         session = playground.session
         look_at(page, playground, "circle, 3 robots, goal")
         ended = threading.Event()
@@ -401,7 +401,7 @@ class Slow(GoToGoal):
 
 @viser_leaves_loops
 def test_a_slider_disturbs_from_the_next_step_on(page: Page) -> None:
-    with running(make_problem("circle", num_robots=3, seed=0), "goal") as playground:
+    with running(make_problem("circle", num_robots=3, seed=0), "go-to-goal") as playground:
         session = playground.session
         look_at(page, playground, "circle, 3 robots, goal")
         session.set_lifelong(True)
@@ -417,7 +417,7 @@ def test_a_slider_disturbs_from_the_next_step_on(page: Page) -> None:
 
 @viser_leaves_loops
 def test_elsewhere_the_playground_asks_for_its_token(page: Page) -> None:
-    with running(make_problem("circle", num_robots=2), "goal", host="127.0.0.2") as playground:
+    with running(make_problem("circle", num_robots=2), "go-to-goal", host="127.0.0.2") as playground:
         page.offline(False)
         page.open(playground.address.partition("?")[0])
         assert page.evaluate("document.body.textContent").startswith("open the address with the token")

@@ -52,7 +52,7 @@ def random() -> np.random.Generator:
 
 @pytest.fixture
 def session(scene: Problem) -> Iterator[Session]:
-    session = Session(scene, "goal")
+    session = Session(scene, "go-to-goal")
     session.start()
     yield session
     session.close()
@@ -160,7 +160,7 @@ def test_a_team_goes_on_from_where_it_is(session: Session) -> None:
 
 
 def test_a_robot_is_pushed_in_all_that_drive_and_nobody_plans_anew(session: Session) -> None:
-    session.choose("goal", "random")
+    session.choose("go-to-goal", "random")
     session.pause(True)
     until(lambda: len(session.frames) == 2 and session.frame.status.state == "paused")
     before, planned = session.frames, [frame.replanned for frame in session.frames]
@@ -211,7 +211,7 @@ def test_a_change_that_is_refused_leaves_the_scene_and_says_why(session: Session
     assert "would touch" in session.frame.status.message
     session.choose("nobody")
     until(lambda: "nobody" in session.frame.status.message)
-    assert session.policies == ("goal",)
+    assert session.policies == ("go-to-goal",)
     assert session.failure is None
 
 
@@ -287,28 +287,28 @@ def test_a_scene_that_the_policy_cannot_drive_in_is_left(session: Session) -> No
 
 def test_policies_drive_side_by_side_with_the_same_seed(session: Session, scene: Problem) -> None:
     until(lambda: session.frame.status.time > 0.3)
-    session.choose("goal", "random")
+    session.choose("go-to-goal", "random")
     session.reset()
     until(lambda: len(session.frames) == 2 and session.recorded_steps > 3)
     session.pause(True)
     until(lambda: session.frame.status.state == "paused")
     first, second = session.frames
-    assert [frame.policy for frame in session.frames] == ["goal", "random"]
+    assert [frame.policy for frame in session.frames] == ["go-to-goal", "random"]
     assert not np.array_equal(first.states, second.states)
     assert first.status is second.status
     motions = session.replay().motions
-    assert [motion.content["title"].partition(",")[0] for motion in motions] == ["goal", "random"]
+    assert [motion.content["title"].partition(",")[0] for motion in motions] == ["go-to-goal", "random"]
     session.choose("random")
     until(lambda: len(session.frames) == 1)
     np.testing.assert_array_equal(session.frame.states, second.states, "and goes on alone")
-    session.choose("random", "goal")
+    session.choose("random", "go-to-goal")
     session.reset()
     until(lambda: len(session.frames) == 2 and np.array_equal(session.frame.states, scene.start))
     np.testing.assert_array_equal(session.frames[1].states, scene.start, "both from the same start")
 
 
 def test_what_is_changed_for_one_is_changed_for_all(session: Session) -> None:
-    session.choose("goal", "random")
+    session.choose("go-to-goal", "random")
     session.set_speed(5)
     until(lambda: len(session.frames) == 2 and session.recorded_steps > 25)
     session.pause(True)
@@ -331,11 +331,11 @@ def test_what_is_changed_for_one_is_changed_for_all(session: Session) -> None:
     assert session.frame.status.message.startswith("random: the robot of robot_0 would touch")
 
 
-@pytest.mark.parametrize("policies", [(), ("goal", "goal"), ("goal", "nobody")])
+@pytest.mark.parametrize("policies", [(), ("go-to-goal", "go-to-goal"), ("go-to-goal", "nobody")])
 def test_a_choice_that_cannot_be_leaves_who_drives(session: Session, policies: tuple[str, ...]) -> None:
     session.choose(*policies)
     until(lambda: session.frame.status.message)
-    assert session.policies == ("goal",)
+    assert session.policies == ("go-to-goal",)
     status = session.frame.status.time
     session.pause(False)
     until(lambda: session.frame.status.time > status)
@@ -396,8 +396,8 @@ def test_a_policy_that_predicts_looks_as_far_as_it_is_told(scene: Problem) -> No
     session.start()
     session.set_horizon(7)
     until(lambda: session.frame.status.number > 2)
-    session.choose("goal")
-    until(lambda: session.policies == ("goal",) and session.frame.guidance is None)
+    session.choose("go-to-goal")
+    until(lambda: session.policies == ("go-to-goal",) and session.frame.guidance is None)
     session.set_horizon(0)
     session.choose("d4orm-c2f")
     until(lambda: session.frame.status.message)
@@ -511,7 +511,7 @@ def test_without_the_extra_one_line_names_it() -> None:
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # viser leaves a loop open
 def test_a_page_cannot_ask_for_a_tunnel_to_elsewhere(scene: Problem) -> None:
-    playground = pytest.importorskip("d4orm_planners.play.playground").Playground(scene, "goal")
+    playground = pytest.importorskip("d4orm_planners.play.playground").Playground(scene, "go-to-goal")
     server = playground._server
     assert server.get_host() == "127.0.0.1"
     assert server.request_share_url() is None
@@ -524,7 +524,7 @@ def test_a_page_cannot_ask_for_a_tunnel_to_elsewhere(scene: Problem) -> None:
 @pytest.mark.slow
 def test_ctrl_c_leaves_no_process_and_no_port() -> None:
     pytest.importorskip("viser")
-    command = [sys.executable, "-c", "from d4orm_planners.cli.app import main; main()", "play", "-k", "2", "-p", "goal"]
+    command = [sys.executable, "-c", "from d4orm_planners.cli.app import main; main()", "play", "-k", "2", "-p", "go-to-goal"]
     environment = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**environment, "PYTHONUNBUFFERED": "1"}
@@ -547,7 +547,7 @@ def test_ctrl_c_leaves_no_process_and_no_port() -> None:
 @pytest.mark.parametrize("options", [("--port", "70000"), ("--host", "203.0.113.1")])
 def test_a_place_where_one_cannot_listen_is_said(options: tuple[str, str]) -> None:
     pytest.importorskip("viser")
-    code = f"from d4orm_planners.cli.app import main; main(['play', '-k', '2', '-p', 'goal', *{options!r}])"
+    code = f"from d4orm_planners.cli.app import main; main(['play', '-k', '2', '-p', 'go-to-goal', *{options!r}])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert result.returncode == 2
     assert result.stderr.startswith("d4orm: cannot listen at")

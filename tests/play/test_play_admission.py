@@ -25,7 +25,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptio
 @pytest.fixture
 def playground(request: pytest.FixtureRequest) -> Iterator[Playground]:
     scene = make_problem("circle", num_robots=2)
-    with running(scene, "goal", host=getattr(request, "param", "127.0.0.1")) as shown:
+    with running(scene, "go-to-goal", host=getattr(request, "param", "127.0.0.1")) as shown:
         yield shown
 
 

@@ -48,7 +48,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptio
 
 @pytest.fixture(scope="module")
 def playground() -> Iterator[Playground]:
-    with running(make_problem("circle", num_robots=3), "goal") as shown:
+    with running(make_problem("circle", num_robots=3), "go-to-goal") as shown:
         shown.session.pause(True)
         until(lambda: shown.session.frame.status.state == "paused")
         yield shown
@@ -304,7 +304,7 @@ class Broken(GoToGoal):
 def test_a_flood_of_edits_does_not_stop_the_clock(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(GoToGoal, "_begin", Broken._begin)
     monkeypatch.setattr(GoToGoal, "begun", 0, raising=False)
-    session = Session(make_problem("circle", num_robots=3), "goal")
+    session = Session(make_problem("circle", num_robots=3), "go-to-goal")
     session.set_speed(0.05)
     session.start()
     times: set[float] = set()
@@ -321,7 +321,7 @@ def test_a_flood_of_edits_does_not_stop_the_clock(monkeypatch: pytest.MonkeyPatc
 
 
 def test_of_a_setting_the_last_one_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    session = Session(make_problem("circle", num_robots=3), "goal")
+    session = Session(make_problem("circle", num_robots=3), "go-to-goal")
     begun: list[object] = []
     monkeypatch.setattr(GoToGoal, "_begin", lambda *_: begun.append(None))
     for level in range(1, 301):
@@ -337,7 +337,7 @@ def test_no_edit_ends_the_session(error: Exception) -> None:
     def fail(scene: Any) -> Any:
         raise error
 
-    session = Session(make_problem("circle", num_robots=3), "goal")
+    session = Session(make_problem("circle", num_robots=3), "go-to-goal")
     session.start()
     session.edit(fail)
     until(lambda: session.frame.status.message)
@@ -416,7 +416,7 @@ def test_many_who_say_nothing_keep_nobody_out(gate: AuthenticatingProxy) -> None
 
 def test_closing_does_not_wait_for_a_plan(monkeypatch: pytest.MonkeyPatch) -> None:
     ended = threading.Event()
-    with running(make_problem("circle", num_robots=2), "goal") as playground:
+    with running(make_problem("circle", num_robots=2), "go-to-goal") as playground:
         visitor(playground)  # who does not hang up
         monkeypatch.setattr(GoToGoal, "_begin", lambda *_: ended.wait(PATIENCE))
         playground.session.reset()

@@ -24,7 +24,7 @@ from d4orm_planners.rl.dataset import recording as recording_module
 minari = pytest.importorskip("minari")
 
 RANDOM = {"scenario": "random", "num_robots": 3}
-IN_TIME = {"policy": "goal", "environment": RANDOM, "seeds": range(4)}
+IN_TIME = {"policy": "go-to-goal", "environment": RANDOM, "seeds": range(4)}
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -124,7 +124,7 @@ def test_actions_are_those_of_the_policy_whatever_disturbs_them() -> None:
 
 
 def test_a_recorded_episode_is_read_as_it_was_written(tmp_path: Path) -> None:
-    episode = record_episode(navigation_v0.parallel_env(**RANDOM), make_policy("goal"), seed=2)
+    episode = record_episode(navigation_v0.parallel_env(**RANDOM), make_policy("go-to-goal"), seed=2)
     path = tmp_path / "2.npz"
     episode.save(path)
     again = RecordedEpisode.load(path)
@@ -170,7 +170,7 @@ def test_a_killed_recording_goes_on_and_loses_nothing(tmp_path: Path) -> None:
     command = (
         "dataset",
         "--policy",
-        "goal",
+        "go-to-goal",
         "--num-robots",
         "3",
         "--seeds",
@@ -290,7 +290,7 @@ def test_a_folder_with_another_dataset_is_left_alone(tmp_path: Path) -> None:
 
 def test_the_command_writes_where_minari_looks(d4orm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    options = ("--policy", "goal", "--num-robots", "2", "--seeds", "2", "--workers", "1", "--reward", "training")
+    options = ("--policy", "go-to-goal", "--num-robots", "2", "--seeds", "2", "--workers", "1", "--reward", "training")
     outcome = d4orm("dataset", *options, "--disturb", "delay=1")
     assert outcome.status == 0, outcome.err
     assert "wrote 2 episodes" in outcome.out
@@ -311,7 +311,7 @@ def test_the_command_writes_where_minari_looks(d4orm, tmp_path: Path, monkeypatc
         (("--id", "my data"), "dataset name 'my data' is none of Minari's"),
         (("--scenario-set", "model=car"), "--scenario-set model is said by --model"),
         (("--disturb", "delay=1,2"), "--disturb delay: an episode has one level, not 2"),
-        (("--set", "speed=1", "--policy", "goal"), "takes no settings"),
+        (("--set", "speed=1", "--policy", "go-to-goal"), "takes no settings"),
         (("--workers", "0"), "workers is 0"),
     ],
 )

@@ -26,7 +26,7 @@ from d4orm_planners.rl.samples import Samples, record_samples
 from d4orm_planners.rl.training import TrainingSettings, train
 
 TINY = ImitationSettings(
-    expert="goal", num_robots=2, episodes=20, rounds=3, epochs=40, validation_worlds=20, seed=3,
+    expert="go-to-goal", num_robots=2, episodes=20, rounds=3, epochs=40, validation_worlds=20, seed=3,
     scenario_settings={"size": 2.5},
 )  # fmt: skip
 
@@ -72,7 +72,7 @@ def test_the_policy_is_one_of_ppo(imitated: Path) -> None:
     path = imitated / "policy.safetensors"
     header = load_network(path).header
     assert header.algorithm == "ppo"
-    assert header.training["expert"] == "goal"
+    assert header.training["expert"] == "go-to-goal"
     env = navigation_v0.parallel_env(scenario="random", num_robots=1, size=2.5)
     assert run_episode(env, make_policy("ppo", path=path), seed=1).metrics["arrived"] == 1
 
@@ -102,7 +102,7 @@ def test_an_imitation_that_was_broken_off_goes_on_to_the_same_end(imitated: Path
 def test_dagger_asks_the_expert_where_the_learner_has_led(imitated: Path) -> None:
     env = navigation_v0.parallel_env(scenario="random", num_robots=2, size=2.5)
     learner = load_network(imitated / "policy.safetensors").controls
-    own, led = (record_samples(env, make_policy("goal"), 7, driver) for driver in (None, learner))
+    own, led = (record_samples(env, make_policy("go-to-goal"), 7, driver) for driver in (None, learner))
     np.testing.assert_array_equal(own.observations[:2], led.observations[:2])
     np.testing.assert_array_equal(own.controls[:2], led.controls[:2])
     assert not np.array_equal(own.observations[2:4], led.observations[2:4])
@@ -114,12 +114,12 @@ def test_it_begins_with_a_dataset(agents: str, tmp_path: Path) -> None:
     from d4orm_planners.rl.dataset import Demonstrations, write_dataset
 
     environment: dict[str, Any] = {"scenario": "random", "num_robots": 2, "size": 2.5}
-    demonstrations = Demonstrations(policy="goal", environment=environment, seeds=range(6), agents=agents)
+    demonstrations = Demonstrations(policy="go-to-goal", environment=environment, seeds=range(6), agents=agents)
     write_dataset(demonstrations, tmp_path / "data set", workers=1)
     settings = replace(TINY, dataset=tmp_path / "data set", rounds=2, episodes=4)
     result = imitate(settings, tmp_path / "out")
     env = navigation_v0.parallel_env(**environment)
-    counts = [len(record_samples(env, make_policy("goal"), seed)) for seed in range(6)]
+    counts = [len(record_samples(env, make_policy("go-to-goal"), seed)) for seed in range(6)]
     if agents == "team":
         assert result.curve[0].steps == sum(counts[1:])
     assert not list((tmp_path / "out" / "episodes").glob("000-*"))
@@ -137,7 +137,7 @@ def test_a_dataset_of_others_imports_no_code(tmp_path: Path) -> None:
     code.write_text(f"open({str(marker)!r}, 'w').close()\n"
                     "from d4orm_env.scenarios.generators import circle as scene\n")  # fmt: skip
     environment = {"scenario": "circle", "num_robots": 2}
-    write_dataset(Demonstrations(policy="goal", environment=environment, seeds=[0]), tmp_path / "data", workers=1)
+    write_dataset(Demonstrations(policy="go-to-goal", environment=environment, seeds=[0]), tmp_path / "data", workers=1)
     metadata = tmp_path / "data" / "data" / "metadata.json"
     content = json.loads(metadata.read_text())
     content["demonstrations"]["environment"]["scenario"] = f"{code}:scene"
@@ -194,7 +194,7 @@ def test_ppo_goes_on_from_what_was_imitated(imitated: Path, tmp_path: Path) -> N
 
 
 def test_an_expert_is_told_that_another_drives() -> None:
-    assert ImitationSettings(expert="goal").all_expert_settings == {}
+    assert ImitationSettings(expert="go-to-goal").all_expert_settings == {}
     own = ImitationSettings(expert_settings={"delay": 2, "num_samples": 64}).all_expert_settings
     assert own == {**OTHERS_DRIVE, "delay": 2, "num_samples": 64}
     make_policy("d4orm-c2f", **own)
@@ -229,8 +229,8 @@ def test_bad_settings_are_refused(change: dict[str, Any], message: str) -> None:
     [
         (("imitation", "--steps", "100"), "--steps is for ppo and sac; leave it out"),
         (("imitation", "--start-from", "x.safetensors"), "--start-from is for ppo and sac"),
-        (("ppo", "--expert", "goal"), "--expert is for imitation; use it with 'd4orm train imitation'"),
-        (("imitation", "--expert-set", "x=1", "--expert", "goal"), "takes no"),
+        (("ppo", "--expert", "go-to-goal"), "--expert is for imitation; use it with 'd4orm train imitation'"),
+        (("imitation", "--expert-set", "x=1", "--expert", "go-to-goal"), "takes no"),
         (("imitate",), "algorithm 'imitate' is unknown; choose one of ppo, sac, imitation"),
         (("ppo", "--start-from", "none.safetensors"), "none.safetensors does not exist"),
     ],
@@ -249,7 +249,7 @@ def test_the_command_imitates(capsys: pytest.CaptureFixture[str], tmp_path: Path
     problem = make_problem("random", num_robots=2)
     arguments = ["--num-robots", "2", "--episodes", "2", "--rounds", "2", "--epochs", "1", "--scenario", "circle"]
     with pytest.raises(SystemExit) as exit_:
-        cli.main(["train", "imitation", *arguments, "--expert", "goal", "--out", str(tmp_path)])
+        cli.main(["train", "imitation", *arguments, "--expert", "go-to-goal", "--out", str(tmp_path)])
     assert exit_.value.code == 0
     told = capsys.readouterr().out
     assert f"use it: make_policy('ppo', path='{tmp_path / 'policy.safetensors'}')" in told

@@ -135,7 +135,7 @@ def test_step_loop_shows_that_the_plan_avoids_what_driving_straight_does_not(tmp
     completed("step_loop", out)
     rows = {(float(row["noise [m/s^2]"]), row["policy"]): row for row in table(out / "step_loop.csv")}
     assert rows[0.0, "d4orm"]["success"] == "1 of 1"
-    assert rows[0.0, "goal"]["success"] == "0 of 1"
+    assert rows[0.0, "go-to-goal"]["success"] == "0 of 1"
     assert rows[0.5, "d4orm"]["success"] == "0 of 1", "a plan executed blindly does not survive much noise"
 
 

@@ -127,7 +127,7 @@ def test_trials_of_a_file_are_not_run_again(d4orm, tmp_path: Path) -> None:
 
 
 def test_a_figure_is_made_of_trials_of_other_times(d4orm, tmp_path: Path) -> None:
-    part = ("robustness", "--section", "2D Holonomic", "--policy", "d4orm-d, defaults")
+    part = ("robustness", "--section", "2D Holonomic", "--policy", "hybrid")
     status, out, err = d4orm(*part, "--seeds", "2", "--workers", "2")
     assert status == 0, err
     folder = tmp_path / "reproduction" / "robustness"
@@ -145,7 +145,7 @@ def test_a_figure_is_made_of_trials_of_other_times(d4orm, tmp_path: Path) -> Non
         assert (again / f"robustness.{name}").read_text(encoding="utf-8") == text
     few = [trial for trial in earlier if trial.control_noise_std == 0 and trial.seed == 1]
     (group,) = regrouped(FIGURES["robustness"], few)
-    assert (group.section, group.label, list(group.trials)) == ("2D Holonomic", "d4orm-d, defaults", few)
+    assert (group.section, group.label, list(group.trials)) == ("2D Holonomic", "hybrid", few)
     for arguments, complaint in (
         (("ipopt", "--trials", str(kept)), "none of the 14 trials is one of the figure 'ipopt'"),
         (("robustness", "--trials", str(kept), "--seeds", "3"), "--seeds is about running trials"),
@@ -446,9 +446,9 @@ def test_a_planner_that_is_not_there_is_named_before_anything_runs(tmp_path: Pat
 
 
 def test_a_part_of_a_figure() -> None:
-    part = find_figure("big-teams").only(["2D Holo Random"], ["d4orm-d, defaults", "d4orm-c2f"])
+    part = find_figure("big-teams").only(["2D Holo Random"], ["hybrid", "d4orm-c2f"])
     assert [(section.num_robots, list(section.policies)) for section in part.sections] == [
-        ((16, 32, 64), ["d4orm-d, defaults", "d4orm-c2f"]),
+        ((16, 32, 64), ["hybrid", "d4orm-c2f"]),
     ]
     assert find_figure("big-teams").only() == FIGURES["big-teams"]
     for labels, limit in ((["d4orm-c2f"], None), (["d4orm-c2f", "d4orm-d"], 30.0)):  # which is a planner's
