@@ -36,7 +36,7 @@ def least_times(problem: Problem, joint: JointState) -> np.ndarray:
     velocity = joint.states[:, d : 2 * d]
     towards = (velocity * to_goal).sum(axis=1) / np.maximum(distance, 1e-9)
     if problem.world.num_obstacles:
-        distance = problem.resumed_at(joint.states, joint.goals).ways.length
+        distance = problem.resumed_at(joint.states, joint.goals).shortest_paths.length
         towards = np.linalg.norm(velocity, axis=1)
     way = np.maximum(distance - problem.goal_radius, 0)
     to_top_speed = (speed**2 - towards**2) / (2 * acceleration)

@@ -44,7 +44,8 @@ def mean_squared_jerk(controls: FloatArray, arrived: BoolArray, dt: float) -> fl
 
 
 def stretch(problem: Problem, trajectory: Trajectory) -> np.ndarray:
-    """``(K,)`` the way that each robot travelled over its shortest free way, :attr:`Problem.ways`; 1 is the least.
+    """``(K,)`` the way that each robot travelled over its shortest free way, :attr:`Problem.shortest_paths`; 1 is the
+    least.
 
     The rest of the way, from where the robot docked to the goal itself, counts as travelled. Infinite for a robot that
     did not arrive, or that has no free way.
@@ -55,7 +56,7 @@ def stretch(problem: Problem, trajectory: Trajectory) -> np.ndarray:
     positions = np.asarray(trajectory.positions, np.float64)
     way = np.concatenate([positions, problem.goal[None].astype(np.float64)])
     travelled = np.linalg.norm(np.diff(way, axis=0), axis=-1).sum(axis=0)
-    shortest = problem.ways.length
+    shortest = problem.shortest_paths.length
     counts = trajectory.arrived[-1] & np.isfinite(shortest)
     return np.where(counts, travelled / np.maximum(shortest, problem.goal_radius), np.inf)
 

@@ -71,7 +71,7 @@ class ObstacleParts(NamedTuple):
     gap: slice  # between the two surfaces
 
 
-class WayParts(NamedTuple):
+class PathParts(NamedTuple):
     """What it sees of its shortest free way, from the first component of that on.
 
     Attributes:
@@ -83,7 +83,7 @@ class WayParts(NamedTuple):
     length: slice
 
 
-Parts: TypeAlias = OwnParts | NeighborParts | ObstacleParts | WayParts
+Parts: TypeAlias = OwnParts | NeighborParts | ObstacleParts | PathParts
 
 
 @dataclass(frozen=True)
@@ -94,13 +94,13 @@ class ObservationSlices:
         dimension: ``d``.
         num_neighbors: Neighbours listed, nearest first.
         num_obstacles: Obstacles listed, nearest first; walls of the bounds are among them.
-        observed_way: Whether the way is there.
+        observed_path: Whether the way is there.
     """
 
     dimension: int
     num_neighbors: int
     num_obstacles: int
-    observed_way: bool = field(default=False, kw_only=True)
+    observed_path: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
         whole_number(self.num_neighbors, "num_neighbors", 0)
@@ -123,14 +123,14 @@ class ObservationSlices:
         return ObstacleParts(*_slices(1, self.dimension, 1))
 
     @cached_property
-    def way(self) -> WayParts:
+    def path(self) -> PathParts:
         """Slices of :meth:`ways`."""
-        return WayParts(*_slices(self.dimension, 1))
+        return PathParts(*_slices(self.dimension, 1))
 
     @cached_property
     def size(self) -> int:
         """Number of components ``D``."""
-        return self._obstacles_end + self.observed_way * self.way[-1].stop
+        return self._obstacles_end + self.observed_path * self.path[-1].stop
 
     @property
     def _neighbors_end(self) -> int:
@@ -150,7 +150,7 @@ class ObservationSlices:
         rows = observations[..., self._neighbors_end : self._obstacles_end]
         return rows.reshape(*rows.shape[:-1], self.num_obstacles, self.obstacle[-1].stop)
 
-    def ways(self, observations: FloatArray) -> FloatArray:
+    def paths(self, observations: FloatArray) -> FloatArray:
         """``(..., .)`` what observations ``(..., D)`` say of the way; empty where they do not."""
         return observations[..., self._obstacles_end :]
 
@@ -160,7 +160,7 @@ class ObservationSlices:
         blocks: list[tuple[str, Parts]] = [("", self.own)]
         blocks += [(f"neighbor_{row}.", self.neighbor) for row in range(self.num_neighbors)]
         blocks += [(f"obstacle_{row}.", self.obstacle) for row in range(self.num_obstacles)]
-        blocks += [("way.", self.way)] * self.observed_way
+        blocks += [("path.", self.path)] * self.observed_path
         return tuple(prefix + name for prefix, parts in blocks for name in _component_names(parts))
 
 
@@ -182,7 +182,7 @@ class ObservationLayout(ObservationSlices):
         problem: Problem,
         num_neighbors: int = 4,
         num_obstacles: int = 4,
-        observed_way: bool = False,
+        observed_path: bool = False,
         spare: BoundsSlack = BoundsSlack(),  # noqa: B008 - it is immutable
     ) -> ObservationLayout:
         """The layout for a problem, with bounds that no motion of its robots can leave.
@@ -191,13 +191,13 @@ class ObservationLayout(ObservationSlices):
             problem: The problem.
             num_neighbors: Neighbours listed.
             num_obstacles: Obstacles listed.
-            observed_way: Whether the way is there.
+            observed_path: Whether the way is there.
             spare: Room beyond that, for what disturbs the motion or what is seen of it.
 
         Raises:
             ValueError: If a number of neighbours or obstacles is negative or not whole.
         """
-        slices = ObservationSlices(problem.dimension, num_neighbors, num_obstacles, observed_way=observed_way)
+        slices = ObservationSlices(problem.dimension, num_neighbors, num_obstacles, observed_path=observed_path)
         team, reach = problem.team, _reach(problem, spare)
         radius, speed, acceleration = (
             float(values.max()) for values in (team.radius, team.max_speed, team.max_acceleration)
@@ -210,17 +210,17 @@ class ObservationLayout(ObservationSlices):
         _fill(high, slices.own, own)
         _fill(slices.neighbors(high), slices.neighbor, neighbor)
         _fill(slices.obstacles(high), slices.obstacle, {"present": 1, "position": reach, "gap": reach})
-        if observed_way:
-            _fill(slices.ways(high), slices.way, {"direction": 1, "length": WINDING * reach})
+        if observed_path:
+            _fill(slices.paths(high), slices.path, {"direction": 1, "length": WINDING * reach})
         low = -high
         _fill(low, slices.own, {"time_left": 0, "arrived": 0})
         _fill(slices.neighbors(low), slices.neighbor, {"present": 0})
         _fill(slices.obstacles(low), slices.obstacle, {"present": 0})
-        if observed_way:
-            _fill(slices.ways(low), slices.way, {"length": 0})
+        if observed_path:
+            _fill(slices.paths(low), slices.path, {"length": 0})
         for bound in (low, high):
             bound.setflags(write=False)
-        return cls(problem.dimension, num_neighbors, num_obstacles, low, high, observed_way=observed_way)
+        return cls(problem.dimension, num_neighbors, num_obstacles, low, high, observed_path=observed_path)
 
     @cached_property
     def bounds(self) -> FloatArray:

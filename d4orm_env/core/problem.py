@@ -240,12 +240,12 @@ class Problem(Frozen):
         return self.arrays._replace(grid=grid)
 
     @cached_property
-    def ways(self) -> ShortestPaths:
-        """The shortest free way of every robot; see :func:`d4orm_env.paths.shortest_paths.shortest_ways`."""
+    def shortest_paths(self) -> ShortestPaths:
+        """The shortest free way of every robot; see :func:`d4orm_env.paths.shortest_paths.shortest_paths`."""
         # The one road up from here: it is compiled.
-        from d4orm_env.paths.shortest_paths import shortest_ways
+        from d4orm_env.paths.shortest_paths import shortest_paths
 
-        return shortest_ways(self)
+        return shortest_paths(self)
 
     def check_reachable(self) -> None:
         """Whether every robot has a way to its goal that keeps its radius and the margin from obstacles and bounds.
@@ -255,7 +255,7 @@ class Problem(Frozen):
         Raises:
             ValueError: If one has none; the message names all of those.
         """
-        robots = np.flatnonzero(np.isinf(self.ways.length))
+        robots = np.flatnonzero(np.isinf(self.shortest_paths.length))
         if len(robots):
             names = ", ".join(f"robot_{robot}" for robot in robots)
             reach = sorted({f"{radius + self.margin:.4g}" for radius in np.asarray(self.team.radius)[robots]})

@@ -80,8 +80,8 @@ def fresh_goal(
         free = problem.world.clearance(places) > radius[robot] + problem.margin
         gaps = np.linalg.norm(places[:, None] - bodies, axis=-1) - keep_off
         free &= (gaps > 0).all(axis=1)
-        if free.any() and problem.world.num_obstacles and np.isfinite(problem.ways.length[robot]):
-            free[free] = np.isfinite(problem.ways.distance_from(robot, places[free]))
+        if free.any() and problem.world.num_obstacles and np.isfinite(problem.shortest_paths.length[robot]):
+            free[free] = np.isfinite(problem.shortest_paths.distance_from(robot, places[free]))
         if free.any():
             return as_float32(places[np.argmax(free)])
     raise RuntimeError(

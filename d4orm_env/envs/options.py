@@ -45,10 +45,10 @@ class EnvOptions:
         reward: ``"paper"``, ``"training"`` (:class:`~d4orm_env.envs.rewards.TrainingReward`), or a function from a
             :class:`~d4orm_env.envs.rewards.RewardInput` to the rewards ``(..., K)`` of all robots.
         progress: What the distances of rewards are, the paper's among them: ``"straight"``, or the length of the
-            shortest free ``"way"``, see :mod:`d4orm_env.paths.shortest_paths`; the same in a world without obstacles.
+            shortest free ``"path"``, see :mod:`d4orm_env.paths.shortest_paths`; the same in a world without obstacles.
             Not for
             ``lifelong``.
-        observed_way: Whether an observation ends with direction and length of the shortest free way. Not for
+        observed_path: Whether an observation ends with direction and length of the shortest free way. Not for
             ``lifelong``.
         observed_robots: Nearest robots in an observation; missing ones are marked absent.
         observed_obstacles: Nearest obstacles in an observation; likewise.
@@ -66,7 +66,7 @@ class EnvOptions:
     randomize_instance: bool | None = None
     reward: str | RewardFunction = "paper"
     progress: str = "straight"
-    observed_way: bool = False
+    observed_path: bool = False
     observed_robots: int = 4
     observed_obstacles: int = 4
     scenario_settings: Mapping[str, Any] = field(default_factory=dict)
@@ -106,13 +106,13 @@ class EnvOptions:
     def _check(self) -> None:
         if not isinstance(self.randomize_instance, bool | None):
             raise ValueError(f"randomize_instance is {shown(self.randomize_instance)}; it must be True, False or None")
-        if self.progress not in ("straight", "way"):
-            raise ValueError(f"progress is {shown(self.progress)}; it must be 'straight' or 'way'")
-        if not isinstance(self.observed_way, bool):
-            raise ValueError(f"observed_way is {shown(self.observed_way)}; it must be True or False")
-        if self.lifelong and (self.progress == "way" or self.observed_way):
+        if self.progress not in ("straight", "path"):
+            raise ValueError(f"progress is {shown(self.progress)}; it must be 'straight' or 'path'")
+        if not isinstance(self.observed_path, bool):
+            raise ValueError(f"observed_path is {shown(self.observed_path)}; it must be True or False")
+        if self.lifelong and (self.progress == "path" or self.observed_path):
             raise ValueError(
-                "progress='way' and observed_way need goals that stay; leave them out in lifelong mode, which draws "
+                "progress='path' and observed_path need goals that stay; leave them out in lifelong mode, which draws "
                 "new ones all the time"
             )
         if self.problem is None:

@@ -37,7 +37,7 @@ from d4orm_env.envs.rewards import (
     paper_reward,
 )
 from d4orm_env.envs.team_step import TeamStep
-from d4orm_env.paths.shortest_paths import observe_ways
+from d4orm_env.paths.shortest_paths import observe_paths
 
 _MAX_OBSERVED = 10_000
 _OPEN_WORLD_EXTENT = 1000.0
@@ -67,13 +67,13 @@ class Simulation:
             problem,
             num_neighbors=whole_number(options.observed_robots, "observed_robots", 0, _MAX_OBSERVED),
             num_obstacles=whole_number(options.observed_obstacles, "observed_obstacles", 0, _MAX_OBSERVED),
-            observed_way=options.observed_way,
+            observed_path=options.observed_path,
             spare=self._spare,
         )
         self._disturbed: DisturbedWorlds | None = None
         self._disturb(0)  # to know what bodies there are
         # In an open world the two are the same.
-        self.along_ways = options.progress == "way" and problem.world.num_obstacles > 0
+        self.along_ways = options.progress == "path" and problem.world.num_obstacles > 0
         if self.along_ways:
             self.reward = self.reward or paper_reward
             problem.check_reachable()
@@ -332,7 +332,7 @@ class Simulation:
             dt=self.problem.dt,
         )
         if self.along_ways:
-            ways = self.problem.ways
+            ways = self.problem.shortest_paths
             step = along_ways(step, ways.length, ways.distance(step.previous_positions), ways.distance(step.positions))
         rewards, self._terms = compute_rewards(reward, step)
         return rewards
@@ -359,8 +359,8 @@ class Simulation:
         sight = ObservationInputs.of_team(self.arrays.goal, states, controls, self.arrived, time_left, bodies)
         observations: FloatArray = np.empty((len(self.states), layout.size), np.float32)
         self._engine.observe_worlds(self.arrays, layout, sight, observations[None])
-        if layout.observed_way:
-            observe_ways(observations, layout, *self.problem.ways.ahead(states[:, : self._dimension]))
+        if layout.observed_path:
+            observe_paths(observations, layout, *self.problem.shortest_paths.ahead(states[:, : self._dimension]))
         return observations if self._disturbed is None else self._disturbed.observe(observations[None], layout)[0]
 
     def _assign_goals(self, robots: NDArray[np.intp]) -> None:

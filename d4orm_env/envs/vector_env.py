@@ -25,7 +25,7 @@ from d4orm_env.envs.vector_disturbances import DisturbedBatch
 from d4orm_env.envs.vector_infos import final_infos, masked
 from d4orm_env.envs.vector_inputs import checked_autoreset_mode, reset_mask, world_seeds
 from d4orm_env.envs.world_draws import OWN_ARRAYS, WorldDraws
-from d4orm_env.paths.shortest_paths import ahead_in_each, observe_ways
+from d4orm_env.paths.shortest_paths import ahead_in_each, observe_paths
 from d4orm_env.scenarios.problems import ScenarioLike
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         self._way_direction = np.zeros((*self.robot_rewards.shape, problem.dimension))
         self._way_length, self._first_length = (np.zeros(self.robot_rewards.shape) for _ in range(2))
         if self._template.along_ways:
-            self._first_length[:] = problem.ways.length
+            self._first_length[:] = problem.shortest_paths.length
         shape = (count, problem.num_robots, self._template.layout.size)
         self._observations = np.empty(shape, np.float32)
         self._running = np.zeros(count, np.bool_)
@@ -305,12 +305,12 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
                 advance(true(self._arrays[world]), layout, cycles, orders[one], part, made[one])
         self._disturbances.meet(orders == STEP)
         altered = self._disturbances.alters_sight
-        if self._template.along_ways or (layout.observed_way and not altered):
+        if self._template.along_ways or (layout.observed_path and not altered):
             self._way_direction[going], self._way_length[going] = self._ahead(going, self._worlds.state[going])
         if altered:
             self._look(going, out)
-        elif layout.observed_way:
-            observe_ways(out, layout, self._way_direction, self._way_length)
+        elif layout.observed_path:
+            observe_paths(out, layout, self._way_direction, self._way_length)
         return out.reshape(self.num_envs, -1)
 
     def _look(self, worlds: NDArray[np.intp], out: FloatArray) -> None:
@@ -323,8 +323,8 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         for row, world in enumerate(worlds if self._apart else ()):
             one = slice(row, row + 1)
             self._engine.observe_worlds(self._arrays[world], layout, sight.of(one), seen[one])
-        if layout.observed_way:
-            observe_ways(seen, layout, *self._ahead(worlds, sight.state))
+        if layout.observed_path:
+            observe_paths(seen, layout, *self._ahead(worlds, sight.state))
         seen = self._disturbances.observe(seen, layout)
         if seen is not out:
             out[worlds] = seen
@@ -333,8 +333,8 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         """Directions ``(b, K, d)`` and lengths ``(b, K)`` of the ways in some worlds, from ``states`` ``(b, K, n)``."""
         places = states[..., : self.problem.dimension]
         if not self._template.redraws:
-            return self.problem.ways.ahead(places)
-        return ahead_in_each([self._problems[world].ways for world in worlds], places)
+            return self.problem.shortest_paths.ahead(places)
+        return ahead_in_each([self._problems[world].shortest_paths for world in worlds], places)
 
     def _before(self) -> WorldBatch | None:
         """The worlds before a step, as far as a reward is computed from them; ``None`` for the paper's."""
@@ -388,7 +388,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
                 self._arrays[world] = problem.arrays_to_observe(self._template.layout.num_obstacles)
                 self._apart |= bool(self._draws.differing(problem))
                 if self._template.along_ways:
-                    self._first_length[world] = problem.ways.length
+                    self._first_length[world] = problem.shortest_paths.length
         self._disturbances.begin(indices, self._draws.seeds)
 
     def _infos(self, mask: BoolArray | None = None) -> Info:

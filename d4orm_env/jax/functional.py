@@ -168,8 +168,8 @@ def observe(problem: Problem, state: State, layout: ObservationLayout, max_cycle
     Raises:
         ValueError: If the layout has the shortest free way, which is not known here.
     """
-    if layout.observed_way:
-        raise ValueError("the functional API does not know the shortest free ways; leave observed_way out")
+    if layout.observed_path:
+        raise ValueError("the functional API does not know the shortest free ways; leave observed_path out")
     cycles = problem.horizon if max_cycles is None else max_cycles
     time_left = jnp.maximum(0, 1 - state.steps.astype(jnp.float32) / np.float32(cycles))
     world = Worlds(state.states, state.arrived, state.controls)

@@ -79,7 +79,7 @@ class FunctionalEnv:
         num_instances: How many instances there are to choose among, for a scenario that draws at random; ``seed=``
             draws others.
         **options: Further attributes of :class:`~d4orm_env.envs.options.EnvOptions`, and arguments of the scenario. Not
-            ``render_mode``, ``lifelong``, ``progress="way"``, ``observed_way``, nor disturbances but
+            ``render_mode``, ``lifelong``, ``progress="path"``, ``observed_path``, nor disturbances but
             :class:`~d4orm_env.disturbances.ControlNoise`: they are not pure functions.
 
     Attributes:
@@ -198,8 +198,8 @@ def _refuse(options: EnvOptions) -> None:
     refused = {
         "render_mode": options.render_mode is not None,
         "lifelong": options.lifelong,
-        "progress='way'": options.progress == "way",
-        "observed_way": options.observed_way,
+        "progress='path'": options.progress == "path",
+        "observed_path": options.observed_path,
     }
     for name, given in refused.items():
         if given:

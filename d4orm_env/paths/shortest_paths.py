@@ -116,7 +116,7 @@ def _find(world: tuple[Space, Fields], robot: int, places: Floats) -> tuple[Floa
     return target, length, anchor
 
 
-def shortest_ways(problem: Problem) -> ShortestPaths:
+def shortest_paths(problem: Problem) -> ShortestPaths:
     """The shortest free ways of a team.
 
     In a world without obstacles they are straight, and there is nothing to compute. Otherwise a wavefront spreads from
@@ -182,7 +182,7 @@ def ahead_in_each(ways: Sequence[ShortestPaths], places: FloatArray) -> tuple[Fl
     return _towards(given, target), length
 
 
-def observe_ways(observations: FloatArray, layout: ObservationLayout, direction: Floats, length: Floats) -> None:
+def observe_paths(observations: FloatArray, layout: ObservationLayout, direction: Floats, length: Floats) -> None:
     """Fill in what robots see of their ways.
 
     Args:
@@ -191,7 +191,7 @@ def observe_ways(observations: FloatArray, layout: ObservationLayout, direction:
         direction: ``(..., K, d)`` of the ways, unit vectors.
         length: ``(..., K)`` of the ways [m].
     """
-    seen, parts = layout.ways(observations), layout.way
+    seen, parts = layout.paths(observations), layout.path
     seen[..., parts.direction] = direction
     seen[..., parts.length] = np.minimum(length, layout.high[-1])[..., None]
 

@@ -120,7 +120,7 @@ def sample_once(teams: tuple[tuple[str, ...], ...]) -> None:
 def find_ways() -> None:
     """Find the shortest free ways among walls, and guide a team along them."""
     problem = make_problem("doorway", num_robots=4)
-    problem.ways.distance(problem.goal)
+    problem.shortest_paths.distance(problem.goal)
     make_planner("mapf", engine="cpu").solve(problem, seed=0)
 
 

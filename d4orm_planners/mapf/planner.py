@@ -80,7 +80,7 @@ class NoPaths:
         try:
             problem.check_reachable()
         except ValueError as error:
-            return cls(str(error), tuple(np.flatnonzero(np.isinf(problem.ways.length)).tolist()))
+            return cls(str(error), tuple(np.flatnonzero(np.isinf(problem.shortest_paths.length)).tolist()))
         return None
 
     def explained(self, iteration: Iteration) -> Iteration:

@@ -70,9 +70,9 @@ class RobotVecEnv(VecEnv):
         ways: bool = False,
         **kwargs: Any,
     ) -> None:
-        kwargs |= {"reward": reward, "observed_way": ways, "autoreset_mode": "SameStep"}
+        kwargs |= {"reward": reward, "observed_path": ways, "autoreset_mode": "SameStep"}
         if ways:
-            kwargs["progress"] = "way"
+            kwargs["progress"] = "path"
         self._env = NavigationVectorEnv(num_worlds, scenario, num_robots, **kwargs)
         problem = self.problem = self._env.problem
         if not problem.docks:
@@ -162,8 +162,8 @@ class RobotVecEnv(VecEnv):
     def encoded(self, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Features ``(N, F)`` and frames ``(N, 2)`` of what robots of any such worlds see ``(N, .)``."""
         if self.ways:
-            seen, way = seen[:, : self.features.slices.size].copy(), self._env.layout.ways(seen)
-            parts = self._env.layout.way
+            seen, way = seen[:, : self.features.slices.size].copy(), self._env.layout.paths(seen)
+            parts = self._env.layout.path
             self.features.along(seen, way[:, parts.direction], way[:, parts.length][:, 0])
         return self.features.encode(seen)
 

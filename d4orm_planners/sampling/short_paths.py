@@ -36,7 +36,7 @@ def on_short_paths(task: SamplingTask, search: SolveRun) -> SamplingTask:
         return task
     if problem.world.num_obstacles:
         with search.watch.paused():  # it may compile
-            lengths = np.asarray(problem.ways.length, np.float64)
+            lengths = np.asarray(problem.shortest_paths.length, np.float64)
         if lengths.max() >= reference:
             return task
     slack = SLACK + SLACK_GROWTH * search.iteration

@@ -61,7 +61,7 @@ def goals_along_ways(problem: Problem, places: FloatArray | Floats, goals: Float
     """
     if not problem.world.num_obstacles:
         return goals
-    direction, length = problem.ways.ahead(places)
+    direction, length = problem.shortest_paths.ahead(places)
     first = (goals == problem.goal).all(axis=1)
     ahead, known = along_ways(direction, np.where(first, length, np.inf))
     return np.where(known[:, None], places + ahead, goals).astype(np.float32)

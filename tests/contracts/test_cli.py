@@ -50,7 +50,7 @@ def test_planning_and_running_take_the_recommended_planner(d4orm) -> None:
 
 
 def test_run_compares_policies_side_by_side(d4orm, tmp_path: Path) -> None:
-    outcome = d4orm("run", "--num-robots", "2", "--compare", "goal, random", "--out", "compare.html")
+    outcome = d4orm("run", "--num-robots", "2", "--compare", "go-to-goal, random", "--out", "compare.html")
     assert outcome.status == 0, outcome.err
     page = (tmp_path / "compare.html").read_text(encoding="utf-8")
     assert page.index('"title": "go-to-goal"') < page.index('"title": "random"')
@@ -59,9 +59,12 @@ def test_run_compares_policies_side_by_side(d4orm, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
-        (("--compare", "goal,random"), "--compare needs --out"),
-        (("--compare", "go-to-goal", "--policy", "d4orm", "--out", "a.html"), "--policy does not go with --compare goal"),
-        (("--compare", "goal,nobody", "--out", "a.html"), "nobody"),
+        (("--compare", "go-to-goal,random"), "--compare needs --out"),
+        (
+            ("--compare", "go-to-goal", "--policy", "d4orm", "--out", "a.html"),
+            "--policy does not go with --compare goal",
+        ),
+        (("--compare", "go-to-goal,nobody", "--out", "a.html"), "nobody"),
         (("--out", "a.htm"), "must end in .html"),
     ],
 )

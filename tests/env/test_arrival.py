@@ -126,7 +126,12 @@ def test_planners_solve_it(name: str) -> None:
 @pytest.mark.parametrize("name", ["d4orm-c2f", "go-to-goal"])
 def test_policies_arrive(name: str) -> None:
     env = navigation_v0.parallel_env(
-        "circle", num_robots=2 if name == "go-to-goal" else 4, arrival="stay", diameter=6.0, horizon=150, num_obstacles=0
+        "circle",
+        num_robots=2 if name == "go-to-goal" else 4,
+        arrival="stay",
+        diameter=6.0,
+        horizon=150,
+        num_obstacles=0,
     )
     episode = run_episode(env, make_policy(name), seed=0)
     assert episode.metrics["arrived"] == env.unwrapped.problem.num_robots

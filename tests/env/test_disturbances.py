@@ -732,7 +732,9 @@ def test_an_episode_records_the_truth_and_where_it_was_disturbed(tmp_path: Any) 
 @pytest.mark.parametrize("scenario", ["circle", "sphere"])
 def test_pictures_show_where_it_was_disturbed(scenario: str, tmp_path: Any) -> None:
     disturbances = [Push(2.0, 0.3), Stall(1.0, robots=1), Intruder(2)]
-    episode = run_episode(navigation_v0.parallel_env(scenario, 3, disturbances=disturbances, max_cycles=30), "go-to-goal")
+    episode = run_episode(
+        navigation_v0.parallel_env(scenario, 3, disturbances=disturbances, max_cycles=30), "go-to-goal"
+    )
     problem, trajectory, marks = episode.problem, episode.trajectory, episode.marks
     figure = plot_trajectory(problem, trajectory, marks=marks)
     told = {text.get_text() for text in figure.legends[0].get_texts()}

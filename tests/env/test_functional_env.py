@@ -99,8 +99,8 @@ def test_a_reward_of_ones_own_is_traced() -> None:
 
 
 def test_the_way_is_not_to_be_seen() -> None:
-    env = navigation_v0.parallel_env("circle", 2, observed_way=True)
-    with pytest.raises(ValueError, match="leave observed_way out"):
+    env = navigation_v0.parallel_env("circle", 2, observed_path=True)
+    with pytest.raises(ValueError, match="leave observed_path out"):
         functional.observe(env.problem, functional.reset(env.problem, KEY), env.unwrapped._simulation.layout)
 
 
@@ -184,8 +184,8 @@ def test_noise_is_drawn_from_the_key() -> None:
         ({"disturbances": [Delay(2)]}, "disturbances other than ControlNoise are no pure functions"),
         ({"lifelong": True}, "lifelong is not possible"),
         ({"render_mode": "human"}, "render_mode is not possible"),
-        ({"observed_way": True}, "observed_way is not possible"),
-        ({"progress": "way"}, "progress='way' is not possible"),
+        ({"observed_path": True}, "observed_path is not possible"),
+        ({"progress": "path"}, "progress='path' is not possible"),
         ({"num_instances": 0}, "num_instances is 0"),
         ({"colour": 1}, "colour"),
         ({"scenario": "maze", "num_instances": 4}, "differ in more than numbers"),

@@ -53,8 +53,10 @@ def team_steps(problem: Problem, actions: np.ndarray, **options: Any) -> tuple[n
 def test_the_papers_reward_along_the_way(spatial: bool) -> None:
     problem = walled(spatial)
     actions = random_actions(problem, 8)  # too few to come near to anything
-    rewards, places, _ = team_steps(problem, actions, progress="way")
-    np.testing.assert_allclose(rewards, 1 - problem.ways.distance(places[1:]) / problem.ways.length, atol=1e-5)
+    rewards, places, _ = team_steps(problem, actions, progress="path")
+    np.testing.assert_allclose(
+        rewards, 1 - problem.shortest_paths.distance(places[1:]) / problem.shortest_paths.length, atol=1e-5
+    )
     straight, _, _ = team_steps(problem, actions)
     assert (np.abs(rewards - straight) > 1e-3).any()
 
@@ -62,8 +64,8 @@ def test_the_papers_reward_along_the_way(spatial: bool) -> None:
 def test_a_reward_to_learn_from_along_the_way() -> None:
     problem = walled()
     reward = TrainingReward(progress=1.0, arrival=0, margin=0, contact=0, time=0)
-    rewards, places, _ = team_steps(problem, random_actions(problem, 12), progress="way", reward=reward)
-    lengths = problem.ways.distance(places)
+    rewards, places, _ = team_steps(problem, random_actions(problem, 12), progress="path", reward=reward)
+    lengths = problem.shortest_paths.distance(places)
     longest = problem.team.max_speed * problem.dt
     np.testing.assert_allclose(rewards, (lengths[:-1] - lengths[1:]) / longest, atol=1e-4)
 
@@ -73,7 +75,7 @@ def test_a_reward_to_learn_from_along_the_way() -> None:
 def test_environments_agree(spatial: bool, reward: str) -> None:
     problem, count = walled(spatial), 3
     actions = random_actions(problem, 10)
-    options = {"progress": "way", "observed_way": True, "reward": reward}
+    options = {"progress": "path", "observed_path": True, "reward": reward}
     rewards, _, seen = team_steps(problem, actions, **options)
     single, batch = (
         joint(problem=problem, **options),
@@ -96,7 +98,7 @@ def test_an_open_world_has_the_same_rewards_to_the_bit() -> None:
     actions = random_actions(problem, 10)
     for reward in ("paper", "training"):
         straight, _, _ = team_steps(problem, actions, reward=reward)
-        along, _, _ = team_steps(problem, actions, reward=reward, progress="way")
+        along, _, _ = team_steps(problem, actions, reward=reward, progress="path")
         np.testing.assert_array_equal(straight, along)
 
 
@@ -105,16 +107,16 @@ def test_an_open_world_has_the_same_rewards_to_the_bit() -> None:
 def test_the_way_is_observed_at_the_end(spatial: bool, closed: bool) -> None:
     problem = walled(spatial) if closed else walled(spatial).replace(world=World(3 if spatial else 2))
     d, actions = problem.dimension, random_actions(walled(spatial), 6)
-    _, places, seen = team_steps(problem, actions, observed_way=True)
+    _, places, seen = team_steps(problem, actions, observed_path=True)
     _, _, plain = team_steps(problem, actions)
-    layout = ObservationLayout.for_problem(problem, observed_way=True)
+    layout = ObservationLayout.for_problem(problem, observed_path=True)
     np.testing.assert_array_equal(seen[..., : -d - 1], plain)
     np.testing.assert_allclose(
-        layout.ways(seen)[..., layout.way.direction], problem.ways.direction(places[1:]), atol=1e-6
+        layout.paths(seen)[..., layout.path.direction], problem.shortest_paths.direction(places[1:]), atol=1e-6
     )
-    np.testing.assert_allclose(layout.ways(seen)[..., d], problem.ways.distance(places[1:]), rtol=1e-6)
+    np.testing.assert_allclose(layout.paths(seen)[..., d], problem.shortest_paths.distance(places[1:]), rtol=1e-6)
     assert layout.obstacles(seen).shape[-2:] == (4, d + 2)
-    assert layout.names[-d - 1 :] == (*(f"way.direction_{axis}" for axis in "xyz"[:d]), "way.length")
+    assert layout.names[-d - 1 :] == (*(f"path.direction_{axis}" for axis in "xyz"[:d]), "path.length")
     assert layout.names[: -d - 1] == ObservationLayout.for_problem(problem).names
     assert np.isfinite(layout.bounds).all()
     assert (layout.low <= seen).all()
@@ -123,17 +125,17 @@ def test_the_way_is_observed_at_the_end(spatial: bool, closed: bool) -> None:
 
 def test_nothing_is_observed_of_the_way_by_default() -> None:
     slices = ObservationSlices(2, 4, 4)
-    assert not slices.observed_way
-    assert slices.ways(np.zeros((3, slices.size))).shape == (3, 0)
+    assert not slices.observed_path
+    assert slices.paths(np.zeros((3, slices.size))).shape == (3, 0)
 
 
 def test_spaces_hold_what_is_observed() -> None:
-    env = navigation_v0.parallel_env("four_obstacles", observed_way=True)
+    env = navigation_v0.parallel_env("four_obstacles", observed_path=True)
     observations, _ = env.reset(seed=1)
     for agent, observation in observations.items():
         assert env.observation_space(agent).contains(observation)
     batch = gymnasium.make_vec(
-        "d4orm/Navigation-v0", num_envs=2, scenario="four_obstacles", observed_way=True, **BATCHED
+        "d4orm/Navigation-v0", num_envs=2, scenario="four_obstacles", observed_path=True, **BATCHED
     )
     assert batch.observation_space.contains(batch.reset(seed=1)[0])
 
@@ -150,7 +152,7 @@ def drawn(seed: int, num_robots: int) -> Problem:
 
 
 def test_instances_have_ways_of_their_own() -> None:
-    options = {"scenario": drawn, "num_robots": 2, "progress": "way", "observed_way": True}
+    options = {"scenario": drawn, "num_robots": 2, "progress": "path", "observed_path": True}
     single = joint(**options)
     batch = gymnasium.make_vec("d4orm/Navigation-v0", num_envs=2, **BATCHED, **options)
     observations, _ = batch.reset(seed=3)
@@ -166,7 +168,7 @@ def test_instances_have_ways_of_their_own() -> None:
 
 
 def test_environments_travel_with_their_ways() -> None:
-    env = joint(problem=walled(), progress="way", observed_way=True)
+    env = joint(problem=walled(), progress="path", observed_path=True)
     env.reset(seed=0)
     action = random_actions(walled(), 1).reshape(-1)
     copy = pickle.loads(pickle.dumps(env))
@@ -176,17 +178,17 @@ def test_environments_travel_with_their_ways() -> None:
 
 
 def test_bad_options_are_named() -> None:
-    with pytest.raises(ValueError, match="progress is 'round'; it must be 'straight' or 'way'"):
+    with pytest.raises(ValueError, match="progress is 'round'; it must be 'straight' or 'path'"):
         navigation_v0.parallel_env("circle", progress="round")
-    with pytest.raises(ValueError, match="observed_way is 1; it must be True or False"):
-        navigation_v0.parallel_env("circle", observed_way=1)
+    with pytest.raises(ValueError, match="observed_path is 1; it must be True or False"):
+        navigation_v0.parallel_env("circle", observed_path=1)
     with pytest.raises(ValueError, match="need goals that stay"):
-        navigation_v0.parallel_env("circle", observed_way=True, lifelong=True)
+        navigation_v0.parallel_env("circle", observed_path=True, lifelong=True)
     cage = [[-2, -2, -1.8, 2], [1.8, -2, 2, 2], [-1.8, -2, 1.8, -1.8], [-1.8, 1.8, 1.8, 2]]
     problem = walled().replace(world=World(boxes=cage), goal=[[1, -0.4], [3, 0.4]])
     with pytest.raises(ValueError, match="robot_1 has no way from start to goal"):
-        navigation_v0.parallel_env(problem=problem, progress="way")
-    env = navigation_v0.parallel_env(problem=problem, observed_way=True)
+        navigation_v0.parallel_env(problem=problem, progress="path")
+    env = navigation_v0.parallel_env(problem=problem, observed_path=True)
     seen = env.reset(seed=0)[0]["robot_1"]
     assert seen[-1] == env.observation_space("robot_1").high[-1]
     np.testing.assert_array_equal(seen[-3:-1], [0, 0])

@@ -11,7 +11,7 @@ from shortest_support import visible_lengths
 
 from d4orm_env import Problem, Team, World, make_problem, rollout
 from d4orm_env.core.metrics import mean_stretch, stretch
-from d4orm_env.paths.shortest_paths import MAX_NODES, shortest_ways
+from d4orm_env.paths.shortest_paths import MAX_NODES, shortest_paths
 from d4orm_planners import make_planner
 
 RADIUS, MARGIN = 0.15, 0.05
@@ -57,8 +57,8 @@ def test_lengths_are_those_of_visibility_graphs_to_two_percent(seed: int) -> Non
     places = random.uniform(-0.2, 5.6, (150, 2))
     places = np.concatenate([[[0.3, 0.3]], places[world.clearance(places) > reach + 1e-3]])
     expected = visible_lengths(world, reach, problem.goal[0].astype(np.float64), places)
-    lengths = problem.ways.distance(places[:, None])[:, 0]
-    assert lengths[0] == pytest.approx(problem.ways.length[0])
+    lengths = problem.shortest_paths.distance(places[:, None])[:, 0]
+    assert lengths[0] == pytest.approx(problem.shortest_paths.length[0])
     np.testing.assert_array_equal(np.isfinite(lengths), np.isfinite(expected))
     ratio = lengths[np.isfinite(expected)] / expected[np.isfinite(expected)]
     assert ratio.min(initial=1) > 0.999
@@ -69,9 +69,11 @@ def test_lengths_are_those_of_visibility_graphs_to_two_percent(seed: int) -> Non
 def test_paths_are_as_long_as_they_say_and_free(seed: int) -> None:
     random = np.random.default_rng(100 + seed)
     problem = problem_in(scattered_world(random), [0.3, 0.3], [5.1, 5.1])
-    path = problem.ways.path(0)
+    path = problem.shortest_paths.path(0)
     np.testing.assert_array_equal(path[[0, -1]], np.stack([problem.start[0], problem.goal[0]]).astype(np.float64))
-    assert np.linalg.norm(np.diff(path, axis=0), axis=1).sum() == pytest.approx(problem.ways.length[0], rel=1e-9)
+    assert np.linalg.norm(np.diff(path, axis=0), axis=1).sum() == pytest.approx(
+        problem.shortest_paths.length[0], rel=1e-9
+    )
     points = np.concatenate([a + np.linspace(0, 1, 100)[:, None] * (b - a) for a, b in pairwise(path)])
     assert problem.world.clearance(points).min() > 0.99 * REACH
 
@@ -81,10 +83,10 @@ def test_who_follows_the_direction_gets_there(seed: int) -> None:
     problem = problem_in(cells_world(np.random.default_rng(seed + 30), 0.2), [0.3, 0.3], [5.1, 5.1])
     place, travelled, step = problem.start[:, :2].astype(np.float64), 0.0, 0.02
     while np.linalg.norm(place - problem.goal) > 0.05:
-        direction = problem.ways.direction(place)
+        direction = problem.shortest_paths.direction(place)
         np.testing.assert_allclose(np.linalg.norm(direction, axis=-1), 1.0)
         place, travelled = place + step * direction, travelled + step
-        assert travelled < 1.1 * problem.ways.length[0]
+        assert travelled < 1.1 * problem.shortest_paths.length[0]
 
 
 def around(first: float, second: float, radius: float, angle: float) -> float:
@@ -102,7 +104,7 @@ def test_ways_round_a_sphere(size: float, seed: int) -> None:
     start = random.normal(size=3)
     start *= (size + random.uniform(0.5, 2)) / np.linalg.norm(start)
     goal = -start + 0.3 * random.normal(size=3)
-    ways = problem_in(World(3, spheres=[[0, 0, 0, size]]), start, goal).ways
+    ways = problem_in(World(3, spheres=[[0, 0, 0, size]]), start, goal).shortest_paths
     first, second = float(np.linalg.norm(start)), float(np.linalg.norm(goal))
     expected = around(first, second, size + REACH, math.acos(start @ goal / first / second))
     assert 0.999 < ways.length[0] / expected < 1.02
@@ -111,7 +113,7 @@ def test_ways_round_a_sphere(size: float, seed: int) -> None:
 @pytest.mark.parametrize("rise", [0.0, 1.0, 4.0])
 def test_ways_round_a_cylinder_climb_evenly(rise: float) -> None:
     world = World(3, cylinders=[[0, 0, 0.5]], spheres=[[0, 0, 20, 0.1]])
-    ways = problem_in(world, [-1.5, 0, 0], [1.2, 0.1, rise]).ways
+    ways = problem_in(world, [-1.5, 0, 0], [1.2, 0.1, rise]).shortest_paths
     flat = around(1.5, math.hypot(1.2, 0.1), 0.5 + REACH, math.pi - math.atan2(0.1, 1.2))
     assert 0.999 < ways.length[0] / math.hypot(flat, rise) < 1.02
 
@@ -119,7 +121,7 @@ def test_ways_round_a_cylinder_climb_evenly(rise: float) -> None:
 @pytest.mark.parametrize(("ahead", "aside"), [(1.0, 0.0), (2.0, 1.5), (1.0, 2.5)])
 def test_ways_over_a_wall_unfold(ahead: float, aside: float) -> None:
     wall = World(3, boxes=[[-0.2, -3, 0, 0.2, 3, 1]], lower=[-4, -3, 0], upper=[4, 3, 4])
-    ways = problem_in(wall, [-ahead, -aside, 0.3], [ahead, aside, 0.3]).ways
+    ways = problem_in(wall, [-ahead, -aside, 0.3], [ahead, aside, 0.3]).shortest_paths
     gap = math.hypot(ahead - 0.2, 0.7)
     # Up to where the string leaves the rounded edge for the top, in the plane across the wall.
     turn = math.atan2(0.7, ahead - 0.2) + math.pi / 2 - math.acos(REACH / gap)
@@ -134,21 +136,21 @@ def test_open_worlds_have_straight_ways(scenario: str) -> None:
     problem.check_reachable()
     offset = problem.goal - problem.start[:, :d].astype(np.float64)
     gaps = np.linalg.norm(offset, axis=1)
-    np.testing.assert_allclose(problem.ways.length, gaps, rtol=1e-12)
-    np.testing.assert_array_equal(problem.ways.distance(problem.start[:, :d]), problem.ways.length)
-    np.testing.assert_allclose(problem.ways.direction(problem.start[:, :d]), offset / gaps[:, None])
-    np.testing.assert_array_equal(problem.ways.direction(problem.goal), np.zeros((4, d)))
-    assert problem.ways.path(1).shape == (2, d)
+    np.testing.assert_allclose(problem.shortest_paths.length, gaps, rtol=1e-12)
+    np.testing.assert_array_equal(problem.shortest_paths.distance(problem.start[:, :d]), problem.shortest_paths.length)
+    np.testing.assert_allclose(problem.shortest_paths.direction(problem.start[:, :d]), offset / gaps[:, None])
+    np.testing.assert_array_equal(problem.shortest_paths.direction(problem.goal), np.zeros((4, d)))
+    assert problem.shortest_paths.path(1).shape == (2, d)
 
 
 def test_lengths_and_directions_take_batches() -> None:
     problem = make_problem("four_obstacles")
     places = problem.start[:, :2] + np.linspace(0, 0.2, 3)[:, None, None]
-    lengths, directions = problem.ways.distance(places), problem.ways.direction(places)
+    lengths, directions = problem.shortest_paths.distance(places), problem.shortest_paths.direction(places)
     assert lengths.shape == (3, problem.num_robots)
     assert directions.shape == (3, problem.num_robots, 2)
-    np.testing.assert_array_equal(lengths[0], problem.ways.length)
-    np.testing.assert_array_equal(lengths[2], problem.ways.distance(places[2]))
+    np.testing.assert_array_equal(lengths[0], problem.shortest_paths.length)
+    np.testing.assert_array_equal(lengths[2], problem.shortest_paths.distance(places[2]))
 
 
 def test_robots_without_a_way_are_named() -> None:
@@ -157,9 +159,9 @@ def test_robots_without_a_way_are_named() -> None:
     problem = problem_in(World(boxes=cage), starts, goals)
     with pytest.raises(ValueError, match=r"^robot_0, robot_2 have no way from start to goal that is 0\.2 m clear .*"):
         problem.check_reachable()
-    np.testing.assert_array_equal(np.isinf(problem.ways.length), [True, False, True, False])
-    assert problem.ways.path(0).shape == (0, 2)
-    np.testing.assert_array_equal(problem.ways.direction(problem.start)[[0, 2]], np.zeros((2, 2)))
+    np.testing.assert_array_equal(np.isinf(problem.shortest_paths.length), [True, False, True, False])
+    assert problem.shortest_paths.path(0).shape == (0, 2)
+    np.testing.assert_array_equal(problem.shortest_paths.direction(problem.start)[[0, 2]], np.zeros((2, 2)))
     with pytest.raises(ValueError, match=r"^robot_0 has no way .* use a smaller radius or margin$"):
         problem.select([0, 1]).check_reachable()
     problem.select([1, 3]).check_reachable()
@@ -173,17 +175,17 @@ def test_a_gap_is_passed_if_it_is_wide_enough(spare: float, passable: bool, turn
     wall = np.array([[-0.1, half], [0.1, half], [0.1, 20], [-0.1, 20]])
     world = World(polygons=[wall @ turned.T, -wall @ turned.T], lower=[-3, -3], upper=[3, 3])
     problem = problem_in(world, turned @ [-1.5, 0.3], turned @ [1.5, 0.3])
-    assert np.isfinite(problem.ways.length[0]) == passable
+    assert np.isfinite(problem.shortest_paths.length[0]) == passable
     if passable:
-        assert problem.ways.length[0] < 1.02 * (2 * math.hypot(1.4, 0.3) + 0.2)
+        assert problem.shortest_paths.length[0] < 1.02 * (2 * math.hypot(1.4, 0.3) + 0.2)
 
 
 def test_places_within_the_margin_are_left_and_reached() -> None:
     world = World(boxes=[[-1, -1, 1, 0]])
     problem = problem_in(world, [-0.9, RADIUS + 0.01], [0.9, RADIUS + 0.02])
     problem.check_reachable()
-    assert problem.ways.length[0] == pytest.approx(1.8, rel=0.04)
-    assert problem.ways.distance([[0.0, 0.05]])[0] == pytest.approx(0.95, abs=0.06)  # in contact
+    assert problem.shortest_paths.length[0] == pytest.approx(1.8, rel=0.04)
+    assert problem.shortest_paths.distance([[0.0, 0.05]])[0] == pytest.approx(0.95, abs=0.06)  # in contact
     between = problem_in(World(boxes=[[-1, -1, 1, 0], [-1, 0.36, 1, 1]]), [-1.5, 0.18], [0, 0.18])
     with pytest.raises(ValueError, match="robot_0 has no way"):
         between.check_reachable()
@@ -192,13 +194,13 @@ def test_places_within_the_margin_are_left_and_reached() -> None:
 def test_robots_of_different_size_have_ways_of_their_own() -> None:
     world = World(boxes=[[-0.1, 0.25, 0.1, 3], [-0.1, -3, 0.1, -0.25]])
     problem = problem_in(world, [[-2, 0], [-2, 1]], [[2, 0], [2, 1]], radius=np.array([0.15, 0.3]))
-    assert problem.ways.length[0] == pytest.approx(4)
-    assert problem.ways.length[1] > 6
+    assert problem.shortest_paths.length[0] == pytest.approx(4)
+    assert problem.shortest_paths.length[1] > 6
 
 
 def test_a_world_too_large_for_the_grid_gets_a_coarser_one() -> None:
     world = World(boxes=[[400, -300, 410, 300]])
-    ways = problem_in(world, [0, 0], [800, 0]).ways
+    ways = problem_in(world, [0, 0], [800, 0]).shortest_paths
     assert ways._world is not None
     assert np.diff(ways._world[1].first_anchor).max() <= MAX_NODES
     assert ways.length[0] == pytest.approx(2 * math.hypot(400, 300) + 10, rel=0.02)
@@ -206,9 +208,9 @@ def test_a_world_too_large_for_the_grid_gets_a_coarser_one() -> None:
 
 def test_ways_stay_with_the_problem_and_not_with_its_copies() -> None:
     problem = make_problem("four_obstacles")
-    assert problem.ways is problem.ways
+    assert problem.shortest_paths is problem.shortest_paths
     moved = problem.replace(goal=problem.start[:, :2], start=problem.start)
-    assert moved.ways.length.max() == 0
+    assert moved.shortest_paths.length.max() == 0
 
 
 def test_stretch_of_a_straight_drive_is_one() -> None:
@@ -230,18 +232,18 @@ def test_stretch_among_obstacles_is_measured_by_the_way_round() -> None:
     assert plan.stretch < stretch(straight, plan.trajectory)[0]
 
 
-def test_shortest_ways_are_the_same_everywhere() -> None:
+def test_shortest_paths_are_the_same_everywhere() -> None:
     """To the bit, as computed on x86-64 with AVX-512 and without AVX."""
     shapes = {"circles": [[1, 1, 0.3]], "polygons": [[[-1, -1], [-0.5, 0], [-1, 1]]]}
     flat = problem_in(World(boxes=[[0, -1, 0.4, 1]], **shapes), [-1.5, 0.1], [1.5, 0.2])
-    assert flat.ways.length[0].hex() == "0x1.2ad66747603b8p+2"
+    assert flat.shortest_paths.length[0].hex() == "0x1.2ad66747603b8p+2"
     spatial = World(3, boxes=[[0, -1, -1, 0.4, 1, 1]], spheres=[[1, 1, 0, 0.5]])
-    assert problem_in(spatial, [-1.5, 0.1, 0], [1.5, 0.2, 0.1]).ways.length[0].hex() == "0x1.f5b8178d42f7ep+1"
+    assert problem_in(spatial, [-1.5, 0.1, 0], [1.5, 0.2, 0.1]).shortest_paths.length[0].hex() == "0x1.f5b8178d42f7ep+1"
 
 
-def test_shortest_ways_are_the_same_each_time() -> None:
+def test_shortest_paths_are_the_same_each_time() -> None:
     problem = make_problem("four_obstacles")
-    one, other = shortest_ways(problem), shortest_ways(problem.replace())
+    one, other = shortest_paths(problem), shortest_paths(problem.replace())
     np.testing.assert_array_equal(one.length, other.length)
     assert one._world is not None
     assert other._world is not None

@@ -210,7 +210,7 @@ def test_the_files_of_a_study(tmp_path: Path) -> None:
 
 
 def test_the_command_line(d4orm: Call, tmp_path: Path) -> None:
-    options = ("--policy", "goal,random", "-k", "2", "--seeds", "2", "--workers", "1", "-q")
+    options = ("--policy", "go-to-goal,random", "-k", "2", "--seeds", "2", "--workers", "1", "-q")
     status, _, error = d4orm("evaluate", *options, "--disturb", "delay=0,2", "--disturb", "push.speed=0.3")
     assert (status, error) == (0, "")
     assert len(TrialStore.existing(tmp_path / "evaluation").trials()) == 2 * 2 * 3

@@ -236,7 +236,9 @@ if __name__ == "__main__":
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
 def test_what_crashes_dies_or_hangs_is_a_row_and_the_rest_goes_on(tmp_path: Path) -> None:
-    result = program(tmp_path, TROUBLE + EVALUATE.format(policies='"go-to-goal"', arguments="workers=2, trial_timeout=8"))
+    result = program(
+        tmp_path, TROUBLE + EVALUATE.format(policies='"go-to-goal"', arguments="workers=2, trial_timeout=8")
+    )
     assert result.stdout == "(6, 3) (6, 3)\n", result.stderr
     stored = TrialStore(tmp_path / "out" / STORE).trials()
     errors = {(row.seed, row.control_noise_std): row.error for row in stored}
@@ -271,7 +273,9 @@ def test_a_plan_that_cannot_be_made_fails_at_all_levels_at_once(tmp_path: Path) 
 
 @pytest.mark.slow
 def test_a_program_without_a_guard_is_told_so(tmp_path: Path) -> None:
-    body = EVALUATE.format(policies='"go-to-goal"', arguments="workers=2").replace('if __name__ == "__main__":', "if True:")
+    body = EVALUATE.format(policies='"go-to-goal"', arguments="workers=2").replace(
+        'if __name__ == "__main__":', "if True:"
+    )
     result = program(tmp_path, body)
     assert result.returncode == 1
     last = result.stderr.strip().splitlines()[-1]
@@ -283,7 +287,20 @@ def test_a_program_without_a_guard_is_told_so(tmp_path: Path) -> None:
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
 def test_a_killed_evaluation_goes_on_where_it_was(tmp_path: Path) -> None:
     """Killed in the middle; ``tests/test_robustness.py`` kills at once."""
-    arguments = ["-p", "go-to-goal", "-k", "8", "-n", "60", "--control-noise-std", "0,0.1", "-j2", "-q", "-o", str(tmp_path)]
+    arguments = [
+        "-p",
+        "go-to-goal",
+        "-k",
+        "8",
+        "-n",
+        "60",
+        "--control-noise-std",
+        "0,0.1",
+        "-j2",
+        "-q",
+        "-o",
+        str(tmp_path),
+    ]
     command = [sys.executable, "-m", "d4orm_planners.cli.app", "evaluate", *arguments]
     process = subprocess.Popen(command)
     deadline = time.monotonic() + 120
@@ -547,7 +564,9 @@ SPELLINGS: tuple[dict[str, Any], ...] = (
 
 def test_several_models_meet_every_scenario_and_team_size(tmp_path: Path) -> None:
     models = ["velocity2d", None, "differential_drive"]
-    rows = evaluate("go-to-goal", ["circle", "random"], out=tmp_path, model=models, num_robots=[1, 2], seeds=[0], workers=1)
+    rows = evaluate(
+        "go-to-goal", ["circle", "random"], out=tmp_path, model=models, num_robots=[1, 2], seeds=[0], workers=1
+    )
     named = ("velocity2d", "holonomic2d", "differential_drive")
     expected = [(name, model, size) for name in ("circle", "random") for model in named for size in (1, 2)]
     assert [(row.scenario, row.model, row.num_robots) for row in rows] == expected

@@ -16,8 +16,8 @@ from d4orm_planners.evaluation.store import Trial, checked_trial
 from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 
 NESTED = "[" * 100_000
-TRIAL = Trial(policy="go-to-goal", config="{}", problem="p", control_noise_std=0.0, seed=1, label="go-to-goal", scenario="circle",
-              num_robots=2, model="holonomic2d", dt=0.1)  # fmt: skip
+TRIAL = Trial(policy="go-to-goal", config="{}", problem="p", control_noise_std=0.0, seed=1, label="go-to-goal",
+              scenario="circle", num_robots=2, model="holonomic2d", dt=0.1)  # fmt: skip
 
 
 def one_line(error: BaseException) -> str:

@@ -538,7 +538,7 @@ def test_closed_loop_survives_noise_that_open_loop_does_not(tmp_path: Path) -> N
 
 
 def test_the_files(d4orm, tmp_path: Path) -> None:
-    arguments = ("--policies", "goal,orca", "--scenario", "circle,random", "--num-robots", "2,3", "--seeds", "1")
+    arguments = ("--policies", "go-to-goal,orca", "--scenario", "circle,random", "--num-robots", "2,3", "--seeds", "1")
     status, out, err = d4orm(*arguments, "--control-noise-std", "0,0.1", "--workers", "1", "--out", "here")
     assert status == 0, err
     written = {path.name for path in (tmp_path / "here").iterdir()}
@@ -640,7 +640,7 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
 
 def test_a_library_that_is_missing_is_named_before_anything_runs(d4orm, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyrvo", None)
-    status, _, err = d4orm("--policies", "goal,orca")
+    status, _, err = d4orm("--policies", "go-to-goal,orca")
     assert status == 2
     assert err == "d4orm: policy 'orca' needs pyrvo; install it with pip install \"d4orm-env[orca]\"\n"
 

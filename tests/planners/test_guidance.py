@@ -354,4 +354,4 @@ def test_who_is_alone_drives_about_as_fast_as_it_can(seed: int) -> None:
     plan = make_planner("mapf").solve(problem, seed=0)
     speed, acceleration = problem.team.limits[0, :2]
     assert plan.solved
-    assert plan.metrics["travel_time"] < 1.3 * (problem.ways.length[0] / speed + 0.5 * speed / acceleration)
+    assert plan.metrics["travel_time"] < 1.3 * (problem.shortest_paths.length[0] / speed + 0.5 * speed / acceleration)

@@ -179,5 +179,5 @@ def test_who_has_a_way_is_not_walled_off(
         problem = Problem(Team(("velocity2d",), radius=radius), [[-3, 0]], [[3, 0]], world)
     except ValueError:
         return
-    if np.isfinite(problem.ways.length).all():
+    if np.isfinite(problem.shortest_paths.length).all():
         assert not prove_infeasible(problem)

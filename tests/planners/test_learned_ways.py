@@ -70,7 +70,7 @@ def test_a_policy_looks_along_ways_among_walls_and_nowhere_else(tmp_path: Path) 
         env = navigation_v0.parallel_env(scenario, num_robots=6)
         assert (actions_of(along, env) != actions_of(straight, env)).any() == differ
     bent = make_problem("rooms", num_robots=6, seed=0)
-    apart = bent.ways.length > np.linalg.norm(bent.goal - bent.start[:, :2], axis=1) * 1.01
+    apart = bent.shortest_paths.length > np.linalg.norm(bent.goal - bent.start[:, :2], axis=1) * 1.01
     assert apart.any()
 
 

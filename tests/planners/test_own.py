@@ -374,7 +374,14 @@ def test_the_command_line_takes_import_paths(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     settings = ["--num-robots", "2", "--workers", "1"]
-    many = ["--policy", "goal,from_here:f", "--policy", "from_here:Mine:strength=0.5", "--policy", "from_here.py:Mine"]
+    many = [
+        "--policy",
+        "go-to-goal,from_here:f",
+        "--policy",
+        "from_here:Mine:strength=0.5",
+        "--policy",
+        "from_here.py:Mine",
+    ]
     for arguments, status in (
         (["evaluate", *many, *settings, "--seeds", "1"], 0),
         (["robustness", "--policy", "from_here:Mine", *settings, "--seeds=1", "--set=from_here:Mine.strength=2"], 0),

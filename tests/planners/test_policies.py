@@ -366,9 +366,9 @@ def test_goals_lie_along_the_ways_of_those_that_have_one() -> None:
     goals[3] += 0.1
     ahead = goals_along_ways(problem, places, goals)
     np.testing.assert_array_equal(ahead[3], goals[3])
-    np.testing.assert_allclose(np.linalg.norm(ahead - places, axis=1)[:3], problem.ways.length[:3], rtol=1e-5)
-    directions = (ahead - places)[:3] / problem.ways.length[:3, None]
-    np.testing.assert_allclose(directions, problem.ways.direction(places)[:3], atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(ahead - places, axis=1)[:3], problem.shortest_paths.length[:3], rtol=1e-5)
+    directions = (ahead - places)[:3] / problem.shortest_paths.length[:3, None]
+    np.testing.assert_allclose(directions, problem.shortest_paths.direction(places)[:3], atol=1e-5)
     np.testing.assert_array_equal(goals_along_ways(problem, problem.goal, problem.goal), problem.goal)
     empty = make_problem("random", num_robots=4)
     assert goals_along_ways(empty, empty.start[:, :2], empty.goal) is empty.goal
@@ -460,7 +460,9 @@ def test_a_full_turn_of_the_heading_makes_no_difference() -> None:
     times = []
     for heading in (0.5, 0.5 + 2 * np.pi, 0.5 - 4 * np.pi):
         problem = Problem(Team(("differential_drive",)), [[0, 0, heading, 0]], [[2.0, 1.0]])
-        times.append(run_episode(navigation_v0.parallel_env(problem=problem), make_policy("go-to-goal")).metrics["makespan"])
+        times.append(
+            run_episode(navigation_v0.parallel_env(problem=problem), make_policy("go-to-goal")).metrics["makespan"]
+        )
     assert times == pytest.approx([times[0]] * 3)
 
 
@@ -504,7 +506,9 @@ def test_driving_to_the_goal_goes_on_in_lifelong_mode() -> None:
     assert sum(info[agent]["arrived"] for info in episode.infos for agent in info) == reached
 
 
-@pytest.mark.parametrize("name", ["go-to-goal", "random", lambda observations, state: {}, lambda observation: observation])
+@pytest.mark.parametrize(
+    "name", ["go-to-goal", "random", lambda observations, state: {}, lambda observation: observation]
+)
 def test_acting_before_the_reset_says_what_to_do(name: Any) -> None:
     with pytest.raises(RuntimeError, match=r"call reset\(env\) before act"):
         make_policy(name).act({}, np.zeros(1, np.float32))

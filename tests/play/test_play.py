@@ -524,7 +524,16 @@ def test_a_page_cannot_ask_for_a_tunnel_to_elsewhere(scene: Problem) -> None:
 @pytest.mark.slow
 def test_ctrl_c_leaves_no_process_and_no_port() -> None:
     pytest.importorskip("viser")
-    command = [sys.executable, "-c", "from d4orm_planners.cli.app import main; main()", "play", "-k", "2", "-p", "go-to-goal"]
+    command = [
+        sys.executable,
+        "-c",
+        "from d4orm_planners.cli.app import main; main()",
+        "play",
+        "-k",
+        "2",
+        "-p",
+        "go-to-goal",
+    ]
     environment = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**environment, "PYTHONUNBUFFERED": "1"}

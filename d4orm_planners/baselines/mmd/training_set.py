@@ -122,7 +122,7 @@ def _with_phantoms(problem: Problem, frame: WayFrame, random: np.random.Generato
         return None
     world = problem.world
     hindered = problem.replace(world=world.replace(circles=np.concatenate([world.circles, circles])))
-    return hindered if np.isfinite(hindered.ways.length).all() else None
+    return hindered if np.isfinite(hindered.shortest_paths.length).all() else None
 
 
 def _evenly(positions: FloatArray, arrival: int) -> Floats:

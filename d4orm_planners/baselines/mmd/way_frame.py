@@ -107,7 +107,7 @@ def make_frame(problem: Problem, robot: int, space: Space, turn: Floats) -> WayF
         space: The world, of :func:`world_space`.
         turn: ``(3,)`` any vector, by which the axes are chosen in space.
     """
-    corners = problem.ways.path(robot)
+    corners = problem.shortest_paths.path(robot)
     if not len(corners):
         return None
     way = np.zeros((len(corners), 3))
