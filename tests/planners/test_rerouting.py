@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from d4orm_planners.d4orm_d.rerouting import reroute
+from d4orm_planners.hybrid.rerouting import reroute
 from engine_support import MODEL_NAMES
 
 from d4orm_env.core.problem import Problem
