@@ -110,7 +110,7 @@ def _at_rest(model: str, x: Array) -> Array:
 def _near_robot(team: PlainTeam, place: Array) -> Array:
     """``(K,)`` bool from the full distance matrix."""
     distance = jnp.linalg.norm(place[:, None] - place[None, :], axis=-1)
-    distance = distance + jnp.diag(jnp.full(len(place), jnp.inf, jnp.float32))
+    distance = jnp.where(jnp.eye(len(place), dtype=bool), jnp.inf, distance)
     return (distance <= team.radius[:, None] + team.radius[None, :] + team.margin).any(axis=1)
 
 
@@ -157,9 +157,10 @@ def score(model: str, team: PlainTeam, controls: Array, collisions: bool = True)
     return jax.vmap(partial(team_rewards, model, collisions, team))(controls)
 
 
-def softmax_mean(rewards: Array, samples: Array, temperature: float) -> Array:
+def softmax_mean(rewards: Array, samples: Array, temperature: float | Array) -> Array:
     """Mean of ``samples`` ``(M, ...)``, weighted by the softmax of the normalised ``rewards`` ``(M,)`` of the teams."""
-    normalised = (rewards - rewards.mean()) / jnp.maximum(rewards.std(), 1e-6)
+    deviation = rewards - rewards.mean()
+    normalised = deviation / jnp.maximum(jnp.sqrt((deviation**2).mean()), 1e-6)
     return jnp.tensordot(jax.nn.softmax(normalised / temperature), samples, axes=1)
 
 
@@ -171,7 +172,7 @@ def denoise(
     noise_scale: Array,
     key: Array,
     num_samples: int,
-    temperature: float,
+    temperature: float | Array,
     collisions: bool = True,
 ) -> Array:
     """One denoising run with team weights (paper, Algorithm 1).
@@ -221,4 +222,4 @@ def denoise_around_rest(
     model, team = plain_team(problem)
     zero = jnp.zeros((problem.horizon, problem.num_robots, problem.control_size), jnp.float32)
     scale, key = jnp.asarray(noise_scale, jnp.float32), jax.random.key(seed)
-    return np.asarray(denoise(model, team, zero, scale, key, num_samples, temperature, collisions))
+    return np.asarray(denoise(model, team, zero, scale, key, num_samples, jnp.float32(temperature), collisions))

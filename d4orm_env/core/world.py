@@ -103,9 +103,11 @@ class World(Frozen):
             for index, radius in enumerate(round_obstacles[:, -1]):
                 if radius <= 0:
                     raise ValueError(f"radius of {name}[{index}] is {radius:g}; it must be positive")
-        for index, box in enumerate(self.boxes):
-            if (box[: self.dimension] >= box[self.dimension :]).any():
-                raise ValueError(f"boxes[{index}] is {box.tolist()}; its lower corner must lie below its upper corner")
+        d = self.dimension
+        for index in np.flatnonzero((self.boxes[:, :d] >= self.boxes[:, d:]).any(axis=1))[:1].tolist():
+            raise ValueError(
+                f"boxes[{index}] is {self.boxes[index].tolist()}; its lower corner must lie below its upper corner"
+            )
         if len(self.polygons) and self.dimension != 2:
             raise ValueError(f"polygons need a world of dimension 2, and this one has {self.dimension}")
         count = sum(map(len, self.polygons))

@@ -7,6 +7,7 @@ one without end, and a box has the radius zero. Polygons are cut into triangles.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,11 @@ class Shapes:
     def count(self) -> int:
         """How many there are."""
         return len(self.boxes) + len(self.triangles)
+
+    @cached_property
+    def _columns(self) -> Floats:
+        """``(2 d + 1, B)`` the boxes, one number of all of them after another."""
+        return self.boxes.T.astype(np.float64)
 
     def corners(self) -> tuple[Floats, Floats]:
         """``(S, d)`` lowest and highest corners of boxes around each [m]."""
@@ -77,9 +83,9 @@ class Shapes:
             items: ``(N,)``.
         """
         if not len(self.triangles):
-            return _box_distance(points, self.boxes, items)
+            return _box_distance(points, self._columns, items)
         distance, angular = np.empty(len(points)), items >= len(self.boxes)
-        distance[~angular] = _box_distance(points[~angular], self.boxes, items[~angular])
+        distance[~angular] = _box_distance(points[~angular], self._columns, items[~angular])
         corners = self.triangles[items[angular] - len(self.boxes)].astype(np.float64)
         distance[angular] = _triangle_distance(points[angular], corners)
         return distance
@@ -97,8 +103,8 @@ class Shapes:
         return slope
 
 
-def _box_distance(points: Floats, boxes: FloatArray, items: IntArray) -> Floats:
-    d, columns = points.shape[1], boxes.T.astype(np.float64)
+def _box_distance(points: Floats, columns: Floats, items: IntArray) -> Floats:
+    d = points.shape[1]
     square, deepest = np.zeros(len(points)), np.full(len(points), -np.inf)
     for axis in range(d):
         x = points[:, axis]

@@ -215,15 +215,18 @@ def _refined(
         level, cells = waiting.pop()
         width = cell * 2**level
         centre = low + (cells.place + 0.5) * width
-        distance = shapes.signed_distance(centre.take(cells.cell, axis=0), cells.item)
+        # Side by side along each axis, which is quicker to read.
+        points = np.stack([column.take(cells.cell) for column in centre.T]).T
+        distance = shapes.signed_distance(points, cells.item)
         bounds = np.searchsorted(cells.cell, np.arange(len(cells.place)))
         clearance, diagonal = np.minimum.reduceat(distance, bounds), width * np.sqrt(len(size))
         bar = _smallest(distance, cells.cell, bounds, nearest) + diagonal * turn.at_most(centre, diagonal / 2)
         unasked: NDArray[np.bool_] = np.all(np.abs(centre - middle) <= hole - width / 2, axis=1)
-        keep = distance <= (np.where(unasked, clearance, bar) + 2 * rounding)[cells.cell]
-        cells = _Cells(cells.place, cells.cell[keep], cells.item[keep])
+        bar = np.where(unasked, clearance, bar) + 2 * rounding
+        near = np.flatnonzero(distance <= bar.take(cells.cell))
+        cells = _Cells(cells.place, cells.cell.take(near), cells.item.take(near))
         if level == 0:
-            distance = distance[keep]
+            distance = distance.take(near)
             if nearest == 1:
                 keep = ~_hidden(shapes, centre, cells, distance, width, 2 * rounding)
                 cells, distance = _Cells(cells.place, cells.cell[keep], cells.item[keep]), distance[keep]

@@ -130,7 +130,8 @@ def step(
     given = _reward_input(problem, state, following, happened, before)
     # Flags times Python's numbers have JAX's default precision, so terms are rounded before they are summed.
     parts = function.terms(given).values() if term_names(function) else [function(given)]  # type: ignore[attr-defined]
-    return following, happened._replace(rewards=sum(jnp.asarray(part, jnp.float32) for part in parts))
+    nothing = jnp.zeros_like(after)
+    return following, happened._replace(rewards=sum((jnp.asarray(part, jnp.float32) for part in parts), nothing))
 
 
 def _reward_input(problem: Problem, state: State, after: State, happened: Step, distances: jax.Array) -> RewardInput:
@@ -182,11 +183,11 @@ def observe(problem: Problem, state: State, layout: ObservationLayout, max_cycle
 def _arrays(problem: Problem) -> ProblemArrays:
     """:attr:`Problem.arrays` for a problem whose numbers may be traced."""
     team, world = problem.team, problem.world
-    goal_speed = jnp.inf if problem.goal_speed is None else problem.goal_speed
+    fastest = jnp.inf if problem.goal_speed is None else problem.goal_speed
     # Rounded before they are computed with, whatever precision JAX has by default.
     start, goal, dt, margin, goal_radius, goal_speed = (
         jnp.asarray(value, jnp.float32)
-        for value in (problem.start, problem.goal, problem.dt, problem.margin, problem.goal_radius, goal_speed)
+        for value in (problem.start, problem.goal, problem.dt, problem.margin, problem.goal_radius, fastest)
     )
     gap2 = ((start[:, : team.dimension] - goal) ** 2).sum(axis=-1)
     distance = jnp.sqrt(jnp.maximum(gap2, goal_radius**2))

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from d4orm_env.core.arrays import FloatArray, IntArray
+from d4orm_env.core.arrays import FloatArray, Ints
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
@@ -119,7 +119,7 @@ def _neighbors(arrays: ProblemArrays, place: Columns, velocity: Columns, count: 
     """``2 d + 2`` for each."""
     robots = np.arange(len(arrays.radius), dtype=np.int32)
 
-    def look(other: tuple[IntArray, Columns, Array | FloatArray]) -> tuple[Array, Columns]:
+    def look(other: tuple[Ints, Columns, Array | FloatArray]) -> tuple[Array, Columns]:
         number, motion, radius = other
         relative = [theirs - own for theirs, own in zip(motion, (*place, *velocity))]
         key = jnp.where(robots == number, jnp.inf, _square(relative[: len(place)]))

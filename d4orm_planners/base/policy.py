@@ -10,7 +10,6 @@ from functools import partial
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray, as_float32
 from d4orm_env.core.problem import Problem
@@ -143,7 +142,7 @@ def robot_indices(agents: Iterable[str]) -> list[int]:
     return [int(agent.rsplit("_", 1)[1]) for agent in agents]
 
 
-def within_limits(problem: Problem, actions: Mapping[str, ArrayLike]) -> Actions:
+def within_limits(problem: Problem, actions: Actions) -> Actions:
     """Actions as the step executes them: each inside its robot's own limits.
 
     What is no action of this team, such as one that is not finite, stays as it is: the environment says what is wrong.
@@ -158,9 +157,9 @@ def within_limits(problem: Problem, actions: Mapping[str, ArrayLike]) -> Actions
         try:
             control = as_float32(action)
         except ValueError:
-            return dict(actions)
+            return actions
         if agent not in robots or control.shape != size or not usable(control).all():
-            return dict(actions)
+            return actions
         controls[robots[agent]] = control
     limited = limit_controls(problem, controls)
     return {agent: limited[robots[agent]] for agent in actions}

@@ -95,8 +95,8 @@ def roll_out_once(models: tuple[str, ...], *, drives: bool = True) -> None:
     Samples are weighed and averaged here too, and first: the process that scores them, which takes longer, needs that
     last.
     """
-    from d4orm_planners.engine.cpu_sampling import Sampling
     from d4orm_env.engine.threads import Threads
+    from d4orm_planners.engine.cpu_sampling import Sampling
 
     problem = _smallest_problem(models)
     rewards = np.zeros((1, 2), np.float32)

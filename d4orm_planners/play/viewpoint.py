@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 import viser
 from numpy.typing import NDArray
@@ -37,11 +39,14 @@ class Viewpoint:
         camera.position, camera.look_at = view_from(limits, dimension, WIDE)
         camera.up, camera.fov = up, FIELD_OF_VIEW
         for client in self._server.get_clients().values():
-            client.camera.up_direction = up
+            with suppress(ValueError):
+                client.camera.up_direction = up
             self._look(client)
 
     def _look(self, client: viser.ClientHandle) -> None:
-        client.camera.position, client.camera.look_at = view_from(self._limits, self._dimension, client.camera.aspect)
+        camera = client.camera
+        with suppress(ValueError):  # where a browser says that it looks nowhere, or there is nothing to see yet
+            camera.position, camera.look_at = view_from(self._limits, self._dimension, camera.aspect)
 
 
 def view_from(limits: Points, dimension: int, aspect: float) -> tuple[Vector, Vector]:

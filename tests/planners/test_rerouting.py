@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from d4orm_planners.hybrid.rerouting import reroute
 from engine_support import MODEL_NAMES
 
 from d4orm_env.core.problem import Problem
@@ -20,6 +19,7 @@ from d4orm_planners import make_planner
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine import path_index
+from d4orm_planners.hybrid.rerouting import reroute
 from d4orm_planners.mapf import beams
 from d4orm_planners.tracking.steering import straight_drives
 

@@ -368,7 +368,6 @@ def test_two_browsers_play_with_one_team(page: Page, tmp_path: Path) -> None:
         session.pause(False)
         wait_for(lambda: session.frame.status.time > 0)
         assert session.failure is None
-        assert page.complaints == []
 
 
 @viser_leaves_loops

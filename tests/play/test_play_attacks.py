@@ -394,6 +394,7 @@ def test_a_request_without_an_end_is_hung_up_on(
     gate: AuthenticatingProxy, sent: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert answers(gate, sent)[:12] in (b"", b"HTTP/1.1 403")
+    assert answers(gate, REQUESTS[0]), "and it goes on"
     assert not caplog.records
 
 
@@ -412,6 +413,18 @@ def test_many_who_say_nothing_keep_nobody_out(gate: AuthenticatingProxy) -> None
         for raw in silent:
             raw.close()
     assert answers(gate, b"GET / HTTP/1.1\r\n\r\n").startswith(b"HTTP/1.1 403")
+
+
+@pytest.mark.parametrize("wrong", [{"look_at": [0, 0, 9]}, {"up_direction": [0, 0, 0]}, {"wxyz": [0, 0, 0, 0]}])
+def test_a_camera_that_looks_nowhere_ends_nothing(wrong: dict[str, object], capfd: pytest.CaptureFixture[str]) -> None:
+    with running(make_problem("circle", num_robots=2), "goal") as playground, visitor(playground) as connection:
+        say(connection, {**CAMERA, **wrong})
+        refused(playground, lambda: say(connection, update(control(playground, "Robots"), 0)))
+        playground.session.load(lambda: make_problem("sphere", num_robots=2))
+        until(lambda: playground._view._looked_at == ("sphere", 2, 3, 1))
+        shown = playground._panel._status.content
+        until(lambda: playground._panel._status.content != shown)
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_closing_does_not_wait_for_a_plan(monkeypatch: pytest.MonkeyPatch) -> None:
