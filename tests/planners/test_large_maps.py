@@ -126,12 +126,12 @@ def test_a_roadmap_does_not_get_coarser_with_the_horizon() -> None:
 
 
 def test_ways_are_refined_beyond_the_limit_that_made_them_coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ways, "MAX_NODES", 400)
+    monkeypatch.setattr(shortest_paths, "MAX_NODES", 400)
     world = GridMap(maze(9, 3), 0.6).world
     problem = alone(world, (0.9, 0.9), (10.5, 10.5))
     assert np.isfinite(problem.shortest_paths.length).all()
     monkeypatch.undo()
-    assert problem.shortest_paths.length == pytest.approx(problem.replace().ways.length, rel=0.02)
+    assert problem.shortest_paths.length == pytest.approx(problem.replace().shortest_paths.length, rel=0.02)
 
 
 @numba.njit
