@@ -12,18 +12,18 @@ from d4orm_planners import make_planner, make_policy, run_episode
 from d4orm_planners.sampling.denoising import DenoisingFilm
 
 
-def planned(scenario: str, planner: str = "d4orm-d", **arguments: object) -> Replay:
+def planned(scenario: str, planner: str = "hybrid", **arguments: object) -> Replay:
     """A plan."""
     problem = make_problem(scenario, **arguments)
     return make_planner(planner).solve(problem, seed=0).animate()
 
 
 def denoised() -> Replay:
-    """Noise that turns into ways."""
+    """Noise that turns into trajectories."""
     problem = make_problem("circle", num_robots=16)
     film = DenoisingFilm(problem)
     plan = make_planner("d4orm").solve(problem, watcher=film)
-    return Replay("From noise to sixteen ways", (plan.motion("d4orm", film.developed(60)),))
+    return Replay("From noise to sixteen trajectories", (plan.motion("d4orm", film.developed(60)),))
 
 
 def compared(title: str, policies: dict[str, str], **options: object) -> Replay:
@@ -54,7 +54,7 @@ REPLAYS: dict[str, Callable[[], Replay]] = {
     "denoising": denoised,
     "warehouse": lambda: planned("warehouse", num_robots=16),
     "rooms": lambda: planned("rooms", num_robots=12),
-    "maze": lambda: planned("maze", num_robots=8, planner="guided"),
+    "maze": lambda: planned("maze", num_robots=8, planner="mapf"),
     "forest": lambda: planned("forest", num_robots=12),
     "doorway": lambda: planned("doorway", num_robots=6),
     "sphere": lambda: planned("sphere", num_robots=12),
@@ -62,7 +62,7 @@ REPLAYS: dict[str, Callable[[], Replay]] = {
     "hundred": lambda: planned("circle", num_robots=100, diameter=18),
     "policies": lambda: compared(
         "Four policies",
-        {"d4orm-c2f": "d4orm-c2f", "orca": "orca", "d4orm, open loop": "d4orm", "straight ahead": "goal"},
+        {"d4orm-c2f": "d4orm-c2f", "orca": "orca", "d4orm, open loop": "d4orm", "straight ahead": "go-to-goal"},
         scenario="circle",
         num_robots=8,
     ),
@@ -84,7 +84,7 @@ REPLAYS: dict[str, Callable[[], Replay]] = {
         "The same eight robots by the rivals", ("d4orm", "mppi", "cem", "mbd", "i-mbd"), "circle", num_robots=8
     ),
     "nodes": lambda: planned_by("Nodes that exchange candidates", ("d-d4orm",), "circle", num_robots=16),
-    "amswarm": lambda: planned_by("AMSwarm", ("amswarm", "d4orm-d"), "amswarm_3"),
+    "amswarm": lambda: planned_by("AMSwarm", ("amswarm", "hybrid"), "amswarm_3"),
     "ipopt": lambda: planned_by("Direct collocation", ("ipopt",), "circle", num_robots=4),
     "instances": lambda: drawn(
         "Other instances of one scenario",

@@ -129,14 +129,14 @@ def check_places(team: Team, world: World, what: str, places: FloatArray, margin
             f"{what}s of robot_{one} at {_point(places[one])} and robot_{other} at {_point(places[other])} "
             f"overlap by {0 - between[pair]:.3g} m; move them more than {radius[one] + radius[other]:g} m apart"
         )
-    robot = int(np.argmin(gaps))
-    gap, nearest = gaps[robot], "an obstacle or the bounds"
+    least = int(np.argmin(gaps))
+    gap, nearest = gaps[least], "an obstacle or the bounds"
     if len(between) and between.min() < gap:
         pair = int(np.argmin(between))
-        robot, gap, nearest = int(second[pair]), between[pair], f"robot_{first[pair]}"
+        least, gap, nearest = int(second[pair]), between[pair], f"robot_{first[pair]}"
     if gap > margin:
         return ""
-    return f"the {what} of robot_{robot} is {gap:.3g} m from {nearest}, and the margin is {margin:g} m"
+    return f"the {what} of robot_{least} is {gap:.3g} m from {nearest}, and the margin is {margin:g} m"
 
 
 def _near_pairs(points: Floats, radius: Floats, margin: float) -> tuple[IntArray, IntArray, Floats]:

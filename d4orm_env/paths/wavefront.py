@@ -579,9 +579,9 @@ def _spread(
                 continue
             value[p], anchor[p] = length, a
             heapq.heappush(heap, (length, p))
-    for n in range(count):
-        if not nodes.done[n]:
-            anchor[n] = _NOBODY
+    for node in range(count):
+        if not nodes.done[node]:
+            anchor[node] = _NOBODY
     return points[:used].copy(), values[:used].copy(), parents[:used].copy(), own_goal
 
 

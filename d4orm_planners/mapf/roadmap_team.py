@@ -17,8 +17,9 @@ from d4orm_env.paths.wavefront import make_space
 from d4orm_planners.mapf.lacam import TeamOnRoadmap
 from d4orm_planners.mapf.near_neighbours import sort_into_cells
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
-from d4orm_planners.mapf.replanning import Others, Trip, find_way, straighten, touches
+from d4orm_planners.mapf.replanning import Trip, find_way, straighten, touches
 from d4orm_planners.mapf.roadmap import WALL_SLACK, Roadmap
+from d4orm_planners.mapf.safe_intervals import Others
 from d4orm_planners.tracking.path_drives import drive_along
 from d4orm_planners.tracking.routes import Corners
 from d4orm_planners.tracking.timed_path import drive_by_clock, timed_kernel

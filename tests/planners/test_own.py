@@ -403,7 +403,7 @@ def test_the_command_line_takes_import_paths(
 @pytest.mark.parametrize(
     ("page", "file", "expected"),
     [
-        ("own_policy", "mine", "3.0 0.0\nin turn 1.0\nat once 0.0\ngently 0.0\ngoal 0.0\n"),
+        ("own_policy", "mine", "3.0 0.0\nin turn 1.0\nat once 0.0\ngently 0.0\ngo-to-goal 0.0\n"),
         ("own_planner", "waiting", "True solved True\n"),
     ],
 )
