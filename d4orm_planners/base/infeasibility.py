@@ -29,6 +29,12 @@ SIMILAR = 1.1
 """Robots whose radii differ by less are judged by the smallest of them."""
 
 
+def prepare_proofs(problem: Problem) -> None:
+    """Import what takes longer than the proofs of such a problem."""
+    if problem.world.num_obstacles:
+        import scipy.ndimage  # noqa: F401
+
+
 def prove_infeasible(problem: Problem) -> dict[int, str]:
     """Return why a problem has no solution, by robot; empty where that is not proved.
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.arrays import FloatArray, duration, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_planners.base.candidate import Candidate
-from d4orm_planners.base.infeasibility import prove_infeasible
+from d4orm_planners.base.infeasibility import prepare_proofs, prove_infeasible
 from d4orm_planners.base.plan import IterationRecord, Plan, Status
 from d4orm_planners.base.settings import CheckedSettings, Count, EngineName
 from d4orm_planners.base.solve import SolveRun
@@ -141,6 +141,8 @@ class Planner(ABC):
         search.time_limit = limit
         search.watcher = watcher
         try:
+            with search.watch.paused():
+                prepare_proofs(problem)
             proved = not search.best.solved and prove_infeasible(problem)
             status = "infeasible" if proved else _run(search, most, callback)
         except KeyboardInterrupt:

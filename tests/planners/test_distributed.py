@@ -544,7 +544,7 @@ def test_a_node_that_hangs_does_not_hang_the_solve(mode: str, monkeypatch: pytes
     # What the other node found is not lost.
     assert plan.controls.any()
     if mode == "sync":
-        assert plan.history[-1].note == "node 1 did not finish in time"
+        assert plan.history[-1].note.startswith("node 1 did not finish in time")
 
 
 @MODE
