@@ -199,6 +199,11 @@ class Problem(Frozen):
         """The largest distance from an obstacle at which it counts [m]."""
         return float(np.max(self.team.radius)) + self.margin
 
+    @property
+    def stride(self) -> float:
+        """How far the fastest robot drives in a step at full speed [m], the unit of planners' settings."""
+        return self.dt * float(self.team.max_speed.max())
+
     @cached_property
     def rounding(self) -> float:
         """Allowance for what float32 makes of distances [m]: a little of a radius, more where coordinates are large."""

@@ -38,10 +38,11 @@ class IpoptConfig(PlannerConfig):
         perturbation: Standard deviation of the noise on the warm start's states and controls, in SI units for robots of
             the default size, and as many times more for larger ones.
         lookout: Robots are kept clear of what came nearer than this in the last solution, the margin not counted, in
-            radii of the largest robot; ``None`` keeps them clear of everything at every step, as in the paper.
+            steps of the fastest robot at full speed; ``None`` keeps them clear of everything at every step, as in the
+            paper.
         rounds: Solves per restart. As long as the rollout does not keep the margin, the next one begins where the last
             one ended; what came near is minded too, and robots stand where they docked. The paper solves once.
-        clearance: Added to every distance to keep, for what rounding and tolerances take away, in the same radii.
+        clearance: Added to every distance to keep, for what rounding and tolerances take away, in the same steps.
         tolerance: IPOPT's, on the scaled optimality error.
         barrier: IPOPT's first barrier parameter.
         solver_iterations: IPOPT's own iterations in each solve.
@@ -52,9 +53,9 @@ class IpoptConfig(PlannerConfig):
 
     max_iterations: Count = 20
     perturbation: NotNegative = 0.1
-    lookout: NotNegative | None = 10 / 3
+    lookout: NotNegative | None = 5.0
     rounds: Count = 8
-    clearance: NotNegative = 1 / 75
+    clearance: NotNegative = 0.02
     tolerance: Positive = 1e-3
     barrier: Positive = 1.0
     solver_iterations: SolverIterations = 1000
@@ -95,7 +96,7 @@ class Ipopt(Planner):
 
     def init(self, search: SolveRun) -> WarmStart:
         """See :meth:`Planner.init`."""
-        program = TeamProgram(search.problem, self.config.clearance * search.problem.team.largest_radius)
+        program = TeamProgram(search.problem, self.config.clearance * search.problem.stride)
         return WarmStart(program, self._warm_start(search, program))
 
     def iterate(self, search: SolveRun, state: WarmStart) -> tuple[WarmStart, Iteration]:
@@ -107,7 +108,7 @@ class Ipopt(Planner):
     def _restart(self, search: SolveRun, state: WarmStart) -> Iteration:
         config, problem, program = self.config, search.problem, state.program
         motion = self._perturbed(search, program, state.motion)
-        lookout = None if config.lookout is None else config.lookout * problem.team.largest_radius
+        lookout = None if config.lookout is None else config.lookout * problem.stride
         contacts = program.contacts(motion, lookout)
         docks = np.full(problem.num_robots, problem.horizon)
         best, note, options = None, "", self._options()

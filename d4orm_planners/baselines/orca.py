@@ -44,7 +44,7 @@ class OrcaConfig(CheckedSettings):
     Attributes:
         time_horizon: For this long the new velocities keep the robots apart [s].
         obstacle_time_horizon: The same for obstacles, bounds and docked robots, which do not give way [s].
-        neighbor_distance: Robots farther away than this are not looked at, in radii of the largest robot.
+        neighbor_distance: Robots farther away than this are not looked at, in steps of the fastest at full speed.
         max_neighbors: So many of the nearest robots are looked at.
         clearance: Added to every robot's radius [m]; by default the problem's margin. Two robots so keep twice that
             distance, which leaves robots with inertia some room: they cannot take a new velocity at once.
@@ -58,7 +58,7 @@ class OrcaConfig(CheckedSettings):
 
     time_horizon: Positive = 1.0
     obstacle_time_horizon: Positive = 1.0
-    neighbor_distance: Positive = 200 / 3
+    neighbor_distance: Positive = 100.0
     max_neighbors: Neighbors = 10
     clearance: NotNegative | None = None
     ways: bool = True
@@ -116,7 +116,7 @@ class Orca(StatePolicy):
         for robot in moving:
             simulator.add_agent(
                 places[robot].tolist(),
-                config.neighbor_distance * DEFAULT_RADIUS,
+                config.neighbor_distance * problem.stride / float(unit),
                 config.max_neighbors,
                 config.time_horizon,
                 config.obstacle_time_horizon,

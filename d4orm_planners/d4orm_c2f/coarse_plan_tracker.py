@@ -77,7 +77,7 @@ class CoarsePlanTracker:
         last_step: int,
     ) -> None:
         self.problem, self._config, self._seed, self._lifelong = problem, config, seed, lifelong
-        self._last_step, self._astray = last_step, config.replan_distance * problem.team.largest_radius
+        self._last_step, self._astray = last_step, config.replan_distance * problem.stride
         self._refiner, self._background = refiner, background
         # Ways that fit between others to the centimetre are no guidance: fine plans cannot keep to them. But where
         # the team does not get on there may be no other ways.

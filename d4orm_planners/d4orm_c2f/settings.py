@@ -88,7 +88,7 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
         replan: Whether the guidance is planned anew for robots that are stuck or astray, and for a team that has lost
             it or has come to its end; for robots with new goals it always is.
         replan_distance: The guidance is planned anew for robots this far from it, and for all if they are so on
-            average, in radii of the largest robot.
+            average, in steps of the fastest at full speed.
         patience: Or when they have come no nearer to their goals for so many steps.
         deadline: Seconds that a control loop may take; one that takes longer is left behind, and the last plan goes on.
             ``None`` waits for every loop.
@@ -131,7 +131,7 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
     refine: Refinement = "background"
     refine_every: Count = 5
     replan: bool = True
-    replan_distance: Positive = 20 / 3
+    replan_distance: Positive = 10.0
     patience: Count = 15
     deadline: Positive | None = None
     control_noise_std: NotNegative = 0.0

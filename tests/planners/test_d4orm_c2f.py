@@ -255,7 +255,7 @@ def test_others_stay_safe_where_one_goal_is_walled_in() -> None:
 
 def test_the_guidance_is_planned_anew_for_robots_pushed_away() -> None:
     env = navigation_v0.parallel_env(problem=circle(4))
-    policy = controller(replan_distance=4 / 3)
+    policy = controller(replan_distance=2.0)
     observations, _ = env.reset(seed=0)
     policy.reset(env, seed=0)
     while env.agents:
@@ -390,7 +390,7 @@ def test_ways_through_rooms_are_kept_in_order() -> None:
 def test_who_lost_the_guidance_begins_anew_straight_to_the_goals(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = circle(4)
     limits = {"learn_limits": False}  # whoever does the opposite is not weak
-    policy = controller(replan_distance=4 / 3, patience=1000, coarse_iterations=3, replan_iterations=2, **limits)
+    policy = controller(replan_distance=2.0, patience=1000, coarse_iterations=3, replan_iterations=2, **limits)
     steps = iter(range(10**6))
 
     def pushed(actions: dict[str, Any]) -> dict[str, Any]:
@@ -423,7 +423,7 @@ def test_the_first_coarse_plan_may_begin_with_what_a_policy_does() -> None:
 
 def test_with_new_goals_for_some_the_others_keep_to_their_ways(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = make_problem("random", num_robots=3, seed=1)
-    policy = controller(replan_distance=400.0, patience=1000, coarse_iterations=3, replan_iterations=2)
+    policy = controller(replan_distance=500.0, patience=1000, coarse_iterations=3, replan_iterations=2)
     factor = policy.config.coarse_factor
     calls = replanned(monkeypatch, policy, lambda actions: actions, problem=problem, lifelong=True, max_cycles=80)
     goals, some = problem.goal, 0

@@ -33,9 +33,8 @@ class Swarm:
 
     def __init__(self, problem: Problem, config: AMSwarmConfig, random: np.random.Generator) -> None:
         self._problem, self._config, self._random = problem, config, random
-        stride = problem.dt * float(problem.team.max_speed.max())
-        self._method = make_method(config, problem.dt, stride)
-        self._clearance, self._perturbation = config.clearance * stride, config.perturbation * stride
+        self._method = make_method(config, problem.dt, problem.stride)
+        self._clearance, self._perturbation = config.clearance * problem.stride, config.perturbation * problem.stride
         d, team = problem.dimension, problem.team
         self._goals = problem.goal.astype(np.float64)
         self._radius = np.asarray(team.radius, np.float64)

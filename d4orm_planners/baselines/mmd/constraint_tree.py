@@ -199,7 +199,7 @@ class Planning:
         distances = self._distances[robot, others]
         surroundings = Surroundings(
             space=self._space,
-            clearance=frame.reach + config.clearance * self._problem.team.largest_radius,
+            clearance=frame.reach + config.clearance * self._problem.stride,
             size=self._problem.team.largest_radius,
             dt=self._problem.dt,
             spheres=np.array([constraint.sphere for constraint in constraints]).reshape(-1, 4),

@@ -38,8 +38,8 @@ class MMDConfig(PlannerConfig):
         soft_pull: Share of a violation of soft constraints, which are the other robots' ways, that a step of guidance
             takes away; 0 leaves them out (MMD-CBS).
         constraint_radius: Of constraints, as a multiple of the distance that two robots keep.
-        clearance: Distance from obstacles beyond radius and margin that guidance leads to, in radii of the largest
-            robot.
+        clearance: Distance from obstacles beyond radius and margin that guidance leads to, in steps of the fastest
+            robot at full speed.
         quickest: Times the shortest time of its way that a motion takes at least.
         slowest: And at most; between the two it is drawn.
 
@@ -56,7 +56,7 @@ class MMDConfig(PlannerConfig):
     reuse_steps: Count | None = 3
     soft_pull: ShareOrNone = 0.5
     constraint_radius: Stretch = 1.2
-    clearance: NotNegative = 0.2
+    clearance: NotNegative = 0.3
     quickest: Stretch = 1.1
     slowest: Stretch = 3.0
 
