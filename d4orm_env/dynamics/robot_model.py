@@ -285,17 +285,8 @@ def norm_scale(square: Number, limit: Number, ops: Ops) -> Number:
 
 
 def control_scale(square: Number, limit: Number, ops: Ops) -> Number:
-    """As :func:`norm_scale`; NaN where the square has overflowed, lest the control pass for none at all.
-
-    Exactly one also for what is longer by no more than rounding, so that a control that was scaled once stays as it is.
-    """
-    most = limit * limit
-    twice = most + most
-    coarse = (twice + twice) + (twice + twice)
-    coarse = (coarse + coarse) + (coarse + coarse)
-    # Scaling leaves at most 13 units of rounding of the limit's square; 32 times that square resolves no fewer than 16.
-    beyond = coarse + (square - most) > coarse
-    return norm_scale(ops.where(beyond, square, most), limit, ops) + (square - square)
+    """As :func:`norm_scale`; NaN where the square has overflowed, lest the control pass for none at all."""
+    return norm_scale(square, limit, ops) + (square - square)
 
 
 def clip(value: Number, limit: Number, ops: Ops) -> Number:

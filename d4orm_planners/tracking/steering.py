@@ -100,17 +100,20 @@ def track_velocities(problem: Problem, states: FloatArray, velocities: FloatArra
 
 
 def limit_controls(problem: Problem, controls: FloatArray) -> FloatArray:
-    """``(K, m)`` what a step executes of controls: clipped to each robot's own limits, zero on padding.
+    """Return controls ``(K, m)`` that a step executes as they are: inside each robot's own limits, zero on padding.
 
     Args:
         problem: Whose robots they are.
-        controls: ``(K, m)`` float32.
+        controls: ``(K, m)`` float32, finite.
     """
     limited = np.zeros_like(controls)
     for model, robots in by_model(problem):
-        u, limits = controls[robots, : model.control_size].T, problem.team.limits[robots].T
-        allowed = model.functions.limit_control(tuple(u), tuple(limits), NUMPY_OPS)
-        limited[robots, : model.control_size] = np.stack(allowed, axis=1)
+        limits = tuple(problem.team.limits[robots].T)
+        before, after = None, controls[robots, : model.control_size].T
+        # Scaling may leave a control a rounding above its limit, and the step would scale it again.
+        while before is None or before.tobytes() != after.tobytes():
+            before, after = after, np.stack(model.functions.limit_control(tuple(after), limits, NUMPY_OPS))
+        limited[robots, : model.control_size] = after.T
     return limited
 
 
