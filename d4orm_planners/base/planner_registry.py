@@ -224,7 +224,8 @@ def _configured(
         TypeError: For an unknown setting.
     """
     if preset is not None and not (isinstance(preset, str) and preset in presets):
-        raise ValueError(f"preset {shown(preset)} of {owner} is unknown; choose one of {', '.join(presets)}")
+        remedy = f"choose one of {', '.join(presets)}" if presets else "it has none, so leave it out"
+        raise ValueError(f"preset {shown(preset)} of {owner} is unknown; {remedy}")
     settings = NOTHING if preset is None else presets[preset]
     known = config_class.setting_names({**settings, **config})
     applying = {name: value for name, value in settings.items() if name in known}

@@ -62,7 +62,7 @@ def test_run_compares_policies_side_by_side(d4orm, tmp_path: Path) -> None:
         (("--compare", "go-to-goal,random"), "--compare needs --out"),
         (
             ("--compare", "go-to-goal", "--policy", "d4orm", "--out", "a.html"),
-            "--policy does not go with --compare goal",
+            "--policy does not go with --compare go-to-goal",
         ),
         (("--compare", "go-to-goal,nobody", "--out", "a.html"), "nobody"),
         (("--out", "a.htm"), "must end in .html"),
@@ -253,7 +253,7 @@ def test_numbers_may_have_an_exponent_without_a_point(d4orm, setting: str) -> No
 
 def test_settings_have_an_option_of_their_own_or_set(d4orm) -> None:
     settings = ("--set", "engine=cpu", "--set", "preset=paper", "--set", "max_iterations=1")
-    assert d4orm("plan", "--num-robots", "2", *QUICK[:4], *settings, "--quiet").status in (0, 1)
+    assert d4orm("plan", "-p", "d4orm", "-k", "2", *QUICK[:4], *settings, "--quiet").status in (0, 1)
 
 
 def test_version(d4orm) -> None:
@@ -286,7 +286,7 @@ def test_help(d4orm, command: list[str]) -> None:
 
 def test_help_loads_nothing_heavy() -> None:
     code = (
-        "import sys\nfrom d4orm_planners import cli\n"
+        "import sys\nfrom d4orm_planners.cli import app as cli\n"
         "try:\n    cli.main(['--help'])\nexcept SystemExit:\n    pass\n"
         "heavy = ('numba', 'jax', 'torch', 'matplotlib', 'pettingzoo', 'pyarrow', 'pyrvo', 'ray')\n"
         "print([m for m in heavy if m in sys.modules])"

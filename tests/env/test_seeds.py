@@ -11,7 +11,7 @@ from planner_support import hop_problem
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.seeds import Stream, derived_seed, generator
-from d4orm_env.engine.cpu import CpuEngine
+from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
 from d4orm_env.scenarios.settings import Settings
 from d4orm_planners import make_policy, run_episode
 from d4orm_planners.base.planner_registry import make_planner
@@ -48,14 +48,14 @@ def test_generators_of_streams_scenarios_and_environments_differ() -> None:
 
 def seeds_of_an_episode(seed: int, monkeypatch: pytest.MonkeyPatch, **settings: Any) -> list[int]:
     """What the engine was given in an episode of D4orm-C2F."""
-    denoise, used = CpuEngine.denoise, []
+    denoise, used = CpuSamplingEngine.denoise, []
 
     def recorded(engine: Any, *arguments: Any) -> Any:
         used.append(arguments[5])
         return denoise(engine, *arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(CpuEngine, "denoise", recorded)
+        patch.setattr(CpuSamplingEngine, "denoise", recorded)
         policy = make_policy(
             "d4orm-c2f", engine="cpu", coarse_samples=32, coarse_steps=3, num_samples=16, num_steps=2, **settings
         )

@@ -36,6 +36,7 @@ from d4orm_planners.sampling.tuned import TUNED
 from d4orm_planners.tracking.steering import straight_drives
 
 ALL = pytest.mark.parametrize("name", list_planners())
+WITH_PRESETS = pytest.mark.parametrize("name", [name for name in list_planners() if PLANNERS[name].presets])
 SAMPLING = tuple(name for name in list_planners() if issubclass(PLANNERS[name], SamplingPlanner))
 
 
@@ -425,7 +426,7 @@ def test_a_bad_setting_is_refused_by_name(name: str, setting: str, value: Any, m
     assert "\n" not in str(caught.value)
 
 
-@ALL
+@WITH_PRESETS
 def test_an_unknown_preset_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match=f"preset 'papers' of planner '{name}' is unknown.*paper"):
         make_planner(name, preset="papers")
@@ -439,7 +440,7 @@ def test_a_policy_that_is_no_planner_is_pointed_to(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["d4rom", "", "D4ORM", None, 4])
 def test_an_unknown_planner_is_refused(name: Any) -> None:
-    with pytest.raises(ValueError, match="is unknown; choose one of d4orm, d4orm-d, d-d4orm, mppi"):
+    with pytest.raises(ValueError, match="is unknown; choose one of d4orm, d4orm-d, hybrid, d-d4orm, mppi"):
         make_planner(name)
 
 
@@ -515,7 +516,7 @@ def test_the_paper_presets_of_the_methods_own_parameters() -> None:
     assert make_planner("mbd", preset="paper").config.max_iterations == 1
 
 
-@ALL
+@WITH_PRESETS
 def test_settings_override_the_preset(name: str) -> None:
     config = make_planner(name, preset="paper", engine="cpu", max_iterations=7).config
     assert (config.engine, config.max_iterations) == ("cpu", 7)
@@ -535,7 +536,7 @@ def tiny_problem(num_robots: int) -> Problem:
 def method(name: str, **config: Any) -> Any:
     shared = {
         "engine": "cpu", "num_samples": SAMPLES, "num_steps": STEPS, "temperature": TEMPERATURE, "weight_cutoff": 0.0,
-        "beta_start": BETAS[0], "beta_end": BETAS[1],
+        "beta_start": BETAS[0], "beta_end": BETAS[1], "short_paths": False,
     }  # fmt: skip
     known = PLANNERS[name].config_class.setting_names()
     return make_planner(name, **{key: value for key, value in shared.items() if key in known}, **config)
