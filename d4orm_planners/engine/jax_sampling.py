@@ -125,7 +125,7 @@ def _denoise(
     """The steps from ``begin`` to before ``end``; both are arguments, so that one compilation serves all parts."""
 
     def update(step: Array, run: _DenoisingState) -> _DenoisingState:
-        mean, factor, scale = run.mean, run.factor, run.factor * noise_scale[step] * inputs.units
+        mean, factor, scale = run.mean, run.factor, run.factor * noise_scale[step] * inputs.units[None]
         rewards, deformations = _score(static, inputs, step.astype(jnp.uint32), mean, scale)
         if static.credit == "team":
             rewards = rewards.mean(axis=0, keepdims=True)
@@ -145,7 +145,7 @@ def _denoise(
         new_mean = jnp.where((weights.sum(axis=-1) > 0)[None, :, None], new_mean, mean)
         if static.rules.adapt is not None:
             deviation2 = jnp.einsum("tkms,ks->tkm", (usable - new_mean[..., None]) ** 2, weights)
-            factor = jnp.asarray(static.rules.adapt(deviation2 / inputs.units**2, jnp), jnp.float32)
+            factor = jnp.asarray(static.rules.adapt(deviation2 / inputs.units[None] ** 2, jnp), jnp.float32)
         usable_samples = finite.sum(dtype=jnp.int32)
         average = jnp.where(finite, rewards, 0).sum() / jnp.maximum(usable_samples, 1).astype(jnp.float32)
         excluded = run.excluded + (finite.size - usable_samples)

@@ -157,9 +157,10 @@ def step_by_step(
     result = engine.denoise(task, recorded.rules, mean, np.array(sigma, np.float32), num_samples, 11)
     mean, factor, drift = mean.astype(np.float64), 1.0, 0.0
     rows = 1 if task.credit == "team" else task.problem.num_robots
+    units = task.problem.team.control_units.astype(np.float64)
     assert [rewards.shape for rewards in recorded.rewards] == [(rows, num_samples)] * len(sigma)
     for step, (rewards, weights) in enumerate(zip(recorded.rewards, recorded.weights, strict=True)):
-        scale = factor * np.float64(np.float32(sigma[step]))
+        scale = factor * np.float64(np.float32(sigma[step])) * units
         samples = mean + scale * engine_noise(task.problem, 11, step, num_samples)
         assert_rewards(task, task.base + samples, rewards, drift)
         assert result.rewards[step] == pytest.approx(rewards.mean(), abs=1e-6)
@@ -175,7 +176,7 @@ def step_by_step(
         drift += 3 * np.sqrt(num_samples) * ROUNDOFF * float(np.abs(samples).max())
         if rules.adapt is not None:
             spread2 = np.einsum("ks,stkm->tkm", shares, (samples - mean) ** 2)
-            np.testing.assert_allclose(recorded.deviations[step], spread2, atol=10 * drift)
+            np.testing.assert_allclose(recorded.deviations[step], spread2 / units**2, atol=10 * drift)
             factor = rules.adapt(recorded.deviations[step].astype(np.float64), np)
     np.testing.assert_allclose(result.mean, mean, atol=drift)
     assert result.excluded == 0
