@@ -95,7 +95,7 @@ class StudyOptions:
         from d4orm_planners.evaluation.study import Study
 
         study = Study(
-            policies=_with_settings(_policies(self.policies or ["d4orm,goal"]), parse_settings(self.settings)),
+            policies=_with_settings(_policies(self.policies or ["d4orm,go-to-goal"]), parse_settings(self.settings)),
             scenarios=names(self.scenario) or (),
             seeds=seed_list(self.seeds),
             control_noise_std=decimals(

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,7 +42,7 @@ def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate
         path.write_text(markdown(rates), encoding="utf-8")
     if any(rate.disturbance for rate in rates):
         return paths[:2]
-    with _picture(paths[2]) as path:
+    with target(paths[2]) as path:
         _draw_noise(path, rates)
     return paths
 
@@ -67,7 +66,7 @@ def write_disturbances(folder: str | os.PathLike[str], groups: Sequence[TrialGro
     with target(paths[0]) as path:
         path.write_text(_page(rates, stood, pairs), encoding="utf-8")
     write_csv(paths[1], [vars(one) for one in stood])
-    with _picture(paths[2]) as path:
+    with target(paths[2]) as path:
         _draw_map(path, rates)
     if pairs:
         paths.append(Path(folder, "pairs.csv"))
@@ -75,18 +74,9 @@ def write_disturbances(folder: str | os.PathLike[str], groups: Sequence[TrialGro
     for name in dict.fromkeys(one.disturbance for one in stood):
         file = re.sub(r"[^\w.-]", "_", name)
         paths.append(Path(folder, f"disturbance-{file}.png"))
-        with _picture(paths[-1]) as path:
+        with target(paths[-1]) as path:
             _draw_disturbance(path, name, [rate for rate in rates if rate.disturbance == name])
     return paths
-
-
-@contextmanager
-def _picture(path: Path) -> Iterator[Path]:
-    """A :func:`target` for a picture, in which no name is a formula."""
-    from matplotlib import rc_context
-
-    with target(path) as temporary, rc_context({"text.parse_math": False}):
-        yield temporary
 
 
 def _page(rates: Sequence[SuccessRate], stood: Sequence[Tolerance], pairs: Sequence[PairedPolicies]) -> str:
@@ -145,7 +135,7 @@ def _pair_cells(pair: PairedPolicies) -> tuple[str, ...]:
     )
 
 
-@own_style()
+@own_style({"text.parse_math": False})  # no name is a formula
 def _draw_noise(path: Path, rates: Sequence[SuccessRate]) -> None:
     """Success against the execution noise: one line per policy, one panel per scenario and team."""
     groups = panels(rates)
@@ -157,7 +147,7 @@ def _draw_noise(path: Path, rates: Sequence[SuccessRate]) -> None:
     figure.savefig(path, dpi=150)
 
 
-@own_style()
+@own_style({"text.parse_math": False})  # no name is a formula
 def _draw_disturbance(path: Path, name: str, rates: Sequence[SuccessRate]) -> None:
     """Success against the level of one disturbance: one line per policy, one panel per scenario, team and noise.
 
@@ -196,7 +186,7 @@ def _draw_lines(ax: Any, rates: Sequence[SuccessRate], place: Callable[[SuccessR
     ax.grid(alpha=0.3)
 
 
-@own_style()
+@own_style({"text.parse_math": False})  # no name is a formula
 def _draw_map(path: Path, rates: Sequence[SuccessRate]) -> None:
     """A heat map of success: a row per policy, a column per level of every disturbance, a panel as above."""
     groups = _panels([rate for rate in rates if rate.disturbance])

@@ -11,12 +11,12 @@ from planner_support import hop_problem
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.seeds import Stream, derived_seed, generator
-from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
 from d4orm_env.scenarios.settings import Settings
 from d4orm_planners import make_policy, run_episode
 from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d_d4orm.node import node_seed
+from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
 
 SEEDS = (0, 1, 2, 3, 2**31, 2**32, 2**32 + 1, 2**63 - 1, 2**64)
 NUMBERS = (0, 1, 2, 17, 1000, 1001, 1 << 16, 10**6, 1_000_003)
