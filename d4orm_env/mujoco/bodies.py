@@ -16,7 +16,7 @@ from d4orm_env.core.winding import unwound
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TimeStep
 from d4orm_env.mujoco.physics import Physics
 from d4orm_env.mujoco.scene import DRIVES, HALF_TRACK, NOT_SOLID, OBSTACLE, PUCKS, WHEEL_RADIUS, build_scene
-from d4orm_env.mujoco.wheels import GRAVITY, Commands, WheelControl
+from d4orm_env.mujoco.wheels import GRAVITY, WheelCommands, WheelControl
 
 Robots = NDArray[np.intp]
 
@@ -188,7 +188,7 @@ class TeamBodies:
         pull[self._held[self._servos]] = 0
         self.data.qfrc_applied[self._servo_dofs] = self.scene.mass[self._servos, None] * pull
 
-    def _turn_wheels(self, commands: Commands, time: float) -> None:
+    def _turn_wheels(self, commands: WheelCommands, time: float) -> None:
         """Have the wheels follow commands that were given so long before the end of MuJoCo's next step [s]."""
         if not len(self._drives):
             return
@@ -196,7 +196,7 @@ class TeamBodies:
         torque[self._held[self._drives]] = 0
         self.data.qfrc_applied[self._wheel_dofs] = torque
 
-    def _commands(self, controls: FloatArray, states: FloatArray, limits: FloatArray) -> Commands:
+    def _commands(self, controls: FloatArray, states: FloatArray, limits: FloatArray) -> WheelCommands:
         """What the drives are told: a turn rate, and a speed, or an acceleration from the speed wanted last."""
         rows = []
         for robot in self._drives.tolist():
@@ -213,7 +213,7 @@ class TeamBodies:
             self._wanted[robot] = min(max(end, -float(limits[robot, SPEED])), float(limits[robot, SPEED]))
             rows.append((begin, second, first))
         speed, acceleration, turn_rate = np.array(rows, np.float64).reshape(-1, 3).T
-        return Commands(speed, acceleration, turn_rate, limits[self._drives, SPEED].astype(np.float64))
+        return WheelCommands(speed, acceleration, turn_rate, limits[self._drives, SPEED].astype(np.float64))
 
     def _note_contacts(self, touched: BoolArray) -> None:
         contact = self.data.contact

@@ -20,7 +20,7 @@ GRAVITY = 9.81
 """[m/s^2]."""
 
 
-class Commands(NamedTuple):
+class WheelCommands(NamedTuple):
     """What ``D`` drives are to do from the beginning of a step on, each ``(D,)``.
 
     Attributes:
@@ -63,7 +63,7 @@ class WheelControl:
         """Forget the past of some drives ``(D,)``."""
         self._integral[drives] = 0
 
-    def torque(self, commands: Commands, time: float, step: float, spin: Floats) -> Floats:
+    def torque(self, commands: WheelCommands, time: float, step: float, spin: Floats) -> Floats:
         """``(D, 2)`` torques of left and right wheels for the next step [N m].
 
         Args:

@@ -51,7 +51,7 @@ Rows = tuple[Expression, float, float]
 """A matrix of expressions with their lower and their upper bound."""
 
 
-class TeamMotion(NamedTuple):
+class CollocatedMotion(NamedTuple):
     """What the program decides on.
 
     Attributes:
@@ -104,8 +104,13 @@ class TeamProgram:
         ]
 
     def solve(
-        self, guess: TeamMotion, contacts: Contacts, docks: IntArray, options: Options, should_stop: Callable[[], bool]
-    ) -> tuple[TeamMotion, str]:
+        self,
+        guess: CollocatedMotion,
+        contacts: Contacts,
+        docks: IntArray,
+        options: Options,
+        should_stop: Callable[[], bool],
+    ) -> tuple[CollocatedMotion, str]:
         """Solve from a guess.
 
         Args:
@@ -133,7 +138,7 @@ class TeamProgram:
 
     def _run_ipopt(
         self,
-        guess: TeamMotion,
+        guess: CollocatedMotion,
         contacts: Contacts,
         docks: IntArray,
         options: Options,
@@ -158,7 +163,7 @@ class TeamProgram:
         keep(solution["x"])
         return str(solver.stats()["return_status"])
 
-    def contacts(self, motion: TeamMotion, lookout: float | None) -> Contacts:
+    def contacts(self, motion: CollocatedMotion, lookout: float | None) -> Contacts:
         """What comes within ``lookout`` [m] of the distance to keep, and when; everything always, for ``None``."""
         steps = np.arange(1, self.problem.horizon + 1)
         if lookout is None:
@@ -317,19 +322,19 @@ class TeamProgram:
         for robot in range(problem.num_robots):
             for values, components, limit in self._limited(robot):
                 (states if values is self.states[robot] else controls)[:, robot, components] = limit
-        low, high = TeamMotion(-states, -controls), TeamMotion(states, controls)
+        low, high = CollocatedMotion(-states, -controls), CollocatedMotion(states, controls)
         reach = np.array([[self._reach(robot)] for robot in range(problem.num_robots)])
         low.states[:, :, : problem.dimension] = problem.world.bounds[0] + reach
         high.states[:, :, : problem.dimension] = problem.world.bounds[1] - reach
         return self._packed(low), self._packed(high)
 
-    def _packed(self, motion: TeamMotion) -> Floats:
+    def _packed(self, motion: CollocatedMotion) -> Floats:
         """The values of the variables, in the order of the program."""
         states = [motion.states[1:, robot, : unit.size] / unit for robot, unit in enumerate(self.units[0])]
         controls = [motion.controls[:, robot, : unit.size] / unit for robot, unit in enumerate(self.units[1])]
         return np.concatenate([part.ravel() for part in (*states, *controls)])
 
-    def _unpacked(self, values: Floats) -> TeamMotion:
+    def _unpacked(self, values: Floats) -> CollocatedMotion:
         problem = self.problem
         states = np.zeros((problem.horizon + 1, problem.num_robots, problem.state_size))
         states[0] = problem.start
@@ -341,7 +346,7 @@ class TeamProgram:
             states[1:, robot, : model.state_size] = self.units[0][robot] * own
             own = parts[problem.num_robots + robot].reshape(problem.horizon, -1)
             controls[:, robot, : model.control_size] = self.units[1][robot] * own
-        return TeamMotion(states, controls)
+        return CollocatedMotion(states, controls)
 
 
 def _stopper(

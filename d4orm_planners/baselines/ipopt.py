@@ -13,7 +13,7 @@ from d4orm_planners.base.candidate import Candidate, evaluate_controls
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
 from d4orm_planners.base.settings import Count, NotNegative, Positive
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.baselines.collocation import Contacts, TeamMotion, TeamProgram, load_casadi
+from d4orm_planners.baselines.collocation import CollocatedMotion, Contacts, TeamProgram, load_casadi
 from d4orm_planners.tracking.steering import prepare_drives, straight_drives
 
 FOUND = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
@@ -71,7 +71,7 @@ class WarmStart:
     """
 
     program: TeamProgram
-    motion: TeamMotion
+    motion: CollocatedMotion
 
 
 class Ipopt(Planner):
@@ -134,7 +134,7 @@ class Ipopt(Planner):
         config = self.config
         return {"tol": config.tolerance, "max_iter": config.solver_iterations, "mu_init": config.barrier}
 
-    def _warm_start(self, search: SolveRun, program: TeamProgram) -> TeamMotion:
+    def _warm_start(self, search: SolveRun, program: TeamProgram) -> CollocatedMotion:
         """The controls that the search was given, or else the solution of the program without collisions."""
         if search.current.controls.any():
             return _motion(search.current)
@@ -145,7 +145,7 @@ class Ipopt(Planner):
         docks = np.full(problem.num_robots, problem.horizon)
         return program.solve(_motion(straight), {}, docks, self._options(), search.should_stop)[0]
 
-    def _perturbed(self, search: SolveRun, program: TeamProgram, warm_start: TeamMotion) -> TeamMotion:
+    def _perturbed(self, search: SolveRun, program: TeamProgram, warm_start: CollocatedMotion) -> CollocatedMotion:
         random = np.random.default_rng(search.iteration_seed(Stream.PERTURBATION))
         parts = []
         for part, units in zip(warm_start, program.units, strict=True):
@@ -153,11 +153,11 @@ class Ipopt(Planner):
             for robot, unit in enumerate(units):
                 noise[:, robot, : unit.size] *= unit
             parts.append(part + noise)
-        return TeamMotion(*parts)
+        return CollocatedMotion(*parts)
 
 
-def _motion(candidate: Candidate) -> TeamMotion:
-    return TeamMotion(candidate.trajectory.states.astype(float), candidate.controls.astype(float))
+def _motion(candidate: Candidate) -> CollocatedMotion:
+    return CollocatedMotion(candidate.trajectory.states.astype(float), candidate.controls.astype(float))
 
 
 def _docks(candidate: Candidate) -> np.ndarray:

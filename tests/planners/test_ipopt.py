@@ -18,7 +18,7 @@ from d4orm_env.core.world import World
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
-from d4orm_planners.baselines.collocation import TeamMotion, TeamProgram
+from d4orm_planners.baselines.collocation import CollocatedMotion, TeamProgram
 from d4orm_planners.engine.select import get_sampling_engine
 
 MODELS = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive", "unicycle", "car")
@@ -113,7 +113,7 @@ def test_robots_stand_where_they_dock() -> None:
 def test_the_motion_is_what_the_engine_rolls_out(model: str) -> None:
     problem = swap_problem((model, model))
     program = TeamProgram(problem, clearance=2e-3)
-    still = TeamMotion(
+    still = CollocatedMotion(
         np.repeat(problem.start[None].astype(float), 46, axis=0), np.zeros((45, 2, problem.control_size))
     )
     motion, note = program.solve(still, {}, np.array([45, 45]), {"tol": 1e-3}, lambda: False)
@@ -127,7 +127,7 @@ def test_the_motion_is_what_the_engine_rolls_out(model: str) -> None:
 def test_contacts_are_those_that_come_near() -> None:
     problem = hop_problem(3, world=World(2, circles=[[0.25, -1.0, 0.1]]))
     program = TeamProgram(problem, clearance=0.0)
-    motion = TeamMotion(np.repeat(problem.start[None].astype(float), 31, axis=0), np.zeros((30, 3, 2)))
+    motion = CollocatedMotion(np.repeat(problem.start[None].astype(float), 31, axis=0), np.zeros((30, 3, 2)))
     everything = program.contacts(motion, None)
     assert set(everything) == {(0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3)}
     assert all(steps.tolist() == list(range(1, 31)) for steps in everything.values())

@@ -120,7 +120,7 @@ def _metadata(folder: Path) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class _Part:
+class _Shard:
     """What one episode of the dataset takes of a recorded one.
 
     Attributes:
@@ -136,19 +136,19 @@ class _Part:
     together: bool
 
 
-def _team(episode: RecordedEpisode) -> Iterator[_Part]:
-    yield _Part(len(episode.actions), lambda values: values, {}, True)
+def _team(episode: RecordedEpisode) -> Iterator[_Shard]:
+    yield _Shard(len(episode.actions), lambda values: values, {}, True)
 
 
-def _robots(episode: RecordedEpisode) -> Iterator[_Part]:
+def _robots(episode: RecordedEpisode) -> Iterator[_Shard]:
     for robot, steps in enumerate(episode.acting.sum(axis=0).tolist()):
-        yield _Part(steps, lambda values, robot=robot: values[:, robot], {"robot": robot}, False)  # type: ignore[misc]
+        yield _Shard(steps, lambda values, robot=robot: values[:, robot], {"robot": robot}, False)  # type: ignore[misc]
 
 
-_PARTS: Mapping[str, Callable[[RecordedEpisode], Iterable[_Part]]] = {"team": _team, "robot": _robots}
+_PARTS: Mapping[str, Callable[[RecordedEpisode], Iterable[_Shard]]] = {"team": _team, "robot": _robots}
 
 
-def _buffer(episode: RecordedEpisode, part: _Part) -> EpisodeBuffer:
+def _buffer(episode: RecordedEpisode, part: _Shard) -> EpisodeBuffer:
     """An episode as Minari takes it."""
     from minari.data_collector import EpisodeBuffer
 
