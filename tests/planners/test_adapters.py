@@ -11,6 +11,7 @@ import pytest
 from d4orm_env import make_problem, navigation_v0
 from d4orm_planners import run_episode
 from d4orm_planners.base.adapters import from_rllib, from_sb3, from_torchrl
+from d4orm_planners.tracking.steering import limit_controls
 
 torch = pytest.importorskip("torch")
 PROBLEM = make_problem("circle", num_robots=3, horizon=10, model="differential_drive")
@@ -88,6 +89,7 @@ def test_rllib() -> None:
     observed, actions, space = first_actions(from_rllib(module, normalized=False))
     with torch.no_grad():
         mean = module(torch.as_tensor(observed))[:, :2].numpy()
-    np.testing.assert_allclose(actions, mean, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(actions, limit_controls(PROBLEM, mean), rtol=1e-4, atol=1e-5)
     _, scaled, space = first_actions(from_rllib(module))
-    np.testing.assert_allclose(scaled, space.high * np.clip(mean, -1, 1), rtol=1e-4, atol=1e-5)
+    within = limit_controls(PROBLEM, space.high * np.clip(mean, -1, 1))
+    np.testing.assert_allclose(scaled, within, rtol=1e-4, atol=1e-5)
