@@ -37,7 +37,6 @@ class D4ormD(DeformingPlanner):
             "start": "team",
             "first_collisions": False,
             "big_team": None,
-            "penalty": D4ormDConfig.penalty,  # of independent repairs, which it has not
         }
     }
     config: D4ormDConfig
@@ -67,24 +66,29 @@ class D4ormD(DeformingPlanner):
         team = DeformedPlan(self, search, search.engine.rollout(search.problem, iteration.controls))
         return state.shorten(team), replace(iteration, controls=team.controls)
 
+    def is_big(self, problem: Problem) -> bool:
+        """Return whether the team is a big one."""
+        return self.config.big_team is not None and problem.num_robots > self.config.big_team
+
     def num_samples(self, search: SolveRun) -> int:
         """See :meth:`SamplingPlanner.num_samples`."""
-        big = self.config.big_team is not None and search.problem.num_robots > self.config.big_team
-        return max(self.config.num_samples // 2, 2) if big else self.config.num_samples
+        return max(self.config.num_samples // 2, 2) if self.is_big(search.problem) else self.config.num_samples
 
     def task(self, search: SolveRun, base: FloatArray) -> SamplingTask:
         """See :meth:`SamplingPlanner.task`."""
         task = super().task(search, base)
-        return replace(task, penalty=1.0, collisions=search.iteration > 0 or self.config.first_collisions)
+        return replace(task, collisions=search.iteration > 0 or self.config.first_collisions)
 
     def straight_start(self, problem: Problem) -> FloatArray | None:
         """Controls ``(H, K, m)`` that send everybody straight to its goal, or ``None`` to start with the whole team."""
-        if self.config.start == "team":
-            return None
-        drives = straight_drives(problem)
         if self.config.start == "auto":
-            graph = conflicts(drives.positions[:, :, 0], problem.team.radius, problem.margin)
-            # As many as when everybody meets half of the team.
-            if 2 * sum(map(len, graph)) >= problem.num_robots**2:
-                return None
-        return drives.controls[:, :, 0]
+            return straight_start(problem) if self.is_big(problem) else None
+        return straight_drives(problem).controls[:, :, 0] if self.config.start == "straight" else None
+
+
+def straight_start(problem: Problem) -> FloatArray | None:
+    """Controls ``(H, K, m)`` straight to the goals; ``None`` where robots so meet half of the others."""
+    drives = straight_drives(problem)
+    graph = conflicts(drives.positions[:, :, 0], problem.team.radius, problem.margin)
+    # As many as when everybody meets half of the team.
+    return None if 2 * sum(map(len, graph)) >= problem.num_robots**2 else drives.controls[:, :, 0]

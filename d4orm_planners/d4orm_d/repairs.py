@@ -80,7 +80,7 @@ class _Repair:
             config.repair_samples,
             config.noise_scale(config.repair_steps) * np.float32(wider),
             credit=credit,
-            penalty=config.penalty,
+            penalty=config.repair_penalty,
             # A robot that starts next to its goal has little to lose by making way, but would lose it many times over.
             reference_distance=float(max(distance.mean(), problem.goal_radius)),
         )

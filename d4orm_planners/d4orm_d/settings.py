@@ -7,7 +7,6 @@ from typing import Annotated
 
 from d4orm_planners.base.settings import Count, Positive, Samples, Steps, one_of
 from d4orm_planners.sampling.d4orm import DeformationConfig
-from d4orm_planners.sampling.settings import Credit
 
 Decoupling = Annotated[str, one_of(("independent", "groups"))]
 Start = Annotated[str, one_of(("auto", "team", "straight"))]
@@ -27,14 +26,15 @@ class D4ormDConfig(DeformationConfig):
             around all others, and takes over only what is no worse.
         start: What the first iteration does without initial controls. ``"team"`` deforms the whole team at once;
             ``"straight"`` sends everybody straight to its goal and leaves the rest to repairs; ``"auto"`` does the
-            second where robots so meet less than half of the others on average.
+            second in big teams where robots so meet less than half of the others on average.
         first_collisions: Whether the first iteration over the whole team minds collisions.
         repair_samples: ``M`` of an independent repair. A few may be better than many: their error is a search of
             its own.
         repair_steps: ``N`` of an independent repair.
         credit: Of iterations over the whole team.
-        penalty: What a violation costs per step in an independent repair, and 1 elsewhere. At the paper's one it can be
-            cheaper to brush past a robot than to wait for it.
+        penalty: What a violation costs per step in these.
+        repair_penalty: What it costs in an independent repair. At the paper's one it can be cheaper to brush past a
+            robot than to wait for it.
     """
 
     big_team: Count | None = 32
@@ -43,8 +43,7 @@ class D4ormDConfig(DeformationConfig):
     first_collisions: bool = True
     repair_samples: Samples = 128
     repair_steps: Steps = 50
-    credit: Credit = "alternate"
-    penalty: Positive = 3.0
+    repair_penalty: Positive = 3.0
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,14 @@ from typing import ClassVar
 
 import numpy as np
 
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.problem import Problem
 from d4orm_planners.base.planner import Iteration, Planner
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.d4orm_d.deformed_plan import DeformedPlan
 from d4orm_planners.d4orm_d.groups import Groups
-from d4orm_planners.d4orm_d.planner import D4ormD
+from d4orm_planners.d4orm_d.planner import D4ormD, straight_start
 from d4orm_planners.d4orm_d.repairs import Repairs
 from d4orm_planners.hybrid.settings import HybridConfig
 from d4orm_planners.mapf.improvement import FIRST_ROUNDS, GUIDED_ROUNDS, improve_by_lns, improve_first_paths
@@ -80,7 +82,7 @@ class Hybrid(Planner):
     def without_paths(self, search: SolveRun, state: Groups | Repairs) -> tuple[State, Iteration]:
         """Start straight or with the whole team, repair who fails, then improve."""
         if search.iteration == 0 and not search.current.controls.any():
-            drives = self.denoiser.straight_start(search.problem)
+            drives = self.straight_start(search.problem)
             return self.whole_team(search, state) if drives is None else (state, Iteration(drives))
         if self.improves_by_lns and search.best.solved:
             return state, improve_by_lns(search)
@@ -90,6 +92,10 @@ class Hybrid(Planner):
         if isinstance(state, Groups):
             return state.replan(team), team.iteration()
         return self.repair(team, state), team.iteration()
+
+    def straight_start(self, problem: Problem) -> FloatArray | None:
+        """Controls ``(H, K, m)`` that send everybody straight to its goal, or ``None`` to start with the whole team."""
+        return straight_start(problem) if self.config.start == "auto" else self.denoiser.straight_start(problem)
 
     def repair(self, team: DeformedPlan, state: Repairs) -> Repairs:
         """Search for paths around others for who fails, and deform who fails nevertheless."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from d4orm_planners.base.settings import one_of
+from d4orm_planners.base.settings import Positive, one_of
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
+from d4orm_planners.sampling.settings import Credit
 
 Start = Annotated[str, one_of(("auto", "team", "straight", "mapf"))]
 Improver = Annotated[str, one_of(("lns", "denoising"))]
@@ -25,6 +26,8 @@ class HybridConfig(D4ormDConfig):
             paths around all others, or ``"denoising"``, the whole team deformed again.
     """
 
+    credit: Credit = "alternate"
+    penalty: Positive = 1.0
     start: Start = "auto"
     reroute: bool = True
     improver: Improver = "lns"

@@ -196,7 +196,7 @@ BAD = [
     (("plan", "--time-limit", "0"), "time_limit is 0"),
     (("plan", "--max-iterations", "0"), "max_iterations is 0"),
     (("plan", "--out", "plan.txt"), "must end in .npz"),
-    (("plan", "--out", "missing/plan.npz"), "'missing' does not exist"),
+    (("plan", "--out", "missing/plan.npz"), "does not exist; create it first"),
     (("plan", "--picture", "plan.bmp"), "must end in .png"),
     (("plan", "--no-such-option",), "--no-such-option"),
     (("run", "truncated.npz"), "truncated.npz is not a readable plan"),

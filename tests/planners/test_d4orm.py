@@ -160,7 +160,7 @@ def test_who_pays_for_both_sides_of_a_contact_makes_way() -> None:
 def test_a_violation_costs_what_is_asked(name: str) -> None:
     search = SolveRun(make_planner(name, engine="cpu", penalty=4.0), hop_problem(2), 0, None)
     # D4orm-D's is that of its repairs.
-    assert search.planner.task(search, search.current.controls).penalty == (1.0 if name == "d4orm-d" else 4.0)
+    assert search.planner.task(search, search.current.controls).penalty == 4.0
 
 
 def test_both_engines_plan_the_same() -> None:

@@ -55,7 +55,7 @@ def test_a_file_that_calls_a_problem_infeasible_is_not_believed(tmp_path: Path) 
         replace(solved, status="infeasible")
 
 
-@pytest.mark.parametrize("name", ["d4orm", "d4orm-d", "mapf", "mmd"])
+@pytest.mark.parametrize("name", ["hybrid", "mapf", "mmd"])
 def test_a_reason_that_proves_nothing_is_kept(name: str) -> None:
     few = {"num_samples": 64, "num_steps": 5, "repair_samples": 64, "repair_steps": 5}
     known = make_planner(name).config.setting_names()

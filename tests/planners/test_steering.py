@@ -12,7 +12,7 @@ from env_support import line_problem, mixed_problem
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
-from d4orm_planners.tracking.steering import Rollouts, drives
+from d4orm_planners.tracking.steering import NEAR_VIA, Rollouts, drives
 
 CPU = CpuSamplingEngine()
 SWITCH_TIMES = (0, 3, 10, 25, 79)
@@ -128,8 +128,9 @@ def test_a_way_by_points_comes_near_all_of_them_in_turn(model: str) -> None:
     ways = drives(problem, given.states, given.controls, switch, start + steps)
     assert ways.arrived.all()
     gap = np.linalg.norm(ways.positions[:, :, :, None] - (start + steps), axis=4)
-    assert (gap.min(axis=0) < 0.5).all()
-    first = (gap < 0.5).argmax(axis=0)
+    near = NEAR_VIA * problem.team.largest_radius
+    assert (gap.min(axis=0) < near).all()
+    first = (gap < near).argmax(axis=0)
     assert (first[..., 1] > first[..., 0]).all()
     rollout = CPU.rollout(problem, ways.controls[:, :, 1])
     np.testing.assert_allclose(rollout.states, ways.states[:, :, 1], atol=1e-4)
