@@ -201,7 +201,7 @@ def test_teams_of_more_than_32_are_sampled_half_as_often() -> None:
 
 @pytest.mark.parametrize(("scenario", "straight"), [("circle", False), ("random", True)])
 def test_sparse_teams_start_straight(scenario: str, straight: bool) -> None:
-    search = search_of(make_problem(scenario, num_robots=16, seed=0), iterations=1)
+    search = search_of(make_problem(scenario, num_robots=16, seed=0), iterations=1, big_team=8)
     assert (search.denoising_steps == 0) == straight
     drives = search_of(make_problem(scenario, num_robots=16, seed=0), iterations=1, start="straight").current
     assert drives.trajectory.arrived[-1].all()

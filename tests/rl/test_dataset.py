@@ -196,7 +196,7 @@ def test_a_killed_recording_goes_on_and_loses_nothing(tmp_path: Path) -> None:
     seeds = sorted({*kept, 100_001})
     anew = []
     dataset = written(tmp_path / "one", seeds=seeds, progress=lambda what, done, total: anew.append(what))
-    assert anew == ["starting", "goal, seed 100001"]
+    assert anew == ["starting", "go-to-goal, seed 100001"]
     # A worker may have ended its episode after the kill.
     there = [own["seed"] for own in dataset.storage.get_episode_metadata(dataset.episode_indices)]
     assert set(seeds) <= set(there)
