@@ -154,13 +154,13 @@ def test_robots_are_paid_for_the_way_made_along_ways() -> None:
     actions = np.random.default_rng(0).uniform(-1, 1, (6, 2)).astype(np.float32)
     controls = env.features.decode(actions, env.frames, env.problem.team.control_limits)
     paid = {}
-    for progress in ("way", "straight"):
+    for progress in ("path", "straight"):
         worlds = NavigationVectorEnv(1, "rooms", 6, reward="training", progress=progress)
         worlds.reset(seed=0)
         worlds.step(controls.reshape(1, -1))
         paid[progress] = worlds.robot_rewards[0]
     rewards = env.step(actions)[1]
-    np.testing.assert_allclose(rewards, paid["way"], atol=1e-6)
+    np.testing.assert_allclose(rewards, paid["path"], atol=1e-6)
     assert (rewards != paid["straight"]).any()
 
 
