@@ -294,10 +294,10 @@ def test_the_command_writes_where_minari_looks(d4orm, tmp_path: Path, monkeypatc
     outcome = d4orm("dataset", *options, "--disturb", "delay=1")
     assert outcome.status == 0, outcome.err
     assert "wrote 2 episodes" in outcome.out
-    assert "minari.load_dataset('d4orm/random-2-goal-v0')" in outcome.out
-    dataset = minari.load_dataset("d4orm/random-2-goal-v0")
+    assert "minari.load_dataset('d4orm/random-2-go-to-goal-v0')" in outcome.out
+    dataset = minari.load_dataset("d4orm/random-2-go-to-goal-v0")
     assert dataset.total_episodes == 2
-    assert list(minari.list_local_datasets()) == ["d4orm/random-2-goal-v0"]
+    assert list(minari.list_local_datasets()) == ["d4orm/random-2-go-to-goal-v0"]
     assert d4orm("dataset", *options, "--disturb", "delay=1", "--quiet").out == ""
 
 
