@@ -491,7 +491,7 @@ def test_the_number_of_workers_makes_no_difference(tmp_path: Path) -> None:
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, workers: int) -> None:
-    arguments = f"--policies goal --num-robots 8 --seeds 60 --control-noise-std 0,0.1 --out {tmp_path}".split()
+    arguments = f"--policies go-to-goal --num-robots 8 --seeds 60 --control-noise-std 0,0.1 --out {tmp_path}".split()
     command = [
         sys.executable,
         "-m",
