@@ -308,7 +308,9 @@ print(len(rows_of(Path({str(tmp_path / "out")!r}))))
 def program(folder: Path, text: str) -> str:
     """What a program prints."""
     (folder / "program.py").write_text(text)
-    path = os.pathsep.join(filter(None, [str(ROOT), str(ROOT / "tests" / "planners"), os.environ.get("PYTHONPATH")]))
+    path = os.pathsep.join(
+        filter(None, [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "planners"), os.environ.get("PYTHONPATH")])
+    )
     result = subprocess.run(
         [sys.executable, "program.py"],
         capture_output=True, text=True, check=False, cwd=folder, env={**os.environ, "PYTHONPATH": path},
