@@ -173,6 +173,6 @@ def test_a_process_that_starts_with_the_flag_plans() -> None:
         "plan = make_planner('mbd', num_samples=32, engine='jax').solve(problem, seed=0, max_iterations=1)\n"
         "print(plan.controls.dtype)"
     )
-    environment = {**os.environ, "JAX_ENABLE_X64": "1", "PYTHONPATH": str(Path(functional.__file__).parents[1])}
+    environment = {**os.environ, "JAX_ENABLE_X64": "1", "PYTHONPATH": str(Path(functional.__file__).parents[2])}
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, "float32\n"), done.stderr
