@@ -74,7 +74,7 @@ def main() -> int:
     there = problems()
 
     def run() -> list[Trial]:
-        study = Study(policies={"hybrid": settings}, scenarios=tuple(there.values()), seeds=range(seeds))
+        study = Study(policies={"d4orm-d": settings}, scenarios=tuple(there.values()), seeds=range(seeds))
         return trials_of((study,), arguments.out)
 
     trials = measured_trials(arguments.trials, run, arguments.out / "amswarm_gaps.parquet")
