@@ -193,7 +193,7 @@ def test_who_is_farthest_from_its_goal_is_pushed_and_who_has_docked_is_not(sessi
     until(lambda: session.frame.status.state == "arrived")
     session.push(0, [0.3, 0.0])
     until(lambda: session.frame.status.message)
-    assert "robot_0 of goal has docked" in session.frame.status.message
+    assert "robot_0 of go-to-goal has docked" in session.frame.status.message
     session.edit(lambda scene: edits.move_goal(scene, 2, [0.7, 0.9]))
     until(lambda: session.frame.status.state == "running")
     session.pause(True)
@@ -240,7 +240,7 @@ def test_everybody_arrives_and_is_sent_on(session: Session) -> None:
 
 def test_what_happened_becomes_a_replay(session: Session) -> None:
     until(lambda: session.recorded_steps > 2)
-    assert "circle, 4 robots by goal" in session.replay().html
+    assert "circle, 4 robots by go-to-goal" in session.replay().html
     session.edit(edits.remove_robot)
     until(lambda: session.frame.problem.num_robots == 3)
     assert "circle, 3 robots by goal" in session.replay().html
