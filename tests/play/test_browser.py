@@ -261,7 +261,7 @@ def test_obstacles_are_dragged_and_scenes_and_replays_saved(page: Page, tmp_path
             wait_for((tmp_path / name).exists)
         saved = load_problem(tmp_path / "scene.yaml")
         np.testing.assert_array_equal(saved.world.boxes, session.frame.problem.world.boxes)
-        assert "circle, 2 robots by goal" in (tmp_path / "replay.html").read_text(encoding="utf-8")
+        assert "circle, 2 robots by go-to-goal" in (tmp_path / "replay.html").read_text(encoding="utf-8")
 
 
 @viser_leaves_loops
@@ -325,7 +325,7 @@ def test_policies_are_ticked_and_drive_side_by_side(page: Page, tmp_path: Path) 
         click(page, "Save replay")
         wait_for((tmp_path / "replay.html").exists)
         text = (tmp_path / "replay.html").read_text(encoding="utf-8")
-        assert "by goal, d4orm-c2f" in text
+        assert "by go-to-goal, d4orm-c2f" in text
 
 
 @viser_leaves_loops

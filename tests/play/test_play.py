@@ -243,7 +243,7 @@ def test_what_happened_becomes_a_replay(session: Session) -> None:
     assert "circle, 4 robots by go-to-goal" in session.replay().html
     session.edit(edits.remove_robot)
     until(lambda: session.frame.problem.num_robots == 3)
-    assert "circle, 3 robots by goal" in session.replay().html
+    assert "circle, 3 robots by go-to-goal" in session.replay().html
 
 
 def test_a_replay_shows_intruders_while_they_were_there(session: Session) -> None:
