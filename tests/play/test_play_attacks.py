@@ -288,7 +288,7 @@ def test_the_name_of_a_scene_is_text(playground: Playground) -> None:
     frame = playground.session.frame
     problem = frame.problem.replace(name="{alert(1)}\n# <img src=x>")
     text = panel.status_text([type(frame)(**{**vars(frame), "problem": problem})])
-    assert text.startswith("**\\{alert(1)\\} # \\<img src=x\\>, 3 robots, goal: ")
+    assert text.startswith("**\\{alert(1)\\} # \\<img src=x\\>, 3 robots, go-to-goal: ")
 
 
 class Broken(GoToGoal):
@@ -417,7 +417,7 @@ def test_many_who_say_nothing_keep_nobody_out(gate: AuthenticatingProxy) -> None
 
 @pytest.mark.parametrize("wrong", [{"look_at": [0, 0, 9]}, {"up_direction": [0, 0, 0]}, {"wxyz": [0, 0, 0, 0]}])
 def test_a_camera_that_looks_nowhere_ends_nothing(wrong: dict[str, object], capfd: pytest.CaptureFixture[str]) -> None:
-    with running(make_problem("circle", num_robots=2), "goal") as playground, visitor(playground) as connection:
+    with running(make_problem("circle", num_robots=2), "go-to-goal") as playground, visitor(playground) as connection:
         say(connection, {**CAMERA, **wrong})
         refused(playground, lambda: say(connection, update(control(playground, "Robots"), 0)))
         playground.session.load(lambda: make_problem("sphere", num_robots=2))
