@@ -440,7 +440,7 @@ def test_an_error_is_a_row_and_is_tried_again(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(trials_module, "make_policy", lambda name, **settings: Unlucky())
     rates = rates_of(["go-to-goal"], tmp_path, **TINY)
     assert [(row.trials, row.errors, row.error) for row in rates] == [(2, 1, "RuntimeError: out of luck")] * 2
-    assert "- `goal`: RuntimeError: out of luck" in markdown(rates)
+    assert "- `go-to-goal`: RuntimeError: out of luck" in markdown(rates)
     monkeypatch.undo()
     rates = rates_of(["go-to-goal"], tmp_path, **TINY)
     assert [(row.trials, row.errors) for row in rates] == [(2, 0)] * 2
@@ -561,7 +561,8 @@ def test_the_table_row_by_row(tmp_path: Path) -> None:
         "",
         f"| {' | '.join(HEADER)} |",
         f"|{'---|' * len(HEADER)}",
-        "| goal | 0.1 | 1 of 2 (50%) | 9% to 91% | 0 | 1 | 0 | 0 | 5.00 | - | 0.38 | - | - | 0.062 (-0.202 to 0.327) |",
+        "| go-to-goal | 0.1 | 1 of 2 (50%) | 9% to 91% | 0 | 1 | 0 | 0 | 5.00 | - | 0.38 | - | - "
+        "| 0.062 (-0.202 to 0.327) |",
     ]
     paths = write_robustness(tmp_path, rates)
     assert sorted(path.name for path in paths) == sorted(path.name for path in tmp_path.iterdir())
@@ -618,7 +619,7 @@ def test_settings_reach_the_policies_that_have_them(d4orm, monkeypatch: pytest.M
         (("--trials", "0"), "seeds is empty"),
         (("--seeds", "99999999999"), "1000000"),
         (("--workers", "0"), "workers is 0"),
-        (("--set", "speed=1"), "'speed' is a setting of none of the policies goal"),
+        (("--set", "speed=1"), "'speed' is a setting of none of the policies go-to-goal"),
         (("--set", "orca.time_horizon=1"), "'orca' is not among the policies"),
         (("--policies", "orca", "--set", "time_horizon=-1"), "time_horizon is -1"),
         (("--policies", "orca", "--set", "orca.speed=1"), "'speed' is no setting of policy 'orca'"),
