@@ -184,6 +184,6 @@ def test_no_code_that_a_dataset_names_is_run(recorded: Path, tmp_path: Path) -> 
     metadata = json.loads(path.read_text())
     metadata["demonstrations"]["environment"]["scenario"] = f"{tmp_path / 'harm.py'}:scene"
     path.write_text(json.dumps(metadata))
-    with pytest.raises(ValueError, match="does not say in a form that can be read of which team it is .*is unknown"):
+    with pytest.raises(ValueError, match=r"does not say in a form that can be read of which team it is .*is unknown"):
         dataset_samples(str(tmp_path / "copy"), "holonomic2d", observation_size())
     assert not (tmp_path / "harmed").exists()
