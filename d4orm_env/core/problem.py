@@ -201,7 +201,7 @@ class Problem(Frozen):
 
     @property
     def stride(self) -> float:
-        """How far the fastest robot drives in a step at full speed [m], the unit of planners' settings."""
+        """Distance that the fastest robot drives in a step at full speed [m], the unit of planners' settings."""
         return self.dt * float(self.team.max_speed.max())
 
     @cached_property

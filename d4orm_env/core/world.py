@@ -167,7 +167,7 @@ class World(Frozen):
 
     @property
     def _usual_reach(self) -> float:
-        """What to index by when nobody has said: a share of the room that the obstacles take [m]."""
+        """Default cell of the index: a share of the room that the obstacles take [m]."""
         lower, upper = self.shapes.extent()
         return max(float((upper - lower).max()), SMALLEST) / 32
 

@@ -32,7 +32,7 @@ _WORDS = {"": None, "~": None, "null": None, "Null": None, "NULL": None} | {
 
 
 def is_yaml_path(path: str | os.PathLike[str]) -> bool:
-    """Whether a path ends as those of YAML files do, in letters of either case."""
+    """Return whether a path ends as those of YAML files do, in letters of either case."""
     return Path(path).suffix.lower() in SUFFIXES
 
 

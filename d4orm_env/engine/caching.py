@@ -62,7 +62,7 @@ class _Files(IndexDataCacheFile):
     """
 
     def load(self, key: tuple[object, ...]) -> Any:
-        """What is kept under a key, or ``None``."""
+        """Return what is kept under a key, or ``None``."""
         kept = super().load(key)
         # Two processes that add to an index at once may have given the same file to different keys.
         return kept[1] if kept is not None and kept[0] == key else None
@@ -106,7 +106,7 @@ class _Place(CompileResultCacheImpl):
 
 
 def _is_private(folder: Path) -> bool:
-    """Whether nobody else can put files there, which would be unpickled and executed."""
+    """Return whether nobody else can put files there, which would be unpickled and executed."""
     if not folder.is_absolute():  # where nobody knows the home folder, it begins with ~
         return False
     if not hasattr(os, "getuid"):
