@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 
 import numpy as np
 import viser
@@ -39,14 +40,21 @@ class Viewpoint:
         camera.position, camera.look_at = view_from(limits, dimension, WIDE)
         camera.up, camera.fov = up, FIELD_OF_VIEW
         for client in self._server.get_clients().values():
-            with suppress(ValueError):
+            with _looking_nowhere():
                 client.camera.up_direction = up
             self._look(client)
 
     def _look(self, client: viser.ClientHandle) -> None:
         camera = client.camera
-        with suppress(ValueError):  # where a browser says that it looks nowhere, or there is nothing to see yet
+        with _looking_nowhere():
             camera.position, camera.look_at = view_from(self._limits, self._dimension, camera.aspect)
+
+
+@contextmanager
+def _looking_nowhere() -> Iterator[None]:
+    """A context that leaves a camera alone whose browser says that it looks nowhere, or that has nothing to see yet."""
+    with suppress(ValueError, FloatingPointError), np.errstate(divide="raise", invalid="raise"):
+        yield
 
 
 def view_from(limits: Points, dimension: int, aspect: float) -> tuple[Vector, Vector]:

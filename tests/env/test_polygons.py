@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from shapely import Polygon
 
 from d4orm_env import World
-from d4orm_env.core import simple_polygon
+from d4orm_env.geometry import simple_polygon
 from d4orm_env.geometry.polygon import triangulate
 from d4orm_env.geometry.simple_polygon import first_crossing, orientation
 

@@ -344,8 +344,8 @@ def test_a_goal_without_a_way_is_named_at_once() -> None:
 
 
 @pytest.mark.parametrize(("scenario", "mapf"), [("circle", False), ("four_obstacles", False), ("maze", True)])
-def test_teams_are_guided_where_obstacles_lead_far_round(scenario: str, guided: bool) -> None:
-    assert needs_detour(make_problem(scenario, num_robots=8, seed=0)) == guided
+def test_paths_are_found_where_obstacles_lead_far_round(scenario: str, mapf: bool) -> None:
+    assert needs_detour(make_problem(scenario, num_robots=8, seed=0)) == mapf
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -212,7 +212,8 @@ def test_entry_points_are_found_and_loaded_when_asked_for(
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(
-        "[d4orm.policies]\ntheirs = theirs_module:Theirs\nbroken = theirs_module:nothing\ngoal = theirs_module:Theirs\n"
+        "[d4orm.policies]\ntheirs = theirs_module:Theirs\n"
+        "broken = theirs_module:nothing\ngo-to-goal = theirs_module:Theirs\n"
         "[d4orm.planners]\ntheirs-planner = test_own:Ahead\n"
     )
     (tmp_path / "theirs_module.py").write_text("from test_own import Push\nclass Theirs(Push):\n    'Theirs.'\n")

@@ -248,7 +248,7 @@ def test_obstacles_are_dragged_and_scenes_and_replays_saved(page: Page, tmp_path
     with running(problem.resumed_at(problem.start, problem.goal, world=world), "go-to-goal") as playground:
         session = playground.session
         page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
-        look_at(page, playground, "circle, 2 robots, goal")
+        look_at(page, playground, "circle, 2 robots, go-to-goal")
         tick(page, "Paused")
         wait_for(lambda: session.frame.status.state == "paused" and len(playground.clients) == 1)
         start, end = pixel(playground, (0, 0)), pixel(playground, (0.9, 0.9))
@@ -269,7 +269,7 @@ def test_a_robot_that_is_dragged_with_shift_is_pushed(page: Page, tmp_path: Path
     with running(make_problem("circle", num_robots=3, seed=0), "go-to-goal") as playground:
         session = playground.session
         session.pause(True)
-        look_at(page, playground, "circle, 3 robots, goal: paused")
+        look_at(page, playground, "circle, 3 robots, go-to-goal: paused")
         wait_for(lambda: len(playground.clients) == 1)
         page.frames(8)
         before = session.frame.states
@@ -289,7 +289,7 @@ def test_goals_are_dragged_in_space(page: Page) -> None:
     with running(make_problem("sphere", num_robots=3, seed=0), "go-to-goal") as playground:
         session = playground.session
         session.pause(True)
-        look_at(page, playground, "sphere, 3 robots, goal: paused")
+        look_at(page, playground, "sphere, 3 robots, go-to-goal: paused")
         wait_for(lambda: len(playground.clients) == 1)
         page.frames(8)
         goal, wanted = session.frame.goals[0], pixel(playground, np.zeros(3))
@@ -307,12 +307,12 @@ def test_policies_are_ticked_and_drive_side_by_side(page: Page, tmp_path: Path) 
         session = playground.session
         session.pause(True)  # nobody stands on a goal yet
         page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
-        look_at(page, playground, "circle, 3 robots, goal: paused")
+        look_at(page, playground, "circle, 3 robots, go-to-goal: paused")
         wait_for(lambda: len(playground.clients) == 1)
         click(page, "Who drives")
         tick(page, "D4orm-C2F")
         wait_for(lambda: session.policies == ("go-to-goal", "d4orm-c2f"))
-        page.until("document.body.textContent.includes('circle, 3 robots, goal, d4orm-c2f')")
+        page.until("document.body.textContent.includes('circle, 3 robots, go-to-goal, d4orm-c2f')")
         wait_for(lambda: len(playground._view._lanes) == 2)
         offset = playground._view._lanes[1]._nodes[""].position[:2]
         goal = session.frames[1].goals[0]
@@ -333,9 +333,9 @@ def test_two_browsers_play_with_one_team(page: Page, tmp_path: Path) -> None:
     with running(make_problem("circle", num_robots=3, seed=0), "go-to-goal") as playground:
         session = playground.session
         session.pause(True)
-        look_at(page, playground, "circle, 3 robots, goal: paused")
+        look_at(page, playground, "circle, 3 robots, go-to-goal: paused")
         with browser(tmp_path) as other:
-            look_at(other, playground, "circle, 3 robots, goal: paused")
+            look_at(other, playground, "circle, 3 robots, go-to-goal: paused")
             wait_for(lambda: len(playground.clients) == 2)
             tick(other, "Lifelong goals")
             lifelong = beside("Lifelong goals", "input[type=checkbox]")
@@ -374,7 +374,7 @@ def test_two_browsers_play_with_one_team(page: Page, tmp_path: Path) -> None:
 def test_a_slow_planner_does_not_freeze_the_page(page: Page) -> None:
     with running(make_problem("circle", num_robots=3, seed=0), "go-to-goal") as playground:
         session = playground.session
-        look_at(page, playground, "circle, 3 robots, goal")
+        look_at(page, playground, "circle, 3 robots, go-to-goal")
         ended = threading.Event()
         register_policy("slow", lambda: Slow(ended))
         session.choose("slow")
@@ -402,7 +402,7 @@ class Slow(GoToGoal):
 def test_a_slider_disturbs_from_the_next_step_on(page: Page) -> None:
     with running(make_problem("circle", num_robots=3, seed=0), "go-to-goal") as playground:
         session = playground.session
-        look_at(page, playground, "circle, 3 robots, goal")
+        look_at(page, playground, "circle, 3 robots, go-to-goal")
         session.set_lifelong(True)
         click(page, "What goes wrong")
         bar = beside("Intruders", ".mantine-Slider-track")
@@ -423,5 +423,5 @@ def test_elsewhere_the_playground_asks_for_its_token(page: Page) -> None:
         assert not playground.clients
         page.open("about:blank")
         page.open(playground.address)
-        page.until("document.body.textContent.includes('circle, 2 robots, goal')")
+        page.until("document.body.textContent.includes('circle, 2 robots, go-to-goal')")
         assert "token" not in page.evaluate("location.href"), "nor in the browser's history"

@@ -467,7 +467,7 @@ def test_closed_loop_survives_the_noise_that_the_open_loop_does_not(tmp_path: Pa
     rows = {row["policy"]: row for row in table(out / "noisy_control.csv")}
     assert rows["d4orm-c2f"]["success"] == "True"
     assert rows["d4orm-c2f"]["arrived"] == "4 of 4"
-    assert rows["d4orm-d"]["success"] == "False"
+    assert rows["hybrid"]["success"] == "False"
     assert all(float(row["loop, median [ms]"]) <= float(row["loop, 95th percentile [ms]"]) for row in rows.values())
     assert (out / "noisy_control.png").read_bytes().startswith(PNG)
 
