@@ -117,10 +117,7 @@ def build_index(shapes: Shapes, cell: float, reach: float, nearest: int = 1, lev
 def nearest_distance(shapes: Shapes, index: WorldIndex, points: Floats) -> Floats:
     """``(N,)`` signed distance from points ``(N, d)`` to the nearest of the obstacles [m]; there must be some."""
     distance = np.empty(len(points))
-    place = (points - index.low) * index.scale
-    inside: NDArray[np.bool_] = np.all((place > 0) & (place < index.size), axis=1)
-    cell = np.zeros(len(points), np.int64)
-    cell[inside] = np.ravel_multi_index(tuple(place[inside].astype(np.int64).T), tuple(index.size))
+    inside, cell = _cells_of(points, index)
     # Beyond the grid every obstacle may be the nearest.
     begin = np.where(inside, index.first[cell], 0)
     count = np.where(inside, index.first[cell + 1] - begin, shapes.count)
@@ -138,6 +135,27 @@ def nearest_distance(shapes: Shapes, index: WorldIndex, points: Floats) -> Float
         distance[done:last] = np.minimum.reduceat(gaps, starts)
         done = last
     return distance
+
+
+def is_farther(shapes: Shapes, index: WorldIndex, points: Floats, distance: float) -> NDArray[np.bool_]:
+    """``(N,)`` true where :func:`nearest_distance` is more than ``distance``, which the index must reach."""
+    inside, cell = _cells_of(points, index)
+    clearance, slack = index.clearance[cell], index.slack
+    # Beyond the grid all is clear, but for obstacles without an end.
+    beyond: NDArray[np.bool_] = np.any((points < index.ends[0]) | (points > index.ends[1]), axis=1)
+    farther: NDArray[np.bool_] = beyond | (inside & (clearance - slack > distance))
+    undecided = np.flatnonzero(~farther & ~(inside & (clearance + slack < distance)))
+    farther[undecided] = nearest_distance(shapes, index, points[undecided]) > distance
+    return farther
+
+
+def _cells_of(points: Floats, index: WorldIndex) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """``(N,)`` true where a point lies within the grid, and the number of its cell, 0 elsewhere."""
+    place = (points - index.low) * index.scale
+    inside: NDArray[np.bool_] = np.all((place > 0) & (place < index.size), axis=1)
+    cell = np.zeros(len(points), np.int64)
+    cell[inside] = np.ravel_multi_index(tuple(place[inside].astype(np.int64).T), tuple(index.size))
+    return inside, cell
 
 
 def _layout(shapes: Shapes, cell: float, reach: float) -> tuple[Floats, NDArray[np.int64], float]:

@@ -72,6 +72,8 @@ def test_index_finds_the_nearest_obstacle(seed: int, dimension: int, count: int,
     world.index(radius)
     np.testing.assert_array_equal(world.clearance(points), all_clearances(world, points))
     np.testing.assert_array_equal(world.clearance(points[7]), world.clearance(points)[7])
+    for distance in (radius / 7, radius, 3 * radius):
+        np.testing.assert_array_equal(world.is_clear(points, distance), all_clearances(world, points) > distance)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
