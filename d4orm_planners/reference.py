@@ -39,6 +39,7 @@ class PlainTeam(NamedTuple):
     margin: Array
     goal_radius: Array
     goal_speed: Array  # infinite without a limit
+    collision_penalty: Array
 
 
 def plain_team(problem: Problem) -> tuple[str, PlainTeam]:
@@ -56,7 +57,7 @@ def plain_team(problem: Problem) -> tuple[str, PlainTeam]:
     numbers = (
         problem.start, problem.goal, team.radius, team.max_speed, team.max_acceleration, team.max_turn_rate,
         world.balls, world.cylinders, world.boxes, world.bounds, problem.dt, problem.margin, problem.goal_radius,
-        jnp.inf if problem.goal_speed is None else problem.goal_speed,
+        jnp.inf if problem.goal_speed is None else problem.goal_speed, problem.collision_penalty,
     )  # fmt: skip
     return models[0], PlainTeam(*(jnp.asarray(number, jnp.float32) for number in numbers))
 
@@ -142,9 +143,10 @@ def team_rewards(model: str, collisions: bool, team: PlainTeam, controls: Array)
         y = jnp.where(arrives[:, None], _at_rest(model, y), y)
         x = jnp.where(docked[:, None], x, y)
         place = x[:, :dimension]
-        reward = 1 - jnp.linalg.norm(place - team.goal, axis=1) / scale - _near_obstacle(team, place)
+        reward = 1 - jnp.linalg.norm(place - team.goal, axis=1) / scale
+        reward = reward - team.collision_penalty * _near_obstacle(team, place)
         if collisions:
-            reward = reward - _near_robot(team, place)
+            reward = reward - team.collision_penalty * _near_robot(team, place)
         return (x, docked | arrives), reward
 
     start = (team.start, jnp.zeros(len(team.start), bool))

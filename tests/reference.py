@@ -53,7 +53,7 @@ def judge(task: SamplingTask, controls: np.ndarray) -> Judged:
         gaps = _gaps_to_robots(task, place, t), problem.world.clearance(place) - problem.team.radius
         beyond = [gap - problem.margin for gap in gaps]
         total += 1 - inverse * np.linalg.norm(problem.goal - place, axis=-1)
-        total -= task.penalty * sum((gap <= 0).astype(float) for gap in beyond)
+        total -= task.penalty * problem.collision_penalty * sum((gap <= 0).astype(float) for gap in beyond)
         doubt = np.minimum(doubt, np.abs(np.stack([short, *beyond])).min(axis=(0, 2)))
     return Judged(total.T / controls.shape[1], doubt, inverse)
 

@@ -79,6 +79,8 @@ class Problem(Frozen):
         goal_radius: A robot within it has arrived [m].
         goal_speed: Speed at which a robot may still dock [m/s]; ``None`` is no limit, as in the paper.
         name: Where the problem comes from, for tables and pictures.
+        collision_penalty: Taken off a robot's reward per step within the margin of another robot, and of an obstacle
+            or a bound; 1 in the paper.
         arrival: ``"dock"``: a robot that arrives stands there for ever, as in the paper. ``"stay"``: it may be moved
             again, to make way; all must be at their goals at the end.
 
@@ -103,6 +105,7 @@ class Problem(Frozen):
     goal_speed: float | None
     name: str
     arrival: Arrival
+    collision_penalty: float
 
     def __init__(
         self,
@@ -117,6 +120,7 @@ class Problem(Frozen):
         goal_speed: float | None = None,
         name: str = "custom",
         arrival: Arrival = "dock",
+        collision_penalty: float = 1.0,
     ) -> None:
         world = World(dimension=team.dimension) if world is None else world
         if world.dimension != team.dimension:
@@ -136,6 +140,7 @@ class Problem(Frozen):
             goal_speed=goal_speed,
             name=name,
             arrival=arrival,
+            collision_penalty=positive_number(collision_penalty, "collision_penalty", most=LARGEST),
         )
         self._check()
 
@@ -232,6 +237,7 @@ class Problem(Frozen):
             squared_goal_radius=np.float32(self.goal_radius * self.goal_radius),
             squared_goal_speed=np.float32(goal_speed * goal_speed),
             docks=np.bool_(self.docks),
+            collision_penalty=np.float32(self.collision_penalty),
         )
         for array in arrays:
             if isinstance(array, np.ndarray):
@@ -289,6 +295,8 @@ class Problem(Frozen):
         sha.update(f"{self.dt!r} {self.horizon} {self.margin!r} {self.goal_radius!r} {self.goal_speed!r}".encode())
         if not self.docks:
             sha.update(self.arrival.encode())
+        if self.collision_penalty != 1:
+            sha.update(f"collision_penalty {self.collision_penalty!r}".encode())
         return sha.hexdigest()
 
     def __eq__(self, other: object) -> bool:

@@ -30,6 +30,7 @@ class ProblemArrays(NamedTuple):
         squared_goal_radius: ``()``.
         squared_goal_speed: ``()``, infinite without a limit.
         docks: ``()`` bool: who has arrived stands there for ever.
+        collision_penalty: ``()``.
     """
 
     model_codes: NDArray[np.int32]
@@ -47,6 +48,7 @@ class ProblemArrays(NamedTuple):
     squared_goal_radius: np.float32
     squared_goal_speed: np.float32
     docks: np.bool_
+    collision_penalty: np.float32
 
 
 def inverse_initial_distance(positions: FloatArray, goal: FloatArray, goal_radius: float) -> FloatArray:

@@ -36,6 +36,20 @@ class StepResult(NamedTuple):
     margin_violated: BoolArray
     rewards: FloatArray
 
+    def with_contacts(self, touched: BoolArray, near: BoolArray, penalty: np.float32) -> StepResult:
+        """The step with contacts that the engine does not know of, as with dynamic obstacles.
+
+        Args:
+            touched: ``(K,)`` robots in contact.
+            near: ``(K,)`` robots within the margin, which pay for it.
+            penalty: What they pay.
+        """
+        return self._replace(
+            collided=self.collided | touched,
+            margin_violated=self.margin_violated | near,
+            rewards=self.rewards - penalty * near,
+        )
+
 
 class Engine(Protocol):
     """Operations that environments and planners alike need from the physics."""

@@ -123,5 +123,6 @@ def judge(
         for k in range(num_robots):
             worlds.rewards[first + s, k] = reward.step_reward(
                 np.sqrt(w[k * STRIDE + DISTANCE2 * TILE + s]), worlds.inverse[own, k],
-                np.float32(_bit(near[k, ROBOT], s)), np.float32(_bit(near[k, OBSTACLE], s)), ONE,
+                np.float32(_bit(near[k, ROBOT], s)), np.float32(_bit(near[k, OBSTACLE], s)),
+                arrays.collision_penalty, ONE,
             )  # fmt: skip

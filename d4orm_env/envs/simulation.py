@@ -307,11 +307,7 @@ class Simulation:
         if self._disturbed is None or not self._disturbed.bodies.shape[1]:
             return result
         touched, near = self._disturbed.touched(result.states[None])
-        return result._replace(
-            collided=result.collided | touched[0],
-            margin_violated=result.margin_violated | near[0],
-            rewards=result.rewards - near[0],
-        )
+        return result.with_contacts(touched[0], near[0], self.arrays.collision_penalty)
 
     def _rewards(self, reward: RewardFunction, result: StepResult, arrived: BoolArray) -> FloatArray:
         """``(K,)`` of the step from the present states to ``result``."""

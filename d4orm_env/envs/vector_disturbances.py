@@ -33,6 +33,7 @@ class DisturbedBatch:
         problem, cycles = template.problem, template.max_cycles
         self._worlds, self._cycles = worlds, cycles
         self._disturbed = DisturbedWorlds(template.disturbances, problem, len(worlds.steps), cycles)
+        self._penalty = problem.arrays.collision_penalty
         self._limits = self._disturbed.true_limits(problem.arrays.limits)
         self._seen: Seen | None = None
         self._nothing = not template.disturbances
@@ -80,9 +81,10 @@ class DisturbedBatch:
         touched, near = self._disturbed.touched(worlds.state)
         worlds.contacts[moved] += (touched & ~worlds.collided)[moved]
         worlds.violations[moved] += (near & ~worlds.violated)[moved]
-        worlds.rewards[moved] -= near[moved]
-        worlds.reward[moved] -= near[moved].mean(axis=1)
-        worlds.total_reward[moved] -= near[moved].sum(axis=1)
+        cost = self._penalty * near[moved]
+        worlds.rewards[moved] -= cost
+        worlds.reward[moved] -= cost.mean(axis=1)
+        worlds.total_reward[moved] -= cost.sum(axis=1)
         worlds.collided[:] |= touched
         worlds.violated[:] |= near
 

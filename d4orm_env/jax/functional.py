@@ -185,9 +185,9 @@ def _arrays(problem: Problem) -> ProblemArrays:
     team, world = problem.team, problem.world
     fastest = jnp.inf if problem.goal_speed is None else problem.goal_speed
     # Rounded before they are computed with, whatever precision JAX has by default.
-    start, goal, dt, margin, goal_radius, goal_speed = (
-        jnp.asarray(value, jnp.float32)
-        for value in (problem.start, problem.goal, problem.dt, problem.margin, problem.goal_radius, fastest)
+    numbers = (problem.dt, problem.margin, problem.goal_radius, fastest, problem.collision_penalty)
+    start, goal, dt, margin, goal_radius, goal_speed, penalty = (
+        jnp.asarray(value, jnp.float32) for value in (problem.start, problem.goal, *numbers)
     )
     gap2 = ((start[:, : team.dimension] - goal) ** 2).sum(axis=-1)
     distance = jnp.sqrt(jnp.maximum(gap2, goal_radius**2))
@@ -211,6 +211,7 @@ def _arrays(problem: Problem) -> ProblemArrays:
         "squared_goal_radius": goal_radius**2,
         "squared_goal_speed": goal_speed**2,
         "docks": problem.arrival == "dock",
+        "collision_penalty": penalty,
     }
     return ProblemArrays(**arrays)
 

@@ -179,15 +179,14 @@ def goal_distance(arrays: ProblemArrays, place: Array) -> Array:
     return jnp.where(gap2 <= tiny, jnp.float32(0), jnp.sqrt(jnp.maximum(gap2, tiny)))
 
 
-def rewards_of(
-    arrays: ProblemArrays, place: Array, pair_violation: Array, obstacle_violation: Array, penalty: Array | np.float32
-) -> Array:
-    """``(K, S)`` reward of one step; a violation costs ``penalty``."""
+def rewards_of(arrays: ProblemArrays, place: Array, pair_violation: Array, obstacle_violation: Array) -> Array:
+    """``(K, S)`` reward of one step."""
     return reward.step_reward(
         goal_distance(arrays, place),
         arrays.inverse_initial_distance[:, None],
-        penalty * pair_violation.astype(jnp.float32),
-        penalty * obstacle_violation.astype(jnp.float32),
+        pair_violation.astype(jnp.float32),
+        obstacle_violation.astype(jnp.float32),
+        arrays.collision_penalty,
         jnp.float32(1),
     )
 
@@ -197,7 +196,7 @@ def judge(arrays: ProblemArrays, place: Array) -> Verdict:
     zero = jnp.float32(0)
     contact = robot_contacts(arrays, place, zero) | obstacle_contacts(arrays, place, zero)
     pair, obstacle = robot_contacts(arrays, place, arrays.margin), obstacle_contacts(arrays, place, arrays.margin)
-    return contact, pair | obstacle, rewards_of(arrays, place, pair, obstacle, np.float32(1))
+    return contact, pair | obstacle, rewards_of(arrays, place, pair, obstacle)
 
 
 @partial(jax.jit, static_argnums=0)

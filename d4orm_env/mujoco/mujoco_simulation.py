@@ -117,11 +117,5 @@ class MujocoSimulation(Simulation):
         """What a step came to: flags and rewards of a team that stands where it is now, and who was touched."""
         still = np.ones(len(states), np.bool_)
         verdict = self._engine.step(arrays._replace(docks=np.bool_(True)), states, still, np.zeros_like(controls))
-        return StepResult(
-            states,
-            controls,
-            arrived,
-            verdict.collided | touched,
-            verdict.margin_violated | touched,
-            verdict.rewards - (touched & ~verdict.margin_violated),
-        )
+        judged = verdict._replace(states=states, controls=controls, arrived=arrived)
+        return judged.with_contacts(touched, touched & ~verdict.margin_violated, arrays.collision_penalty)

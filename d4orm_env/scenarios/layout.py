@@ -69,6 +69,7 @@ def build(settings: Settings, layout: Layout) -> Problem:
         goal_speed=settings.goal_speed,
         name=settings.scenario,
         arrival=settings.arrival,
+        collision_penalty=settings.collision_penalty,
     )
 
 

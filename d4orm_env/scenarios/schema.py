@@ -163,6 +163,7 @@ class ProblemFile(Entry):
     goal_radius: Squared = 0.075
     goal_speed: Squared | None = None
     arrival: Arrival = "dock"
+    collision_penalty: Number = 1.0
     robots: list[RobotEntry] = Field(min_length=1)
     world: WorldEntry = WorldEntry()
 
@@ -184,6 +185,7 @@ class ProblemFile(Entry):
             goal_radius=self.goal_radius,
             goal_speed=self.goal_speed,
             arrival=self.arrival,
+            collision_penalty=self.collision_penalty,
             name=self.name,
         )
 
@@ -272,6 +274,8 @@ def describe(problem: Problem) -> dict[str, object]:
     settings = {name: getattr(problem, name) for name in ("dt", "horizon", "margin", "goal_radius", "goal_speed")}
     if not problem.docks:
         settings["arrival"] = problem.arrival
+    if problem.collision_penalty != 1:
+        settings["collision_penalty"] = problem.collision_penalty
     robots = [_describe_robot(problem, robot) for robot in range(problem.num_robots)]
     return {
         "version": VERSION,

@@ -42,6 +42,7 @@ class Settings:
         goal_radius: A robot within it has arrived [m].
         goal_speed: Speed at which a robot may still dock [m/s]; ``None`` is no limit.
         arrival: ``"dock"``: who arrives stands there for ever. ``"stay"``: it may be moved again, to make way.
+        collision_penalty: Taken off the reward per step within the margin of a robot, and of an obstacle.
         max_speed: Speed limit [m/s], one or ``K``.
         max_acceleration: Acceleration limit [m/s^2], one or ``K``.
         max_turn_rate: Turn rate limit [rad/s], one or ``K``.
@@ -65,6 +66,7 @@ class Settings:
     goal_radius: float = 0.075
     goal_speed: float | None = None
     arrival: Arrival = "dock"
+    collision_penalty: float = 1.0
     max_speed: ArrayLike = 1.0
     max_acceleration: ArrayLike = 1.0
     max_turn_rate: ArrayLike = float(np.pi / 2)
@@ -78,7 +80,7 @@ class Settings:
                 raise ValueError(f"{name} is {getattr(self, name)}; scenarios make at most {MAX_COUNT}")
         if self.horizon is not None:
             object.__setattr__(self, "horizon", whole_number(self.horizon, "horizon", 1, MAX_HORIZON))
-        for name in ("dt", "goal_radius", "obstacle_radius"):
+        for name in ("dt", "goal_radius", "obstacle_radius", "collision_penalty"):
             object.__setattr__(self, name, bounded(getattr(self, name), name))
         object.__setattr__(self, "margin", bounded(self.margin, "margin", zero_allowed=True))
         check_arrival(self.arrival)

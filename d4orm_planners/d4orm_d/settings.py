@@ -32,9 +32,8 @@ class D4ormDConfig(DeformationConfig):
             its own.
         repair_steps: ``N`` of an independent repair.
         credit: Of iterations over the whole team.
-        penalty: What a violation costs per step in these.
-        repair_penalty: What it costs in an independent repair. At the paper's one it can be cheaper to brush past a
-            robot than to wait for it.
+        penalty: Factor of the problem's collision penalty in these.
+        repair_penalty: The same in an independent repair. At 1 it can be cheaper to brush past a robot than to wait.
     """
 
     big_team: Count | None = 32

@@ -94,7 +94,6 @@ class Sampling:
         self.scoring = score.Scoring(
             docked=np.ascontiguousarray(docked, bool),
             collisions=task.collisions,
-            penalty=np.float32(task.penalty),
             bodies=make_bodies(*moving, self.arrays.margin),
             bounds=bound_boxes(self.arrays),
         )

@@ -58,7 +58,6 @@ class _Inputs(NamedTuple):
     base: Array
     docked: Array
     moving: MovingObstacles | None
-    penalty: Array
     seed: tuple[Array, Array]
 
 
@@ -96,7 +95,7 @@ def _score(static: _Static, inputs: _Inputs, step: Array, mean: Array, scale: Ar
             if inputs.moving is not None and obstacle is not None:
                 near_robot |= moving_contacts(arrays, place, obstacle, inputs.moving.radius, arrays.margin)
         near_obstacle = obstacle_contacts(arrays, place, arrays.margin)
-        return (worlds, total + rewards_of(arrays, place, near_robot, near_obstacle, inputs.penalty)), deformation
+        return (worlds, total + rewards_of(arrays, place, near_robot, near_obstacle)), deformation
 
     worlds = Worlds(
         jnp.broadcast_to(arrays.start[..., None], (*arrays.start.shape, static.num_samples)),
@@ -178,14 +177,8 @@ class JaxSamplingEngine(JaxEngine):
         problem = task.problem
         docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
         scored = (
-            task.arrays,
-            problem.team.control_units,
-            task.base,
-            docked,
-            task.moving,
-            np.float32(task.penalty),
-            noise.seed_words(seed),
-        )
+            task.arrays, problem.team.control_units, task.base, docked, task.moving, noise.seed_words(seed),
+        )  # fmt: skip
         static = _Static(problem.team.models, rules, num_samples, task.collisions, task.credit)
         scale = np.asarray(noise_scale, np.float32)
         begun = (mean, np.ones_like(mean), np.zeros_like(scale), np.int32(0))

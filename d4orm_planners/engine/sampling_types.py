@@ -38,7 +38,7 @@ class SamplingTask:
             part of a sample by that robot's own reward.
         moving: Bodies to avoid that are not sampled, or ``None``.
         arrived: ``(K,)`` robots docked from the beginning, or ``None`` for none.
-        penalty: What a violation of the margin costs per step, against a reward of one for standing at the goal.
+        penalty: Factor of the problem's collision penalty.
         reference_distance: Distances count relative to the initial one (paper, section III-D), or to this if that is
             less: a robot that starts next to its goal then loses no more by waiting than others do. ``None`` for the
             paper's.
@@ -57,6 +57,7 @@ class SamplingTask:
     def arrays(self) -> ProblemArrays:
         """The problem as this task scores it."""
         arrays = self.problem.arrays
+        arrays = arrays._replace(collision_penalty=np.float32(self.penalty * self.problem.collision_penalty))
         if self.reference_distance is None:
             return arrays
         inverse = np.minimum(arrays.inverse_initial_distance, np.float32(1 / self.reference_distance))

@@ -76,14 +76,12 @@ class Scoring(NamedTuple):
     Attributes:
         docked: ``(K,)`` bool, docked from the beginning.
         collisions: Whether robots count when near each other or near a moving body.
-        penalty: What a violation costs per step.
         bodies: What moves, :class:`~d4orm_planners.engine.proximity.Bodies`.
         bounds: ``(S, d, 2)`` boxes beyond them, see :func:`~d4orm_planners.engine.proximity.bound_boxes`.
     """
 
     docked: BoolArray
     collisions: bool
-    penalty: np.float32
     bodies: Bodies
     bounds: FloatArray
 
@@ -153,7 +151,7 @@ def _runner(name: str) -> Callable[..., None]:
                 x, gap2, docked = dock(standing, read_x(moved, 0, s), read_u(u, 0, s), limits, goal, docking)
                 write_x(w, STATE * TILE, s, x)
                 w[DOCKED * TILE + s] = ONE if docked else ZERO
-                w[TOTAL * TILE + s] += reward.step_reward(np.sqrt(gap2), inverse, ZERO, ZERO, ONE)
+                w[TOTAL * TILE + s] += reward.step_reward(np.sqrt(gap2), inverse, ZERO, ZERO, ZERO, ONE)
             _copy(w[: dimension * TILE], places[i * dimension * TILE : (i + 1) * dimension * TILE])
 
     return run
@@ -167,7 +165,7 @@ def _add_standing(goal: FloatArray, inverse: np.float32, count: np.float32, w: F
         for axis in range(goal.shape[0]):
             gap = w[(STATE + axis) * TILE + s] - goal[axis]
             gap2 += gap * gap
-        w[TOTAL * TILE + s] += count * reward.step_reward(np.sqrt(gap2), inverse, ZERO, ZERO, ONE)
+        w[TOTAL * TILE + s] += count * reward.step_reward(np.sqrt(gap2), inverse, ZERO, ZERO, ZERO, ONE)
 
 
 @inlined
@@ -219,7 +217,7 @@ def _score_tile(
     """Roll out a tile of samples, noise beginning with this counter; leave summed rewards in rows TOTAL."""
     w, places, draws, controls, standing = space.w, space.places, space.draws, space.controls, space.standing
     moved, keys, scratch, offset, scale = space.moved, space.keys, space.scratch, drawing.offset, drawing.scale
-    penalty, bounds = scoring.penalty, scoring.bounds
+    penalty, bounds = arrays.collision_penalty, scoring.bounds
     num_steps, num_robots, num_controls = offset.shape
     num_pairs = (num_controls + 1) // 2
     # Taken out of the tuple once: every access counts a reference, which costs as much as several samples.

@@ -32,7 +32,7 @@ class DeformationConfig(ContinuationSettings, DenoisingConfig):
         num_steps: ``N``.
         credit: ``"group"`` by default: each robot's own reward at first, then that of those it is in conflict with.
             ``"alternate"`` goes on by the team's reward after its first iteration, and every other one.
-        penalty: 2 by default, what a contact costs the two that touch.
+        penalty: 2 by default, for the two that touch.
         clip_between_iterations: True by default: with the default's credit that solves slightly sooner. The paper clips
             in the rollout only.
         late_steps: Share of the steps, the last ones, at which the noise is small enough for fewer samples.

@@ -11,6 +11,8 @@ from env_support import act, line_problem, mixed_problem
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.problem import Problem
+from d4orm_env.disturbances import Disturbance, Intruder
+from d4orm_env.envs.joint_env import JointNavigationEnv
 from d4orm_env.envs.rewards import RewardInput, TrainingReward
 from d4orm_env.envs.vector_env import NavigationVectorEnv
 from d4orm_planners import make_policy, run_episode
@@ -169,3 +171,37 @@ def test_lifelong_rewards_are_for_the_goals_of_the_step() -> None:
     env = navigation_v0.parallel_env(problem=line_problem([0.15]), reward=closer, lifelong=True)
     env.reset(seed=0)
     assert env.step({"robot_0": np.float32([1, 0])})[1]["robot_0"] == pytest.approx(0.1, abs=1e-6)
+
+
+@pytest.mark.parametrize("disturbances", [[], [Intruder(30, 1.0)]], ids=["robots and obstacles", "intruders"])
+def test_the_collision_penalty_is_an_argument(disturbances: list[Disturbance]) -> None:
+    """What it takes off more is what 1 takes off, as often as a robot is within the margin of one kind of thing."""
+    settings: dict[str, Any] = {"num_obstacles": 9, "bounds": 0.3, "seed": 1, "disturbances": disturbances}
+    envs = [JointNavigationEnv("random", 8, collision_penalty=penalty, **settings) for penalty in (1.0, 3.0)]
+    batch = NavigationVectorEnv(1, "random", 8, collision_penalty=3.0, **settings)
+    for env in (*envs, batch):
+        env.reset(seed=0)
+    counts = set()
+    for _ in range(30):
+        action = envs[0].action_space.high
+        (_, usual, *_, info), (_, dear, *_) = (env.step(action) for env in envs)
+        kinds = (usual - dear) / 2 * 8
+        assert kinds == pytest.approx(round(kinds), abs=1e-4)
+        violated = sum(agent["margin_violated"] for agent in info["agents"].values())
+        assert violated <= round(kinds) <= 3 * violated
+        counts.add(round(kinds))
+        assert batch.step(action[None])[1][0] == pytest.approx(dear, abs=1e-5)
+    assert len(counts) > 2
+
+
+def test_a_collision_penalty_must_be_positive() -> None:
+    for wrong in (0, -1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="collision_penalty"):
+            navigation_v0.parallel_env("circle", num_robots=2, collision_penalty=wrong)
+        with pytest.raises(ValueError, match="collision_penalty"):
+            line_problem([1.0]).replace(collision_penalty=wrong)
+
+
+def test_another_penalty_is_another_problem() -> None:
+    problem = line_problem([1.0])
+    assert problem.replace(collision_penalty=2.0) != problem == problem.replace(collision_penalty=1.0)

@@ -116,6 +116,7 @@ def problems(draw: st.DrawFn) -> Problem:
         margin=draw(st.floats(0, 10)),
         goal_radius=draw(st.floats(1e-3, 10)),
         goal_speed=draw(st.none() | st.floats(0, 1e6)),
+        collision_penalty=draw(st.floats(1e-3, 1e3)),
         name=draw(st.text(st.characters(exclude_categories=["Cs"]))),
     )
 
@@ -332,7 +333,8 @@ def test_any_text_gives_a_value_error_or_a_problem(text: str | bytes) -> None:
 
 
 WORDS = [
-    *("version", "name", "dt", "horizon", "margin", "goal_radius", "goal_speed", "robots", "world", "scenario"),
+    *("version", "name", "dt", "horizon", "margin", "goal_radius", "goal_speed", "collision_penalty"),
+    *("robots", "world", "scenario"),
     *("model", "start", "goal", "velocity", "heading", "speed", "radius", "max_speed", "max_acceleration"),
     *("bounds", "lower", "upper", "circles", "spheres", "cylinders", "boxes", "center"),
     *("num_robots", "seed", "num_obstacles", "diameter", "size", "jitter"),

@@ -105,7 +105,8 @@ def with_slow_docking(task: SamplingTask) -> SamplingTask:
 
 def harder(task: SamplingTask) -> SamplingTask:
     """Violations cost more, and distances count relative to more than the robots' own."""
-    return replace(task, penalty=3.0, reference_distance=5.0)
+    problem = task.problem.replace(collision_penalty=1.5)
+    return replace(task, problem=problem, penalty=2.0, reference_distance=5.0)
 
 
 TASKS: dict[str, Callable[[], SamplingTask]] = {
@@ -191,7 +192,8 @@ def assert_rewards(task: SamplingTask, controls: np.ndarray, rewards: np.ndarray
     gap, tolerance = rewards - judged.rewards, error * judged.inverse_distance
     if task.credit == "team":
         gap, tolerance = rewards - judged.rewards.mean(axis=0), tolerance.mean(keepdims=True)
-    assert (np.abs(gap[:, clear]) <= (tolerance + 16 * ROUNDOFF * task.penalty)[:, None]).all()
+    penalty = task.penalty * task.problem.collision_penalty
+    assert (np.abs(gap[:, clear]) <= (tolerance + 16 * ROUNDOFF * penalty)[:, None]).all()
 
 
 ENGINES = {"cpu": CPU, "jax": JAX}
