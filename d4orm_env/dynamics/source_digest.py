@@ -1,34 +1,91 @@
-"""What a function of a robot model is made of: its code, and the constants and functions that it names."""
+"""The code that a function is made of: its own, that of all functions that it calls, and the constants they name."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterator
-from types import CodeType, FunctionType
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from types import CellType, CodeType, FunctionType, ModuleType
 from typing import Any
 
+import numpy as np
 
-def pieces(function: Any, seen: frozenset[FunctionType] = frozenset()) -> Iterator[object]:
-    """Source text or bytecode, and the numbers that the code holds or names, through all functions that it calls."""
-    code = function.__code__
-    yield _text(function)
-    yield from _numbers(code)
-    cells = zip(code.co_freevars, (cell.cell_contents for cell in function.__closure__ or ()), strict=True)
-    named = {name: function.__globals__[name] for name in code.co_names if name in function.__globals__} | dict(cells)
-    for name, value in sorted(named.items()):
-        if isinstance(value, FunctionType) and value not in seen:
-            yield from pieces(value, seen | {function})
-        elif isinstance(value, float | int | str | tuple):
-            yield name
-            yield value
+FOREIGN = sys.stdlib_module_names | {"llvmlite", "numba", "numpy"}
+"""Packages whose functions are not looked into; their versions are noted elsewhere."""
 
 
-def _text(function: FunctionType) -> str:
+def source_text(function: FunctionType) -> object:
+    """Source of a function, which stays the same from one version of Python to the next."""
     try:
         return inspect.getsource(function)
     except (OSError, TypeError):  # defined where there is no file
-        return f"{function.__code__.co_code.hex()} {function.__code__.co_names}"
+        return bytecode(function)
 
 
-def _numbers(code: CodeType) -> Iterator[object]:
-    return (value for value in code.co_consts if isinstance(value, float | int | tuple))
+def bytecode(function: FunctionType) -> object:
+    """Code of a function as Python has compiled it, which needs no file."""
+    return [(code.co_code, code.co_names, code.co_varnames, _constants(code)) for code in _codes(function.__code__)]
+
+
+def pieces(function: Any, content: Callable[[FunctionType], object] = source_text) -> Iterator[object]:
+    """Yield the content of a function and of those that it calls, compiled ones too, and the constants that they name.
+
+    The order depends on names only.
+    """
+    seen: set[FunctionType] = set()
+    waiting = [function]
+    while waiting:
+        called = waiting.pop()
+        function = _plain(called)
+        if function is None or function in seen:
+            continue
+        seen.add(function)
+        yield from (content(function), getattr(called, "targetoptions", None), *_constants(function.__code__))
+        for name, value in sorted(_named(function).items()):
+            for part in value if isinstance(value, tuple) else (value,):
+                if isinstance(part, np.ndarray):
+                    yield from (name, part.dtype.str, part.shape, part.tobytes())
+                elif isinstance(part, float | int | str | tuple | np.generic):
+                    yield from (name, part)
+                elif isinstance(part, type):
+                    yield from (name, getattr(part, "_fields", ()))
+                else:
+                    waiting.append(part)
+
+
+def _plain(value: Any) -> FunctionType | None:
+    """The Python function behind one that numba has compiled, or will; ``None`` where there is none to look into."""
+    value = getattr(value, "py_func", getattr(value, "_defn", value))
+    own = isinstance(value, FunctionType) and value.__module__.partition(".")[0] not in FOREIGN
+    return value if own else None
+
+
+def _named(function: FunctionType) -> Mapping[str, Any]:
+    """What the names of a function's code and annotations mean, in modules that it names too."""
+    names = {name for code in _codes(function.__code__) for name in code.co_names}
+    names.update(*(re.findall(r"\w+", str(text)) for text in function.__annotations__.values()))
+    named = {name: function.__globals__[name] for name in names if name in function.__globals__}
+    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
+        if cell != _EMPTY:
+            named[name] = cell.cell_contents
+    for module in [value for value in named.values() if isinstance(value, ModuleType)]:
+        if module.__name__.partition(".")[0] not in FOREIGN:
+            named |= {f"{module.__name__}.{name}": vars(module)[name] for name in names if name in vars(module)}
+    return named
+
+
+_EMPTY = CellType()
+"""Of a name that has no value yet."""
+
+
+def _codes(code: CodeType) -> Iterator[CodeType]:
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _codes(constant)
+
+
+def _constants(code: CodeType) -> list[object]:
+    values = [constant for constant in code.co_consts if not isinstance(constant, CodeType)]
+    return [sorted(map(repr, value)) if isinstance(value, frozenset) else value for value in values]

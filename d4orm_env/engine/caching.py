@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-import inspect
 import os
 import stat
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import partial
+from functools import cached_property, partial
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
-from types import ModuleType
 from typing import Any, ParamSpec, Protocol, TypeVar
 
 import numba
@@ -29,6 +27,7 @@ from numba.core.typing.templates import Signature
 from numba.misc.appdirs import AppDirs
 
 from d4orm_env.core.files import replaced_when_done
+from d4orm_env.dynamics.source_digest import bytecode, pieces
 
 P = ParamSpec("P")
 R_co = TypeVar("R_co", covariant=True)
@@ -48,11 +47,6 @@ class Kernel(Protocol[P, R_co]):
     def signatures(self) -> Sequence[tuple[object, ...]]: ...
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
-
-
-def fingerprint(modules: tuple[ModuleType, ...]) -> str:
-    """SHA-256 over the source text of these modules."""
-    return hashlib.sha256("".join(inspect.getsource(module) for module in modules).encode()).hexdigest()
 
 
 class _Files(IndexDataCacheFile):
@@ -123,16 +117,22 @@ def _is_private(folder: Path) -> bool:
 
 
 class _SourceKeyedCache(FunctionCache):
-    """Kernels by a key of our own: numba notices an edit of the file a kernel is in, but neither of those it calls into
-    nor what functions one kernel of a factory has that another has not.
+    """Kernels by a key of their own: numba notices an edit of the file a kernel is in, but neither of those it calls
+    into nor what functions one kernel of a factory has that another has not.
     """
 
     _impl_class = _Place
 
     def __init__(self, function: Callable[..., object], key: str) -> None:
         super().__init__(function)
-        self._source_key = key
+        self._function, self._key = function, key
         self._cache_file = _Files(self.cache_path, self._impl.filename_base, self._impl.locator.get_source_stamp())
+
+    @cached_property
+    def _source_key(self) -> str:
+        """SHA-256 over all code that the kernel is made of."""
+        content = repr([self._key, *pieces(self._function, bytecode)])
+        return hashlib.sha256(content.encode()).hexdigest()
 
     def _index_key(self, sig: Signature, codegen: JITCPUCodegen) -> tuple[object, ...]:
         return sig, codegen.magic_tuple(), self._source_key
@@ -150,11 +150,12 @@ class _SourceKeyedCache(FunctionCache):
         )
 
 
-def cached_kernel(key: str, variant: str = "", **options: Any) -> Callable[[Callable[P, R_co]], Kernel[P, R_co]]:
-    """Decorator: compile with numba on first call, and keep the result on disk under ``key``.
+def cached_kernel(variant: str = "", key: str = "", **options: Any) -> Callable[[Callable[P, R_co]], Kernel[P, R_co]]:
+    """Decorator: compile with numba on first call, and keep the result on disk until any code that it calls changes.
 
     The kernels of a factory need a ``variant`` each, which names their files: processes that compile two of them at the
-    same time would otherwise write to the same ones, and one might be loaded for the other.
+    same time would otherwise write to the same ones, and one might be loaded for the other. ``key`` is what a kernel
+    depends on besides code.
 
     Where neither the package's folder nor the user's cache folder can be written, kernels are compiled anew in every
     process; set ``NUMBA_CACHE_DIR`` to a folder that can.
@@ -169,7 +170,7 @@ def cached_kernel(key: str, variant: str = "", **options: Any) -> Callable[[Call
         if dispatcher is function:
             raise ImportError("NUMBA_DISABLE_JIT is set, but the kernels run only when compiled; unset it")
         with suppress(RuntimeError):
-            dispatcher._cache = _SourceKeyedCache(function, key)
+            dispatcher._cache = _SourceKeyedCache(function, f"{key} {options}")
         return dispatcher
 
     return decorate

@@ -8,15 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray, IntArray
-from d4orm_env.engine import compiling, noise, sample_noise
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine import noise
+from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.engine.sample_noise import BIT_OPS
 
-_SOURCES = fingerprint((noise, compiling, sample_noise))
 
-
-@cached_kernel(_SOURCES, **OPTIONS)
+@cached_kernel(**OPTIONS)
 def draw_normals(
     keys: NDArray[np.uint32], steps: IntArray, stream: np.uint32, call: np.uint32, out: FloatArray
 ) -> None:
@@ -42,7 +40,7 @@ def draw_normals(
             out[b, 2 * num_pairs] = noise.normal_pair(np.uint32(2 * num_pairs), key, BIT_OPS)[0]
 
 
-@cached_kernel(_SOURCES, **OPTIONS)
+@cached_kernel(**OPTIONS)
 def draw_uniforms(
     keys: NDArray[np.uint32], steps: IntArray, stream: np.uint32, call: np.uint32, out: FloatArray
 ) -> None:

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.engine import observing
-from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
+from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, aligned_zeros, compiled, inlined
 from d4orm_env.engine.observing import ObservationSpec, allocate_sensed, observe
 from d4orm_env.engine.simd import TILE, use_wide_registers
@@ -26,9 +25,6 @@ from d4orm_env.engine.tiles import (
     robot_mover,
 )
 from d4orm_env.engine.world_tiles import judge, load, load_world, store_world
-
-SOURCES = observing.SOURCES + fingerprint((observing,))
-
 
 STEP, RESET, LOOK, SKIP = (np.uint8(order) for order in range(4))
 """What to do with a world: step it, put it back to its start, only observe it, or leave it alone altogether."""
@@ -197,7 +193,7 @@ def advance_worlds_kernel(
     move_robot = robot_mover(names)
     read_motion = motion_reader(names)
 
-    @cached_kernel(models_key(SOURCES, names), variant="_".join(names), **OPTIONS)
+    @cached_kernel(variant="_".join(names), key=models_key(names), **OPTIONS)
     def advance_worlds(
         arrays: ProblemArrays,
         view: ObservationSpec,

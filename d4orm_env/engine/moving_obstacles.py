@@ -5,14 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
-from d4orm_env.engine import compiling
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS
 
-_SOURCES = fingerprint((compiling,))
 
-
-@cached_kernel(_SOURCES, **OPTIONS)
+@cached_kernel(**OPTIONS)
 def meet_bodies(
     states: FloatArray, radius: FloatArray, bodies: FloatArray, margin: np.float32, touched: BoolArray, near: BoolArray
 ) -> None:

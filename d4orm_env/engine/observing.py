@@ -12,9 +12,8 @@ from numba.extending import register_jitable
 from d4orm_env.core import observation
 from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.dynamics import collision, reward, robot_model, transition
-from d4orm_env.engine import world_tiles
-from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
+from d4orm_env.dynamics import transition
+from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import INLINED, ONE, OPTIONS, ZERO, aligned_zeros, compiled, inlined
 from d4orm_env.engine.simd import TILE
 from d4orm_env.engine.stepping import models_key
@@ -24,8 +23,6 @@ from d4orm_env.engine.world_tiles import WorldArrays, load
 
 if TYPE_CHECKING:
     from d4orm_env.engine.episodes import WorldBatch
-
-SOURCES = fingerprint((robot_model, transition, collision, reward, observation, *world_tiles.PARTS, world_tiles))
 
 
 for _function in (
@@ -130,7 +127,7 @@ def observe_worlds_kernel(
     """
     read_motion = motion_reader(names)
 
-    @cached_kernel(models_key(SOURCES, names), variant="_".join(names), **OPTIONS)
+    @cached_kernel(variant="_".join(names), key=models_key(names), **OPTIONS)
     def observe_worlds(
         arrays: ProblemArrays, sight: ObservationInputs, view: ObservationSpec, tile_range: IntArray, out: FloatArray
     ) -> None:

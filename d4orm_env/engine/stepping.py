@@ -7,7 +7,6 @@ from typing import TypeAlias
 
 import numpy as np
 
-from d4orm_env.core import winding
 from d4orm_env.core.winding import Unwinding, unwinding
 from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import COMMON, MODEL_CODES, MODELS, model_digest
@@ -22,15 +21,9 @@ from d4orm_env.dynamics.robot_model import (
     Vector,
     runge_kutta,
 )
-from d4orm_env.engine import compiling, elementary
-from d4orm_env.engine import simd as lanes
-from d4orm_env.engine import tile_layout as rows
 from d4orm_env.engine.compiling import ZERO, inlined
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.tile_layout import PICK, SQUARED_GAP, SQUARED_NORM, Row
-
-PARTS = (winding, lanes, compiling, elementary, rows)
-"""Modules that steps are made of, for fingerprints."""
 
 Docking: TypeAlias = tuple[np.float32, np.float32, np.bool_]
 """Squares of the goal radius and of the goal speed, and whether who has arrived stands there for ever."""
@@ -51,9 +44,9 @@ def models_of_kernel(models: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(sorted(different, key=MODEL_CODES.__getitem__))
 
 
-def models_key(sources: str, names: tuple[str, ...]) -> str:
-    """Key in the cache of a kernel made of these sources and models: the codes are in the kernel too."""
-    return f"{sources} {[(name, MODEL_CODES[name], model_digest(MODELS[name])) for name in names]}"
+def models_key(names: tuple[str, ...]) -> str:
+    """Key in the cache of a kernel for these models: the codes are in the kernel too."""
+    return repr([(name, MODEL_CODES[name], model_digest(MODELS[name])) for name in names])
 
 
 def _in_scalar_style(function: ModelFunction) -> ModelFunction:

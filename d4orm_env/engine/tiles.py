@@ -21,16 +21,11 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import MODEL_CODES, MODELS
 from d4orm_env.dynamics.robot_model import Model, TimeStep
-from d4orm_env.engine import stepping
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS, cosine, sine
 from d4orm_env.engine.simd import TILE, at_most, use_wide_registers, within_2, within_3
 from d4orm_env.engine.stepping import Docking, dispatch, make_stepper
 from d4orm_env.engine.tile_layout import PICK, READ, WRITE, read2, read3, squared_gap2, squared_gap3
-
-PARTS = (*stepping.PARTS, stepping)
-"""Modules that tiles are made of, for fingerprints."""
-
 
 # First rows of a robot in the workspace. A power of two in all would map the same row of every robot to the same cache
 # set.

@@ -47,7 +47,7 @@ class StepResult(NamedTuple):
         return self._replace(
             collided=self.collided | touched,
             margin_violated=self.margin_violated | near,
-            rewards=self.rewards - penalty * near,
+            rewards=self.rewards - penalty * near.astype(np.float32),
         )
 
 

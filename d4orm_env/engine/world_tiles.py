@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from d4orm_env.core.arrays import BoolArray, FloatArray, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import reward
-from d4orm_env.engine import obstacles, tiles
+from d4orm_env.engine import obstacles
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
 from d4orm_env.engine.simd import NOWHERE, TILE
 from d4orm_env.engine.tiles import (
@@ -30,9 +30,6 @@ from d4orm_env.engine.types import ObservationInputs
 
 if TYPE_CHECKING:
     from d4orm_env.engine.episodes import WorldBatch
-
-PARTS = (*tiles.PARTS, tiles, obstacles)
-"""Modules that these are made of, for fingerprints."""
 
 
 class WorldArrays(NamedTuple):

@@ -18,7 +18,7 @@ from d4orm_env.dynamics.models import COMMON, names_of_codes
 from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, aligned_zeros
 from d4orm_env.engine.episodes import WorldBatch, advance_worlds_kernel
-from d4orm_env.engine.observing import SOURCES, ObservationSpec, observe_worlds_kernel
+from d4orm_env.engine.observing import ObservationSpec, observe_worlds_kernel
 from d4orm_env.engine.simd import TILE, use_wide_registers
 from d4orm_env.engine.stepping import models_key, models_of_kernel
 from d4orm_env.engine.tiles import STRIDE, measure_goal_distance, robot_mover
@@ -35,7 +35,7 @@ def roll_out_kernel(names: tuple[str, ...]) -> Kernel[[ProblemArrays, WorldArray
     """
     move_robot = robot_mover(names)
 
-    @cached_kernel(models_key(SOURCES, names), variant="_".join(names), **OPTIONS)
+    @cached_kernel(variant="_".join(names), key=models_key(names), **OPTIONS)
     def roll_out(arrays: ProblemArrays, moments: WorldArrays) -> None:
         use_wide_registers()
         num_robots, dimension = arrays.goal.shape

@@ -22,11 +22,8 @@ import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Ints, Whole
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine import compiling
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
-
-SOURCES = fingerprint((compiling,))
 
 _HALVINGS = 6
 """Of the angle by which a blocked line is turned, and of the length by which a corner is cut."""
@@ -391,7 +388,7 @@ def _settled(space: Space, lattice: Lattice, reach: float, place: Place) -> tupl
     return (x, y, z), clearance > reach
 
 
-@cached_kernel(SOURCES, variant="settle", **OPTIONS)
+@cached_kernel(variant="settle", **OPTIONS)
 def settle_nodes(space: Space, lattice: Lattice, reach: float) -> int:
     """Find the points of a lattice where a body of this reach fits, if that is less than half a step away.
 
@@ -512,7 +509,7 @@ def _add_anchor(points: Floats, values: Floats, parents: Ints, number: int, plac
     parents[number] = parent
 
 
-@cached_kernel(SOURCES, variant="wave", **OPTIONS)
+@cached_kernel(variant="wave", **OPTIONS)
 def _spread(
     space: Space, lattice: Lattice, reach: float, goal: Floats, nodes: _Nodes
 ) -> tuple[Floats, Floats, Ints, float]:
@@ -670,7 +667,7 @@ def _look_from(space: Space, fields: Fields, robot: int, q: Place) -> tuple[Plac
     return target, length, anchor
 
 
-@cached_kernel(SOURCES, variant="look", **OPTIONS)
+@cached_kernel(variant="look", **OPTIONS)
 def look(
     space: Space, fields: Fields, first: int, places: Floats, target: Floats, length: Floats, anchor: Ints
 ) -> None:
@@ -702,7 +699,7 @@ def is_free_line(space: Space, reach: float, tail: Floats, head: Floats) -> bool
     return _sees(space, reach, p, clearance_at(space, p[0], p[1], p[2]), q, clearance_at(space, q[0], q[1], q[2]))
 
 
-@cached_kernel(SOURCES, variant="lines", **OPTIONS)
+@cached_kernel(variant="lines", **OPTIONS)
 def free_lines(space: Space, reach: float, tails: Floats, heads: Floats, free: BoolArray) -> None:
     """:func:`is_free_line` of many, from ``tails`` ``(Q, 3)`` to ``heads`` ``(Q, 3)``; ``free`` ``(Q,)`` is output."""
     for b in range(tails.shape[0]):

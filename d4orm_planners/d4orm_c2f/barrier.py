@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
-from d4orm_env.engine import compiling
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.envs.joint_state import JointState
 
@@ -138,7 +137,7 @@ def _near(problem: Problem) -> float:
     return NEAR * problem.team.largest_radius + STOPS * float((speed**2 / (2 * acceleration)).max())
 
 
-@cached_kernel(fingerprint((compiling,)), variant="nearest", **OPTIONS)
+@cached_kernel(variant="nearest", **OPTIONS)
 def find_nearest(one: Any, other: Any, normals: Any, least: Any, velocities: Any, exact: float) -> Any:
     """Move ``velocities`` ``(K, d)`` to the nearest that keep to all barriers; whether any were found.
 

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from d4orm_env.core.arrays import FloatArray, IntArray
-from d4orm_env.engine import compiling, noise, simd
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, ZERO, aligned_zeros, compiled
 from d4orm_env.engine.noise import DRAWS
 from d4orm_env.engine.simd import add_turned, add_turned_squares, use_wide_registers
-
-SOURCES = fingerprint((noise, simd, compiling))
 
 
 @compiled
@@ -29,7 +26,7 @@ def _sum_lanes(sums: FloatArray, time_range: IntArray, k: int, moment: FloatArra
             moment[t, k, i] = sums[begin]
 
 
-@cached_kernel(SOURCES, **OPTIONS)
+@cached_kernel(**OPTIONS)
 def average_noise(
     kept: FloatArray,
     odd: FloatArray,
@@ -72,7 +69,7 @@ def average_noise(
             _sum_lanes(squares, time_range, k, second_moment)
 
 
-@cached_kernel(SOURCES, **OPTIONS)
+@cached_kernel(**OPTIONS)
 def project_noise(kept: FloatArray, centre: FloatArray, along: FloatArray, across: FloatArray) -> None:
     """Inner products of every draw with a direction, and with that direction turned by 90 degrees.
 

@@ -14,14 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import FloatArray, IntArray, Ints, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.dynamics import collision
-from d4orm_env.engine import compiling, elementary, obstacles, simd
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
 from d4orm_env.engine.obstacles import is_closed, touches_static
 from d4orm_env.engine.threads import Threads, available_cores
-
-SOURCES = fingerprint((collision, simd, compiling, elementary, obstacles))
 
 BLOCK = 8
 """Steps in a block."""
@@ -220,14 +216,14 @@ def _unlink(table: PathTable, block: Whole, robot: Whole) -> None:
     following[other] = following[robot]
 
 
-@cached_kernel(SOURCES, **OPTIONS)
+@cached_kernel(**OPTIONS)
 def _link_all(table: PathTable) -> None:
     for block in range(table.first.shape[0]):
         for robot in range(table.places.shape[1]):
             _link(table, block, robot)
 
 
-@cached_kernel(SOURCES, **OPTIONS)
+@cached_kernel(**OPTIONS)
 def _move(table: PathTable, robots: IntArray, paths: FloatArray) -> None:
     for i in range(robots.shape[0]):
         for t in range(paths.shape[0]):
@@ -312,7 +308,7 @@ def count_near(table: PathTable, robot: Whole, without: IntArray, path: FloatArr
     return count
 
 
-@cached_kernel(SOURCES, **OPTIONS)
+@cached_kernel(**OPTIONS)
 def _pairs(table: PathTable, block_range: IntArray) -> IntArray:
     """Pairs that are near in a range of blocks, each as one number; some of them more than once."""
     num_robots = table.places.shape[1]
@@ -339,7 +335,7 @@ def _pairs(table: PathTable, block_range: IntArray) -> IntArray:
     return found[:count]
 
 
-@cached_kernel(SOURCES, **OPTIONS)
+@cached_kernel(**OPTIONS)
 def _count_meetings(
     table: PathTable,
     robots: IntArray,
@@ -380,7 +376,7 @@ def _count_meetings(
                                 other = table.following[block, other]
 
 
-@cached_kernel(SOURCES, **OPTIONS)
+@cached_kernel(**OPTIONS)
 def _judge_alone(arrays: ProblemArrays, robots: IntArray, ways: FloatArray, robot_range: IntArray, steps: Ints) -> None:
     """See :func:`judge_alone`."""
     dimension, closed, never = arrays.goal.shape[1], is_closed(arrays), ways.shape[2]

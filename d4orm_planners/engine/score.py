@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.dynamics import collision, reward, robot_model, transition
+from d4orm_env.dynamics import reward, transition
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import TimeStep
-from d4orm_env.engine import noise, obstacles, sample_noise, tiles
-from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
+from d4orm_env.engine import obstacles
+from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, aligned_zeros, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.noise import DRAWS
@@ -30,12 +30,7 @@ from d4orm_env.engine.sample_noise import TURN, VECTOR, Drawing, draw_block, fil
 from d4orm_env.engine.simd import BLOCK, NOWHERE, TILE, subtract_where, use_wide_registers
 from d4orm_env.engine.stepping import Docking, dispatch, make_stepper, models_key, models_of_kernel
 from d4orm_env.engine.tile_layout import READ, WRITE, Row
-from d4orm_planners.engine import proximity
 from d4orm_planners.engine.proximity import Bodies, Scratch, enclose, make_scratch, mark_robots, near_static, place_of
-
-SOURCES = fingerprint(
-    (robot_model, transition, collision, reward, noise, sample_noise, obstacles, *tiles.PARTS, tiles, proximity)
-)
 
 # First rows of a robot in the workspace: see tiles, which has others because it keeps more of a robot.
 STATE, DOCKED, TOTAL, ROWS = 0, 6, 7, 9
@@ -287,7 +282,7 @@ def score_kernel(models: tuple[str, ...]) -> Score:
 def _score_kernel(models: tuple[str, ...]) -> Score:
     run_robot = dispatch({name: _runner(name) for name in models})
 
-    @cached_kernel(models_key(SOURCES, models), variant="_".join(models), **OPTIONS)
+    @cached_kernel(variant="_".join(models), key=models_key(models), **OPTIONS)
     def score_tiles(
         arrays: ProblemArrays,
         scoring: Scoring,

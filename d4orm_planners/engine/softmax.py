@@ -9,8 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.engine import compiling
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, compiled
 
 LANES = 16
@@ -105,7 +104,7 @@ def _weigh(
         row[i] *= share
 
 
-@cached_kernel(fingerprint((compiling,)), **OPTIONS)
+@cached_kernel(**OPTIONS)
 def _softmax(
     rewards: FloatArray, log_ratio: FloatArray, temperature: np.float32, cutoff: np.float32, weights: FloatArray
 ) -> None:

@@ -15,20 +15,16 @@ from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.dynamics import collision, robot_model, transition
+from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import SPEED, TimeStep
-from d4orm_env.engine import obstacles, stepping
-from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
+from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.obstacles import is_closed, touches_static
 from d4orm_env.engine.stepping import make_stepper, models_key
 from d4orm_env.engine.tile_layout import Row
-from d4orm_planners.engine import path_index
 from d4orm_planners.engine.path_index import PathTable, count_near, is_unsure, steps_of
-
-SOURCES = fingerprint((robot_model, transition, collision, obstacles, *stepping.PARTS, stepping, path_index))
 
 _FAR = np.float32(10)
 """How far ahead a robot that turns off looks, in seconds at full speed."""
@@ -246,7 +242,7 @@ def search_kernel(name: str) -> Search:
         velocity = slowed(approach(state, aim, limits, h, OPS), pace)
         return limit_control(track(state, velocity, limits, h, OPS), limits, OPS)
 
-    @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
+    @cached_kernel(variant=name, key=models_key((name,)), **OPTIONS)
     def search(
         arrays: ProblemArrays, table: PathTable, moves: Moves, rules: BeamRules, seekers: Queries, part: IntArray,
         u: FloatArray, x: FloatArray, found: BoolArray,

@@ -7,11 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core.arrays import Floats, IntArray, Ints, Whole
-from d4orm_env.engine import compiling
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
-
-SOURCES = fingerprint((compiling,))
 
 
 class Cells(NamedTuple):
@@ -85,7 +82,7 @@ def squared_gap(points: Floats, u: Whole, tails: Floats, v: Whole, heads: Floats
     return dx * dx + dy * dy + dz * dz
 
 
-@cached_kernel(SOURCES, variant="near", **OPTIONS)
+@cached_kernel(variant="near", **OPTIONS)
 def near_lines(
     cells: Cells, tails: Floats, heads: Floats, reach: float, first: IntArray, items: Ints, after: bool
 ) -> int:

@@ -15,13 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Ints, Whole
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
-from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.near_neighbours import squared_gap
 from d4orm_planners.mapf.roadmap import Roadmap
-
-SOURCES = fingerprint((near_neighbours,))
 
 FREE, MOVING, DONE = 0, 1, 2
 """Robots that have not moved yet in a step; that are about to, once others have made way; that have, or stay."""
@@ -134,7 +131,7 @@ def closed(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, tail: W
     return False
 
 
-@cached_kernel(SOURCES, variant="costs", **OPTIONS)
+@cached_kernel(variant="costs", **OPTIONS)
 def fill_costs(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, end: Whole, costs: FloatArray) -> None:
     """Length of a robot's shortest way from every node to one; ``costs`` ``(N,)`` is output."""
     costs[:] = np.inf
@@ -153,7 +150,7 @@ def fill_costs(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, end
                 heapq.heappush(heap, (np.float64(through), head))
 
 
-@cached_kernel(SOURCES, variant="open", **OPTIONS)
+@cached_kernel(variant="open", **OPTIONS)
 def is_open(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, at: Whole, costs: FloatArray) -> bool:
     """Whether nobody who has docked closes the way that a robot at a node would take by these costs."""
     if not costs[at] < np.inf:
@@ -309,7 +306,7 @@ def _move(
     return count
 
 
-@cached_kernel(SOURCES, variant="step", **OPTIONS)
+@cached_kernel(variant="step", **OPTIONS)
 def step_team(
     roadmap: Roadmap,
     bodies: Footprints,

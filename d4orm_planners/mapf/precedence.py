@@ -15,14 +15,11 @@ import numpy as np
 
 from d4orm_env.core.arrays import Floats, IntArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS
-from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.near_neighbours import Cells, cells_about, sort_into_cells
 from d4orm_planners.mapf.roadmap import Roadmap
 from d4orm_planners.tracking.routes import Corners, Route, Routes
-
-SOURCES = fingerprint((near_neighbours,))
 
 SPACING = 4 / 15
 """Distance between the points of a route, at most, in radii of the largest robot, as all lengths below."""
@@ -191,7 +188,7 @@ def _find_waits(cells: Cells, first: IntArray, times: Floats, radius: Floats, ap
         room = count
 
 
-@cached_kernel(SOURCES, variant="waits", **OPTIONS)
+@cached_kernel(variant="waits", **OPTIONS)
 def find_waits(
     cells: Cells,
     first: IntArray,

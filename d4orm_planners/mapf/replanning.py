@@ -9,17 +9,14 @@ import numpy as np
 from numba.extending import register_jitable
 
 from d4orm_env.core.arrays import Floats, IntArray, Whole
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
-from d4orm_env.paths import wavefront
 from d4orm_env.paths.wavefront import Space, is_free_line
-from d4orm_planners.mapf import near_neighbours, pibt, safe_intervals
+from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.near_neighbours import Cells
 from d4orm_planners.mapf.pibt import Footprints
 from d4orm_planners.mapf.roadmap import Roadmap
 from d4orm_planners.mapf.safe_intervals import Others, find_visits, free_intervals, interval_at
-
-SOURCES = fingerprint((near_neighbours, pibt, safe_intervals, wavefront))
 
 BLOCK = 16
 """Steps for which it is known at once whether somebody is about."""
@@ -91,7 +88,7 @@ def _is_line_clear(others: Others, k: Whole, tail: Floats, head: Floats, depart:
     return True
 
 
-@cached_kernel(SOURCES, variant="straighten", **OPTIONS)
+@cached_kernel(variant="straighten", **OPTIONS)
 def straighten(
     roadmap: Roadmap, bodies: Footprints, space: Space | None, others: Others, k: Whole, reach: float, way: IntArray
 ) -> int:
@@ -130,7 +127,7 @@ def straighten(
     return count
 
 
-@cached_kernel(SOURCES, variant="touches", **OPTIONS)
+@cached_kernel(variant="touches", **OPTIONS)
 def touches(others: Others, k: Whole, places: Floats) -> bool:
     """Whether a robot at places ``(T + 1, 3)`` comes nearer to any other than it may, after the start."""
     for step in range(1, places.shape[0]):
@@ -169,7 +166,7 @@ def _followed_back(path: IntArray, entry: Whole) -> IntArray:
     return found
 
 
-@cached_kernel(SOURCES, variant="way", **OPTIONS)
+@cached_kernel(variant="way", **OPTIONS)
 def find_way(roadmap: Roadmap, cells: Cells, bodies: Footprints, others: Others, k: Whole, trip: Trip) -> IntArray:
     """The soonest way of a robot to its goal among all others: safe interval path planning.
 

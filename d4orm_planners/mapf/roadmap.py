@@ -8,14 +8,12 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Ints
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.paths.shortest_paths import in_space, lay_lattice
 from d4orm_env.paths.wavefront import Space, free_lines, make_space
 from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.near_neighbours import find_near, sort_into_cells
-
-SOURCES = fingerprint((near_neighbours,))
 
 PAIR_SLACK = 0.4
 """Distance that robots keep from each other beyond radii and margin, in radii: what they stray from their ways."""
@@ -126,7 +124,7 @@ def _room(problem: Problem, space: Space | None, reaches: Floats, tails: Floats,
     return room
 
 
-@cached_kernel(SOURCES, variant="gaps", **OPTIONS)
+@cached_kernel(variant="gaps", **OPTIONS)
 def measure_gaps(
     nodes: Floats, tails: IntArray, heads: IntArray, near_first: IntArray, near: Ints, gaps: Floats
 ) -> None:

@@ -13,18 +13,14 @@ import numpy as np
 
 from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, Floats, IntArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.dynamics import robot_model, transition
+from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE
-from d4orm_env.engine import stepping
-from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
+from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, ZERO, to_fixed_tuple
 from d4orm_env.engine.stepping import make_stepper, models_key
-from d4orm_planners.tracking import pursuit
 from d4orm_planners.tracking.pursuit import lookaheads, point_ahead, point_reached, square_to, steering
 from d4orm_planners.tracking.routes import Routes
-
-SOURCES = fingerprint((robot_model, transition, *stepping.PARTS, stepping, pursuit))
 
 BRAKING = 0.5
 """Share of its acceleration that a robot counts on before corners and in them."""
@@ -85,7 +81,7 @@ Drive: TypeAlias = Kernel[[Part, Progress, FloatArray, BoolArray, FloatArray], N
 """A kernel of :func:`drive_kernel`."""
 
 
-@cached_kernel(SOURCES, variant="direct", **OPTIONS)
+@cached_kernel(variant="direct", **OPTIONS)
 def direct(
     routes: Routes,
     paces: Floats,
@@ -133,7 +129,7 @@ def direct(
         progress.pace[k] = paces[i]
 
 
-@cached_kernel(SOURCES, variant="paces", **OPTIONS)
+@cached_kernel(variant="paces", **OPTIONS)
 def fill_paces(arcs: Floats, dt: float, corner: Floats, speed: float, braking: float, paces: Floats) -> None:
     """How fast every point of a route may be passed.
 
@@ -165,7 +161,7 @@ def drive_kernel(name: str) -> Drive:
     (move, dock), steer = make_stepper(robot), steering(name)
     n, m, d, num_limits = robot.state_size, robot.control_size, robot.dimension, len(robot.limit_names)
 
-    @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
+    @cached_kernel(variant=name, key=models_key((name,)), **OPTIONS)
     def drive(part: Part, progress: Progress, states: FloatArray, docked: BoolArray, controls: FloatArray) -> None:
         h = transition.TimeStep(part.time_step[0], part.time_step[1], part.time_step[2], part.time_step[3])
         docks, rules = part.docks, (part.docking[0], part.docking[1], part.docks)

@@ -10,16 +10,13 @@ from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.dynamics import robot_model, transition
+from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import MODELS
-from d4orm_env.engine import stepping
-from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
+from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.stepping import make_stepper, models_key
 from d4orm_env.engine.tile_layout import SQUARED_GAP
-
-SOURCES = fingerprint((robot_model, transition, *stepping.PARTS, stepping))
 
 
 class DriveRules(NamedTuple):
@@ -98,7 +95,7 @@ def drive_kernel(name: str) -> Kernel[[DriveRules, DriveOutputs, IntArray, Float
     limit_control, squared_gap = inlined(robot.functions.limit_control), SQUARED_GAP[robot.dimension]
     n, m, d, num_limits = robot.state_size, robot.control_size, robot.dimension, len(robot.limit_names)
 
-    @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
+    @cached_kernel(variant=name, key=models_key((name,)), **OPTIONS)
     def drive(
         rules: DriveRules, ways: DriveOutputs, robots: IntArray, u: FloatArray, x: FloatArray, arrived: BoolArray
     ) -> None:

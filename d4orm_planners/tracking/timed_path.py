@@ -11,7 +11,7 @@ from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import MODELS
-from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
+from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, ZERO, inlined, to_fixed_tuple
 from d4orm_env.engine.stepping import make_stepper, models_key
 from d4orm_planners.tracking import path_drives, pursuit
@@ -19,8 +19,6 @@ from d4orm_planners.tracking.path_drives import RESERVE
 from d4orm_planners.tracking.pursuit import point_ahead, point_reached, square_to, steering
 from d4orm_planners.tracking.routes import Corners, Route
 from d4orm_planners.tracking.straight_drives import RobotSpec
-
-SOURCES = path_drives.SOURCES + fingerprint((path_drives,))
 
 HURRYING = 0.85
 """Share of its acceleration that a robot counts on that hurries: if it leaves its route so, it drives by the clock."""
@@ -93,7 +91,7 @@ def timed_kernel(name: str) -> Kernel[[RobotSpec, Timed, bool, FloatArray, Float
     (move, dock), steer = make_stepper(model), steering(name)
     n, m, d, num_limits = model.state_size, model.control_size, model.dimension, len(model.limit_names)
 
-    @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
+    @cached_kernel(variant=name, key=models_key((name,)), **OPTIONS)
     def drive(robot: RobotSpec, route: Timed, backs_up: bool, controls: FloatArray, places: Floats) -> int:
         dt, docks, rules = robot.time_step, robot.docks, (robot.docking[0], robot.docking[1], robot.docks)
         h, own = transition.TimeStep(dt[0], dt[1], dt[2], dt[3]), to_fixed_tuple(robot.limits, num_limits)

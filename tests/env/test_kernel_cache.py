@@ -5,23 +5,56 @@ from __future__ import annotations
 import errno
 import importlib.util
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
 from numba.core import config
 
-from d4orm_env.engine import threads, tiles
-from d4orm_env.engine.caching import fingerprint, has_to_be_compiled
+from d4orm_env.engine.caching import has_to_be_compiled
 
 KERNEL = """
 from os import environ
 from d4orm_env.engine.caching import cached_kernel
 
-@cached_kernel(environ["KERNEL_KEY"])
+@cached_kernel(key=environ["KERNEL_KEY"])
 def twice(x):
     return 2 * x
+"""
+
+CALLER = """
+import parts
+from parts import Pair, double
+from d4orm_env.engine.caching import cached_kernel
+
+@cached_kernel()
+def twice(x):
+    return double(Pair(x, 0).first) + parts.nothing(x)
+"""
+
+PARTS = """
+import numpy as np
+from typing import NamedTuple
+from numba import njit
+
+FACTOR = np.int64(2)
+
+class Pair(NamedTuple):
+    first: int
+    second: int
+
+@njit
+def double(x):
+    return FACTOR * x
+
+@njit
+def nothing(x):
+    def inner():
+        return x * 0
+    return inner()
 """
 
 
@@ -69,7 +102,29 @@ class TestKernelCache:
         spec.loader.exec_module(module)
         return module
 
-    def test_kernels_come_from_disk_until_the_sources_they_call_change(self, path: Path) -> None:
+    @pytest.mark.parametrize(
+        ("before", "after"),
+        [
+            ("np.int64(2)", "np.int64(1 + 1) * np.int64(1)"), ("np.int64(2)", "np.float64(2)"),
+            ("FACTOR * x", "x * FACTOR"), ("x * 0", "0 * x"), ("second: int", "other: int"),
+            ("@njit\ndef double", "@njit(error_model='numpy')\ndef double"),
+        ],
+    )  # fmt: skip
+    def test_kernels_come_from_disk_until_code_they_call_changes(
+        self, path: Path, monkeypatch: pytest.MonkeyPatch, before: str, after: str
+    ) -> None:
+        monkeypatch.syspath_prepend(path.parent)
+        path.write_text(CALLER)
+        hits = []
+        for text in (PARTS, PARTS, PARTS.replace(before, after), PARTS):
+            monkeypatch.delitem(sys.modules, "parts", raising=False)
+            monkeypatch.setitem(sys.modules, "parts", ModuleType("parts"))
+            exec(text, vars(sys.modules["parts"]))
+            hits.append(self.hits(path))
+        # The same value by another expression is the same kernel.
+        assert hits == [0, 1, int(after.startswith("np.int64")), 1]
+
+    def test_kernels_come_from_disk_until_their_key_changes(self, path: Path) -> None:
         assert self.hits(path, "one version") == 0
         assert self.hits(path, "one version") == 1
         assert self.hits(path, "another version") == 0
@@ -144,7 +199,3 @@ class TestKernelCache:
         monkeypatch.setattr(config, "DISABLE_JIT", 1)
         with pytest.raises(ImportError, match="NUMBA_DISABLE_JIT is set"):
             self.hits(path)
-
-    def test_fingerprints_follow_the_source(self) -> None:
-        assert fingerprint((tiles, threads)) == fingerprint((tiles, threads))
-        assert len({fingerprint(modules) for modules in ((tiles,), (threads,), (tiles, threads))}) == 3

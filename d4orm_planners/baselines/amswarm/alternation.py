@@ -15,8 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, Floats, Whole
-from d4orm_env.engine import compiling
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
 
 MOST_PENALTY = 5e7
@@ -88,7 +87,7 @@ class Targets(NamedTuple):
     acceleration: Floats
 
 
-@cached_kernel(fingerprint((compiling,)), **OPTIONS)
+@cached_kernel(**OPTIONS)
 def alternate(
     method: Method,
     bodies: Neighbourhood,

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from d4orm_env.core.arrays import Floats, IntArray, Whole
-from d4orm_env.engine import compiling
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS
 
 
-@cached_kernel(fingerprint((compiling,)), variant="count", **OPTIONS)
+@cached_kernel(variant="count", **OPTIONS)
 def count_conflicts(places: Floats, others: Floats, distances: Floats, counts: IntArray) -> None:
     """Fill ``counts`` ``(B, 2)`` int64 with how many others each of some ways conflicts with, and at how many steps.
 
@@ -36,7 +35,7 @@ def count_conflicts(places: Floats, others: Floats, distances: Floats, counts: I
                 counts[b, 1] += steps
 
 
-@cached_kernel(fingerprint((compiling,)), variant="first", **OPTIONS)
+@cached_kernel(variant="first", **OPTIONS)
 def first_conflict(places: Floats, distances: Floats) -> tuple[Whole, Whole, Whole, Whole]:
     """``(pairs, step, robot, robot)``: how many pairs conflict, and the earliest conflict; robots are -1 if none does.
 

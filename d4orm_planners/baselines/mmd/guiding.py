@@ -13,12 +13,9 @@ import numpy as np
 from numba.extending import register_jitable
 
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
-from d4orm_env.engine import compiling
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
-from d4orm_env.paths import wavefront
 from d4orm_env.paths.wavefront import Space, clearance_at
-from d4orm_planners.baselines.mmd import clock, way_frame
 from d4orm_planners.baselines.mmd.clock import fill_clock
 from d4orm_planners.baselines.mmd.way_frame import WayFrame, locate, trace
 
@@ -69,7 +66,7 @@ def _point_variance(sines: Floats, deviation: Floats) -> Floats:
     return variance
 
 
-@cached_kernel(fingerprint((compiling, wavefront, clock, way_frame)), variant="guide", **OPTIONS)
+@cached_kernel(variant="guide", **OPTIONS)
 def guide(
     frame: WayFrame,
     sines: Floats,

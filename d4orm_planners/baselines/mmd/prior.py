@@ -14,8 +14,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.portable import cos
-from d4orm_env.engine import compiling
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS
 from d4orm_planners.baselines.mmd.way_frame import FEATURES, MODES
 
@@ -108,7 +107,7 @@ def posterior(now: float, then: float) -> tuple[float, float, float]:
     return float(of_clean), float(of_noisy), float(np.sqrt((1 - then) / (1 - now) * (1 - ratio)))
 
 
-@cached_kernel(fingerprint((compiling,)), variant="condition", **OPTIONS)
+@cached_kernel(variant="condition", **OPTIONS)
 def condition(prior: Prior, features: FloatArray, context: FloatArray) -> None:
     """Fill ``context`` ``(P, W)`` with what features ``(P, FEATURES)`` add to the first layer, its bias included."""
     for p in range(features.shape[0]):
@@ -119,7 +118,7 @@ def condition(prior: Prior, features: FloatArray, context: FloatArray) -> None:
                 context[p, j] += value * prior.context[i, j]
 
 
-@cached_kernel(fingerprint((compiling,)), variant="predict", **OPTIONS)
+@cached_kernel(variant="predict", **OPTIONS)
 def predict(
     prior: Prior, context: FloatArray, level: FloatArray, signal: FloatArray, noisy: FloatArray, clean: FloatArray
 ) -> None:

@@ -9,21 +9,16 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.dynamics import robot_model, transition
+from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import MODELS
-from d4orm_env.engine import stepping
-from d4orm_env.engine.caching import Kernel, cached_kernel, fingerprint
+from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.stepping import make_stepper, models_key
-from d4orm_env.paths import wavefront
 from d4orm_env.paths.wavefront import Space, clearance_at
-from d4orm_planners.baselines.mmd import clock, way_frame
 from d4orm_planners.baselines.mmd.clock import fill_clock
 from d4orm_planners.baselines.mmd.way_frame import WayFrame, trace
 from d4orm_planners.tracking.straight_drives import RobotSpec
-
-SOURCES = fingerprint((robot_model, transition, *stepping.PARTS, stepping, wavefront, clock, way_frame))
 
 GAIN = np.float32(1.5)
 """Share of its distance from the motion that a robot makes up for in a second [1/s]."""
@@ -68,7 +63,7 @@ def tracking_kernel(
     limit_control = inlined(model.functions.limit_control)
     n, m, d, num_limits = model.state_size, model.control_size, model.dimension, len(model.limit_names)
 
-    @cached_kernel(models_key(SOURCES, (name,)), variant=name, **OPTIONS)
+    @cached_kernel(variant=name, key=models_key((name,)), **OPTIONS)
     def drive(
         robot: RobotSpec,
         frame: WayFrame,

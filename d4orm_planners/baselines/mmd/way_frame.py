@@ -15,13 +15,9 @@ from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.portable import sin
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
-from d4orm_env.engine import compiling
-from d4orm_env.engine.caching import cached_kernel, fingerprint
+from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
-from d4orm_env.paths import wavefront
 from d4orm_env.paths.wavefront import Space, clearance_at, make_space
-
-SOURCES = fingerprint((compiling, wavefront))
 
 POINTS = 64
 """Stretches of equal time that a motion is cut into, as in the publication."""
@@ -155,7 +151,7 @@ def _unit(vector: Floats, otherwise: Floats, scale: float = 1.0) -> Floats:
     return vector / length if length > 1e-6 * scale else otherwise
 
 
-@cached_kernel(SOURCES, variant="resample", **OPTIONS)
+@cached_kernel(variant="resample", **OPTIONS)
 def resample(way: Floats, reference: Floats) -> float:
     """Fill ``reference`` ``(N + 1, 3)`` with places equally far apart on the way ``(w, 3)``; its length."""
     last = reference.shape[0] - 1
@@ -176,7 +172,7 @@ def resample(way: Floats, reference: Floats) -> float:
     return total
 
 
-@cached_kernel(SOURCES, variant="tangents", **OPTIONS)
+@cached_kernel(variant="tangents", **OPTIONS)
 def round_tangents(reference: Floats, tangents: Floats) -> None:
     """Fill ``tangents`` ``(N + 1, 3)`` with the mean direction of the way about each point."""
     last = reference.shape[0] - 1
@@ -243,7 +239,7 @@ def _gap(way: Floats, corner: int) -> float:
     return np.sqrt(dx * dx + dy * dy + dz * dz)
 
 
-@cached_kernel(SOURCES, variant="describe", **OPTIONS)
+@cached_kernel(variant="describe", **OPTIONS)
 def describe(
     space: Space, reference: Floats, along: Floats, across: Floats, length: float, reach: float, features: FloatArray
 ) -> None:
