@@ -195,6 +195,13 @@ class SolveRun:
             wall_time=self.watch.elapsed,
             history=tuple(self.history),
             trajectory=self.best.trajectory,
-            metrics=trajectory_metrics(self.problem, self.best.trajectory) | self.metrics,
+            metrics=trajectory_metrics(self.problem, self.best.trajectory) | self._denoising() | self.metrics,
             provenance=Provenance.here(self.planner.preset, self.planner.config.keywords()),
         )
+
+    def _denoising(self) -> dict[str, float]:
+        """Denoising steps done, and the share of the iterations that did some."""
+        steps = [record.denoising_steps for record in self.history]
+        denoised = np.diff(steps, prepend=0) > 0
+        share = denoised.mean() if steps else 0.0
+        return {"denoising_steps": float(self.denoising_steps), "denoising_share": float(share)}

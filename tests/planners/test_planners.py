@@ -76,6 +76,10 @@ def test_solve_returns_a_plan(name: str) -> None:
     assert (plan.denoising_steps > 0) == (name not in ("ipopt", "mapf", "amswarm"))
     assert plan.wall_time > 0
     assert trajectory_metrics(problem, plan.trajectory).items() <= plan.metrics.items()
+    assert plan.metrics["denoising_steps"] == plan.denoising_steps
+    denoises = name not in ("ipopt", "mapf", "amswarm", "hybrid")  # hybrid may, or may not
+    assert (0 < plan.metrics["denoising_share"] <= 1) == (plan.denoising_steps > 0)
+    assert plan.metrics["denoising_share"] == 1 or not denoises
 
 
 @ALL
