@@ -544,7 +544,9 @@ def test_ctrl_c_leaves_no_process_and_no_port() -> None:
         socket.create_connection(("127.0.0.1", port), timeout=PATIENCE)
 
 
-@pytest.mark.parametrize("options", [("--port", "70000"), ("--host", "203.0.113.1")])
+@pytest.mark.parametrize(
+    "options", [("--port", "70000"), ("--host", "203.0.113.1"), ("--host", "\xe4" * 70), ("--host", "")]
+)
 def test_a_place_where_one_cannot_listen_is_said(options: tuple[str, str]) -> None:
     pytest.importorskip("viser")
     code = f"from d4orm_planners.cli.app import main; main(['play', '-k', '2', '-p', 'go-to-goal', *{options!r}])"
