@@ -25,6 +25,7 @@ from d4orm_planners import IterationRecord, evaluate
 from d4orm_planners.evaluation import tables, trials
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.leaderboard import leaderboard
+from d4orm_planners.evaluation.pool import JobEvent, ProcessPool
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import mean_interval, solved_after, success_by, success_rate, wilson_interval
@@ -257,6 +258,17 @@ def test_what_crashes_dies_or_hangs_is_a_row_and_the_rest_goes_on(tmp_path: Path
     after = {row.key: row for row in TrialStore(tmp_path / "out" / STORE).trials()}
     assert len(after) == 12
     assert all(after[key] == row for key, row in before.items())
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="needs signal masks")
+def test_ctrl_c_does_not_end_a_worker_that_starts() -> None:
+    pool = ProcessPool(1, run=iter)
+    pool.start("ab")
+    os.kill(pool._workers[0].process.pid or 0, signal.SIGINT)
+    said = [message.content for _ in range(4) for message in pool.wait(None)]
+    pool.close()
+    assert said == [JobEvent.BEGUN, "a", "b", JobEvent.ENDED]
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
 @pytest.mark.slow

@@ -544,6 +544,30 @@ def test_ctrl_c_leaves_no_process_and_no_port() -> None:
         socket.create_connection(("127.0.0.1", port), timeout=PATIENCE)
 
 
+@pytest.mark.parametrize(("module", "program"), [("typer", "cli"), ("viser", "cli"), ("viser", "cli.app")])
+def test_ctrl_c_while_it_is_loaded_is_quiet_even_where_a_library_swallows_it(module: str, program: str) -> None:
+    pytest.importorskip("viser")
+    code = f"""
+import signal, sys
+class Finder:
+    @staticmethod
+    def find_spec(name, path, target=None):
+        if name == "typer" == {module!r}:
+            raise KeyboardInterrupt
+        if name == "viser" == {module!r}:
+            try:
+                signal.raise_signal(signal.SIGINT)
+            except KeyboardInterrupt:
+                pass
+sys.meta_path.insert(0, Finder)
+sys.argv[1:] = ["play", "-k", "2", "--no-open"]
+from d4orm_planners.{program} import main
+main()
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=PATIENCE)
+    assert (result.returncode, result.stdout, result.stderr) == (130, "", "")
+
+
 @pytest.mark.parametrize(
     "options", [("--port", "70000"), ("--host", "203.0.113.1"), ("--host", "\xe4" * 70), ("--host", "")]
 )
