@@ -12,7 +12,7 @@ import typer
 from d4orm_planners.cli.arguments import check_target, names, refuse_options, single_levels
 from d4orm_planners.cli.common_options import Physics, PictureOptions, ProblemOptions
 from d4orm_planners.cli.dataclass_options import takes
-from d4orm_planners.cli.outputs import episode_rows, print_table
+from d4orm_planners.cli.outputs import episode_rows, print_table, require_success
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
@@ -110,8 +110,7 @@ def run(options: RunOptions) -> None:
         print_table("Execution", episode_rows(episode))
         if options.out is not None:
             typer.echo(f"wrote {options.out}")
-    if not episode.metrics["success"]:
-        raise typer.Exit(1)
+    require_success(episode, problem)
 
 
 def compare(options: RunOptions, policies: Sequence[str]) -> None:
