@@ -11,6 +11,7 @@ import io
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
@@ -185,7 +186,8 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit."""
     _standard_streams()
     try:
-        with _interrupted_by_sigterm():
+        with _interrupted_by_sigterm(), warnings.catch_warnings():
+            warnings.showwarning = _warn
             status = app(arguments, standalone_mode=False)
     except ClickException as error:
         status = _complain(error.format_message() + _given(error))
@@ -214,6 +216,11 @@ def _complain(message: str) -> int:
         line = f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
     typer.echo(f"d4orm: {line}", err=True)
     return 2
+
+
+def _warn(message: Warning | str, *where: object, **more: object) -> None:
+    """Say it without the place in the program that Python names."""
+    _complain(f"warning: {message}")
 
 
 if __name__ == "__main__":

@@ -72,7 +72,7 @@ def require_success(episode: Episode, problem: Problem) -> None:
 
     if not episode.metrics["success"]:
         if proofs := prove_infeasible(problem):
-            _tell_reasons("there is no solution", {f"robot_{robot}": proof for robot, proof in proofs.items()})
+            _tell_reasons("there is no solution", {f"robot_{robot}": proof for robot, proof in sorted(proofs.items())})
         raise typer.Exit(1)
 
 

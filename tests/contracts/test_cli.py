@@ -258,6 +258,16 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.filterwarnings("default")
+def test_a_warning_is_one_line_without_a_place_in_the_program(d4orm, tmp_path: Path) -> None:
+    robots = "  - {model: velocity2d, start: [%g, 0], goal: [%g, 1]}\n"
+    (tmp_path / "tight.yaml").write_text("version: 1\nname: x\nrobots:\n" + robots * 2 % (0, 0, 0.34, 2))
+    outcome = d4orm("run", "--scenario", "tight.yaml", "--policy", "go-to-goal", "--quiet")
+    assert outcome.err.startswith("d4orm: warning: problem 'x': the start of robot_1 is 0.04 m from robot_0, and the ")
+    assert outcome.err.count("\n") == 1
+    assert "schema.py" not in outcome.err
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
 @pytest.mark.parametrize(
     ("arguments", "message"),
