@@ -23,7 +23,7 @@ def bench(
     models: Annotated[str | None, typer.Option("--models", help="Robot models, separated by commas.")] = None,
     engines: Annotated[str | None, typer.Option("--engines", help="Of cpu, jax and plain, with commas.")] = None,
     seeds: Annotated[
-        int | None, typer.Option("--seeds", min=1, max=MOST_SEEDS, help="Seeds for the first feasible plan.")
+        int | None, typer.Option("--seeds", max=MOST_SEEDS, help="Seeds for the first feasible plan.")
     ] = None,
     quiet: Quiet = False,
 ) -> None:
