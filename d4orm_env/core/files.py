@@ -1,4 +1,4 @@
-"""Writing files so that they are whole or not there, after a power cut too."""
+"""Reading files of others, and writing files so that they are whole or not there, after a power cut too."""
 
 from __future__ import annotations
 
@@ -8,6 +8,53 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+
+def require_file(path: Path, kind: str) -> None:
+    """Refuse a folder, a pipe or a device, whose reading may never end. What is not there is left to whoever opens it.
+
+    Args:
+        path: What was given.
+        kind: What should have been, as ``"a map"``.
+
+    Raises:
+        ValueError: If it is none; without its name.
+    """
+    if path.exists() and not path.is_file():
+        raise ValueError(f"is not a file; give the path of {kind}")
+
+
+def read_limited(path: Path, kind: str, most: int) -> bytes:
+    """Return the content of a file of at most so many bytes.
+
+    Raises:
+        ValueError: As :func:`require_file`, or if it has more.
+        OSError: If it cannot be read.
+    """
+    require_file(path, kind)
+    with path.open("rb") as file:
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise ValueError(f"is larger than {most // 1_000_000} MB; files of this kind are smaller than that")
+    return content
+
+
+def target_of(path: Path) -> Path:
+    """Return where a file is written: at its path, or where a symbolic link leads to.
+
+    Raises:
+        OSError: If no file can be there, because of what is there or of a folder that is missing.
+    """
+    target = Path(os.path.realpath(path))
+    if target.is_symlink():
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"folder {target.parent} does not exist; create it, or write {path.name} elsewhere")
+    if target.is_dir():
+        raise IsADirectoryError(f"{path} is a folder; give the name of a file")
+    if target.exists() and not target.is_file():
+        raise OSError(f"{path} is a device or a pipe; give the name of a file")
+    return target
 
 
 @contextmanager
@@ -25,15 +72,7 @@ def replaced_when_done(path: Path, suffixes: tuple[str, ...] = ()) -> Iterator[P
     """
     if suffixes and path.suffix.lower() not in suffixes:
         raise ValueError(f"{path} ends in {path.suffix!r}; choose one of {', '.join(suffixes)}")
-    target = Path(os.path.realpath(path))  # what a symbolic link leads to, be it there or not
-    if target.is_symlink():
-        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
-    if not target.parent.is_dir():
-        raise FileNotFoundError(f"folder {target.parent} does not exist; create it, or write {path.name} elsewhere")
-    if target.is_dir():
-        raise IsADirectoryError(f"{path} is a folder; give the name of a file")
-    if target.exists() and not target.is_file():
-        raise OSError(f"{path} is a device or a pipe; give the name of a file")
+    target = target_of(path)
     # Of a long name a part, because it must not become longer than a name may be.
     temporary = target.with_name(f".{path.stem[:32]}.{os.getpid()}.{time.monotonic_ns()}{path.suffix[:16]}")
     try:

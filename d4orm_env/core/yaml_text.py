@@ -14,6 +14,8 @@ from typing import Any
 
 import yaml
 
+from d4orm_env.core.files import read_limited
+
 SUFFIXES = (".yaml", ".yml")
 MAX_BYTES = 10_000_000
 MAX_DEPTH = 16
@@ -123,14 +125,9 @@ def _line(mark: Any) -> str:
 
 def _read_text(path: Path) -> str:
     try:
-        if path.exists() and not path.is_file():
-            raise ValueError("is not a file; give the path of a YAML file")
-        with path.open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
+        content = read_limited(path, "a YAML file", MAX_BYTES)
     except OSError as error:
         raise ValueError(f"cannot be read ({error.strerror})") from error
-    if len(content) > MAX_BYTES:
-        raise ValueError(f"is larger than {MAX_BYTES // 1_000_000} MB; files of this kind are smaller than that")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

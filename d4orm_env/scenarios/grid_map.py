@@ -14,6 +14,8 @@ from d4orm_env.scenarios.free_space import Mask
 from d4orm_env.scenarios.placement import Points
 
 MAX_CELLS = 2**24
+MAX_BYTES = 8 * MAX_CELLS
+"""Of the file of a map: 16-bit colours with alpha have as many."""
 """Cells of a map at most."""
 
 ROUNDING = 1e-3

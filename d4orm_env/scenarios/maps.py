@@ -12,11 +12,12 @@ from typing import TypeAlias
 import numpy as np
 
 from d4orm_env.core.arrays import shown
+from d4orm_env.core.files import read_limited
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.core.yaml_text import is_yaml_path
 from d4orm_env.scenarios.free_space import FreeSpace, free_space
-from d4orm_env.scenarios.grid_map import MAX_CELLS, GridMap
+from d4orm_env.scenarios.grid_map import MAX_BYTES, GridMap
 from d4orm_env.scenarios.layout import Layout, build
 from d4orm_env.scenarios.movingai import parse_map, parse_scenario
 from d4orm_env.scenarios.placement import Points
@@ -24,8 +25,6 @@ from d4orm_env.scenarios.settings import Settings, bounded, require_plane
 from d4orm_env.scenarios.well_formed import populate, reach_of, with_obstacles
 
 PathLike: TypeAlias = str | os.PathLike[str]
-
-MAX_BYTES = 2 * MAX_CELLS
 
 
 def load_map(path: PathLike, cell: float = 0.6) -> World:
@@ -56,7 +55,7 @@ def read_map(path: PathLike, cell: float = 0.6) -> GridMap:
             from d4orm_env.scenarios.occupancy_image import read_occupancy_image
 
             return read_occupancy_image(file)
-        return _parse(_content(file), cell)
+        return _parse(read_limited(file, "a map", MAX_BYTES), cell)
 
 
 _parse = lru_cache(maxsize=4)(parse_map)
@@ -99,7 +98,7 @@ def _listed_places(settings: Settings, grid: GridMap, space: FreeSpace, path: Pa
         ValueError: If the file is bad, or a robot does not fit where it begins or ends; the message names the line.
     """
     with _named(path):
-        tasks = parse_scenario(_content(path), grid.blocked.shape, settings.num_robots)
+        tasks = parse_scenario(read_limited(path, "a map", MAX_BYTES), grid.blocked.shape, settings.num_robots)
         for task in tasks:
             for what, cell in (("start", task.start), ("goal", task.goal)):
                 if grid.blocked[cell[::-1]]:
@@ -124,13 +123,3 @@ def _named(path: Path) -> Iterator[None]:
         raise ValueError(f"{error.filename or path}: cannot be read ({error.strerror})") from error
     except ValueError as error:
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
-
-
-def _content(path: Path) -> bytes:
-    if path.exists() and not path.is_file():
-        raise ValueError("is not a file; give the path of a map")
-    with path.open("rb") as file:
-        content = file.read(MAX_BYTES + 1)
-    if len(content) > MAX_BYTES:
-        raise ValueError(f"is larger than {MAX_BYTES // 1_000_000} MB; maps of at most {MAX_CELLS} cells are read")
-    return content

@@ -12,9 +12,10 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from d4orm_env.core.arrays import LARGEST, SMALLEST, Floats, positive_number, shown
+from d4orm_env.core.files import read_limited
 from d4orm_env.core.yaml_text import read_yaml
 from d4orm_env.scenarios.free_space import Mask
-from d4orm_env.scenarios.grid_map import MAX_CELLS, GridMap, float32_resolves
+from d4orm_env.scenarios.grid_map import MAX_BYTES, MAX_CELLS, GridMap, float32_resolves
 
 Mode: TypeAlias = Literal["trinary", "scale", "raw"]
 
@@ -49,7 +50,7 @@ def read_occupancy_image(path: Path) -> GridMap:
     if free > occupied:
         raise ValueError(f"free_thresh is {free:g}; it must be at most occupied_thresh, which is {occupied:g}")
     low = _corner(fields["origin"])
-    blocked = ~(_occupancy((path.parent / image).read_bytes(), mode, bool(negate)) < free)
+    blocked = ~(_occupancy(read_limited(path.parent / image, "an image", MAX_BYTES), mode, bool(negate)) < free)
     _require_no_turn(fields["origin"], blocked.shape)
     return _grid_map(blocked.tobytes(), blocked.shape, resolution, low)
 

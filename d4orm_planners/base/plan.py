@@ -15,7 +15,7 @@ import numpy as np
 from d4orm_env.core.archives import ArrayArchive
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.errors import first_line
-from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.files import replaced_when_done, require_file
 from d4orm_env.core.metrics import mean_stretch, trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import Row, count, outcome_rows
@@ -235,6 +235,7 @@ class Plan(DisplayMixin):
         """
         source = _npz_path(path)
         try:
+            require_file(source, "a plan")
             with source.open("rb") as stream, ArrayArchive(stream, ("header", *_ARRAYS)) as archive:
                 header = json.loads(str(archive.array("header", HEADER_BYTES)))
                 if header.pop("format") != FORMAT:

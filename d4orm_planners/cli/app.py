@@ -11,6 +11,7 @@ import io
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
@@ -39,6 +40,9 @@ if TYPE_CHECKING:
 
 # Typer carries its own copy of click, whose base class it does not export.
 ClickException: Any = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
+
+LONGEST = 2000
+"""Characters of a complaint at most: a name that was given may have any number."""
 
 
 class Commands(TyperGroup):
@@ -182,10 +186,11 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit."""
     _standard_streams()
     try:
-        with _interrupted_by_sigterm():
+        with _interrupted_by_sigterm(), warnings.catch_warnings():
+            warnings.showwarning = _warn
             status = app(arguments, standalone_mode=False)
     except ClickException as error:
-        status = _complain(error.format_message())
+        status = _complain(error.format_message() + _given(error))
     except (ValueError, OSError, ImportError) as error:  # ImportError: an extra that is not installed
         status = _complain(_message(error))
     except (KeyboardInterrupt, typer.Abort):
@@ -195,13 +200,27 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _message(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename or 'file'}: {error.strerror}"
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     return str(error)
 
 
+def _given(error: BaseException) -> str:
+    """What was given, which Typer leaves out where a type does not fit."""
+    errors = getattr(error.__cause__, "errors", None)
+    return f", not {errors()[0]['input']!r}" if errors is not None else ""
+
+
 def _complain(message: str) -> int:
-    typer.echo(f"d4orm: {one_line(' '.join(message.split()))}", err=True)
+    line = one_line(" ".join(message.split()))
+    if len(line) > LONGEST:
+        line = f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
+    typer.echo(f"d4orm: {line}", err=True)
     return 2
+
+
+def _warn(message: Warning | str, *where: object, **more: object) -> None:
+    """Say it without the place in the program that Python names."""
+    _complain(f"warning: {message}")
 
 
 if __name__ == "__main__":

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-import os
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -48,7 +48,7 @@ def parse_levels(texts: list[str] | None) -> dict[str, list[object]] | None:
         name = brackets + closed + name
         if not separator or not name or not listed:
             raise ValueError(f"--disturb {text!r} is not of the form name=levels, as delay=0,1,2 or push.speed=0.2,0.5")
-        _add(parsed, name, f"[{listed}]", "--disturb", f"{text!r}: the levels")
+        _add(parsed, name, f"[{listed}]", "--disturb", f"{text!r}: the list")
         values = parsed[name]
         if not isinstance(values, list):
             raise ValueError(f"--disturb {text!r} gives no list of levels; give some like delay=0,1,2")
@@ -140,22 +140,32 @@ def seed_list(text: str) -> list[int]:
         first, last = (int(number) for number in text.split("-")) if "-" in text.strip()[1:] else (0, int(text) - 1)
     except ValueError:
         raise ValueError(f"--seeds {text!r} is neither a number, as 50, nor a range, as 10-19, nor a list") from None
+    if last < first:
+        raise ValueError(f"--seeds {text!r} names no seed; give a number, as 50, or a range, as 10-19")
     if last - first >= MOST_SEEDS:
         raise ValueError(f"--seeds {text!r} asks for more than {MOST_SEEDS} seeds; give fewer")
     return list(range(first, last + 1))
 
 
-def make_folder(folder: Path) -> None:
-    """Make a folder, unless it is there, and find out whether it can be written to.
+@contextmanager
+def output_folder(folder: Path) -> Iterator[None]:
+    """Make a folder, unless it is there; what was made is removed again where nothing was written to it.
 
     Raises:
-        ValueError: If not.
+        ValueError: If it cannot be made or written to.
     """
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(f"folder {str(folder)!r} cannot be made ({error.strerror}); choose another") from None
     check_writable(folder)
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # it is not empty
+            for path in made:
+                path.rmdir()
 
 
 def check_writable(folder: Path) -> None:
@@ -176,15 +186,13 @@ def check_target(path: Path | None, suffixes: tuple[str, ...]) -> None:
     """Find out before planning whether a file can be written.
 
     Raises:
-        ValueError: If it ends otherwise or can not.
+        ValueError: If it ends otherwise, or its folder cannot be written to.
+        OSError: If no file can be there.
     """
     if path is None:
         return
+    from d4orm_env.core.files import target_of
+
     if path.suffix not in suffixes:
         raise ValueError(f"output file {str(path)!r} must end in {' or '.join(suffixes)}")
-    target = Path(os.path.realpath(path))  # of a symbolic link, what is written
-    if not target.parent.is_dir():
-        raise ValueError(f"folder {str(target.parent)!r} does not exist; create it first")
-    if target.is_dir():
-        raise ValueError(f"output file {str(path)!r} is a folder")
-    check_writable(target.parent)
+    check_writable(target_of(path).parent)

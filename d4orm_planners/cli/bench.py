@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from d4orm_planners.cli.arguments import MOST_SEEDS, make_folder, names, numbers
+from d4orm_planners.cli.arguments import MOST_SEEDS, names, numbers, output_folder
 from d4orm_planners.cli.common_options import Quiet
 
 
@@ -41,10 +41,10 @@ def bench(
     }
     chosen = {name: value for name, value in given.items() if value is not None}
     settings = BenchmarkSettings.from_keywords({**(QUICK if quick else {}), **chosen}, "the benchmark")
-    make_folder(out)
     begun = circumstances(" ".join(["d4orm", *sys.argv[1:]]))
-    with parts_progress(enabled=not quiet) as progress:
+    with output_folder(out), parts_progress(enabled=not quiet) as progress:
         results = run_parts(list(parts(settings)), progress)
-    for path in write_report(out, settings, begun, results):
+        written = write_report(out, settings, begun, results)
+    for path in written:
         if not quiet:
             typer.echo(f"wrote {path}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from d4orm_planners.cli.arguments import make_folder, parse_settings, refuse_options, seed_list, single_levels
+from d4orm_planners.cli.arguments import output_folder, parse_settings, refuse_options, seed_list, single_levels
 from d4orm_planners.cli.common_options import Model, Quiet, ScenarioSettings
 from d4orm_planners.cli.dataclass_options import takes
 
@@ -105,8 +105,8 @@ def dataset(options: DatasetOptions) -> None:
     demonstrations = options.demonstrations()
     name = checked_id(demonstrations.dataset_id if options.dataset_id is None else options.dataset_id)
     folder = options.out or dataset_folder(name)
-    make_folder(folder)
-    with resumable(f"the finished episodes are kept in {folder}", enabled=not options.quiet) as progress:
+    kept = f"the finished episodes are kept in {folder}"
+    with output_folder(folder), resumable(kept, enabled=not options.quiet) as progress:
         written = write_dataset(
             demonstrations,
             folder,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from d4orm_planners.cli.arguments import make_folder
+from d4orm_planners.cli.arguments import output_folder
 from d4orm_planners.cli.common_options import Engine, Seed
 from d4orm_planners.cli.outputs import episode_rows, print_plan, print_table, require_solved
 from d4orm_planners.cli.plan_command import solving
@@ -27,15 +27,17 @@ def demo(
     ] = False,
 ) -> None:
     """Plan robots across a warehouse, execute the plan in the environment, verify it, and write pictures."""
-    if denoising:
-        show_denoising(out, num_robots, seed, engine)
-        return
+    with output_folder(out):
+        (show_denoising if denoising else show_warehouse)(out, num_robots, seed, engine)
+
+
+def show_warehouse(out: Path, num_robots: int, seed: int, engine: str) -> None:
+    """Plan for a team in a warehouse, execute the plan, verify it, and write the plan, pictures and a replay."""
     from d4orm_env import make_problem, navigation_v0, verify
     from d4orm_planners.base.episode import run_episode
     from d4orm_planners.base.planner_registry import make_planner
     from d4orm_planners.base.policy import OpenLoop
 
-    make_folder(out)
     problem = make_problem("warehouse", num_robots=num_robots, seed=seed)
     planner = make_planner(engine=engine)
     with solving(planner, problem) as callback:
@@ -79,7 +81,6 @@ def show_denoising(out: Path, num_robots: int, seed: int, engine: str) -> None:
     from d4orm_planners.base.planner_registry import make_planner
     from d4orm_planners.sampling.denoising import DenoisingFilm
 
-    make_folder(out)
     problem = make_problem("circle", num_robots=num_robots, seed=seed)
     planner, film = make_planner("d4orm", engine=engine), DenoisingFilm(problem)
     with solving(planner, problem) as callback:

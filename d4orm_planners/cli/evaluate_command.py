@@ -12,9 +12,9 @@ import typer
 from d4orm_planners.base.escaping import one_line
 from d4orm_planners.cli.arguments import (
     decimals,
-    make_folder,
     names,
     numbers,
+    output_folder,
     parse_levels,
     parse_settings,
     seed_list,
@@ -49,7 +49,7 @@ class StudyOptions:
             "--policies",
             "-p",
             help="Names or package.module:Name with commas, or one with settings, d4orm:num_samples=512; repeatable; "
-            "d4orm,goal by default.",
+            "d4orm,go-to-goal by default.",
         ),
     ] = None
     scenario: Annotated[
@@ -108,8 +108,8 @@ class StudyOptions:
             time_limit=self.time_limit,
             physics=self.physics,
         )
-        make_folder(self.out)
-        with resumable(f"the finished trials are kept in {self.out}", enabled=not self.quiet) as progress:
+        kept = f"the finished trials are kept in {self.out}"
+        with output_folder(self.out), resumable(kept, enabled=not self.quiet) as progress:
             return run_study(
                 study, self.out, trial_timeout=self.trial_timeout, workers=self.workers, ray=self.ray, progress=progress
             )

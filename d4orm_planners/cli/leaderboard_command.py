@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from d4orm_planners.cli.arguments import decimals
+from d4orm_planners.cli.arguments import check_target, decimals
 
 
 def leaderboard(
@@ -26,8 +26,7 @@ def leaderboard(
     from d4orm_planners.evaluation.store import TrialStore
     from d4orm_planners.evaluation.tables import read_parquet, target
 
-    if out.suffix != ".md":
-        raise ValueError(f"output file {str(out)!r} must end in .md")
+    check_target(out, (".md",))
     limits = () if deadlines is None else decimals("--deadlines", deadlines)
     trials = [
         trial

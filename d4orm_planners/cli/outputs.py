@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import typer
@@ -9,6 +10,7 @@ import typer
 from d4orm_planners.base.escaping import one_line
 
 if TYPE_CHECKING:
+    from d4orm_env.core.problem import Problem
     from d4orm_planners.base.episode import Episode
     from d4orm_planners.base.plan import Plan
 
@@ -60,7 +62,21 @@ def require_solved(plan: Plan) -> None:
     """Say why, and end with status 1, if a plan is no solution."""
     if not plan.solved:
         ended = f"no solution found ({plan.status.replace('_', ' ')} after {plan.iterations} iterations)"
-        typer.echo("there is no solution" if plan.status == "infeasible" else ended, err=True)
-        for robot, reason in plan.failures.items():
-            typer.echo(f"  {robot} {reason}", err=True)
+        _tell_reasons("there is no solution" if plan.status == "infeasible" else ended, plan.failures)
         raise typer.Exit(1)
+
+
+def require_success(episode: Episode, problem: Problem) -> None:
+    """End with status 1 if an episode is none, and say so if nothing solves the problem."""
+    from d4orm_planners.base.infeasibility import prove_infeasible
+
+    if not episode.metrics["success"]:
+        if proofs := prove_infeasible(problem):
+            _tell_reasons("there is no solution", {f"robot_{robot}": proof for robot, proof in sorted(proofs.items())})
+        raise typer.Exit(1)
+
+
+def _tell_reasons(what: str, reasons: Mapping[str, str]) -> None:
+    typer.echo(what, err=True)
+    for robot, reason in reasons.items():
+        typer.echo(f"  {robot} {reason}", err=True)

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import threading
 import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from d4orm_planners.cli.arguments import names
 from d4orm_planners.cli.common_options import ProblemOptions
 from d4orm_planners.cli.dataclass_options import takes
+
+if TYPE_CHECKING:
+    from d4orm_planners.play.playground import Playground
 
 LAST_WAIT = 2.0
 """Seconds from Ctrl-C to the end of the process."""
@@ -36,15 +42,8 @@ class PlayOptions(ProblemOptions):
 @takes(PlayOptions)
 def play(options: PlayOptions) -> None:
     """Look at a team live in a browser, and meddle with it; needs the extra viz."""
-    try:
-        from d4orm_planners.play.playground import Playground
-    except ImportError as error:
-        raise ImportError('d4orm play needs viser; install it with pip install "d4orm-env[viz]"') from error
-
-    quieten_viser()
-    typer.echo("getting ready; the first time this compiles for a while ...")
-    policies = names(options.policy) or ()
-    playground = Playground(options.problem(), *policies, seed=options.seed, host=options.host, port=options.port)
+    with _ended_by_signals():
+        playground = _playground(options)
     try:
         typer.echo(f"open {playground.address}\nCtrl-C ends it")
         if options.open_browser and has_display():
@@ -58,6 +57,30 @@ def play(options: PlayOptions) -> None:
         raise
     finally:
         playground.close()
+
+
+@contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """End the process at once if a signal comes: some libraries, while they are loaded, swallow what it raises."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    former = {number: signal.signal(number, lambda *_: os._exit(130)) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)
+
+
+def _playground(options: PlayOptions) -> Playground:
+    try:
+        from d4orm_planners.play.playground import Playground
+    except ImportError as error:
+        raise ImportError('d4orm play needs viser; install it with pip install "d4orm-env[viz]"') from error
+
+    quieten_viser()
+    typer.echo("getting ready; the first time this compiles for a while ...")
+    policies = names(options.policy) or ()
+    return Playground(options.problem(), *policies, seed=options.seed, host=options.host, port=options.port)
 
 
 def quieten_viser() -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from d4orm_planners.cli.arguments import MOST_SEEDS, make_folder, refuse_options
+from d4orm_planners.cli.arguments import MOST_SEEDS, output_folder, refuse_options
 from d4orm_planners.cli.common_options import Quiet
 from d4orm_planners.cli.dataclass_options import takes
 
@@ -34,11 +34,12 @@ class ReproduceOptions:
     seeds: Annotated[
         int | None,
         typer.Option(
-            "--seeds", "-n", max=MOST_SEEDS, help="Trials per row; the paper's 50 by default, 1 with --quick."
+            "--seeds", "-n", min=1, max=MOST_SEEDS, help="Trials per row; the paper's 50 by default, 1 with --quick."
         ),
     ] = None
     workers: Annotated[
-        int, typer.Option("--workers", "-j", help="Processes of one thread each; with 1, one trial on all cores.")
+        int,
+        typer.Option("--workers", "-j", min=1, help="Processes of one thread each; with 1, one trial on all cores."),
     ] = 1
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Folder to make the figure's folder in, and to go on from.")
@@ -77,14 +78,14 @@ def reproduce(options: ReproduceOptions) -> None:
         return
     known = [] if options.go_on_from is None else read_parquet(options.go_on_from)
     folder = options.out / (f"{figure.name}-quick" if options.quick else figure.name)
-    make_folder(folder)
-    if known:
-        TrialStore(folder / STORE).add(*known)
-    if options.quick:
-        figure = figure.quick()
-    else:
-        warm_up()  # the time of a controller would include its compilation
-    with resumable(f"the finished trials are kept in {folder}", enabled=not options.quiet) as progress:
+    kept = f"the finished trials are kept in {folder}"
+    with output_folder(folder), resumable(kept, enabled=not options.quiet) as progress:
+        if known:
+            TrialStore(folder / STORE).add(*known)
+        if options.quick:
+            figure = figure.quick()
+        else:
+            warm_up()  # the time of a controller would include its compilation
         groups = run(figure, folder, seeds=options.seeds, workers=options.workers, progress=progress)
     written = write_reproduction(folder, figure, groups)
     if not options.quiet:
@@ -103,8 +104,8 @@ def _make_of_trials(figure: Figure, options: ReproduceOptions) -> None:
     assert options.trials is not None
     groups = regrouped(figure, read_parquet(options.trials))
     folder = options.out / figure.name
-    make_folder(folder)
-    written = write_reproduction(folder, figure, groups, trials=False)
+    with output_folder(folder):
+        written = write_reproduction(folder, figure, groups, trials=False)
     if not options.quiet:
         tell_results(markdown(figure, groups), written)
 

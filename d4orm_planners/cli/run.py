@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from d4orm_env.core.summary_line import count
-from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_planners.cli.arguments import check_target, names, refuse_options, single_levels
 from d4orm_planners.cli.common_options import Physics, PictureOptions, ProblemOptions
 from d4orm_planners.cli.dataclass_options import takes
-from d4orm_planners.cli.outputs import episode_rows, print_table
+from d4orm_planners.cli.outputs import episode_rows, print_table, require_success
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
+    from d4orm_env.disturbances.disturbance import AnyDisturbance
     from d4orm_planners.base.episode import Episode
     from d4orm_planners.base.policy import Policy
 
@@ -111,8 +110,7 @@ def run(options: RunOptions) -> None:
         print_table("Execution", episode_rows(episode))
         if options.out is not None:
             typer.echo(f"wrote {options.out}")
-    if not episode.metrics["success"]:
-        raise typer.Exit(1)
+    require_success(episode, problem)
 
 
 def compare(options: RunOptions, policies: Sequence[str]) -> None:
@@ -121,6 +119,7 @@ def compare(options: RunOptions, policies: Sequence[str]) -> None:
     Raises:
         ValueError: Without a file to write, or for an option that makes no sense or does not go with it.
     """
+    from d4orm_env.core.summary_line import count
     from d4orm_env.render.replay import Replay
     from d4orm_planners.base.planner_registry import make_policy
 

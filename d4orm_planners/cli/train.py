@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from d4orm_planners.cli.arguments import make_folder, parse_settings, refuse_options
+from d4orm_planners.cli.arguments import output_folder, parse_settings, refuse_options
 from d4orm_planners.cli.common_options import Model
 from d4orm_planners.cli.dataclass_options import takes
 
@@ -109,10 +109,10 @@ def train(options: TrainOptions) -> None:
     """Train a policy that all robots share, by reinforcement or imitation; run again to go on where it stopped."""
     learn = _imitation(options) if options.algorithm == IMITATION else _reinforcement(options)
     folder = options.out or Path("runs") / options.algorithm
-    make_folder(folder)
     from d4orm_planners.cli.progress import resumable, tell_results
 
-    with resumable(f"the checkpoints are kept in {folder}", enabled=not options.quiet) as progress:
+    kept = f"the checkpoints are kept in {folder}"
+    with output_folder(folder), resumable(kept, enabled=not options.quiet) as progress:
         result = learn(folder, progress=progress, command=shlex.join(["d4orm", *sys.argv[1:]]))
     if not options.quiet:
         best = max(result.curve, key=lambda evaluation: evaluation.rank)

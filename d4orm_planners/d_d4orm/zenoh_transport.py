@@ -11,9 +11,11 @@ import re
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from pathlib import Path
 from types import ModuleType
 
 from d4orm_env.core.arrays import duration
+from d4orm_env.core.files import require_file
 from d4orm_planners.d_d4orm.messages import MAX_BYTES
 from d4orm_planners.d_d4orm.transport import WAITING, Mailbox
 
@@ -198,8 +200,9 @@ def _config(zenoh: ModuleType, settings: ZenohSettings) -> object:
     config = plain = zenoh.Config()
     if settings.config_file is not None:
         try:
+            require_file(Path(settings.config_file), "a JSON5 file")
             config = zenoh.Config.from_file(settings.config_file)
-        except zenoh.ZError as error:
+        except (zenoh.ZError, ValueError) as error:
             raise ValueError(f"config_file {settings.config_file}: {_reason(error)}") from error
         for key, name in RESERVED.items():
             if config.get_json(key) != plain.get_json(key):

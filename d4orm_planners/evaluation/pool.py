@@ -9,10 +9,11 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from itertools import count
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple, Protocol
@@ -234,7 +235,8 @@ class ProcessPool:
         ours, theirs = self._context.Pipe()
         work = (theirs, self._receiver, self._threads, self._run)
         process = self._context.Process(target=_work, args=work, daemon=True)
-        process.start()
+        with _interrupts_wait():
+            process.start()
         theirs.close()  # or a dead worker would not close the pipe
         worker = _Worker(process, ours)
         self._workers.append(worker)
@@ -262,6 +264,20 @@ class ProcessPool:
                 '`if __name__ == "__main__":`, because workers import it; or run with one worker'
             )
         return WorkerLost(f"ChildProcessError: the worker process died ({how})")
+
+
+@contextmanager
+def _interrupts_wait() -> Iterator[None]:
+    """Have Ctrl-C wait for the end of the context, and in a process started there, which would print a traceback."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    resource_tracker.ensure_running()  # whose start would end the waiting
+    former = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, former)
 
 
 def _work(pipe: Connection, parent: Connection, threads: int, run: Callable[[Any], Iterator[object]]) -> None:

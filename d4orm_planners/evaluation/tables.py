@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.errors import first_line
-from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.files import replaced_when_done, require_file
 from d4orm_planners.base.escaping import markdown_text, one_line, spreadsheet_cell
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore, checked_trial, config_now
 from d4orm_planners.evaluation.summary import SuccessRate, SuccessWithin
@@ -106,6 +106,7 @@ def read_parquet(path: str | os.PathLike[str]) -> list[Trial]:
     from pyarrow import parquet
 
     try:
+        require_file(Path(path), "one that d4orm evaluate wrote")
         with parquet.ParquetFile(path) as file:
             return list(_trials(file))
     except (pyarrow.ArrowException, OSError, TypeError, KeyError, ValueError, OverflowError) as error:

@@ -121,8 +121,12 @@ def _free_port(host: str, port: int) -> int:
     Raises:
         ValueError: If it is taken, or the host is not one of this machine's.
     """
+    if not host:  # which would be every address
+        raise ValueError(
+            "cannot listen at no host; give --host an address, as 127.0.0.1, or 0.0.0.0 for all of this machine's"
+        )
     try:
         with socket.create_server((host, port)) as listening:
             return int(listening.getsockname()[1])
-    except (OSError, OverflowError) as error:
+    except (OSError, OverflowError, TypeError) as error:  # a name that is none is a TypeError
         raise ValueError(f"cannot listen at {host} port {port} ({error}); choose another --host or --port") from None

@@ -157,7 +157,7 @@ def test_the_settings_of_one_are_listed(d4orm, name: str, listed: set[str], miss
 
 BAD = [
     (("plan", "--num-robots", "0"), "num_robots is 0"),
-    (("plan", "--num-robots", "three"), "--num-robots"),
+    (("plan", "--num-robots", "three"), "not 'three'"),
     (("plan", "--planner", "nope"), "planner 'nope' is unknown; choose one of d4orm"),
     (("plan", "--preset", "nope"), "preset 'nope'"),
     (("plan", "--scenario", "nope"), "scenario 'nope' is unknown"),
@@ -196,7 +196,10 @@ BAD = [
     (("plan", "--time-limit", "0"), "time_limit is 0"),
     (("plan", "--max-iterations", "0"), "max_iterations is 0"),
     (("plan", "--out", "plan.txt"), "must end in .npz"),
-    (("plan", "--out", "missing/plan.npz"), "does not exist; create it first"),
+    (("plan", "--out", "missing/plan.npz"), "does not exist; create it"),
+    (("plan", "--out", "loop.npz"), "loop.npz: Too many levels of symbolic links"),
+    (("plan", "--scenario", "x" * 9999), "is unknown"),
+    (("plan", "--scenario", f"{'x' * 9999}.yaml"), "File name too long"),
     (("plan", "--picture", "plan.bmp"), "must end in .png"),
     (("plan", "--no-such-option",), "--no-such-option"),
     (("run", "truncated.npz"), "truncated.npz is not a readable plan"),
@@ -219,11 +222,22 @@ BAD = [
     (("run", "--policy", "orca", "--preset", "paper"), "'preset' is no setting of policy 'orca'"),
     (("demo", "--out", "good.yaml"), "good.yaml"),
     (("demo", "--num-robots", "0"), "num_robots"),
+    (("demo", "--denoising", "--engine", "gpu", "--out", "a/b"), "engine 'gpu' is unknown"),
+    (("evaluate", "--trial-timeout", "nan"), "trial_timeout is nan"),
+    (("evaluate", "--scenario", "missing.yaml", "--out", "a/b"), "missing.yaml"),
+    (("evaluate", "--seeds", "9-3"), "--seeds '9-3' names no seed; give a number"),
+    (("evaluate", "--disturb", "push.speed=1,,2"), "the list is not YAML"),
+    (("robustness", "--workers", "0"), "workers is 0"),
+    (("reproduce", "team-size", "--seeds", "0"), "not '0'"),
+    (("reproduce", "team-size", "--workers", "0"), "not '0'"),
+    (("reproduce", "team-size", "--trials", "missing.parquet"), "missing.parquet"),
+    (("leaderboard", "missing", "--out", "a.txt"), "'a.txt' must end in .md"),
+    (("leaderboard", "missing", "--out", "a/b.md"), "does not exist; create it"),
     (("nonsense",), "nonsense"),
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("arguments", "message"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
+@pytest.mark.parametrize(("arguments", "message"), BAD, ids=[" ".join(arguments)[:80] for arguments, _ in BAD])
 def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: Sequence[str], message: str) -> None:
     line = "version: 1\nname: x\nrobots:\n"
     robot = "  - {model: velocity2d, start: [%s, 0], goal: [%s, 1]}\n"
@@ -231,6 +245,7 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
     (tmp_path / "nan.yaml").write_text(line + robot % (".nan", 0))
     (tmp_path / "endless.yaml").write_text(line + robot % (0, 0) + "horizon: 100000000\n")
     (tmp_path / "overlap.yaml").write_text(line + robot % (0, 0) + robot % (0.1, 5))
+    (tmp_path / "loop.npz").symlink_to("loop.npz")
     assert d4orm("plan", "--scenario", "good.yaml", "--quiet", *QUICK, "--out", "whole.npz").status in (0, 1)
     (tmp_path / "truncated.npz").write_bytes((tmp_path / "whole.npz").read_bytes()[:500])
     before = sorted(tmp_path.rglob("*"))
@@ -238,9 +253,47 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
     assert outcome.status == 2
     assert outcome.err.count("\n") == 1
     assert outcome.err.startswith("d4orm: ")
+    assert len(outcome.err) < 2100
     assert message in outcome.err
-    # A folder made for the demo is no half-written file.
-    assert [path for path in sorted(tmp_path.rglob("*")) if path.name != "demo"] == before
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_warning_is_one_line_without_a_place_in_the_program(d4orm, tmp_path: Path) -> None:
+    robots = "  - {model: velocity2d, start: [%g, 0], goal: [%g, 1]}\n"
+    (tmp_path / "tight.yaml").write_text("version: 1\nname: x\nrobots:\n" + robots * 2 % (0, 0, 0.34, 2))
+    outcome = d4orm("run", "--scenario", "tight.yaml", "--policy", "go-to-goal", "--quiet")
+    assert outcome.err.startswith("d4orm: warning: problem 'x': the start of robot_1 is 0.04 m from robot_0, and the ")
+    assert outcome.err.count("\n") == 1
+    assert "schema.py" not in outcome.err
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("plan", "--out", "pipe.npz"), "pipe.npz is a device or a pipe"),
+        (("run", "pipe.npz"), "pipe.npz is not a readable plan (is not a file; give the path of a plan)"),
+        (("run", "--scenario", "pipe.yaml"), "pipe.yaml: is not a file; give the path of a YAML file"),
+        (("run", "--scenario", "map", "--scenario-set", "map=pipe.map"), "pipe.map: is not a file"),
+        (
+            ("run", "--scenario", "map", "--scenario-set", "map=map.yaml"),
+            "map.yaml: is not a file; give the path of an",
+        ),
+        (("leaderboard", "pipe.parquet"), "pipe.parquet is no Parquet file of trials: is not a file; give the path"),
+        (("leaderboard", "pipe.sqlite"), "there is no store of trials at pipe.sqlite"),
+        (("reproduce", "team-size", "--go-on-from", "pipe.parquet"), "is not a file"),
+        (("node", "--config", "pipe.yaml"), "pipe.yaml: is not a file"),
+    ],
+)
+def test_a_pipe_is_refused_and_not_waited_for(d4orm, tmp_path: Path, arguments: Sequence[str], message: str) -> None:
+    for suffix in ("npz", "yaml", "map", "parquet", "sqlite"):
+        os.mkfifo(tmp_path / f"pipe.{suffix}")
+    (tmp_path / "map.yaml").write_text("image: pipe.npz\nresolution: 1\norigin: [0, 0, 0]\n")
+    outcome = d4orm(*arguments)
+    assert outcome.status == 2
+    assert outcome.err.count("\n") == 1
+    assert message in outcome.err
 
 
 @pytest.mark.parametrize("setting", ["beta_start=1e-4", "beta_end=2E-2", "late_steps=7e-1", "late_samples=.5"])

@@ -75,9 +75,10 @@ def test_what_path_finding_knew_is_in_a_plans_file(tmp_path: Path) -> None:
     assert loaded.failures == plan.failures
 
 
-def test_the_command_line_says_what_is_proved(d4orm, tmp_path: Path) -> None:
+@pytest.mark.parametrize("command", [("plan",), ("run",), ("run", "--policy", "go-to-goal")])
+def test_the_command_line_says_what_is_proved(d4orm, tmp_path: Path, command: tuple[str, ...]) -> None:
     save_problem(sealed_problem(), tmp_path / "ring.yaml")
-    outcome = d4orm("plan", "--scenario", "ring.yaml", "--quiet")
+    outcome = d4orm(*command, "--scenario", "ring.yaml", "--quiet")
     assert outcome.status == 1
     assert outcome.err.splitlines() == [
         "there is no solution",

@@ -252,8 +252,9 @@ def test_what_is_no_file_of_a_node_is_refused(tmp_path: Path) -> None:
     [
         ({"colour": 1}, "unknown field 'colour'"),
         ({"out": "plan.txt"}, "must end in .npz"),
-        ({"out": "nowhere/plan.npz"}, "does not exist; create it first"),
+        ({"out": "nowhere/plan.npz"}, "does not exist; create it"),
         ({"zenoh": {"config_file": "none.json5"}}, "none.json5: No such file"),
+        ({"zenoh": {"config_file": "/dev/zero"}}, "/dev/zero: is not a file; give the path of a JSON5 file"),
     ],
 )
 def test_bad_input_is_one_line_and_status_two(

@@ -544,7 +544,33 @@ def test_ctrl_c_leaves_no_process_and_no_port() -> None:
         socket.create_connection(("127.0.0.1", port), timeout=PATIENCE)
 
 
-@pytest.mark.parametrize("options", [("--port", "70000"), ("--host", "203.0.113.1")])
+@pytest.mark.parametrize(("module", "program"), [("typer", "cli"), ("viser", "cli"), ("viser", "cli.app")])
+def test_ctrl_c_while_it_is_loaded_is_quiet_even_where_a_library_swallows_it(module: str, program: str) -> None:
+    pytest.importorskip("viser")
+    code = f"""
+import signal, sys
+class Finder:
+    @staticmethod
+    def find_spec(name, path, target=None):
+        if name == "typer" == {module!r}:
+            raise KeyboardInterrupt
+        if name == "viser" == {module!r}:
+            try:
+                signal.raise_signal(signal.SIGINT)
+            except KeyboardInterrupt:
+                pass
+sys.meta_path.insert(0, Finder)
+sys.argv[1:] = ["play", "-k", "2", "--no-open"]
+from d4orm_planners.{program} import main
+main()
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=PATIENCE)
+    assert (result.returncode, result.stdout, result.stderr) == (130, "", "")
+
+
+@pytest.mark.parametrize(
+    "options", [("--port", "70000"), ("--host", "203.0.113.1"), ("--host", "\xe4" * 70), ("--host", "")]
+)
 def test_a_place_where_one_cannot_listen_is_said(options: tuple[str, str]) -> None:
     pytest.importorskip("viser")
     code = f"from d4orm_planners.cli.app import main; main(['play', '-k', '2', '-p', 'go-to-goal', *{options!r}])"

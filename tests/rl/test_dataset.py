@@ -313,6 +313,7 @@ def test_the_command_writes_where_minari_looks(d4orm, tmp_path: Path, monkeypatc
         (("--disturb", "delay=1,2"), "--disturb delay: an episode has one level, not 2"),
         (("--set", "speed=1", "--policy", "go-to-goal"), "takes no settings"),
         (("--workers", "0"), "workers is 0"),
+        (("--shard-size", "0"), "shard_size is 0"),
     ],
 )
 def test_bad_input_on_the_command_line_is_one_line(d4orm, options: Any, complaint: str, tmp_path: Path) -> None:
@@ -320,6 +321,14 @@ def test_bad_input_on_the_command_line_is_one_line(d4orm, options: Any, complain
     assert outcome.status == 2
     assert complaint in outcome.err
     assert outcome.err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_may_be_relative(d4orm, tmp_path: Path) -> None:
+    options = ("--policy", "go-to-goal", "--num-robots", "2", "--seeds", "1", "--workers", "1", "--quiet")
+    outcome = d4orm("dataset", *options, "--out", "one")
+    assert outcome.status == 0, outcome.err
+    assert minari.MinariDataset(tmp_path / "one" / "data").total_episodes == 1
 
 
 def test_nothing_left_is_no_success(d4orm) -> None:

@@ -63,7 +63,7 @@ def write_dataset(
     if workers is not None:
         whole_number(workers, "workers", 1)
     name = checked_id(demonstrations.dataset_id if dataset_id is None else dataset_id)
-    folder = dataset_folder(name) if out is None else Path(out)
+    folder = (dataset_folder(name) if out is None else Path(out)).absolute()  # Minari takes no other
     recording, files = Recording(folder / "recording"), dataset_files(demonstrations, folder / "data")
     recording.claim(demonstrations)
     _record(demonstrations, recording, files.seeds(), workers, progress or (lambda what, done, total: None))
