@@ -18,17 +18,20 @@ export PIP_DISABLE_PIP_VERSION_CHECK ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test integrations portability lint docs bench results format clean
+.PHONY: help demo test test-all integrations portability lint docs bench results format clean
 
 help: ## List the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
 demo: $(CORE_STAMP) ## Plan 16 robots across a warehouse, execute the plan, write pictures to demo/
 	$(BIN)/d4orm demo --out demo
 
-test: $(DEV_STAMP) ## Run the whole test suite; PYTEST_ARGS='-m "not slow"' for the quick part
+test: SELECTED = -m 'not (slow or cluster or browser or studies)'
+test: test-all ## Run the quick tests; make test PYTEST_ARGS='-k reward' for some of them
+
+test-all: $(DEV_STAMP) ## Run all tests
 	$(BIN)/d4orm warmup # once; processes that find nothing in the cache all compile the same kernels
-	$(BIN)/python -m pytest --numprocesses 3 --dist worksteal --durations 40 $(PYTEST_ARGS)
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal --durations 40 $(SELECTED) $(PYTEST_ARGS)
 
 # RLlib and JaxMARL pin an older Gymnasium, BenchMARL an older TorchRL than the rest is tested with.
 test-apart = $(PYTHON) -m venv $(VENV)-$(1) && \

@@ -41,6 +41,7 @@ def test_plan_writes_a_replay(d4orm, tmp_path: Path) -> None:
     assert "circle, 2 robots by hybrid" in (tmp_path / "plan.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_planning_and_running_take_the_recommended_planner(d4orm) -> None:
     assert d4orm("plan", "--num-robots", "2", "--out", "plan.npz", "--quiet").status == 0
     assert Plan.load("plan.npz").planner == make_planner().name
@@ -91,6 +92,7 @@ def test_run_of_a_policy_that_collides_exits_with_one(d4orm) -> None:
 @pytest.mark.parametrize(
     "names", [("--num-robots", "--num-obstacles", "--control-noise-std"), ("--robots", "--obstacles", "--noise")]
 )
+@pytest.mark.slow
 def test_options_have_the_names_of_arguments_and_shorter_ones(d4orm, names: tuple[str, ...]) -> None:
     outcome = d4orm("run", "--policy", "random", *(part for name in names for part in (name, "2")))
     assert outcome.status == 1, outcome.err
@@ -103,6 +105,7 @@ def test_no_solution_in_the_budget_exits_with_one_and_still_writes_the_best_plan
     assert not Plan.load(tmp_path / "plan.npz").solved
 
 
+@pytest.mark.slow
 def test_demo_plans_executes_verifies_and_says_where(d4orm, tmp_path: Path) -> None:
     outcome = d4orm("demo", "--num-robots", "3", "--out", "pictures")
     assert outcome.status == 0, outcome.err
@@ -120,6 +123,7 @@ def test_demo_shows_the_denoising(d4orm, tmp_path: Path) -> None:
     assert "denoising step 100 of" in (tmp_path / "pictures" / "denoising.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_scenario_file(d4orm, tmp_path: Path) -> None:
     robot = "{model: velocity2d, start: [0, 0], goal: [1, 0]}"
     (tmp_path / "mine.yaml").write_text(f"version: 1\nname: mine\nrobots:\n  - {robot}\n")

@@ -119,6 +119,7 @@ def test_the_planners_are_not_loaded_by_the_environment() -> None:
 @pytest.mark.parametrize(
     ("library", "package"), [("jaxmarl", "jaxmarl"), ("torchrl", "'d4orm-env[rl]'"), ("benchmarl", "benchmarl")]
 )
+@pytest.mark.slow
 def test_an_integration_says_which_library_is_missing(library: str, package: str) -> None:
     if library != "jaxmarl":
         pytest.importorskip("torchrl")

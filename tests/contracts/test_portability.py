@@ -43,7 +43,12 @@ def test_every_case_has_a_digest() -> None:
     assert set(plans.QUICK) <= set(plans.CASES)
 
 
-@pytest.mark.parametrize("name", plans.CASES)
+QUICK = ("d4orm", "hybrid", "mppi")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in plans.CASES]
+)
 def test_plans_are_the_same_here_as_everywhere(name: str) -> None:
     assert plans.digest(plans.CASES[name]) == DIGESTS[name]
 

@@ -52,7 +52,9 @@ CASES: dict[str, tuple[str, Callable[[], Problem]]] = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "models" else []) for name in CASES]
+)
 def test_it_observes_and_rewards_as_the_environments_do(name: str) -> None:
     reward, make = CASES[name]
     problem = make()

@@ -145,6 +145,7 @@ def double_precision(enabled: bool) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("name", CASES)
+@pytest.mark.slow
 def test_the_flag_changes_no_bit(name: str) -> None:
     with double_precision(False):
         expected = jax.tree.leaves(CASES[name]())

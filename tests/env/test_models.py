@@ -196,6 +196,7 @@ def test_teams_of_common_models_share_kernels_that_know_no_other(boat: Model) ->
     assert with_boat.roll_out.py_func.__qualname__.endswith("_holonomic2d_boat")
 
 
+@pytest.mark.slow
 def test_the_page_about_own_robots_runs(tmp_path: Path) -> None:
     program = tmp_path / "mecanum.py"
     program.write_text(PAGE.read_text().split("```python\n")[1].partition("```")[0])

@@ -99,6 +99,7 @@ def test_one_after_another_everybody_arrives_in_any_order(name: str, seed: int) 
 
 @pytest.mark.parametrize("name", WALLED)
 @pytest.mark.parametrize(("num_robots", "settings"), [(20, {}), (8, {"num_obstacles": 2}), (8, {"radius": 0.2})])
+@pytest.mark.slow
 def test_every_robot_gets_by_all_others_wherever_they_stand(
     name: str, num_robots: int, settings: dict[str, Any]
 ) -> None:

@@ -89,6 +89,7 @@ def test_measure_leaves_the_first_call_out_and_stops(
     assert spread.largest == max(ticks[:count])
 
 
+@pytest.mark.slow
 def test_every_engine_rule_and_size_is_measured(results: dict[str, list[Any]]) -> None:
     cases = {(row["engine"], row["rules"], row["num_robots"]) for row in results["denoising"]}
     assert cases == {

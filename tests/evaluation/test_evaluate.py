@@ -673,7 +673,6 @@ def test_without_ray_the_error_says_what_to_install(d4orm, monkeypatch: pytest.M
     assert err == 'd4orm: running on a cluster needs ray; install it with pip install "d4orm-env[distributed]"\n'
 
 
-@pytest.mark.slow
 def test_a_cluster_gives_the_same_rows(tmp_path: Path) -> None:
     body = EVALUATE.format(policies='["go-to-goal", "orca"]', arguments='ray="local"')
     result = program(tmp_path, body)
@@ -688,7 +687,7 @@ def test_a_cluster_gives_the_same_rows(tmp_path: Path) -> None:
     assert there == here
 
 
-@pytest.mark.slow
+@pytest.mark.cluster
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
 def test_a_worker_lost_on_a_cluster_is_a_row(tmp_path: Path) -> None:
     # Workers import the module by name, and with it the trouble.

@@ -678,6 +678,7 @@ def test_settling_says_whether_all_others_have_a_solution_as_good() -> None:
     assert first.settle(0)
 
 
+@pytest.mark.slow
 def test_an_asynchronous_node_waits_once_for_one_that_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
     release = threading.Event()
     spoil(monkeypatch, 5, lambda search: release.wait(60))

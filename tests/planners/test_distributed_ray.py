@@ -21,7 +21,7 @@ LOOPBACK = {"0100007F", "0000000000000000FFFF00000100007F", "0000000000000000000
 """127.0.0.1, the same as an IPv6 address, and ::1, as the kernel writes them."""
 
 
-@pytest.mark.slow
+@pytest.mark.cluster
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9 and -STOP")
 def test_rounds_over_ray(subtests: pytest.Subtests) -> None:
     """One process for all parts: Ray, and every actor, takes seconds to start."""

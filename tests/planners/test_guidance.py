@@ -228,6 +228,7 @@ def test_a_robot_that_turns_as_it_drives_chooses_its_gear(
 
 @pytest.mark.parametrize("heading", np.arange(-180, 180, 45))
 @pytest.mark.parametrize("way", [[(0, 0), (3, 0)], [(0, 0), (2, 0), (2, 2)], [(0, 0), (1.5, 0), (1.5, 1), (0, 1)]])
+@pytest.mark.slow
 def test_a_car_follows_a_route_from_every_heading(way: Any, heading: float) -> None:
     start = [[0, 0, np.radians(heading), 0, 0]]
     problem = Problem(Team(("car",)), start, [way[-1]], World(dimension=2), horizon=400)

@@ -238,6 +238,7 @@ def test_so_it_is_for_robots_that_stand_in_all_samples(engine: str) -> None:
 
 @pytest.mark.parametrize("engine", ENGINE_NAMES)
 @pytest.mark.parametrize("scenario", list_scenarios())
+@pytest.mark.slow
 def test_so_it_is_in_every_scenario(scenario: str, engine: str) -> None:
     size = {} if scenario.startswith("amswarm") else {"num_robots": 4}
     problem = make_problem(scenario, **size, **needed(scenario), horizon=20, dt=0.25)

@@ -268,6 +268,7 @@ def executed(name: str, settings: dict[str, Any]) -> bytes:
 
 
 @pytest.mark.parametrize(("name", "setting"), policy_settings())
+@pytest.mark.slow
 def test_every_setting_of_a_policy_changes_something(
     name: str, setting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,7 +18,7 @@ from d4orm_env import Problem, World, load_problem, make_problem
 from d4orm_planners import make_planner, register_policy
 from d4orm_planners.baselines.go_to_goal import GoToGoal
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(missing()), reason=missing())]
+pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +35,7 @@ def replay(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
 @pytest.mark.parametrize("width", [400, 1300])
+@pytest.mark.browser
 def test_a_replay_plays_without_a_network(page: Page, replay: Path, width: int, dark: bool) -> None:
     page.offline()
     page.look(width, 800, dark)
@@ -76,6 +77,7 @@ def test_keys_and_the_slider_go_through_a_replay(page: Page, replay: Path) -> No
     assert page.complaints == []
 
 
+@pytest.mark.browser
 def test_a_robot_under_the_pointer_tells_about_itself(page: Page, replay: Path) -> None:
     page.look()
     page.open(replay.as_uri())
@@ -90,6 +92,7 @@ def test_a_robot_under_the_pointer_tells_about_itself(page: Page, replay: Path) 
     assert "clearance" in text
 
 
+@pytest.mark.browser
 def test_a_hundred_robots_play(page: Page, tmp_path: Path) -> None:
     from d4orm_env.render.replay import Replay, motion
     from d4orm_env.rollout import rollout
@@ -209,6 +212,7 @@ def wait_for(condition: Callable[[], object]) -> None:
 
 
 @viser_leaves_loops
+@pytest.mark.browser
 def test_the_playground_pauses_and_a_dragged_goal_replans(page: Page, tmp_path: Path) -> None:
     with running(make_problem("circle", num_robots=4, seed=0)) as playground:
         pause_and_drag(page, playground, tmp_path)
@@ -242,6 +246,7 @@ def pause_and_drag(page: Page, playground: Any, tmp_path: Path) -> None:
 
 
 @viser_leaves_loops
+@pytest.mark.browser
 def test_obstacles_are_dragged_and_scenes_and_replays_saved(page: Page, tmp_path: Path) -> None:
     world = World(boxes=[[-0.2, -0.2, 0.2, 0.2]])
     problem = make_problem("circle", num_robots=2, seed=0)
@@ -265,6 +270,7 @@ def test_obstacles_are_dragged_and_scenes_and_replays_saved(page: Page, tmp_path
 
 
 @viser_leaves_loops
+@pytest.mark.browser
 def test_a_robot_that_is_dragged_with_shift_is_pushed(page: Page, tmp_path: Path) -> None:
     with running(make_problem("circle", num_robots=3, seed=0), "go-to-goal") as playground:
         session = playground.session
@@ -285,6 +291,7 @@ def test_a_robot_that_is_dragged_with_shift_is_pushed(page: Page, tmp_path: Path
 
 
 @viser_leaves_loops
+@pytest.mark.browser
 def test_goals_are_dragged_in_space(page: Page) -> None:
     with running(make_problem("sphere", num_robots=3, seed=0), "go-to-goal") as playground:
         session = playground.session
@@ -302,6 +309,7 @@ def test_goals_are_dragged_in_space(page: Page) -> None:
 
 
 @viser_leaves_loops
+@pytest.mark.browser
 def test_policies_are_ticked_and_drive_side_by_side(page: Page, tmp_path: Path) -> None:
     with running(make_problem("circle", num_robots=3, seed=0), "go-to-goal") as playground:
         session = playground.session
@@ -329,6 +337,7 @@ def test_policies_are_ticked_and_drive_side_by_side(page: Page, tmp_path: Path) 
 
 
 @viser_leaves_loops
+@pytest.mark.browser
 def test_two_browsers_play_with_one_team(page: Page, tmp_path: Path) -> None:
     with running(make_problem("circle", num_robots=3, seed=0), "go-to-goal") as playground:
         session = playground.session
@@ -371,6 +380,7 @@ def test_two_browsers_play_with_one_team(page: Page, tmp_path: Path) -> None:
 
 
 @viser_leaves_loops
+@pytest.mark.browser
 def test_a_slow_planner_does_not_freeze_the_page(page: Page) -> None:
     with running(make_problem("circle", num_robots=3, seed=0), "go-to-goal") as playground:
         session = playground.session
@@ -399,6 +409,7 @@ class Slow(GoToGoal):
 
 
 @viser_leaves_loops
+@pytest.mark.browser
 def test_a_slider_disturbs_from_the_next_step_on(page: Page) -> None:
     with running(make_problem("circle", num_robots=3, seed=0), "go-to-goal") as playground:
         session = playground.session

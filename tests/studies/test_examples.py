@@ -21,6 +21,8 @@ from d4orm_planners import Plan
 from d4orm_planners.evaluation.tables import read_parquet
 from d4orm_planners.sampling.tuned import TUNED
 
+pytestmark = pytest.mark.studies
+
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = ROOT / "examples"
 PNG = b"\x89PNG"

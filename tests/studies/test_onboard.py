@@ -28,6 +28,8 @@ from d4orm_planners.base.candidate import evaluate_controls
 from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.tracking.steering import straight_drives
 
+pytestmark = pytest.mark.studies
+
 
 @pytest.fixture(scope="module")
 def onboard() -> Any:

@@ -23,6 +23,8 @@ from d4orm_planners.reproduction.numbers import METRICS, first_solution, measure
 from d4orm_planners.reproduction.paper_figures import FIGURES, find_figure
 from d4orm_planners.reproduction.plots import PLOTS, best_reward
 
+pytestmark = pytest.mark.studies
+
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
