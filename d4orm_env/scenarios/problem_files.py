@@ -6,11 +6,13 @@
 from __future__ import annotations
 
 import os
+import warnings
 from pathlib import Path
 
 import yaml
 
 from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.yaml_text import read_yaml
 from d4orm_env.scenarios.schema import describe, parse
@@ -23,6 +25,9 @@ def load_problem(path: str | os.PathLike[str]) -> Problem:
         path: A YAML file of at most 10 MB, 10,000 robots and 5 * 10^7 robots times steps, in the explicit form (every
             robot listed) or the short form (a scenario and its arguments).
 
+    Warns:
+        UserWarning: If it is proved that nothing solves the problem, with the robots and why.
+
     Raises:
         ValueError: If the file cannot be read, is not YAML, breaks the schema, or makes no valid problem. One line that
             names the file, the field, and what was expected.
@@ -30,9 +35,14 @@ def load_problem(path: str | os.PathLike[str]) -> Problem:
     if not isinstance(path, (str, os.PathLike)):
         raise ValueError(f"the path of a scenario file must be text or a path, not {path!r}")
     try:
-        return parse(read_yaml(path))
+        problem = parse(read_yaml(path))
     except ValueError as error:
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
+    proofs = [f"robot_{robot} {proof}" for robot, proof in prove_infeasible(problem).items()]
+    if proofs:
+        more = f", and {len(proofs) - 1} more" if len(proofs) > 1 else ""
+        warnings.warn(f"{path}: nothing solves this problem: {proofs[0]}{more}", stacklevel=2)
+    return problem
 
 
 def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:

@@ -16,6 +16,7 @@ from d4orm_env.core.archives import ArrayArchive
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.errors import first_line
 from d4orm_env.core.files import replaced_when_done, require_file
+from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.metrics import mean_stretch, trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import Row, count, outcome_rows
@@ -26,7 +27,6 @@ from d4orm_env.scenarios.schema import describe, parse
 from d4orm_env.verify import VerificationReport, verify
 from d4orm_planners.base.conflict_groups import conflicts
 from d4orm_planners.base.display import DisplayMixin
-from d4orm_planners.base.infeasibility import prove_infeasible
 from d4orm_planners.base.provenance import Provenance
 
 Status = Literal["solved", "iteration_limit", "time_limit", "stopped", "interrupted", "infeasible", "refuted"]
@@ -95,7 +95,7 @@ class Plan(DisplayMixin):
         status: How the search ended. ``"solved"``: with a solution. ``"iteration_limit"`` or ``"time_limit"``: with the
             budget, so without a solution unless it was to be improved. ``"stopped"`` (by the callback) or
             ``"interrupted"``: with whatever it had. ``"infeasible"``: at once, for there is a proof that nothing solves
-            the problem, see :func:`d4orm_planners.base.infeasibility.prove_infeasible`. ``"refuted"``: a file says
+            the problem, see :func:`d4orm_env.core.infeasibility.prove_infeasible`. ``"refuted"``: a file says
             ``"solved"`` or ``"infeasible"``, and that is not so.
         iterations: Iterations done.
         denoising_steps: Sample-score-update steps done.

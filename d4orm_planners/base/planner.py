@@ -10,9 +10,9 @@ from typing import Any, ClassVar, TypeAlias
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray, duration, whole_number
+from d4orm_env.core.infeasibility import prepare_proofs, prove_infeasible
 from d4orm_env.core.problem import Problem
 from d4orm_planners.base.candidate import Candidate
-from d4orm_planners.base.infeasibility import prepare_proofs, prove_infeasible
 from d4orm_planners.base.plan import IterationRecord, Plan, Status
 from d4orm_planners.base.settings import CheckedSettings, Count, EngineName
 from d4orm_planners.base.solve import SolveRun
@@ -111,7 +111,7 @@ class Planner(ABC):
     ) -> Plan:
         """Plan until a solution is found (or on, with ``improve``), the budget is used up, or Ctrl-C is pressed.
 
-        A problem that :func:`~d4orm_planners.base.infeasibility.prove_infeasible` proves to have no solution ends at
+        A problem that :func:`~d4orm_env.core.infeasibility.prove_infeasible` proves to have no solution ends at
         once.
 
         Args:

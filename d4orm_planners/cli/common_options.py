@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -64,7 +65,9 @@ class ProblemOptions:
         if is_scenario_file(self.scenario):
             reason = f"does not go with a scenario file; change it in {self.scenario}"
             refuse_options(self.context, (*common, "scenario_settings"), reason)
-            return load_problem(self.scenario)
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", ".*nothing solves this problem")  # the commands tell it at their end
+                return load_problem(self.scenario)
         own = parse_settings(self.scenario_settings, "--scenario-set")
         for name in (*common, "seed"):
             if name in own:

@@ -68,7 +68,7 @@ def require_solved(plan: Plan) -> None:
 
 def require_success(episode: Episode, problem: Problem) -> None:
     """End with status 1 if an episode is none, and say so if nothing solves the problem."""
-    from d4orm_planners.base.infeasibility import prove_infeasible
+    from d4orm_env.core.infeasibility import prove_infeasible
 
     if not episode.metrics["success"]:
         if proofs := prove_infeasible(problem):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,13 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from planner_support import cheap_planner, hop_problem, sealed_problem, walled_in_problem
 
-from d4orm_env import save_problem
+from d4orm_env import load_problem, save_problem
+from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.scenarios import list_scenarios, make_problem
 from d4orm_planners import Plan, list_planners, make_planner
-from d4orm_planners.base.infeasibility import prove_infeasible
 
 
 def passage(width: float, *, robots: int = 1, upper: float = 3.0, **changes: object) -> Problem:
@@ -44,6 +45,16 @@ def test_every_planner_ends_at_once_where_nothing_is_a_solution(name: str, tmp_p
     plan.save(tmp_path / "plan.npz")
     loaded = Plan.load(tmp_path / "plan.npz")
     assert (loaded.status, loaded.failures) == ("infeasible", plan.failures)
+
+
+def test_a_file_is_told_of_when_it_is_read(tmp_path: Path) -> None:
+    save_problem(walled_in_problem(), tmp_path / "scene.yaml")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_problem(tmp_path / "scene.yaml")  # too small a proof for so little room
+    save_problem(sealed_problem(), tmp_path / "scene.yaml")
+    with pytest.warns(UserWarning, match="scene.yaml: nothing solves this problem: robot_0 has no free way"):
+        assert load_problem(tmp_path / "scene.yaml") == sealed_problem()
 
 
 def test_a_file_that_calls_a_problem_infeasible_is_not_believed(tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ from d4orm_env.core.arrays import Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.models import MODEL_CODES, NUM_BUILT_IN
 from d4orm_env.dynamics.robot_model import ACCELERATION
-from d4orm_env.verify import CHORD_ERROR
 
 ROUNDING = 64 * 2.0**-23
 """What float32 may be off by, as a share of the largest coordinate or of radius and margin."""
@@ -48,7 +47,7 @@ def prove_infeasible(problem: Problem) -> dict[int, str]:
     """
     d, reach = problem.dimension, problem.team.radius.astype(np.float64) + problem.margin
     starts, goals = problem.start[:, :d].astype(np.float64), problem.goal.astype(np.float64)
-    doubt = CHORD_ERROR + ROUNDING * max(np.abs(starts).max(), np.abs(goals).max(), reach.max())
+    doubt = problem.rounding + ROUNDING * max(np.abs(starts).max(), np.abs(goals).max(), reach.max())
     proofs = dict(_crowded(problem, "starts", starts, _travel(problem, _start_speed(problem)) + doubt, "one step"))
     at_rest = np.full(problem.num_robots, problem.goal_radius + doubt)
     proofs |= dict(_crowded(problem, "has a goal", goals, at_rest, "the goal radius"))
