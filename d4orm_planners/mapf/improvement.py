@@ -16,6 +16,8 @@ FIRST_ROUNDS = 4
 """Rounds for a plan that has just been found."""
 GUIDED_ROUNDS = 8
 """The same for one that was found on a roadmap, with all its corners and stops."""
+FIRST_ROBOT_STEPS = 2**19
+"""Steps of all robots in these rounds together: in a large world there are fewer, for the first plan not to wait."""
 
 
 def improve_by_lns(search: SolveRun) -> Iteration:
@@ -47,4 +49,5 @@ def improve_first_paths(team: WorkingPlan, rounds: int = FIRST_ROUNDS) -> None:
     """Take what faster ways there are at once for a team in which nobody fails, in so many rounds."""
     from d4orm_planners.mapf.lns import improve_paths
 
+    rounds = min(rounds, FIRST_ROBOT_STEPS // (team.problem.num_robots * team.problem.horizon))
     improve_paths(team, team.search.iteration_seed(Stream.NEIGHBOURHOODS), rounds, temperature=0.0)
