@@ -1,4 +1,4 @@
-"""What a function of a robot model is made of: its code, and the constants and functions that it names."""
+"""Parts that a function of a robot model is made of: its code, and the constants and functions that it names."""
 
 from __future__ import annotations
 

@@ -23,10 +23,10 @@ def advance(
 def arrives(
     squared_distance: Number, squared_speed: Number, squared_goal_radius: Number, squared_goal_speed: Number
 ) -> Flag:
-    """Whether a robot at this distance from its goal, at this speed, docks there."""
+    """Check whether a robot at this distance from its goal, at this speed, arrives there."""
     return (squared_distance <= squared_goal_radius) & (squared_speed <= squared_goal_speed)
 
 
 def stands(arrived: Truth, docks: Truth) -> Flag:
-    """Whether a robot that has arrived stays where it is, whatever its control; ``docks`` says whether any does."""
+    """Check whether a robot that has arrived stays at rest, whatever its control; ``docks`` says whether any does."""
     return arrived & docks

@@ -31,7 +31,7 @@ SOURCES = observing.SOURCES + fingerprint((observing,))
 
 
 STEP, RESET, LOOK, SKIP = (np.uint8(order) for order in range(4))
-"""What to do with a world: step it, put it back to its start, only observe it, or leave it alone altogether."""
+"""Orders for a world: step it, put it back to its start, only observe it, or leave it alone altogether."""
 
 
 class WorldBatch(NamedTuple):

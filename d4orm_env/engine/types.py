@@ -1,4 +1,4 @@
-"""What an engine is: what it is asked for, and what it answers."""
+"""Interface of an engine: its inputs and its results."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Engine(Protocol):
 
 
 class ObservationInputs(NamedTuple):
-    """What there is to see of ``B`` worlds.
+    """Inputs to the observations of ``B`` worlds.
 
     Attributes:
         goal: ``(B, K, d)`` [m].
@@ -84,7 +84,7 @@ class ObservationInputs(NamedTuple):
         time_left: float,
         bodies: FloatArray | None = None,
     ) -> ObservationInputs:
-        """Of one world, in arrays of its own: kernels are compiled anew for read-only ones."""
+        """Make those of one world, in arrays of its own: kernels are compiled anew for read-only ones."""
         if bodies is None:
             bodies = np.empty((0, 2 * goal.shape[1] + 1), np.float32)
         one = np.newaxis
