@@ -1,4 +1,4 @@
-"""What disturbances draw from: every disturbance of every world has random numbers of its own."""
+"""Random numbers of disturbances: every disturbance of every world has its own."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ Keys = NDArray[np.uint32]
 Steps = NDArray[np.int64]
 Kernel = Callable[..., None]
 Ahead = dict[tuple[int, int, int, tuple[int, ...]], tuple[int, FloatArray]]
-"""What a single world has drawn ahead in its episode: by kind of number, stream, call and shape the first step, and
+"""Numbers that a single world has drawn ahead in its episode: by kind of number, stream, call and shape the first step,
+and rows of numbers, one for each step from there on.
 rows of numbers, one for each step from there on."""
 
 _NORMAL, _UNIFORM = range(2)

@@ -68,7 +68,7 @@ class Intruder(Disturbance[Courses]):
         return BoundsSlack(distance=2 * self._room(problem) + self.speed * problem.dt, speed=faster, radius=self.radius)
 
     def _room(self, problem: Problem) -> float:
-        """What keeps an intruder clear of any robot [m]."""
+        """Return the distance that keeps an intruder clear of any robot [m]."""
         return self.radius + float(problem.team.radius.max()) + 2 * problem.margin
 
     def begin(self, scene: Scene, draws: Draws) -> Courses:

@@ -97,7 +97,7 @@ def split_state(problem: Problem, state: ArrayLike) -> JointState:
 
 
 def _fits(rest: FloatArray, team_size: int, body: int) -> bool:
-    """Whether the end of a state vector is that of such a team: flags, steps, bodies of ``body`` numbers."""
+    """Check whether the end of a state vector is that of such a team: flags, steps, bodies of ``body`` numbers."""
     flags, steps, bodies = rest[:team_size], rest[team_size : team_size + 1], rest[team_size + 1 :]
     if len(steps) == 0 or len(bodies) % body:
         return False

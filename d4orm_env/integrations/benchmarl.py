@@ -41,7 +41,7 @@ class NavigationTask(TaskClass):
     def get_env_fun(
         self, num_envs: int, continuous_actions: bool, seed: int | None, device: str
     ) -> Callable[[], TorchRLNavigation]:
-        """What makes the environment; see BenchMARL."""
+        """Return a function that makes the environment; see BenchMARL."""
         config = dict(self.config)
         return lambda: TorchRLNavigation(num_envs, self.name, seed=seed, device=device, **config)
 

@@ -46,7 +46,7 @@ class EnvState(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """What a step brought.
+    """Result of one step.
 
     Attributes:
         observations: ``(K, D)``; after the end of an episode those of the next one.

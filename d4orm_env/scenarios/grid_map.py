@@ -82,7 +82,7 @@ class GridMap:
 
 
 def float32_resolves(coordinate: float, cell: float) -> bool:
-    """Whether float32 holds so large a coordinate to a hundredth of a cell [m], as starts to one of the goal radius."""
+    """Check whether float32 holds so large a coordinate to a hundredth of a cell [m], as starts to the goal radius."""
     return coordinate <= LARGEST and bool(RESOLUTION * np.spacing(np.float32(coordinate)) <= cell)
 
 

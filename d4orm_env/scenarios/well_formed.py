@@ -28,7 +28,7 @@ ENOUGH_POINTS = 2**18
 """Lattice points that do where nothing is narrow."""
 
 WINDOW = {2: 32, 3: 8}
-"""How many lattice points away a way round a place is looked for at least."""
+"""Least distance, in lattice points, within which a way round a place is looked for."""
 
 TRIES, ROUNDS = 200, 3
 """Places looked at for each start or goal in one attempt to find all of them, and attempts."""
@@ -75,7 +75,7 @@ class _Placing:
         return tuple(slice(index + self._wide - window, index + self._wide + window + 1) for index in place)
 
     def _goes_round(self, place: NDArray[np.int64]) -> bool:
-        """Whether all that a new disc touches of the untaken region is connected around it."""
+        """Check whether all that a new disc touches of the untaken region is connected around it."""
         about = self._about(place, self._wide)
         untaken = self._free[about] & (self._taken[about] == 0)
         regions, _ = self._label(untaken & ~self._wide_disc)
@@ -83,7 +83,7 @@ class _Placing:
         return len(np.unique(touched[touched > 0])) == 1
 
     def _in_touch(self, place: NDArray[np.int64]) -> bool:
-        """Whether a robot gets from a place to the untaken region through no disc but its own."""
+        """Check whether a robot gets from a place to the untaken region through no disc but its own."""
         about = self._about(place, self._narrow)
         free, taken = self._free[about], self._taken[about]
         untaken = free & (taken == 0)
@@ -121,7 +121,7 @@ def draw_places(
 
 
 def reserve_of(settings: Settings) -> float:
-    """What is left free beside the margin [m]."""
+    """Return the distance left free beside the margin [m]."""
     return RESERVE * settings.team.largest_radius
 
 

@@ -98,7 +98,7 @@ def _judged(problem: Problem, motion: TeamMotion, course: _Course) -> Verificati
 
 
 class _Course:
-    """Where all robots are over the whole horizon, some steps at a time."""
+    """Positions of all robots over the whole horizon, some steps at a time."""
 
     def __init__(self, motion: TeamMotion, sub_steps: int, start: Floats) -> None:
         self._motion, self._sub_steps = motion, sub_steps
