@@ -37,7 +37,7 @@ class Candidate:
 
     @property
     def solved(self) -> bool:
-        """Whether everyone arrives, the margin is kept at every step, and :func:`d4orm_env.verify` agrees."""
+        """True if all arrive, the margin is kept at every step, and :func:`d4orm_env.verify` agrees."""
         return self.report is not None and self.report.ok
 
     @property

@@ -111,11 +111,11 @@ class SolveRun:
 
     @property
     def is_over(self) -> bool:
-        """Whether there is a solution, and nobody asks for a better one."""
+        """True if there is a solution, and no better one is asked for."""
         return self.best.solved and not self.planner.config.improve
 
     def should_stop(self) -> bool:
-        """Whether an iteration must come to its end as it is."""
+        """Check whether an iteration must come to its end as it is."""
         return self.time_left == 0 or self.cancelled.is_set()
 
     def denoise(

@@ -19,7 +19,7 @@ from d4orm_planners.sampling.d4orm import PAPER_DEFORMATION, DeformingPlanner
 from d4orm_planners.tracking.steering import prepare_drives, straight_drives
 
 State = Groups | Repairs
-"""What is kept between iterations, by the way of decoupling."""
+"""State between iterations, by the kind of decoupling."""
 
 
 class D4ormD(DeformingPlanner):

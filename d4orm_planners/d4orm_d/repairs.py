@@ -95,7 +95,7 @@ class _Repair:
             self.take_over(range(self.problem.num_robots), self.problem, trajectory)
 
     def next_robots(self, failed: IntArray) -> tuple[tuple[int, ...], str]:
-        """Whom to repair, and by whose reward.
+        """Choose the robots to repair, and whose reward to use.
 
         Of those that fail some without conflicts among them, those that were not repaired lately first, each by its
         own reward.

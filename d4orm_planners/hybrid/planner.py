@@ -30,13 +30,13 @@ from d4orm_planners.mapf.planner import (
 )
 
 State = Groups | Repairs | RoadmapSolution
-"""What is kept between iterations: the repairer's state, or the roadmap solution once there is one."""
+"""State between iterations: the repairer's, or the roadmap solution once there is one."""
 
 REPLANNING = MAPFConfig()
 MAPF_AFTER = 6
 """Iterations without a solution after which paths are looked for on a roadmap."""
 LNS_PERIOD = 5
-"""Of so many iterations on a roadmap solution one improves the motions, the others replan on the roadmap."""
+"""Number of iterations on a roadmap solution of which one improves the motions; the others replan on the roadmap."""
 
 
 class Hybrid(Planner):
@@ -118,7 +118,7 @@ class Hybrid(Planner):
         return state, replace(iteration, controls=team.controls)
 
     def follow(self, search: SolveRun, solution: RoadmapSolution) -> Iteration:
-        """What a team does on a roadmap solution, a little improved if that is all that is left to do."""
+        """Return the team's controls on a roadmap solution, a little improved if that is all that is left to do."""
         iteration = roadmap_iteration(search, solution)
         if not self.improves_by_lns:
             return iteration

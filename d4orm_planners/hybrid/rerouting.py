@@ -16,7 +16,7 @@ from d4orm_planners.mapf.beams import MotionPrimitives, OtherAgents, find_ways
 from d4orm_planners.tracking.steering import drives, standing
 
 AWAY = np.float32(1e6)
-"""Where a robot is that is in nobody's way [m]."""
+"""Position of a robot that is in nobody's way [m]."""
 SPREAD = 20 / 3
 """Deviation of detours' points from straight ways, beyond half of their lengths, in radii of the largest robot."""
 

@@ -20,7 +20,7 @@ from d4orm_planners.tracking.steering import Rollouts, by_model
 
 @dataclass(frozen=True)
 class MotionPrimitives:
-    """What robots that look for a way may do.
+    """Moves of robots that look for a path.
 
     Attributes:
         angles: By which a robot turns off from the way to its goal [degrees]; in space up and down as well.
@@ -57,7 +57,7 @@ class MotionPrimitives:
 
 @dataclass(frozen=True, eq=False)
 class OtherAgents:
-    """Whom robots that look for a way mind other than they drive at present.
+    """Agents that robots which look for a path avoid, other than the team as it drives at present.
 
     Attributes:
         without: ``(R, N)`` numbers of robots that each does not mind.

@@ -30,7 +30,7 @@ class SearchConstraint(NamedTuple):
 
 @dataclass(eq=False)
 class TeamConfiguration:
-    """Where the team is, and what has been tried from there.
+    """Nodes of the team, and what has been tried from there.
 
     Attributes:
         positions: ``(K,)`` nodes.
@@ -51,7 +51,7 @@ class TeamConfiguration:
         self.order = np.argsort(-self.priorities, kind="stable").astype(np.int64)
 
     def next_constraint(self, roadmap: Roadmap) -> SearchConstraint:
-        """What to try next; those that say of one robot more where it goes come after all others."""
+        """Return the next constraint to try; those on one robot more come after all others."""
         constraint = self.untried.popleft()
         if len(constraint.robots) < len(self.order):
             robot = int(self.order[len(constraint.robots)])
@@ -63,7 +63,7 @@ class TeamConfiguration:
 
 @dataclass(frozen=True, eq=False)
 class TeamMoves:
-    """What a search found.
+    """Result of a search.
 
     Attributes:
         moves: ``(M, 2)`` robots and edges, in an order in which all can be made one after another.
@@ -154,7 +154,7 @@ class TeamOnRoadmap:
     def after(
         self, here: TeamConfiguration, scratch: PibtWorkspace, seed: int, known: dict[bytes, TeamConfiguration]
     ) -> TeamConfiguration | None:
-        """Where a step leads under the next constraint that is untried; ``None`` where that cannot be kept.
+        """Take a step under the next untried constraint; ``None`` where that cannot be kept.
 
         A configuration that is ``known`` is returned itself; others are added.
         """

@@ -98,7 +98,7 @@ class _Neighbourhoods:
 
     @property
     def cost(self) -> float:
-        """Of all together [s]."""
+        """Sum of all costs [s]."""
         return float((self.arrival + self.lag).sum())
 
     def costs(self, robots: IntArray, places: FloatArray) -> tuple[Floats, Floats]:

@@ -60,7 +60,7 @@ class Footprints(NamedTuple):
 
 
 class PibtWorkspace(NamedTuple):
-    """What a step is worked out in.
+    """Workspace of a step.
 
     Attributes:
         state: ``(K,)`` int8.
@@ -94,7 +94,7 @@ def _gap(points: Floats, u: Whole, v: Whole) -> float:
 def _too_near(
     roadmap: Roadmap, bodies: Footprints, k: Whole, tail: Whole, head: Whole, i: Whole, u: Whole, gap: float
 ) -> bool:
-    """Whether robot ``k`` passes robot ``i`` at node ``u`` too near, ``gap``, on its way from one node to another.
+    """Check whether robot ``k`` passes robot ``i`` at node ``u`` too near, ``gap``, on its way between two nodes.
 
     Starts and goals may be nearer to each other than robots keep: then it may leave its own, and come to its own, if it
     comes no nearer on the way.
@@ -113,7 +113,7 @@ def _too_near(
 
 @compiled
 def closed(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, tail: Whole, e: Whole) -> bool:
-    """Whether a robot can never take an edge, because it would dock in passing, or of somebody who has docked.
+    """Check whether an edge is closed to a robot for good: it would dock in passing, or be too near a docked one.
 
     ``docked`` ``(N,)`` is the robot docked at each node, -1 for none.
     """
@@ -155,7 +155,7 @@ def fill_costs(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, end
 
 @cached_kernel(SOURCES, variant="open", **OPTIONS)
 def is_open(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, at: Whole, costs: FloatArray) -> bool:
-    """Whether nobody who has docked closes the way that a robot at a node would take by these costs."""
+    """Check whether no docked robot closes the path that a robot at a node would take by these costs."""
     if not costs[at] < np.inf:
         return False
     while at != bodies.goals[k]:

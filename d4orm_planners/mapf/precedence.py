@@ -1,4 +1,4 @@
-"""Who goes first: from moves on a roadmap to routes, and whom each robot has to let pass before it goes on.
+"""Precedence: from moves on a roadmap to routes, and whom each robot has to let pass before it goes on.
 
 As in action dependency graphs (W. Hoenig, S. Kiesel, A. Tinka, J. W. Durham and N. Ayanian, 2019) only the order
 matters, not the time: wherever two routes come too near to each other, who moved there first goes first. Since the
@@ -202,7 +202,7 @@ def find_waits(
     wait_first: IntArray,
     waits: IntArray,
 ) -> int:
-    """Whom robots have to let pass; see :class:`Routes`.
+    """Find whom robots have to let pass; see :class:`Routes`.
 
     ``owner`` ``(T,)`` is the robot of each point, and ``waits`` ``(room, 3)`` is at which point, for whom and until it
     has come where.

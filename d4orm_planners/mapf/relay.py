@@ -10,9 +10,9 @@ from d4orm_planners.mapf.roadmap import lay_roadmap
 from d4orm_planners.mapf.roadmap_team import FAR, Replanning, TeamRollout
 
 FINENESS = 1.6
-"""How fine the roadmap is."""
+"""Fineness of the roadmap."""
 LINGER = 1.0
-"""For so long others keep off the goal of a robot that has arrived; by then it drives on to another [s]."""
+"""Time for which others keep off the goal of a robot that has arrived; by then it drives on to another [s]."""
 TURNS = 3
 """Ways that are planned per robot before it gives up."""
 

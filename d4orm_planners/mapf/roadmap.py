@@ -130,7 +130,7 @@ def _room(problem: Problem, space: Space | None, reaches: Floats, tails: Floats,
 def measure_gaps(
     nodes: Floats, tails: IntArray, heads: IntArray, near_first: IntArray, near: Ints, gaps: Floats
 ) -> None:
-    """How near to edges nodes are: ``gaps`` is output, all others as in :class:`Roadmap`."""
+    """Measure the distances of nodes from edges: ``gaps`` is output, all others as in :class:`Roadmap`."""
     for e in range(tails.shape[0]):
         for number in range(near_first[e], near_first[e + 1]):
             gaps[number] = np.sqrt(near_neighbours.squared_gap(nodes, near[number], nodes, tails[e], nodes, heads[e]))

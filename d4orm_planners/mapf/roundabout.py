@@ -25,7 +25,7 @@ SLACK = 1 / 75
 PARALLEL = 1e-6
 """Ways are parallel whose directions differ by less, squared [rad^2]."""
 CORRECTION = 1.0
-"""What of its distance from where it should be a robot makes good in a second [1/s]."""
+"""Share of its distance from where it should be that a robot makes good in a second [1/s]."""
 
 
 class Bends(NamedTuple):
@@ -92,7 +92,7 @@ def drive_roundabout(problem: Problem, engine: Engine, side: int) -> FloatArray 
 
 
 def _driven(time: float | Floats, speed: Floats, acceleration: Floats) -> Floats:
-    """How far robots have driven that set out at time zero, as fast as they can."""
+    """Return the distance driven by robots that set out at time zero, as fast as they can."""
     gaining = np.minimum(time, speed / acceleration)
     driven: Floats = 0.5 * acceleration * gaining**2 + speed * (time - gaining)
     return driven
