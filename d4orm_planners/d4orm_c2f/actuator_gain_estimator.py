@@ -23,13 +23,13 @@ WEAKEST = 0.3
 """Nobody is believed to be weaker than that."""
 
 FORGOTTEN = 0.1
-"""What is lost in a time step of the mean of what is added to commands, ..."""
+"""Share that the mean of what is added to commands loses in a time step, ..."""
 
 FIRST = 4
 """... after the first steps, which count as if so many with nothing added had been before."""
 
 BY_CHANCE = 3.0
-"""How many times its standard error that mean may be, and still be nothing but noise."""
+"""Number of standard errors that mean may be, and still be nothing but noise."""
 
 STEP = 0.05
 """Shares of the limits that are told apart."""

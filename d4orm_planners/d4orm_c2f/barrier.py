@@ -20,7 +20,7 @@ NEAR, STOPS = 10 / 3, 2.0
 """Only what is this near is minded: so many radii of the largest robot, and so many of its stops from full speed."""
 
 PARTING = 2.0
-"""With what is nearer than it should be, robots part at so much of what is missing per second [1/s]."""
+"""Rate at which robots part from what is too near, per distance missing [1/s]."""
 
 SWEEPS = 400
 """Times that every barrier is met at most; by then there are no velocities that keep to all, or hardly any."""
@@ -29,7 +29,7 @@ EXACT = 1e-6
 """Changes of that size are none, as a share of the largest speed limit."""
 
 _STEP = 1 / 150
-"""For the direction away from an obstacle, in radii of the largest robot."""
+"""Step for the direction away from an obstacle, in radii of the largest robot."""
 
 Array = NDArray[np.float64]
 
@@ -92,7 +92,7 @@ class Barriers(NamedTuple):
 
 
 def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, caution: float) -> Barriers:
-    """What the velocities of those who are ``free`` have to keep to."""
+    """Return the barriers for the velocities of robots that are ``free``."""
     d = problem.dimension
     places, radius = joint.states[:, :d].astype(np.float64), np.asarray(problem.team.radius, np.float64)
     acceleration, speed = (problem.team.limits[:, limit].astype(np.float64) for limit in (ACCELERATION, SPEED))
@@ -133,7 +133,7 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
 
 
 def _near(problem: Problem) -> float:
-    """How near something must be to be minded [m]."""
+    """Return the distance within which something is minded [m]."""
     speed, acceleration = (problem.team.limits[:, limit].astype(np.float64) for limit in (SPEED, ACCELERATION))
     return NEAR * problem.team.largest_radius + STOPS * float((speed**2 / (2 * acceleration)).max())
 
@@ -173,7 +173,7 @@ def find_nearest(one: Any, other: Any, normals: Any, least: Any, velocities: Any
 
 
 def _walls(problem: Problem, places: Array, robots: list[int], near: float) -> Iterator[tuple[int, Array, float]]:
-    """What stands near robots at ``places`` ``(R, d)``: of which one, the direction away from it, and how far it is."""
+    """Yield what is near robots at ``places`` ``(R, d)``: which robot, the direction away from it, and the distance."""
     d, (lower, upper), shapes = problem.dimension, problem.world.bounds.astype(np.float64), problem.world.shapes
     axes = np.eye(d)
     inward, sides = np.concatenate([axes, -axes]), np.concatenate([places - lower, upper - places], axis=1)

@@ -38,7 +38,7 @@ from d4orm_planners.mapf.relay import relay_ways
 from d4orm_planners.tracking.steering import straight_drives
 
 NEARER = 1 / 3
-"""What counts as coming nearer to the goals, all robots together, in radii of the largest one."""
+"""Least progress towards the goals, all robots together, in radii of the largest one."""
 
 
 class CoarsePlanTracker:
@@ -267,7 +267,7 @@ class CoarsePlanTracker:
         return waiting
 
     def _is_lost(self, joint: JointState, moving: BoolArray) -> bool:
-        """Whether the robots under way are far from their waypoints, at the end of the path, or get no nearer."""
+        """Check whether the robots under way are far from their waypoints, at the end of the path, or get no nearer."""
         positions = joint.states[:, : self.problem.dimension]
         distance = float(np.linalg.norm((joint.goals - positions)[moving], axis=1).sum())
         if distance < self._nearest - NEARER * self.problem.team.largest_radius:

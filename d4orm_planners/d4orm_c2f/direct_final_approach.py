@@ -19,10 +19,10 @@ NEARBY = 3.0
 """Within how many radii of its turning circle of its goal a robot that cannot turn in place looks for a manoeuvre."""
 
 DIRECTIONS, BEYOND = 16, (0.25, 1.0, 2.0)
-"""In how many directions a manoeuvre may lead away at first, and how far, in radii of the turning circle."""
+"""Number of directions of a manoeuvre at first, and its distances, in radii of the turning circle."""
 
 LENGTH, RESERVE = 8.0, 2.0
-"""How long it may be, in radii of the turning circle, and how much longer it may take than at full speed [s]."""
+"""Most length, in radii of the turning circle, and most time beyond that at full speed [s]."""
 
 
 def docking_radius(problem: Problem, docks: bool) -> float:

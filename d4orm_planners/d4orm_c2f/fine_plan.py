@@ -16,11 +16,11 @@ from d4orm_planners.engine.sampling_types import MovingObstacles, SamplingEngine
 from d4orm_planners.tracking.steering import track_velocities
 
 SHORTER = 3
-"""How many times fewer fresh steps a robot takes before it stops if it would violate the margin otherwise."""
+"""Divisor of the fresh steps that a robot takes before it stops if it would violate the margin otherwise."""
 
 
 class Prediction(NamedTuple):
-    """What a control loop comes to.
+    """Prediction of a control loop.
 
     Attributes:
         controls: ``(H_predict + S, K, m)`` with the ``S`` steps that a stop may take.
@@ -34,7 +34,7 @@ class Prediction(NamedTuple):
 
 
 class Situation(NamedTuple):
-    """What a control loop begins with.
+    """State at the beginning of a control loop.
 
     Attributes:
         joint: Where the robots are.
@@ -138,7 +138,7 @@ class Window:
         )
 
     def _bodies(self, joint: JointState, horizon: int) -> MovingObstacles | None:
-        """Where bodies that are no robots will be, going on as they do; ``None`` if none is seen."""
+        """Predict the dynamic obstacles, going on as they do; ``None`` if none is seen."""
         d, bodies = self.problem.dimension, joint.bodies
         seen = bodies[bodies[:, -1] > 0] if len(bodies) else bodies
         if not len(seen):

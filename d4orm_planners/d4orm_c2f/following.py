@@ -11,7 +11,7 @@ from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.tracking.steering import track_velocities
 
 STUCK_WITHIN, STUCK_AFTER = 3, 25
-"""How many waypoints a robot has to get on in so many time steps not to be stuck."""
+"""Progress without which a robot is stuck: so many waypoints in so many time steps."""
 
 BARRED_AFTER = 8
 """The same for robots whose ways lead through those that stand for good, who will not let them pass."""
@@ -23,7 +23,7 @@ CAREFUL_FOR = 30
 """Steps for which a robot that was stuck follows its path."""
 
 CATCHING_UP = 2.0
-"""What of its lag a robot makes good in a second [1/s]."""
+"""Share of its lag that a robot makes good in a second [1/s]."""
 
 
 class StagnationMonitor:

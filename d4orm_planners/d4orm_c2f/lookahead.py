@@ -1,4 +1,4 @@
-"""Which waypoint a robot can drive to straight."""
+"""Waypoint that a robot can drive to straight."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ LEAST = 5
 """Waypoints that a subgoal is ahead all the same: nearer ones hardly pull."""
 
 _SHARES = np.linspace(0, 1, 9)[1:]
-"""Of the straight way, where its clearance from obstacles is looked at."""
+"""Shares of the straight line at which its clearance from obstacles is looked at."""
 
 
 def within_sight(

@@ -40,7 +40,7 @@ NEARLY = 1e-3
 
 @dataclass(frozen=True)
 class LoopRecord:
-    """What one control loop did.
+    """Record of one control loop.
 
     Attributes:
         step: The environment's step at which it began.
@@ -92,7 +92,7 @@ class D4ormC2F(StatePolicy):
 
     @property
     def guidance(self) -> CoarseWaypoints:
-        """What is followed at present."""
+        """Coarse plan that is followed at present."""
         return self._guide.guidance
 
     def _begin(self, env: ParallelEnv, seed: int) -> None:

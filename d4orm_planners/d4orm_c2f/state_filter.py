@@ -1,4 +1,4 @@
-"""What robots' states are, where measurements are noisy: a steady-state Kalman filter that finds out how noisy."""
+"""Filter of noisy measurements of robots' states: a steady-state Kalman filter that finds out how noisy they are."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from d4orm_env.core.problem import Problem
 from d4orm_planners.tracking.steering import by_model
 
 DECAY = 0.98
-"""What is left of what was seen after a time step."""
+"""Share of what was seen that is left after a time step."""
 
 ENOUGH = 40
 """Differences that it takes to say how noisy a component is."""
 
 LEAST_SHARE = 0.1
-"""Of the variance of differences that has to come from measurements for these to be filtered."""
+"""Share of the variance of differences that has to come from measurements for these to be filtered."""
 
 LEAST_GAIN = 0.1
 """No measurement counts less than this."""

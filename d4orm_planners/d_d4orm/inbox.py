@@ -1,4 +1,4 @@
-"""What a node has received: the newest candidate of every other node, judged anew, and a count of the rest."""
+"""Messages that a node has received: the newest candidate of every other node, judged anew, and a count of the rest."""
 
 from __future__ import annotations
 

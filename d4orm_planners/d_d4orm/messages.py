@@ -25,7 +25,7 @@ KINDS = (
     "garbage", "truncated", "too_large", "version", "checksum", "problem", "node", "shape", "not_finite", "limits",
     "stale",
 )  # fmt: skip
-"""What is wrong with a message that is dropped. ``"stale"`` is not the codec's to see, but the inbox's."""
+"""Faults of messages that are dropped. ``"stale"`` is not the codec's to see, but the inbox's."""
 
 _HEADER = struct.Struct("<4sHHIQIIId32s")
 _CHECKSUM = struct.Struct("<I")

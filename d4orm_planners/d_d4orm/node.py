@@ -32,7 +32,7 @@ def node_seed(seed: int, node: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What the nodes of one solve have in common.
+    """Common task of the nodes of one solve.
 
     Attributes:
         num_nodes: How many nodes there are.
@@ -168,7 +168,7 @@ class Node:
         self._note("sent", self.number, self._sequence, candidate, size=len(data))
 
     def _all_have(self, candidate: Candidate) -> bool:
-        """Whether each of the others has sent a solution as good as this one."""
+        """Check whether each of the others has sent a solution as good as this one."""
         reward = candidate.trajectory.rewards.mean() - TOLERANCE
         reports = self.inbox.newest
         return all(
@@ -195,7 +195,7 @@ class Node:
         self._awaited = heard
 
     def _gather(self, timeout: float = 0.0) -> set[int]:
-        """Who sent something new."""
+        """Return the nodes that sent something new."""
         reports = self.inbox.receive(timeout)
         for report in reports:
             self._note("received", report.node, report.sequence, report.candidate)

@@ -65,12 +65,12 @@ class _Job:
 
     @property
     def running(self) -> bool:
-        """Whether it has begun and is not over."""
+        """True if it has begun and is not over."""
         return self._begin is not None and not self._over.is_set()
 
     @property
     def seconds(self) -> float:
-        """How long it has taken."""
+        """Time that it has taken."""
         if self._begin is None:
             return 0.0
         return (self._end or time.perf_counter()) - self._begin
@@ -160,7 +160,7 @@ class NodePool(ABC):
         return max((node.search.best for node in self._nodes), key=lambda candidate: candidate.rank)
 
     def metrics(self) -> dict[str, float]:
-        """What all nodes together sent, and the share of their time that they waited for each other.
+        """Return the messages sent by all nodes, and the share of their time that they waited for each other.
 
         To be asked for once closed.
         """
@@ -217,7 +217,7 @@ class NodePool(ABC):
         return iteration
 
     def _new_records(self) -> list[IterationRecord]:
-        """What the nodes did since the last time."""
+        """Return records of the nodes' iterations since the last call."""
         new = []
         for node in self._nodes:
             records = node.search.history[self._read[node] :]

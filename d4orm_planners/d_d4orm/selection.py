@@ -21,7 +21,7 @@ class Numbered(Protocol):
 
     @property
     def node(self) -> int:
-        """Who sent it."""
+        """Sender's number."""
         ...
 
     @property

@@ -101,7 +101,7 @@ class DD4ormConfig(PlannerConfig):
 
     @property
     def node_planner(self) -> type[NodePlanner]:
-        """What every node refines its candidate with."""
+        """Planner that every node refines its candidate with."""
         return next(kind for kind in NODE_PLANNERS.values() if kind.config_class is type(self.refinement))
 
     def node_planners(self, nodes: int) -> list[NodePlanner]:

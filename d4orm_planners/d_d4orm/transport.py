@@ -1,4 +1,4 @@
-"""How messages travel: the protocol of a transport, and threads of one process as the simplest one."""
+"""Transport of messages: its protocol, and threads of one process as the simplest one."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Transport(Protocol):
 
 
 class Mailbox:
-    """Where messages wait for one who collects them, whatever thread they come from.
+    """Queue of messages for one who collects them, whatever thread they come from.
 
     Attributes:
         closed: Whether there will be no more.

@@ -20,7 +20,7 @@ from d4orm_planners.d_d4orm.transport import WAITING, Mailbox
 logger = logging.getLogger(__name__)
 
 LOOPBACK = ("tcp/127.0.0.1:0",)
-"""Where nodes listen unless configured otherwise: at a free port that only this machine reaches."""
+"""Default endpoint that nodes listen at: a free port that only this machine reaches."""
 
 PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws")
 
@@ -33,7 +33,7 @@ RESERVED = {
     "scouting/multicast/enabled": "multicast",
     "namespace": "namespace",
 }
-"""What a zenoh configuration file leaves to the settings, and the setting."""
+"""Keys that a zenoh configuration file leaves to the settings, and the setting."""
 
 DEFAULTS: Mapping[str, object] = {
     "mode": "peer",
@@ -53,7 +53,7 @@ _NAMESPACE = re.compile(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*")
 
 @dataclass(frozen=True, kw_only=True)
 class ZenohSettings:
-    """Where a node finds the others. By default that is on this machine only, and no port is open beyond loopback.
+    """Network of the nodes. By default that is this machine only, and no port is open beyond loopback.
 
     Attributes:
         namespace: What the nodes of one solve have in common and others on the network have not: their messages have
@@ -107,7 +107,7 @@ class ZenohSettings:
 
     @property
     def on_loopback(self) -> bool:
-        """Whether nobody beyond this machine can connect."""
+        """True if nobody beyond this machine can connect."""
         return all(_is_loopback(endpoint) for endpoint in self.listen)
 
 
@@ -181,7 +181,7 @@ class ZenohTransport:
 
     @property
     def has_listeners(self) -> bool:
-        """Whether anybody would receive what is published now."""
+        """Check whether anybody would receive what is published now."""
         return bool(self._publisher.matching_status.matching)
 
 
@@ -241,5 +241,5 @@ def _is_loopback(endpoint: str) -> bool:
 
 
 def _reason(error: Exception) -> str:
-    """What zenoh says, on one line and without the places in its sources."""
+    """Return zenoh's message, on one line and without the places in its sources."""
     return " ".join(re.sub(r" at /\S+\.rs:\d+\.?", "", str(error)).split())

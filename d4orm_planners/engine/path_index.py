@@ -1,4 +1,4 @@
-"""Where a team is at every step, compiled with numba: who comes near whom, without looking at every pair.
+"""Index of a team's positions at every step, compiled with numba: near robots without looking at every pair.
 
 Time is cut into blocks of a few steps, in which robots get not far. In every block the robots are chained in the
 buckets of a hash table, by the cell of a grid that the middle of each one's way through the block is in. Whoever comes
@@ -27,12 +27,12 @@ BLOCK = 8
 """Steps in a block."""
 
 _DOUBT, _ROUNDING = 1 / 750, 64 * 2.0**-23
-"""How far from the goal radius rounding may decide, as a share of it and as a share of the coordinates: farther than
-:mod:`d4orm_env.verify.docking` has it."""
+"""Distance from the goal radius within which rounding may decide, as a share of it and as a share of the coordinates:
+farther than :mod:`d4orm_env.verify.docking` has it."""
 
 _NOBODY = np.int32(-1)
 _WIDER = 1 + 2.0**-20
-"""By how much distances up to which there may be somebody are stretched for rounding."""
+"""Factor by which distances up to which there may be somebody are stretched for rounding."""
 
 
 class PathTable(NamedTuple):
@@ -116,7 +116,7 @@ class PathIndex:
     def count_meetings(
         self, robots: ArrayLike, ways: FloatArray, until: ArrayLike | None = None
     ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """How many others each of some robots would meet on each of some ways, if nobody else's changed.
+        """Count the others that robots would meet on each of some paths, if nobody else's changed.
 
         Args:
             robots: ``(R,)``.
@@ -134,7 +134,7 @@ class PathIndex:
 
 
 def judge_alone(arrays: ProblemArrays, robots: ArrayLike, ways: FloatArray) -> NDArray[np.int32]:
-    """What can be said of some robots' ways without looking at the others.
+    """Judge some robots' paths without looking at the others.
 
     Args:
         arrays: The problem.
@@ -293,7 +293,7 @@ def _is_among(robot: Whole, robots: IntArray) -> bool:
 
 @compiled
 def count_near(table: PathTable, robot: Whole, without: IntArray, path: FloatArray, begin: Whole, block: Whole) -> int:
-    """How many a robot meets in a block, on a path that begins with its place at step ``begin``.
+    """Count the robots that one meets in a block, on a path that begins with its position at step ``begin``.
 
     Those in ``without`` ``(N,)`` do not count; it has to be one of them.
     """
@@ -409,7 +409,7 @@ def _is_same_place(path: FloatArray, dimension: int, t: int) -> bool:
 
 @inlined
 def is_unsure(arrays: ProblemArrays, place: FloatArray, goal: FloatArray) -> bool:
-    """Whether rounding may decide, here or where the plan is judged, if a robot at this place is at its goal."""
+    """Check whether rounding may decide, here or where the plan is judged, if a robot at this place is at its goal."""
     gap2, extent = 0.0, 0.0
     for axis in range(goal.shape[0]):
         gap = np.float64(place[axis]) - np.float64(goal[axis])

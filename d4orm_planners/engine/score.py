@@ -47,7 +47,7 @@ CONTROL_ROWS = 3
 
 
 class Workspace(NamedTuple):
-    """What one thread needs to score tiles of ``K`` robots over ``H`` steps.
+    """Per-thread workspace to score tiles of ``K`` robots over ``H`` steps.
 
     Attributes:
         w: ``(K STRIDE,)`` the robots.
@@ -71,7 +71,7 @@ class Workspace(NamedTuple):
 
 
 class Scoring(NamedTuple):
-    """What samples are scored by, in all steps of a run.
+    """Rules by which samples are scored, in all steps of a run.
 
     Attributes:
         docked: ``(K,)`` bool, docked from the beginning.

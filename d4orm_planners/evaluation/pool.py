@@ -27,7 +27,7 @@ QUEUED = 2
 
 
 class JobEvent(Enum):
-    """What a process says about a job, apart from its trials."""
+    """Event of a job, apart from its trials."""
 
     BEGUN = "begun"
     ENDED = "ended"
@@ -60,7 +60,7 @@ class Pool(Protocol):
     """Processes that run jobs."""
 
     def free(self) -> bool:
-        """Whether it takes another job now."""
+        """True if it takes another job now."""
 
     def start(self, job: Job) -> int:
         """Hand a job over; returns a ticket for it."""

@@ -83,7 +83,7 @@ def find_visits(cells: Cells, others: Others, k: Whole, steps: Whole) -> tuple[I
 
 @register_jitable(nogil=True, **OPTIONS)
 def free_intervals(visits: IntArray, last: Ints, start: Whole, steps: Whole) -> Intervals:
-    """Return the intervals, in so many steps, in which nobody visits each node; at first a robot may be at its start."""
+    """Return the intervals, in so many steps, in which nobody visits a node; at first a robot may be at its start."""
     count = last.shape[0]
     most = count + visits.shape[0] + 1
     first, begins, ends = np.empty(count + 1, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)

@@ -1,4 +1,4 @@
-"""What one may do to a scene: functions from a problem, whose start is where the robots are now, to another.
+"""Edits of a scene: functions from a problem, whose start is where the robots are now, to another.
 
 All raise a ``ValueError`` of one line where the scene would make no sense; it then stays as it is.
 """

@@ -96,7 +96,7 @@ class Playground:
 
     @property
     def clients(self) -> dict[int, viser.ClientHandle]:
-        """Who looks at the page, by number."""
+        """Clients that look at the page, by number."""
         return self._server.get_clients()
 
     def show(self) -> None:
@@ -116,7 +116,7 @@ class Playground:
 
 
 def _free_port(host: str, port: int) -> int:
-    """That port, or any that is free for 0.
+    """Return that port, or any that is free for 0.
 
     Raises:
         ValueError: If it is taken, or the host is not one of this machine's.

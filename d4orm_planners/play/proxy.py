@@ -12,7 +12,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 GATE_HEADER = "X-D4orm-Gate"
-"""What the gate writes its token into, so that what is behind it can tell who has come through the gate."""
+"""Header that the gate writes its token into, so that what is behind it can tell who has come through the gate."""
 
 logger = logging.getLogger(__name__)
 
@@ -109,7 +109,7 @@ class AuthenticatingProxy:
             self._waiting -= 1
 
     def _answer(self, head: bytes) -> bytes:
-        """What to say to a request; nothing if it may pass. One that cannot be read has shown no token."""
+        """Return the answer to a request; nothing if it may pass. One that cannot be read has shown no token."""
         lines = head.decode("latin-1").split("\r\n")
         headers = {
             name.strip().lower(): value.strip() for name, _, value in (line.partition(":") for line in lines[1:])

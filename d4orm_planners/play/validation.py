@@ -19,7 +19,7 @@ LARGEST_UPLOAD = 2_000_000
 
 _LARGEST_COORDINATE = 1e9
 _ROUNDING = 1e-3
-"""By how much of its step a slider's value may be off."""
+"""Share of its step by which a slider's value may be off."""
 
 Coordinate = Annotated[float, Meta(ge=-_LARGEST_COORDINATE, le=_LARGEST_COORDINATE)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
@@ -101,7 +101,7 @@ class MessageValidator:
         }
 
     def checked(self, client: int, data: str | bytes) -> bytes:
-        """What a client has sent, encoded anew.
+        """Return a client's message, encoded anew.
 
         Args:
             client: Its number.
@@ -160,7 +160,7 @@ class MessageValidator:
 
 
 def _is_on_scale(value: object, control: Any) -> bool:
-    """Whether a value is one of a slider's, from its least by its step to its greatest."""
+    """Check whether a value is one of a slider's, from its least by its step to its greatest."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not control.min <= value <= control.max:
         return False
     steps = (value - control.min) / control.step

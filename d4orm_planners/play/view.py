@@ -1,4 +1,4 @@
-"""What the page shows of a session: those that drive side by side, in rows."""
+"""View of a session: those that drive side by side, in rows."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ MOST_CYCLES = 10_000_000
 
 @dataclass(frozen=True)
 class EpisodeOptions:
-    """What holds for all that drive side by side.
+    """Common options of all that drive side by side.
 
     Attributes:
         seed: Of the policies, of what goes wrong, and of new goals.
@@ -86,7 +86,7 @@ class Viewport:
 
     @property
     def farthest(self) -> int:
-        """Of the robots, from its goal."""
+        """Number of the robot that is farthest from its goal."""
         joint = self._joint
         return int(np.argmax(np.linalg.norm(joint.goals - joint.states[:, : self._scene.dimension], axis=1)))
 
@@ -130,7 +130,7 @@ class Viewport:
         self._observations, _ = self._env.set_state(states)
 
     def frame(self, status: Status) -> Frame:
-        """What is shown of the present."""
+        """Return the frame of the present."""
         joint = self._joint
         return Frame(
             status=status,

@@ -1,4 +1,4 @@
-"""What robots saw and what an expert would have had them do: recorded, and kept in files."""
+"""Samples of robots' observations and an expert's actions: recorded, and kept in files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Driver = Callable[[FloatArray, FloatArray], FloatArray]
 
 MAX_BYTES = 2**31
-"""Of one array of a file that is read."""
+"""Largest array of a file that is read."""
 
 
 @dataclass(frozen=True, eq=False)

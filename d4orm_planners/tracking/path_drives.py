@@ -31,13 +31,13 @@ BRAKING = 0.5
 RESERVE = 0.8
 """Share of the way to where it must stop that a robot plans to stop in."""
 BEYOND = 4.0
-"""How far beyond its goal a robot plans to drive that is stopped by arriving, in lengths of a stop from full speed."""
+"""Distance beyond its goal that a robot plans to drive if stopped by arriving, in lengths of a stop from full speed."""
 SLOWEST = 0.1
 """Share of its speed at which a robot creeps round the sharpest corner."""
 
 
 class Progress(NamedTuple):
-    """How far robots are, and what they are to do next.
+    """Progress of robots along their routes.
 
     Attributes:
         at: ``(K,)`` int64 the point of its route that each is at, counted from its first.
@@ -55,7 +55,7 @@ class Progress(NamedTuple):
 
     @classmethod
     def of(cls, routes: Routes) -> Progress:
-        """Of robots that are about to set out."""
+        """Return that of robots that are about to set out."""
         waits, size = routes.wait_first[:-1].copy(), len(routes.first) - 1
         targets = np.zeros((size, 3), np.float32)
         return cls(np.zeros(size, np.int64), waits, targets, np.zeros(size, np.float32), np.zeros(size, np.float32))
@@ -135,7 +135,7 @@ def direct(
 
 @cached_kernel(SOURCES, variant="paces", **OPTIONS)
 def fill_paces(arcs: Floats, dt: float, corner: Floats, speed: float, braking: float, paces: Floats) -> None:
-    """How fast every point of a route may be passed.
+    """Fill in the speed at which every point of a route may be passed.
 
     Args:
         arcs: ``(P,)`` length of the route up to each [m].
@@ -223,7 +223,7 @@ def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[Floa
 
 
 def beyond_goal(problem: Problem) -> float:
-    """How far beyond their goals robots plan to drive, if these stop them [m]."""
+    """Return the distance beyond their goals that robots plan to drive, if these stop them [m]."""
     if not problem.docks or problem.goal_speed is not None:
         return 0.0
     speed, acceleration = (problem.team.limits[:, column].astype(np.float64) for column in (SPEED, ACCELERATION))

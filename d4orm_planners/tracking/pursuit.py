@@ -30,8 +30,8 @@ Steering: TypeAlias = Callable[[Row, Row, np.float32, np.float32, bool, Row, Tim
 Turning: TypeAlias = Callable[[Row, Row, Row, np.float32, bool, Row], tuple[Row, np.float32]]
 
 LOOKAHEAD = 1 / 3
-"""Of the point of its route that a robot heads for, beyond what it drives in a step and a half, in radii of the largest
-robot, as all lengths below."""
+"""Distance to the point of its route that a robot heads for, beyond what it drives in a step and a half, in radii of
+the largest robot, as all lengths below."""
 CIRCLES = 0.8
 """The same of one that drives in order to turn, in radii of its turning circle."""
 REACHED, COINCIDING = 2 / 15, 1 / 15
@@ -185,7 +185,7 @@ def _vectors(dimension: int) -> tuple[Callable[[Row, Row, np.float32], Row], Len
 
 
 def _turning(robot: Model, length: Length) -> Turning:
-    """What a robot makes of a velocity towards a point that is so far off, and of its pace, in order to face it."""
+    """Return a function that changes a velocity towards a point so far off, and its pace, in order to face it."""
     heading, velocity = -1 if robot.heading_index is None else robot.heading_index, inlined(robot.functions.velocity)
     at_rest = (ZERO,) * robot.control_size
 

@@ -16,7 +16,7 @@ from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.dynamics.transition import TimeStep
 
 NEAR_VIA = 10 / 3
-"""How near to a point on its way a robot turns to its goal, in radii of the largest robot."""
+"""Distance to a point on its way at which a robot turns to its goal, in radii of the largest robot."""
 
 
 def drive_to_goal(problem: Problem, states: FloatArray, goals: FloatArray) -> FloatArray:
@@ -47,7 +47,7 @@ def preferred_velocities(problem: Problem, states: FloatArray, goals: FloatArray
 
 
 def goals_along_ways(problem: Problem, places: FloatArray | Floats, goals: FloatArray) -> FloatArray:
-    """Where robots without a plan should head: along their shortest free ways, as far off as those are long.
+    """Return where robots without a plan should head: along their shortest paths, as far off as those are long.
 
     It is their goals where the world is empty, for robots with new goals, and for those without a way.
 

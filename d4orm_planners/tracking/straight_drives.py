@@ -23,7 +23,7 @@ SOURCES = fingerprint((robot_model, transition, *stepping.PARTS, stepping))
 
 
 class DriveRules(NamedTuple):
-    """What holds for all ways.
+    """Rules for all paths.
 
     Attributes:
         time_step: ``(4,)`` see :class:`~d4orm_env.dynamics.robot_model.TimeStep`.
