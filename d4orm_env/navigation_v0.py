@@ -238,7 +238,7 @@ class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
 
 
 class AECNavigationEnv(parallel_to_aec_wrapper):
-    """PettingZoo's conversion, with a bad action refused when it is given, and by the name of who gave it."""
+    """PettingZoo's conversion, with a bad action refused when it is given, and by the agent's name."""
 
     def __init__(self, environment: parallel_env) -> None:
         super().__init__(environment)

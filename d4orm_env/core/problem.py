@@ -79,8 +79,8 @@ class Problem(Frozen):
         goal_radius: A robot within it has arrived [m].
         goal_speed: Speed at which a robot may still dock [m/s]; ``None`` is no limit, as in the paper.
         name: Where the problem comes from, for tables and pictures.
-        arrival: ``"dock"``: a robot that arrives stands there for ever, as in the paper. ``"stay"``: it may be moved
-            again, to make way; all must be at their goals at the end.
+        arrival: ``"dock"``: a robot that arrives stays there for good, as in the paper. ``"stay"``: it may be moved
+            again, to yield; all must be at their goals at the end.
 
     Raises:
         ValueError: If a value is not finite or out of range, a shape is wrong, a number is not positive, a start or
@@ -191,7 +191,7 @@ class Problem(Frozen):
 
     @property
     def docks(self) -> bool:
-        """True if a robot that has arrived stays at rest for ever."""
+        """True if a robot that has arrived stays there for good."""
         return self.arrival == "dock"
 
     @property

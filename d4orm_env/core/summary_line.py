@@ -1,4 +1,4 @@
-"""Summary of a problem or a motion in a line: for tables, and for whoever prints one."""
+"""Summary of a problem or a motion in a line: for tables and for printing."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ class Seen(NamedTuple):
         states: ``(B, K, n)`` of the robots.
         controls: ``(B, K, m)`` executed last; what first-order robots' speed is read from.
         bodies: ``(B, N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves among the robots and is
-            none; a radius of zero stands for one that nobody sees.
+            none; a radius of zero for one that is not seen.
     """
 
     states: FloatArray
@@ -150,7 +150,7 @@ class Disturbance(Generic[M]):
     ) -> tuple[FloatArray, FloatArray]:
         """States ``(B, K, n)`` and controls ``(B, K, m)`` that the step truly begins from.
 
-        States of robots that stand docked are left as they are, whatever this returns.
+        States of docked robots are left as they are, whatever this returns.
         """
         return states, controls
 

@@ -123,7 +123,7 @@ class DisturbedWorlds:
         arrived: BoolArray,
         steps: Steps,
     ) -> Scene:
-        """The worlds as they stand; arguments as the attributes of :class:`Scene`."""
+        """The worlds as they are; arguments as the attributes of :class:`Scene`."""
         return Scene(self.problem, self.max_cycles, start, goal, states, controls, arrived, steps, self._bodies)
 
     def begin(self, worlds: Worlds, seeds: Sequence[int], start: FloatArray, goal: FloatArray) -> None:

@@ -46,7 +46,7 @@ class Draws:
     """Random numbers of one disturbance at one moment of ``B`` worlds.
 
     They are a function of the world's episode, its step, the disturbance and the number of the call, and of nothing
-    else: a world draws the same alone and in any batch, and a disturbance the same whatever stands beside it.
+    else: a world draws the same alone and in any batch, and a disturbance the same whatever others there are.
 
     Args:
         keys: ``(B, 2)`` keys of the episodes, see :func:`episode_keys`.

@@ -109,7 +109,7 @@ class ModelFunctions(NamedTuple):
     velocity: ModelFunction
     """``(x, u, limits, ops) -> `` velocity vector in the world frame [m/s]."""
     rest: ModelFunction
-    """``(x, zero) -> x`` standing still at the same place and heading."""
+    """``(x, zero) -> x`` at rest at the same position and heading."""
     approach: ModelFunction
     """``(x, goal, limits, h, ops) -> `` fastest velocity straight to the goal from which it can stop there [m/s]."""
     track: ModelFunction

@@ -2,8 +2,8 @@
 
 The order is the definition of a step for every engine: the control is clipped to the limits, RK4 integrates the model
 over ``dt``, the speed limit is applied, and a robot within its goal radius at no more than the goal speed has arrived.
-From then on it stands where it docked (paper, section III; docking as in the paper's reference code), unless the
-problem says that who has arrived may be moved again: then it has arrived for as long as it is there.
+From then on it is at rest where it docked (paper, section III; docking as in the paper's reference code), unless the
+problem says that a robot may be moved again: then it has arrived for as long as it is there.
 """
 
 from __future__ import annotations

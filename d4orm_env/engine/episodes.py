@@ -48,7 +48,7 @@ class WorldBatch(NamedTuple):
         distance: ``(B, K)`` to the goals.
         collided: ``(B, K)`` bool, hard contact.
         violated: ``(B, K)`` bool, within the margin.
-        rewards: ``(B, K)`` of each robot where it stands now.
+        rewards: ``(B, K)`` of each robot where it is now.
         reward: ``(B,)`` float64 mean of the team in the last step; zero at a reset.
         terminated: ``(B,)`` bool: all have docked.
         truncated: ``(B,)`` bool: out of time before that.

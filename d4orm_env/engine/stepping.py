@@ -33,7 +33,7 @@ PARTS = (winding, lanes, compiling, elementary, rows)
 """Modules that steps are made of, for fingerprints."""
 
 Docking: TypeAlias = tuple[np.float32, np.float32, np.bool_]
-"""Squares of the goal radius and of the goal speed, and whether who has arrived stands there for ever."""
+"""Squares of the goal radius and of the goal speed, and whether a robot that has arrived stays there for good."""
 Mover: TypeAlias = Callable[[bool, Row, Row, Row, TimeStep], Row]
 Docker: TypeAlias = Callable[[bool, Row, Row, Row, Row, Docking], tuple[Row, np.float32, bool]]
 

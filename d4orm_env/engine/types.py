@@ -63,7 +63,7 @@ class ObservationInputs(NamedTuple):
         control: ``(B, K, m)`` executed last.
         docked: ``(B, K)`` bool.
         bodies: ``(B, N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves among the robots and is
-            none; a radius of zero stands for one that is not seen.
+            none; a radius of zero for one that is not seen.
         time_left: ``(B,)`` share of the time left, 1 to 0.
     """
 
@@ -106,7 +106,7 @@ class WorldEngine(Engine, Protocol):
     """An engine with what environments need as well."""
 
     def contacts(self, arrays: ProblemArrays, states: FloatArray) -> tuple[BoolArray, BoolArray]:
-        """``(collided (K,), margin_violated (K,))`` of a team standing at ``states`` ``(K, n)``."""
+        """``(collided (K,), margin_violated (K,))`` of a team at rest at ``states`` ``(K, n)``."""
         ...
 
     def observe_worlds(

@@ -76,7 +76,7 @@ class BaseEnv:
         return self._viewer.render(self._simulation)
 
     def _show(self) -> None:
-        """Draw what has just happened, if somebody looks."""
+        """Draw what has just happened, if it is shown."""
         if self.render_mode == "human":
             self.render()
 

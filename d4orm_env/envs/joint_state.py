@@ -14,7 +14,7 @@ bodies                ``N * b``   position, velocity and radius of bodies that m
 ====================  ==========  =====================================================================
 
 with ``b = 2 d + 1``. Bodies there are only under a disturbance that brings them, such as
-:class:`~d4orm_env.disturbances.Intruder`; one that nobody sees is all zeros. With disturbances of what is seen states,
+:class:`~d4orm_env.disturbances.Intruder`; one that is not seen is all zeros. With disturbances of what is seen states,
 controls and bodies are those seen.
 
 Together with the problem that is all there is to know about an episode's present, so a planner can go on from it.

@@ -269,7 +269,7 @@ class Simulation:
 
     @property
     def finished(self) -> BoolArray:
-        """``(K,)`` robots that are done: those that have docked or, where nobody docks, all once all are there."""
+        """``(K,)`` robots that are done: those that have docked or, where none docks, all once all are there."""
         if self.lifelong:
             return np.zeros_like(self.arrived)
         return self.arrived if self.problem.docks else self.arrived & self.arrived.all()
@@ -295,7 +295,7 @@ class Simulation:
         return self._disturbed.scene(start, goal, self.states[None], self.controls[None], self.arrived[None], steps)
 
     def _contacts(self) -> tuple[BoolArray, BoolArray]:
-        """``(K,)`` who is in contact, and who within the margin, where all stand now."""
+        """``(K,)`` robots in contact, and within the margin, where all are now."""
         collided, violated = self._engine.contacts(self.arrays, self.states)
         if self._disturbed is None or not self._disturbed.bodies.shape[1]:
             return collided, violated

@@ -30,7 +30,7 @@ __all__ = ["NavigationTask"]
 class NavigationTask(TaskClass):
     """A scenario, in as many worlds as an experiment asks for, stepped in one compiled call.
 
-    Its success rate, the share of finished episodes in which all arrived and nobody ever touched anything, is logged as
+    Its success rate, the share of finished episodes in which all arrived without a collision, is logged as
     ``success_rate``.
 
     Args:

@@ -41,10 +41,10 @@ class TorchRLNavigation(EnvBase):
     Under ``"robots"`` are ``observation`` ``(B, K, D)``, ``action`` ``(B, K, m)`` in physical units, ``reward``
     ``(B, K, 1)``, zero for robots that have arrived, and ``info``, flags ``(B, K, 1)``: ``acting``, whether the robot
     has yet to arrive, so that its action counts; ``collided``, whether it touches something now; and ``success``,
-    whether its whole team has arrived and nobody has ever touched anything.
+    whether its whole team has arrived without a collision.
 
     An episode is the team's: ``terminated`` when all have arrived, ``truncated`` when time is up, ``(B, 1)`` each. A
-    robot that has arrived stands there until then.
+    robot that has arrived stays there until then.
 
     Args:
         num_worlds: ``B``.

@@ -193,7 +193,7 @@ def rewards_of(
 
 
 def judge(arrays: ProblemArrays, place: Array) -> Verdict:
-    """``(collided, margin violated, reward)`` of teams standing at ``place`` ``(K, d, S)``, each ``(K, S)``."""
+    """``(collided, margin violated, reward)`` of teams at rest at ``place`` ``(K, d, S)``, each ``(K, S)``."""
     zero = jnp.float32(0)
     contact = robot_contacts(arrays, place, zero) | obstacle_contacts(arrays, place, zero)
     pair, obstacle = robot_contacts(arrays, place, arrays.margin), obstacle_contacts(arrays, place, arrays.margin)

@@ -70,7 +70,7 @@ class TeamBodies:
         self.begin()
 
     def begin(self) -> None:
-        """Put everybody at the start, at whatever speed the problem says, and let go of those that were held."""
+        """Put all robots at the start, at whatever speed the problem says, and let go of those that were held."""
         mujoco.mj_resetData(self.scene.model, self.data)
         self._held[:] = False
         self.scene.model.dof_armature[:] = 0

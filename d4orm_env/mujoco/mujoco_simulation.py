@@ -94,7 +94,7 @@ class MujocoSimulation(Simulation):
         return self._judged(arrays, states, controls, arrived, touched)
 
     def _limited(self, controls: FloatArray, limits: FloatArray, standing: BoolArray) -> FloatArray:
-        """``controls`` within the robots' limits, zero for those that stand."""
+        """``controls`` within the robots' limits, zero for those at rest."""
         limited: FloatArray = np.zeros(controls.shape, np.float32)
         for robot in np.flatnonzero(~standing):
             model = self.problem.team.robot_models[robot]

@@ -679,7 +679,7 @@ def look(
     Args:
         space: The world.
         fields: The wavefronts of all robots.
-        first: Number of the first of these robots, who follow each other.
+        first: Number of the first of these robots, which follow each other.
         places: ``(R, Q, 3)``.
         target: ``(R, Q, 3)`` where to go first, the place itself where there is no way; output.
         length: ``(R, Q)`` of the whole way; infinite where there is none, output.

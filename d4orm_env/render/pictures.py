@@ -140,7 +140,7 @@ def plot(problem: Problem, trajectory: Trajectory | None = None, axes: Axes | No
 
     Args:
         problem: What to draw.
-        trajectory: A motion that belongs to it; without one the team stands at its starts.
+        trajectory: A motion that belongs to it; without one the team is at its starts.
         axes: Where to draw; for a spatial problem ``projection="3d"``, or flat for a view from above. By default axes
             of a new figure of ``matplotlib.pyplot``, so that notebooks and ``pyplot.show()`` show it.
 

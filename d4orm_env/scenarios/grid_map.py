@@ -20,7 +20,7 @@ ROUNDING = 1e-3
 """More than float32 rounds away over a map, as a share."""
 
 MOST_PARTS = 8
-"""Lattice points per half of a cell at most; who needs more does not fit."""
+"""Lattice points per half of a cell at most; a team that needs more does not fit."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Starts and goals among walls, such that everybody gets by: a robot never has to wait for one that stands.
+"""Starts and goals among walls, such that every robot gets by those at rest.
 
 Such an instance is called well-formed (Cap, Novak, Kleiner and Selecky, 2015): each robot has a way from its start to
 its goal that keeps clear of all other starts and goals. One after another, in any order, all of them arrive, and none
@@ -39,7 +39,7 @@ class _Placing:
 
     Args:
         inside: The region.
-        separation: How far those who pass by stay away from a place, in steps of the lattice.
+        separation: Distance of robots that pass by from a place, in steps of the lattice.
         most: How many places there will be.
     """
 
@@ -58,7 +58,7 @@ class _Placing:
         self._disc = self._wide_disc[self._about(np.zeros(inside.ndim, np.int64), self._narrow)]
 
     def add(self, place: NDArray[np.int64]) -> bool:
-        """Take a place if that leaves everybody a way."""
+        """Take a place if that leaves every robot a path."""
         if self._taken[tuple(place + self._wide)] or not self._goes_round(place):
             return False
         taken = self._taken[self._about(place, self._narrow)]
@@ -94,7 +94,7 @@ class _Placing:
 def draw_places(
     random: np.random.Generator, space: FreeSpace, groups: Sequence[tuple[Mask | None, int]], separation: float
 ) -> Points:
-    """Random places, far enough apart that a robot gets from each to each while robots stand on all others.
+    """Random places, far enough apart that a robot gets from each to each while robots are on all others.
 
     Args:
         random: Where the draws come from.

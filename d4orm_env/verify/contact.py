@@ -220,7 +220,7 @@ class Pairs(Watch):
 
 
 class Static(Watch):
-    """Robots against things that stand, one column each."""
+    """Robots against static things, one column each."""
 
     def __init__(self, kind: str, robot: Indices, radius: Floats, names: Sequence[str]) -> None:
         rows, columns = (index.ravel() for index in np.indices((len(robot), len(names))))

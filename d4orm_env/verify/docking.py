@@ -82,7 +82,7 @@ def find_docking(problem: Problem, motion: TeamMotion, ends: Floats) -> Docking:
 
 
 def _staying(problem: Problem, motion: TeamMotion, distance: Floats, certain: NDArray[np.bool_]) -> Docking:
-    """Nobody docks: a robot has arrived when it is at its goal, beyond doubt, from some step to the last."""
+    """Goals do not absorb: a robot has arrived when it is at its goal, beyond doubt, from some step to the last."""
     horizon, num_robots = distance.shape
     away = horizon - np.argmax(~certain[::-1], axis=0)
     since = np.where(certain.all(axis=0), 1, away + 1)

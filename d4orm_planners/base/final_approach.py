@@ -49,7 +49,7 @@ def drive_further_in(search: SolveRun, candidate: Candidate, judge: Callable[[Fl
 
 
 def _driven(search: SolveRun, candidate: Candidate, robot: int, step: int, share: float) -> FloatArray:
-    """The team's controls, where a robot takes a share of its control at a step and drives straight home from there."""
+    """The team's controls, where a robot takes a share of its control at a step and then drives to the goal."""
     part, controls = search.problem.select([robot]), candidate.controls.copy()
     own = np.ascontiguousarray(controls[:, [robot], : part.control_size])
     own[step] *= np.float32(share)

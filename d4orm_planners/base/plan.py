@@ -152,7 +152,7 @@ class Plan(DisplayMixin):
     def failures(self) -> dict[str, str]:
         """The robots that the plan leaves unsolved, and why: a sentence for each, by agent name; empty if it is solved.
 
-        It is the proof where there is one; else what each does wrong at the steps, or if nobody does anything, what
+        It is the proof where there is one; else what each does wrong at the steps, or if none does anything, what
         :func:`d4orm_env.verify` found.
         """
         if self.solved:
@@ -272,7 +272,7 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
 
 
 def failed_robots(trajectory: Trajectory, check_interval: int = 1) -> BoolArray:
-    """``(K,)`` who does not arrive, or violates the margin at some ``check_interval``-th step.
+    """``(K,)`` robots that do not arrive, or violate the margin at some ``check_interval``-th step.
 
     The start itself cannot be planned away, so it does not count.
     """

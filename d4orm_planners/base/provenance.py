@@ -1,4 +1,4 @@
-"""Provenance of a plan, for whoever reads it later: settings, version and machine."""
+"""Provenance of a plan, for later readers: settings, version and machine."""
 
 from __future__ import annotations
 

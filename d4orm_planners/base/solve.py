@@ -45,7 +45,7 @@ class SolveRun:
         initial_controls: ``(H, K, m)`` to start from; zeros by default.
         engine: What rolls out and samples, if not the planner's own.
         judge: What makes a candidate of an iteration's controls, if not :func:`evaluate_controls`.
-        check_interval: Only at every so-manyth step is looked who fails (paper, section VI-A); a solution keeps the
+        check_interval: Failures are looked for at every so many steps only (paper, section VI-A); a solution keeps the
             margin at all steps.
 
     Attributes:

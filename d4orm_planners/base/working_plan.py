@@ -32,7 +32,7 @@ class WorkingPlan:
         states: ``(H+1, K, n)``.
         arrived: ``(K,)`` whether each ends at its goal.
         refused: ``(K,)`` step of the fault that the report finds with each; ``H + 1`` for none, or once it moves.
-        index: Where everybody is.
+        index: Positions of all robots.
     """
 
     def __init__(self, search: SolveRun, trajectory: Trajectory, report: VerificationReport | None = None) -> None:

@@ -116,7 +116,7 @@ class TeamProgram:
         Args:
             guess: Where IPOPT starts.
             contacts: What is kept clear of what, and when.
-            docks: ``(K,)`` steps by which the robots are at their goals, and from which on they stand there.
+            docks: ``(K,)`` steps by which the robots are at their goals, and from which on they stay there.
             options: IPOPT's.
             should_stop: Asked every hundredth of a second whether to end; it ends within a tenth, even where writing
                 the program or one of IPOPT's iterations takes longer.

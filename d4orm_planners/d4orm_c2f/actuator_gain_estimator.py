@@ -17,10 +17,10 @@ ENOUGH = 5
 """Times that it has to be, before it is believed to do less."""
 
 AS_STRONG = 0.97
-"""Whoever does that share of it is as strong as its limits say."""
+"""Share of it from which on a robot is as strong as its limits say."""
 
 WEAKEST = 0.3
-"""Nobody is believed to be weaker than that."""
+"""Lowest gain that is believed."""
 
 FORGOTTEN = 0.1
 """Share that the mean of what is added to commands loses in a time step, ..."""

@@ -37,12 +37,12 @@ Array = NDArray[np.float64]
 def safe_velocities(
     problem: Problem, joint: JointState, wanted: FloatArray, free: BoolArray, gap: float, caution: float = 0.0
 ) -> FloatArray:
-    """Velocities near those wanted, at which everybody can still brake before it touches anything.
+    """Velocities near those wanted, at which all can still brake before a collision.
 
     Two robots may close in on each other no faster than both together can brake within what is left between them,
     ``n (v_i - v_j) >= -sqrt(2 (a_i + a_j) (d - gap))``: the braking-distance barrier of Wang, Ames and Egerstedt
     (Safety barrier certificates for collisions-free multirobot systems, IEEE Trans. Robotics 33, 2017), here for the
-    velocities of the next step. On a body that obeys nobody, a side of the bounds, or the nearest obstacle, the robot
+    velocities of the next step. On a dynamic obstacle, a side of the bounds, or the nearest obstacle, the robot
     does all the braking. Robots of first order can stop within a time step. Taken are the nearest velocities to those
     wanted.
 
@@ -50,7 +50,7 @@ def safe_velocities(
         problem: The robots and obstacles.
         joint: Where everything is.
         wanted: ``(K, d)`` [m/s].
-        free: ``(K,)`` who can be told other velocities; the others stand.
+        free: ``(K,)`` robots that can be told other velocities; the others are at rest.
         gap: What is to be left between surfaces [m].
         caution: Robots may come to be so much faster towards anything than they are told [m/s]. If any, they are also
             taken to go on for a time step before they brake.
@@ -70,7 +70,7 @@ def safe_velocities(
 
 
 class Barriers(NamedTuple):
-    """``normals @ (v_one - v_other) >= least`` for velocities; nobody is -1, and stands.
+    """``normals @ (v_one - v_other) >= least`` for velocities; -1 is no robot, and at rest.
 
     Attributes:
         one: ``(R,)`` robots.

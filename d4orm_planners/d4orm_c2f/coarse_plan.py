@@ -16,7 +16,7 @@ class CoarseWaypoints:
 
     Attributes:
         path: ``(H+1, K, d)`` waypoints, one per time step of the control loop [m].
-        ordered: Whether the ways were found on a roadmap, where who waits for whom decides.
+        ordered: Whether the path was found on a roadmap, where precedence decides.
     """
 
     path: FloatArray

@@ -43,7 +43,7 @@ class Deviation:
     Args:
         problem: The robots.
         engine: What knows how they should move.
-        config: What is to be found out: how late commands are, how noisy states are, who is weak or does not obey.
+        config: To be found out: how late commands and how noisy states are, which robots are weak or do not obey.
         docks: Whether robots dock at their goals, rather than drive through them to others.
 
     Attributes:
@@ -52,7 +52,7 @@ class Deviation:
         problem: The robots with the limits that they are believed to have now.
         lateness: How late commands are executed.
         losses: How often commands are not executed at all.
-        standing: Who has stalled.
+        standing: Robots that have stalled.
     """
 
     def __init__(self, problem: Problem, engine: Engine, config: D4ormC2FConfig, docks: bool) -> None:

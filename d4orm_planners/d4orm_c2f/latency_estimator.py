@@ -21,7 +21,7 @@ class Lateness:
     """Remembers the commands that were sent, and compares them with those executed.
 
     Args:
-        team: Who is sent commands.
+        team: Robots that are sent commands.
         known: Steps late that commands are known to be, or ``None`` to find out.
 
     Attributes:

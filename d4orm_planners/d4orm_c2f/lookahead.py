@@ -18,7 +18,7 @@ def within_sight(
     problem: Problem, positions: FloatArray, path: FloatArray, indices: IntArray, targets: IntArray, docked: BoolArray,
     walls: bool,
 ) -> IntArray:  # fmt: skip
-    """The furthest waypoint up to its subgoal that a robot can drive to straight, past what stands.
+    """The furthest waypoint up to its subgoal that a robot can drive to straight, past what is at rest.
 
     A subgoal behind a corner, or behind a robot that has docked, would hold it there.
 
@@ -28,7 +28,7 @@ def within_sight(
         path: ``(H+1, K, d)`` [m].
         indices: ``(K,)`` where on the path they are.
         targets: ``(K,)`` their subgoals.
-        docked: ``(K,)`` who stands.
+        docked: ``(K,)`` robots at rest.
         walls: Whether obstacles count too.
 
     Returns:

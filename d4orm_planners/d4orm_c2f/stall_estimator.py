@@ -1,4 +1,4 @@
-"""Robots that do not obey any more, but brake and stand: the others drive around them."""
+"""Robots that do not obey any more, but brake and stop: the others drive around them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PROBE = 0.1
 
 
 class Standing:
-    """Watches an episode for robots that brake or stand whatever they are commanded.
+    """Watches an episode for robots that brake or stay at rest whatever they are commanded.
 
     Args:
         problem: The robots.

@@ -63,7 +63,7 @@ class StateFilter:
             measured: ``(K, n)`` the states as seen.
             led_to: ``(K, n)`` what those seen a time step ago lead to.
             expected: ``(K, n)`` what those estimated a time step ago lead to.
-            going: ``(K,)`` who has not docked.
+            going: ``(K,)`` robots that have not docked.
         """
         difference = self._turned(np.asarray(measured, np.float64) - led_to)
         before, self._before = self._before, difference

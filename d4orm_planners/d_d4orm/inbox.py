@@ -25,7 +25,7 @@ class Report:
     """A candidate of another node as it was found to be here.
 
     Attributes:
-        node: Who sent it.
+        node: Its sender.
         sequence: Which of its candidates it is.
         candidate: Rolled out and judged by the receiver.
     """

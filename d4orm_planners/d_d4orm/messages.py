@@ -36,7 +36,7 @@ class Message:
     """A candidate as a node claims it to be.
 
     Attributes:
-        node: Who sends it, from 0.
+        node: Its sender, from 0.
         sequence: Which of its candidates it is, from 1.
         controls: ``(H, K, m)`` as planned, for the receiver to go on from as the sender would.
         reward: Mean reward.

@@ -59,7 +59,7 @@ class Node:
         transport: Its access to the others.
         judge: What rolls out and judges, in common with other nodes of this process.
         sequence: The number before that of its first message; more than any that it sent before, if it did, and on a
-            network the time at which it began, by which two nodes of one number know who was first.
+            network the time at which it began, by which two nodes of one number know which was first.
         observer: Called with every :class:`~d4orm_planners.d_d4orm.node_events.Event`, in the node's own thread.
 
     Attributes:
@@ -183,7 +183,7 @@ class Node:
         self.search.close()
 
     def _await_others(self, stop: threading.Event, patience: float) -> None:
-        """Gather until everybody heard from the last time is heard from again, or patience ends."""
+        """Gather until all heard from the last time are heard from again, or patience ends."""
         deadline = time.perf_counter() + patience
         heard = self._gather()
         while not (stop.is_set() or heard >= self._awaited):

@@ -28,7 +28,7 @@ GLANCE = 0.05
 
 
 LAST_WAIT = 30.0
-"""Seconds that the end of the process waits for a thread that nobody else waited for: native code must not be cut."""
+"""Seconds that the end of the process waits for a thread that nothing else waited for: native code must not be cut."""
 
 
 class _Job:
@@ -47,7 +47,7 @@ class _Job:
     def start(self) -> None:
         """Begin.
 
-        Ctrl-C may come while the thread starts, so whoever has to wait for it must know of this job before.
+        Ctrl-C may come while the thread starts, so the pool must know of this job before.
         """
         self._begin = time.perf_counter()
         self._thread.start()
@@ -145,7 +145,7 @@ class NodePool(ABC):
     def close(self) -> Candidate:
         """Part the nodes, and give the best candidate that they have seen.
 
-        A thread leaves what it is at where it can, and nobody waits longer for it than patience.
+        A thread leaves what it is at where it can, and it is waited for no longer than patience.
         """
         self._judge.stop.set()
         for node in self._nodes:
@@ -308,7 +308,7 @@ class AsyncNodePool(NodePool):
                 return candidates
 
     def _run(self, improve: bool) -> None:
-        """Start whoever does not run: at first all, later those who stopped at what proved to be no solution here."""
+        """Start idle nodes: at first all, later those that stopped at what proved to be no solution here."""
         self._judge.solution_ends = not improve
         running = [job for job in self._jobs if job.running]
         failed = [job for job in self._jobs if job.error is not None]

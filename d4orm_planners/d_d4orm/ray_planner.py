@@ -38,7 +38,7 @@ class ActorOutcome(NamedTuple):
         denoising_steps: Spent on it.
         excluded: See :class:`~d4orm_planners.base.planner.Iteration`.
         compiling: Seconds of it that went into compiling.
-        process: Who did it.
+        process: The process that did it.
     """
 
     data: bytes

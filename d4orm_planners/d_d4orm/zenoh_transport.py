@@ -59,8 +59,8 @@ class ZenohSettings:
         namespace: What the nodes of one solve have in common and others on the network have not: their messages have
             the key ``NAMESPACE/candidates``.
         listen: Endpoints to listen at, as ``tcp/192.168.1.10:7447``; port 0 for any free one.
-        connect: Endpoints of other nodes or of a zenoh router; who is away is tried again and again. One is enough, as
-            connected nodes let each other know of the rest.
+        connect: Endpoints of other nodes or of a zenoh router; one that is away is tried again and again. One is
+            enough, as connected nodes let each other know of the rest.
         multicast: Whether to find others by UDP multicast: on the network, or on this machine where the node listens
             on loopback only.
         config_file: A zenoh configuration in JSON5, for TLS, access control and whatever else zenoh has; the settings
@@ -181,7 +181,7 @@ class ZenohTransport:
 
     @property
     def has_listeners(self) -> bool:
-        """Check whether anybody would receive what is published now."""
+        """Check whether any node would receive what is published now."""
         return bool(self._publisher.matching_status.matching)
 
 

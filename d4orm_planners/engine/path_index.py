@@ -1,8 +1,8 @@
 """Index of a team's positions at every step, compiled with numba: near robots without looking at every pair.
 
 Time is cut into blocks of a few steps, in which robots get not far. In every block the robots are chained in the
-buckets of a hash table, by the cell of a grid that the middle of each one's way through the block is in. Whoever comes
-near a way is in one of the few cells around it. Memory and time grow with the robots, not with the pairs.
+buckets of a hash table, by the cell of a grid that the middle of each one's way through the block is in. A robot that
+comes near a way is in one of the few cells around it. Memory and time grow with the robots, not with the pairs.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ farther than :mod:`d4orm_env.verify.docking` has it."""
 
 _NOBODY = np.int32(-1)
 _WIDER = 1 + 2.0**-20
-"""Factor by which distances up to which there may be somebody are stretched for rounding."""
+"""Factor by which distances up to which there may be a robot are stretched for rounding."""
 
 
 class PathTable(NamedTuple):
@@ -48,7 +48,7 @@ class PathTable(NamedTuple):
         middle: ``(B, K, 3)`` float64 where each robot is in each block, more or less [m],
         spread: ``(B, K)`` float64 and how far from there it gets [m].
         widest: ``(1,)`` float64 the largest spread there has been.
-        moving: ``(1,)`` int64 the last block in which there has been anybody moving.
+        moving: ``(1,)`` int64 the last block in which any robot has moved.
         first: ``(B, N)`` int32 the first robot in each bucket of each block.
         following: ``(B, K)`` int32 the robot after each in its bucket.
     """
@@ -71,7 +71,7 @@ class PathIndex:
     """The paths of a team, some of which may change.
 
     Args:
-        positions: ``(H+1, K, d)`` [m], finite; copied. At the start nobody counts as near.
+        positions: ``(H+1, K, d)`` [m], finite; copied. At the start none counts as near.
         radius: ``(K,)`` [m].
         margin: What robots are to keep between them [m].
 
@@ -106,7 +106,7 @@ class PathIndex:
         _move(self.table, np.asarray(robots, np.int64), np.ascontiguousarray(paths, np.float32))
 
     def pairs(self) -> IntArray:
-        """``(P, 2)`` who comes within the margin of whom at any step: the lower number first, in ascending order."""
+        """``(P, 2)`` pairs of robots ever within the margin of each other: the lower number first, ascending."""
         num_blocks, num_robots = self.table.following.shape
         parts: dict[int, IntArray] = {}
         self._threads.over(num_blocks, lambda part: parts.update({int(part[0]): _pairs(self.table, part)}))
@@ -124,7 +124,7 @@ class PathIndex:
             until: ``(R,)`` the last step that counts, or ``None`` for the horizon.
 
         Returns:
-            ``(R, V)``, and the first step at which each meets somebody, ``H+1`` if it meets nobody.
+            ``(R, V)``, and the first step at which each meets one, ``H+1`` if it meets none.
         """
         index, paths = np.asarray(robots, np.int64), np.ascontiguousarray(ways, np.float32)
         last = np.full(len(index), paths.shape[2]) if until is None else np.asarray(until, np.int64)

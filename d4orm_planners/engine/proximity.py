@@ -52,7 +52,7 @@ class Scratch(NamedTuple):
             so that what is within the margin of each other touches.
         num_robots: ``(K,)`` how many robots before it each may touch,
         robots: ``(K, K)`` and which.
-        near: ``(K, BLOCK)`` who is near a robot or a body at which step of the block, a bit for every sample.
+        near: ``(K, BLOCK)`` near a robot or a body at a step of the block, a bit for every sample.
         spare: ``(2 TILE,)`` two rows to overwrite.
     """
 

@@ -38,7 +38,7 @@ class SamplingTask:
             part of a sample by that robot's own reward.
         moving: Bodies to avoid that are not sampled, or ``None``.
         arrived: ``(K,)`` robots docked from the beginning, or ``None`` for none.
-        penalty: What a violation of the margin costs per step, against a reward of one for standing at the goal.
+        penalty: What a violation of the margin costs per step, against a reward of one for being at the goal.
         reference_distance: Distances count relative to the initial one (paper, section III-D), or to this if that is
             less: a robot that starts next to its goal then loses no more by waiting than others do. ``None`` for the
             paper's.
@@ -102,7 +102,7 @@ class SamplingResult(NamedTuple):
 
 
 class DenoisingStep(NamedTuple):
-    """One step of a denoising run, for whoever watches it.
+    """One step of a denoising run, for observers.
 
     Attributes:
         task: What is sampled around, and how it is scored.

@@ -57,7 +57,7 @@ class Workspace(NamedTuple):
         moved: ``(DOCKED TILE,)`` one robot's states, moved and not docked yet.
         keys: ``(2, K H P)`` keys of the noise streams, ``P`` pairs of components each.
         standing: ``(K,)`` whether a robot has docked in all samples.
-        scratch: What is noted of who is near what.
+        scratch: Scratch of :mod:`~d4orm_planners.engine.proximity`.
     """
 
     w: FloatArray

@@ -140,7 +140,7 @@ def run_jobs(jobs: Iterable[Job], pool: Pool, trial_timeout: float | None = None
 
     Args:
         jobs: What to run.
-        pool: Who runs it; closed at the end, also when the iteration is broken off.
+        pool: Pool that runs it; closed at the end, also when the iteration is broken off.
         trial_timeout: Seconds that a trial may take, that of the plan included; ``None`` is no limit.
 
     Raises:
@@ -265,7 +265,7 @@ class ProcessPool:
 
 
 def _work(pipe: Connection, parent: Connection, threads: int, run: Callable[[Any], Iterator[object]]) -> None:
-    """Run jobs until the parent is gone; Ctrl-C is for the parent, who decides."""
+    """Run jobs until the parent is gone; Ctrl-C is for the parent, which decides."""
     os.environ.update(D4ORM_NUM_THREADS=str(threads), OMP_NUM_THREADS=str(threads))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 

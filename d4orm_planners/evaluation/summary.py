@@ -1,4 +1,4 @@
-"""Many trials in a few numbers: success rates, times, success within a deadline, and how much a policy stands."""
+"""Many trials in a few numbers: success rates, times, success within a deadline, tolerance of disturbances."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from d4orm_env.core.arrays import positive_number
 from d4orm_planners.evaluation.store import Trial
 
 THRESHOLD = 0.9
-"""Success rate below which a policy is said to stand a disturbance no longer."""
+"""Success rate below which a policy is said to tolerate a disturbance no longer."""
 
 
 class TrialGroup(NamedTuple):
@@ -100,7 +100,7 @@ class SuccessRate(Compared):
     Attributes:
         verified: Trials with whose executed controls :func:`d4orm_env.verify` found no fault.
         contacts: Those in which robots touched something.
-        late: Those in which somebody did not arrive in time.
+        late: Those in which a robot did not arrive in time.
         travel_time: Mean over the successes of the mean arrival time [s]; ``None`` without any.
         travel_time_lower: Lower end of its interval (Student's t); ``None`` with fewer than two successes.
         travel_time_upper: Upper end.
@@ -274,7 +274,7 @@ class Tolerance:
         control_noise_std: Standard deviation of the execution noise, in the controls' units.
         disturbance: What went wrong, such as ``"push.speed"``.
         stands: The last level before that, in the order in which they were given; ``None`` if it fails at the first.
-        fails: The first level with a success rate below the threshold; ``None`` if it stands all.
+        fails: The first level with a success rate below the threshold; ``None`` if it tolerates all.
         threshold: The threshold.
     """
 
@@ -290,7 +290,7 @@ class Tolerance:
 
     @property
     def text(self) -> str:
-        """Return the level as text: ``"4"``, or ``"over 4"`` where it stands the last level, 4."""
+        """Return the level as text: ``"4"``, or ``"over 4"`` where it tolerates the last level, 4."""
         return f"{self.fails:g}" if self.fails is not None else f"over {self.stands:g}"
 
 

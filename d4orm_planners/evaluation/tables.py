@@ -151,7 +151,7 @@ def target(path: Path) -> Iterator[Path]:
 
 
 def markdown(rates: Sequence[SuccessRate]) -> str:
-    """One table per scenario and team, with errors below. Intervals of means stand in brackets."""
+    """One table per scenario and team, with errors below. Intervals of means are in brackets."""
     blocks = [rate_table(title, group) for title, group in panels(rates).items()]
     return "\n\n".join([*blocks, *errors((rate.label, rate.error) for rate in rates)]) + "\n"
 

@@ -78,7 +78,7 @@ class Queries(NamedTuple):
         limits: ``(R,)`` what their ways must cost less than [s]: the step at which one ends, and what contacts cost.
         without: ``(R, N)`` numbers of robots that they do not mind, their own among them.
         beside: ``(R, M, H+1, d)`` ways that they mind as well [m],
-        radius: ``(R, M)`` and the radii of who is on them [m].
+        radius: ``(R, M)`` and the radii of the agents on them [m].
     """
 
     robots: NDArray[np.int64]

@@ -31,7 +31,7 @@ def improve_by_lns(search: SolveRun) -> Iteration:
 
 
 def _better_roundabout(search: SolveRun) -> Trajectory | None:
-    """A roundabout in which nobody fails, with more reward than the best plan so far."""
+    """A roundabout in which none fails, with more reward than the best plan so far."""
     best = search.best
     for side in (1, -1):
         controls = drive_roundabout(search.problem, search.engine, side)
@@ -44,7 +44,7 @@ def _better_roundabout(search: SolveRun) -> Trajectory | None:
 
 
 def improve_first_paths(team: WorkingPlan, rounds: int = FIRST_ROUNDS) -> None:
-    """Take what faster ways there are at once for a team in which nobody fails, in so many rounds."""
+    """Take what faster ways there are at once for a team in which none fails, in so many rounds."""
     from d4orm_planners.mapf.lns import improve_paths
 
     improve_paths(team, team.search.iteration_seed(Stream.NEIGHBOURHOODS), rounds, temperature=0.0)

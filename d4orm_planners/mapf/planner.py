@@ -116,7 +116,7 @@ def roadmap_iteration(search: SolveRun, guide: RoadmapSolution) -> Iteration:
 
 
 def going_on_from_best(search: SolveRun, guide: RoadmapSolution) -> RoadmapSolution:
-    """The guide of a team that drives as in the best plan so far, whoever found it."""
+    """The guide of a team that drives as in the best plan so far."""
     # Here, because importing numba takes long.
     from d4orm_planners.mapf.roadmap_team import TeamRollout
 
@@ -181,7 +181,7 @@ def compile_roadmap(problem: Problem) -> None:
 
 
 def needs_detour(problem: Problem) -> bool:
-    """Check whether obstacles make somebody's shortest path a long detour, so that straight lines are no start."""
+    """Check whether obstacles make some robot's shortest path a long detour, so that straight lines are no start."""
     if not problem.world.num_obstacles:
         return False
     from d4orm_planners.mapf.lacam import TeamOnRoadmap

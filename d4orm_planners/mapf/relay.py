@@ -18,17 +18,17 @@ TURNS = 3
 
 
 def relay_ways(problem: Problem, ways: FloatArray, changed: BoolArray, seed: int) -> FloatArray | None:
-    """Plan the ways of some robots around all others, who give way only where there is no other one.
+    """Plan the ways of some robots around all others, which yield only where there is no other one.
 
     Args:
         problem: The team where it is now, and its goals.
         ways: ``(T + 1, K, d)`` where the robots are going to be, from now on [m]; those of ``changed`` are not looked
             at.
         changed: ``(K,)`` whose way is planned.
-        seed: Of who may have to give way, and of how leisurely they drive.
+        seed: Of the robots that may have to yield, and of how leisurely they drive.
 
     Returns:
-        ``(H + 1, K, d)`` where everybody is going to be [m]; ``None`` if no ways were found.
+        ``(H + 1, K, d)`` future positions of all robots [m]; ``None`` if no paths were found.
     """
     from d4orm_planners.mapf.planner import compile_path_finding
 

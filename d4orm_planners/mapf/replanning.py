@@ -22,12 +22,12 @@ from d4orm_planners.mapf.safe_intervals import Others, find_visits, free_interva
 SOURCES = fingerprint((near_neighbours, pibt, safe_intervals, wavefront))
 
 BLOCK = 16
-"""Steps for which it is known at once whether somebody is about."""
+"""Steps for which it is known at once whether a robot is about."""
 
 
 @compiled
 def _is_clear(others: Others, k: Whole, step: Whole, x: float, y: float, z: float) -> bool:
-    """Check whether nobody is near a position at a step."""
+    """Check whether no robot is near a position at a step."""
     row = min(step, others.positions.shape[0] - 1)
     for i in range(others.positions.shape[1]):
         dx, dy = others.positions[row, i, 0] - x, others.positions[row, i, 1] - y
@@ -39,7 +39,7 @@ def _is_clear(others: Others, k: Whole, step: Whole, x: float, y: float, z: floa
 
 @compiled
 def _fill_boxes(others: Others, boxes: Floats) -> None:
-    """The lowest and highest places of everybody in every block of steps; ``boxes`` ``(B, K, 6)`` is output."""
+    """The lowest and highest positions of all robots in every block of steps; ``boxes`` ``(B, K, 6)`` is output."""
     positions, num_robots = others.positions, others.positions.shape[1]
     for block in range(boxes.shape[0]):
         for i in range(num_robots):
@@ -82,7 +82,7 @@ def _is_line_free(
 
 @compiled
 def _is_line_clear(others: Others, k: Whole, tail: Floats, head: Floats, depart: Whole, arrive: Whole) -> bool:
-    """Check whether nobody is near a robot that drives straight from one position to another between two steps."""
+    """Check whether none is near a robot that drives straight from one position to another between two steps."""
     for step in range(depart + 1, arrive + 1):
         share = (step - depart) / (arrive - depart)
         x, y = tail[0] + share * (head[0] - tail[0]), tail[1] + share * (head[1] - tail[1])

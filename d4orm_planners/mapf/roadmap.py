@@ -60,7 +60,7 @@ class Roadmap(NamedTuple):
 def lay_roadmap(problem: Problem, fineness: float = 1.0) -> Roadmap:
     """The roadmap of a team's world.
 
-    Nodes of the lattice are so far apart that a robot at one is in nobody's way on the diagonals around it.
+    Nodes of the lattice are so far apart that a robot at one leaves room on the diagonals around it.
 
     Args:
         problem: The team, its starts and goals, and the world.

@@ -55,7 +55,7 @@ class TeamRollout:
     Attributes:
         controls: ``(T, K, m)`` float32.
         places: ``(T + 1, K, 3)`` float64 [m].
-        arrivals: ``(K,)`` int64 step of arrival; ``T + 1`` or more for who has not arrived.
+        arrivals: ``(K,)`` int64 step of arrival; ``T + 1`` or more for one that has not arrived.
     """
 
     controls: FloatArray
@@ -97,7 +97,7 @@ class Replanning:
     Args:
         problem: The team.
         roadmap: The roadmap of its world.
-        linger: Steps after which a robot that has arrived is nobody's obstacle any more, for it goes on to another
+        linger: Steps after which a robot that has arrived is no obstacle any more, for it goes on to another
             goal; ``None`` if it stays.
 
     Attributes:
@@ -149,15 +149,15 @@ class Replanning:
         return changed if changed.cost(self.problem.horizon) < driven.cost(self.problem.horizon) else None
 
     def one_by_one(self, random: np.random.Generator, should_stop: Callable[[], bool], most: int) -> TeamRollout | None:
-        """The team with ways planned one after another; who finds none displaces others, whose turn comes again.
+        """The team, its paths planned one by one; a robot that finds none displaces others, whose turn comes again.
 
         Args:
-            random: Of the order, and of who may be displaced.
+            random: Of the order, and of the robots that may be displaced.
             should_stop: Asked before every way.
             most: Ways planned after which it gives up.
 
         Returns:
-            Everybody's ways within the horizon; ``None`` if they were not found.
+            All robots' paths within the horizon; ``None`` if they were not found.
         """
         problem, steps, num_robots = self.problem, self.problem.horizon, self.problem.num_robots
         places = np.full((steps + 1, num_robots, 3), FAR)
@@ -204,7 +204,7 @@ class Replanning:
         return None if waiting else driven
 
     def leaves(self, arrival: int) -> int | None:
-        """The step from which on a robot that arrives at a step is nobody's obstacle any more, if any."""
+        """The step from which on a robot that arrives at a step is no obstacle any more, if any."""
         return None if self.linger is None else arrival + self.linger + 1
 
     def replan_one(self, driven: TeamRollout, robot: int, latest: int, random: np.random.Generator) -> bool:

@@ -1,4 +1,4 @@
-"""Safe intervals of a roadmap's nodes, compiled with numba; kept only where somebody comes by."""
+"""Safe intervals of a roadmap's nodes, compiled with numba; kept only where robots come by."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Others(NamedTuple):
 
 
 class Intervals(NamedTuple):
-    """Intervals in which nobody is near a node, for each node.
+    """Intervals in which no robot is near a node, for each node.
 
     Attributes:
         first: ``(N + 1,)`` int64 where the intervals of each node begin.
@@ -40,7 +40,7 @@ class Intervals(NamedTuple):
 
 @register_jitable(nogil=True, **OPTIONS)
 def find_visits(cells: Cells, others: Others, k: Whole, steps: Whole) -> tuple[IntArray, Ints]:
-    """Stretches of steps for which somebody is near a node.
+    """Stretches of steps for which a robot is near a node.
 
     Returns:
         ``(V, 3)`` first step, step after the last, and the visit before that to the same node; and ``(N,)`` int32 the
@@ -83,7 +83,7 @@ def find_visits(cells: Cells, others: Others, k: Whole, steps: Whole) -> tuple[I
 
 @register_jitable(nogil=True, **OPTIONS)
 def free_intervals(visits: IntArray, last: Ints, start: Whole, steps: Whole) -> Intervals:
-    """Return the intervals, in so many steps, in which nobody visits a node; at first a robot may be at its start."""
+    """Return the intervals, in so many steps, in which none visits a node; at first a robot may be at its start."""
     count = last.shape[0]
     most = count + visits.shape[0] + 1
     first, begins, ends = np.empty(count + 1, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)

@@ -48,7 +48,7 @@ class CommandQueue:
             self._changed.wait_for(lambda: self._closed or self._waiting, timeout)
 
     def close(self) -> None:
-        """Have nobody wait any more, and nothing to take."""
+        """Wake waiting calls; there is nothing to take any more."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()

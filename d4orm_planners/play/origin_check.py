@@ -58,7 +58,7 @@ class OriginCheck:
         connection.recv = partial(self._receive, connection, client.client_id)  # type: ignore[method-assign, assignment]
 
     async def _receive(self, connection: ServerConnection, client: int) -> bytes:
-        """The next message that may come through; whoever sends something else than messages is hung up on."""
+        """The next message that may come through; a connection with anything else is closed."""
         while True:
             await asyncio.sleep(_MESSAGE_PERIOD)
             data = await ServerConnection.recv(connection)

@@ -1,4 +1,4 @@
-"""A door before a page: who comes from another machine needs the token that is in the address."""
+"""A proxy before a page: requests from other machines need the token that is in the address."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 GATE_HEADER = "X-D4orm-Gate"
-"""Header that the gate writes its token into, so that what is behind it can tell who has come through the gate."""
+"""Header that the gate writes its token into, so that what is behind it can tell what has come through the gate."""
 
 logger = logging.getLogger(__name__)
 
 _HEAD = 16_384
 _PATIENCE = 10.0
 _MOST_WAITING = 100
-"""Connections that have not shown the token yet; who comes while so many wait is hung up on."""
+"""Connections that have not shown the token yet; further ones are closed."""
 
 
 class AuthenticatingProxy:
@@ -165,5 +165,5 @@ async def _pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
 
 
 def _tell_quietly(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Whoever knocks must not be able to fill the terminal."""
+    """Requests must not be able to fill the terminal."""
     logger.debug("%s", context["message"], exc_info=context.get("exception"))

@@ -1,6 +1,6 @@
 """A simulation that goes on by a clock in a thread of its own, and that others may look at and change meanwhile.
 
-The thread plans and steps; nobody waits for it but the simulated clock. Changes are put into a queue and made between
+The thread plans and steps; only the simulated clock waits for it. Changes are put into a queue and made between
 two steps: the team then goes on from where it is, and the policy plans anew. Where several policies drive side by side,
 each has a team of its own in the same world, and whatever is changed is changed for all.
 """
@@ -116,7 +116,7 @@ class Session:
             self._thread.join()
 
     def refuse(self, reason: str) -> None:
-        """Say why what somebody asked for is left."""
+        """Say why a request is refused."""
 
         def make() -> None:
             raise ValueError(reason)
@@ -146,7 +146,7 @@ class Session:
     def push(self, robot: int | None, velocity: ArrayLike, lane: int = 0) -> None:
         """Give a robot a velocity on top of its own at the next step's beginning, in all that drive side by side.
 
-        Nobody tells the policies, which have to find out.
+        The policies are not told, and have to find out.
 
         Args:
             robot: Which one; ``None`` is the one that is farthest from its goal.
@@ -309,7 +309,7 @@ class Session:
         return "arrived" if all(lane.finished for lane in self._lanes) else "running"
 
     def _begin_here(self, terms: EpisodeOptions | None = None) -> None:
-        """Go on from where everybody is."""
+        """Go on from the present states."""
         self._begin([lane.scene for lane in self._lanes], terms=terms)
 
     def _begin(

@@ -1,6 +1,6 @@
 """Checks of what a page asks for, by the type of its message and against what the page offers.
 
-Whoever may open a web socket may send anything. What a message may be is written down here, once; all else goes no
+A web socket may carry anything. What a message may be is written down here, once; all else goes no
 further, and what does is encoded anew, so that nothing but what was checked is read behind it.
 """
 

@@ -20,7 +20,7 @@ Vector = NDArray[np.float64]
 
 
 class Viewpoint:
-    """Shows all that lies between two corners to whoever looks at a page.
+    """Shows a page's viewers all that lies between two corners.
 
     Args:
         server: The page.

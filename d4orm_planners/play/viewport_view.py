@@ -91,7 +91,7 @@ class LaneView:
             )  # fmt: skip
 
     def name(self, text: str, place: Points) -> None:
-        """Write who drives at a place of this scene."""
+        """Write the policy's name at a position of this scene."""
         self._nodes["name"] = self._scene.add_label(
             f"{self._root}/name", text, position=place, anchor="bottom-center", font_screen_scale=1.3
         )
@@ -126,7 +126,7 @@ class LaneView:
             self._draw_lines(frame)
 
     def _with_held(self, kind: str, places: Points) -> Points:
-        """Places with those that somebody drags at the pointer."""
+        """Positions, with those that are dragged at the pointer."""
         for (what, index), place in list(self._held.items()):
             if what == kind and index < len(places):
                 places[index] = place

@@ -92,7 +92,7 @@ class Figure:
     Attributes:
         name: What to call it on the command line.
         title: What it shows.
-        source: Where it stands in the paper.
+        source: Its place in the paper.
         sections: Its panels.
         across: What varies from left to right.
         metrics: What is tabulated, see :data:`~d4orm_planners.reproduction.numbers.METRICS`.

@@ -69,7 +69,7 @@ Shown = Sequence[tuple[Group, Measured]]
 
 
 def _lines(figure: Figure, shown: Shown) -> dict[str, list[Measured]]:
-    """Rows by line of a plot: one per policy, or a single one where policies stand from left to right."""
+    """Rows by line of a plot: one per policy, or a single one where policies go from left to right."""
     lines: dict[str, list[Measured]] = {}
     for _, row in shown:
         lines.setdefault("" if figure.across == "policy" else row.label, []).append(row)

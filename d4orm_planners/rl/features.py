@@ -167,7 +167,7 @@ class Features:
         """The actions that :meth:`decode` makes these controls of.
 
         Args:
-            controls: ``(N, m)`` in physical units; what goes beyond the limits is brought within.
+            controls: ``(N, m)`` in physical units; clipped to the limits.
             frames: ``(N, 2)`` as from :meth:`encode`.
             limits: ``(N, m)`` largest controls.
 

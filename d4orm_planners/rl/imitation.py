@@ -96,7 +96,7 @@ def imitate(
     recorded.
 
     Args:
-        settings: Whom to imitate.
+        settings: Settings of the imitation.
         out: Folder to write to, and to go on from.
         progress: Called as ``progress(what, episodes and epochs done, in all)``.
         command: How the training was called, for the policy file.

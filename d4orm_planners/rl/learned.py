@@ -121,7 +121,7 @@ class LearnedPolicy(Policy):
         return within_limits(self.problem, dict(zip(observations, controls)))
 
     def _look_along_ways(self, network: Network, robots: list[int], seen: FloatArray, state: FloatArray) -> None:
-        """Change the goals in ``seen`` ``(N, D)`` as in training, by the map that everybody has.
+        """Change the goals in ``seen`` ``(N, D)`` as in training, by the map that all have.
 
         Where a robot is follows from its goal and where it sees that.
         """

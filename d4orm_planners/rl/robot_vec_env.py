@@ -26,7 +26,7 @@ class RobotVecEnv(VecEnv):
     Environment ``b * K + k`` is robot ``k`` of world ``b``. Observations are the :class:`Features` ``(B * K, F)``,
     actions ``(B * K, m)`` in ``[-1, 1]``. A robot's episode ends when it arrives (terminated) or its world is out of
     time (truncated, ``infos[i]["TimeLimit.truncated"]``); ``infos[i]["terminal_observation"]`` is what it saw last, and
-    ``is_success`` says whether it arrived without ever touching anything. An arrived robot then stands in its world
+    ``is_success`` says whether it arrived without ever touching anything. An arrived robot then stays in its world
     until that begins anew, when all have arrived or time is up: meanwhile its observation and reward are zero, its
     action is ignored, and :attr:`acted` is ``False``. What happens then is nothing to learn from.
 

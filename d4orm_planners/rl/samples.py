@@ -80,10 +80,10 @@ def record_samples(env: ParallelEnv, expert: Policy, seed: int, learner: Driver 
 
     Args:
         env: A :mod:`d4orm_env.navigation_v0` parallel environment of a team of one model.
-        expert: Who is asked.
+        expert: Policy that is asked.
         seed: Seeds both.
-        learner: Who drives, as ``(observations (N, D), limits (N, m)) -> controls (N, m)``; by default the expert. With
-            a learner the expert is asked where that has led the team.
+        learner: Policy that drives, as ``(observations (N, D), limits (N, m)) -> controls (N, m)``; by default the
+            expert. With a learner the expert is asked where that has led the team.
 
     Returns:
         What the robots saw until they arrived, and what the expert said.

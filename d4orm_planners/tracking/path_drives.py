@@ -1,7 +1,7 @@
 """Driving along routes under the robots' own dynamics, compiled with numba.
 
-Nobody enters a stretch before all whom it has to let pass have passed, and nobody is ever faster than it can stop
-before the next such stretch. Corners are rounded as far as the slack allows, and taken no faster than that.
+No robot enters a stretch before all that it has to let pass have passed, or is ever faster than it can stop before the
+next such stretch. Corners are rounded as far as the slack allows, and taken no faster than that.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Part(NamedTuple):
     Attributes:
         time_step: ``(4,)`` see :class:`~d4orm_env.dynamics.robot_model.TimeStep`.
         docking: ``(2,)`` squares of the goal radius and of the goal speed.
-        docks: Whether who has arrived stands there for ever.
+        docks: Whether a robot that has arrived stays there for good.
         robots: ``(B,)`` int64.
         limits: ``(B, L)``.
         goals: ``(B, d)`` [m].
@@ -97,7 +97,7 @@ def direct(
     standing: BoolArray,
     progress: Progress,
 ) -> None:
-    """Say where everybody is to drive next.
+    """Set the next target of all robots.
 
     Args:
         routes: The routes.
@@ -107,7 +107,7 @@ def direct(
         beyond: How far robots may plan to drive beyond their goals, which stop them [m].
         size: The radius of the largest robot [m].
         positions: ``(K, 3)`` float64 where they are [m].
-        standing: ``(K,)`` bool who has docked, and so is at the end of its route.
+        standing: ``(K,)`` bool: docked, and so at the end of its route.
         progress: Changed in place.
     """
     points, arcs, num_robots = routes.points, routes.arcs, routes.first.shape[0] - 1
@@ -186,7 +186,7 @@ def drive_kernel(name: str) -> Drive:
 
 
 def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[FloatArray, Floats, IntArray]:
-    """Drive the team along its routes until everybody has arrived, or for ``most_steps``.
+    """Drive the team along its routes until all have arrived, or for ``most_steps``.
 
     Args:
         problem: The team.
@@ -195,7 +195,7 @@ def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[Floa
 
     Returns:
         Controls ``(T, K, m)``, places ``(T + 1, K, 3)`` float64 [m] and ``(K,)`` the step of each arrival; ``T + 1``
-        for who has not arrived.
+        for one that has not arrived.
     """
     d, num_robots = problem.dimension, problem.num_robots
     paces = np.concatenate(

@@ -1,8 +1,9 @@
 """Driving towards points of a route under a robot's own dynamics, compiled with numba.
 
-Who turns in place turns before it drives. Who turns only as it drives pursues a point ahead of it, as far off as its
-turning circle takes (R. C. Coulter, *Implementation of the pure pursuit path tracking algorithm*, CMU-RI-TR-92-01,
-1992), in reverse where that lies behind, and where it lies aside it swings round or backs up until it can drive there.
+A robot that turns in place turns before it drives. One that turns only as it drives pursues a point ahead of it, as far
+off as its turning circle takes (R. C. Coulter, *Implementation of the pure pursuit path tracking algorithm*,
+CMU-RI-TR-92-01, 1992), in reverse where that lies behind, and where it lies aside it swings round or backs up until it
+can drive there.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ BEHIND = np.float32(0.5)
 BESIDE = (np.float32(0.3), np.float32(0.954))
 """Cosine and sine of the angle beyond which a point is steered for as sharply as this."""
 ASIDE = (np.float32(0.7), np.float32(0.3), np.float32(0.2))
-"""Sine of the angle beyond which a robot backs up that comes nearer, stands, or is backing up already."""
+"""Sine of the angle beyond which a robot backs up that comes nearer, is at rest, or is backing up already."""
 BACKING = np.float32(0.5)
 """Share of its pace at which a robot backs up."""
 

@@ -1,4 +1,4 @@
-"""Tracking a velocity, and driving straight to the goal as if nobody else were there: one law for every model."""
+"""Tracking a velocity, and driving straight to the goal as if alone: one law for every model."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def goals_along_ways(problem: Problem, places: FloatArray | Floats, goals: Float
 
 
 def along_ways(direction: ArrayLike, length: ArrayLike) -> tuple[Floats, BoolArray]:
-    """Vectors along ways ``(N, d)``, as long as they are, and ``(N,)`` who has one: is neither at its goal nor lost.
+    """Vectors along paths ``(N, d)``, as long as they are, and ``(N,)`` robots with one: neither at the goal nor lost.
 
     Args:
         direction: ``(N, d)`` unit vectors, zero at a goal.

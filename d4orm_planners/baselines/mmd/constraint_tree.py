@@ -1,4 +1,4 @@
-"""The search over constraints: who plans again because of whom, and what it must keep clear of (CBS, ECBS, xECBS)."""
+"""The search over constraints: which robot plans again, and what it must keep clear of (CBS, ECBS, xECBS)."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ class Planning:
         self.steps = 0
 
     def root(self, seeds: list[int]) -> TreeNode:
-        """Everybody's motion, one robot after another around those that have planned (soft constraints only)."""
+        """All robots' motions, one after another around those that have planned (soft constraints only)."""
         motions: list[Motion] = []
         for robot, seed in enumerate(seeds):
             motions.append(self._plan(robot, motions, list(range(robot)), (), seed, None))

@@ -93,7 +93,7 @@ class Demonstrations:
         """All that an episode depends on beside its seed, as JSON has it.
 
         Raises:
-            ValueError: If something has no form in JSON, or the source of what was brought cannot be read.
+            ValueError: If something has no form in JSON, or a user's source cannot be read.
         """
         whole = {
             "policy": self.policy_name,

@@ -167,7 +167,7 @@ class _Recorder(Policy):
         return actions
 
     def team_actions(self) -> tuple[BoolArray, FloatArray]:
-        """``(T, K)`` bool who acted, and ``(T, K, m)`` how."""
+        """``(T, K)`` bool: acted, and the actions ``(T, K, m)``."""
         shape = (len(self._actions), self.problem.num_robots)
         acting, controls = np.zeros(shape, np.bool_), np.zeros((*shape, self.problem.control_size), np.float32)
         for step, actions in enumerate(self._actions):
