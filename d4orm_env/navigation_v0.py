@@ -84,7 +84,7 @@ class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
 
     @property
     def np_random(self) -> np.random.Generator:
-        """Where episodes draw their randomness from; seeded by :meth:`reset`."""
+        """Generator that episodes draw their randomness from; seeded by :meth:`reset`."""
         if self._np_random is None:
             self._np_random = seeding.np_random()[0]
         return self._np_random
@@ -190,7 +190,7 @@ class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
 
     @property
     def last_step(self) -> TeamStep:
-        """What the last step, reset or :meth:`set_state` did to the whole team, robots that have left included.
+        """Result of the last step, reset or :meth:`set_state` for the whole team, robots that have left included.
 
         Raises:
             RuntimeError: Before the first reset.
@@ -223,7 +223,7 @@ class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
         raise AssertionError("every action is fine")
 
     def complaint(self, agent: str, action: ArrayLike) -> str:
-        """What is wrong with an action of that agent; the empty string if nothing is."""
+        """Describe what is wrong with an action of that agent; the empty string if nothing is."""
         shape = (self._control_size,)
         try:
             array = as_float32(action)
@@ -238,7 +238,7 @@ class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
 
 
 class AECNavigationEnv(parallel_to_aec_wrapper):
-    """PettingZoo's conversion, with a bad action refused when it is given, and by the name of who gave it."""
+    """PettingZoo's conversion, with a bad action refused when it is given, and by the agent's name."""
 
     def __init__(self, environment: parallel_env) -> None:
         super().__init__(environment)

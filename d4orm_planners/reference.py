@@ -102,7 +102,7 @@ def _step_robot(model: str, dt: Array, limits: tuple[Array, Array, Array], x: Ar
 
 
 def _at_rest(model: str, x: Array) -> Array:
-    """``(K, n)`` states standing still."""
+    """``(K, n)`` states at rest."""
     if model == "velocity2d":
         return x
     return x.at[:, 3:].set(0.0) if model != "holonomic2d" else x.at[:, 2:].set(0.0)

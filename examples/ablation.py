@@ -1,4 +1,4 @@
-"""What each of D4orm-C2F's measures against disturbances does: left out by itself, and all of them left out.
+"""Ablation of D4orm-C2F's measures against disturbances: each left out by itself, and all of them left out.
 
     python examples/ablation.py --seeds 30 --out ablation
 
@@ -45,7 +45,7 @@ MEANT_FOR = {
     "pushes 0.2/s, 0.3 m/s": "last_resort",
     NOTHING: "drive_home",
 }
-"""Which measure is tried under which disturbance."""
+"""Measure that is tried under each disturbance."""
 SETTINGS: Mapping[str, Mapping[str, Any]] = {
     ALL: {},
     **MEASURES,
@@ -82,7 +82,7 @@ def by_cell(trials: Sequence[Trial]) -> Cells:
 
 
 def travel_time(trial: Trial) -> float:
-    """Of the robots, on average [s]."""
+    """Return the robots' travel time, on average [s]."""
     assert trial.travel_time is not None
     return trial.travel_time
 

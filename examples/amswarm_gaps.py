@@ -1,4 +1,4 @@
-"""Whether D4orm-D solves the fifth environment of AMSwarm where robots fit between its cylinders.
+"""D4orm-D in the fifth environment of AMSwarm, with gaps between its cylinders that robots fit through.
 
     python examples/amswarm_gaps.py --seeds 10 --out amswarm_gaps
 

@@ -29,7 +29,7 @@ WORLDS, HORIZON = 256, 32
 
 
 def settings(folder: Path, iterations: int) -> Any:
-    """Of an experiment: short rollouts of many worlds, and small batches."""
+    """Return the settings of an experiment: short rollouts of many worlds, and small batches."""
     config = ExperimentConfig.get_from_yaml()
     config.save_folder, config.loggers, config.create_json = str(folder), [], True
     config.max_n_iters, config.max_n_frames, config.gamma, config.lr = iterations, None, 0.98, 1e-3
@@ -41,7 +41,7 @@ def settings(folder: Path, iterations: int) -> Any:
 
 
 class Successes(Callback):
-    """How many episodes ended in each iteration, and how many of them succeeded."""
+    """Counts of the episodes that ended in each iteration, and of those that succeeded."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -31,7 +31,7 @@ REACH = 5.0
 
 
 class Agent(nn.Module):
-    """What robots do, and what it is worth."""
+    """Actor and critic of a robot."""
 
     def __init__(self, inputs: int, outputs: int, width: int = 64) -> None:
         super().__init__()
@@ -55,7 +55,7 @@ class Agent(nn.Module):
 
 
 class Batch(NamedTuple):
-    """What was seen, done and got: each with the leading axes time and robot."""
+    """Batch of experience: each array with the leading axes time and robot."""
 
     seen: Any
     action: Any

@@ -1,4 +1,4 @@
-"""What D4orm's first solution takes by whose reward samples are weighted, and by what a contact costs in it.
+"""Steps to D4orm's first solution by whose reward samples are weighted, and by what a contact costs in it.
 
     python examples/contact_penalty.py --seeds 50 --out contact_penalty
 

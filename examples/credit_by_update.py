@@ -1,4 +1,4 @@
-"""Which matters more, who gets the credit or how samples become an update: a factorial of both, on four teams.
+"""Factorial of credit and update, on four teams: who gets the credit, and how samples become an update.
 
     python examples/credit_by_update.py --seeds 50 --out factorial
 

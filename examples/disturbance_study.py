@@ -1,4 +1,4 @@
-"""How often do controllers bring eight robots home when something goes wrong: ten disturbances, another physics.
+"""Success of controllers with eight robots under ten disturbances, and in another physics.
 
     python examples/disturbance_study.py --seeds 50 --out disturbance_study
 
@@ -62,7 +62,7 @@ DISTURBANCES: dict[str, Disturbance[Any]] = {
 }
 NOTHING = "none"
 BODIES = {"MuJoCo, pucks": "holonomic2d", "MuJoCo, two wheels": "differential_drive"}
-"""What is on instead of a disturbance, and the robots' model."""
+"""Physics in place of a disturbance, and the robots' model."""
 COLUMNS = (NOTHING, *DISTURBANCES, *BODIES)
 
 Cells = dict[tuple[str, str, str], list[Trial]]
@@ -126,7 +126,7 @@ def rows_of(cells: Cells) -> list[dict[str, Any]]:
 
 
 def successes(trials: Sequence[Trial]) -> str:
-    """How many there were, and in how many trials anybody touched anything."""
+    """Return the number of successes, and of trials in which anybody touched anything."""
     return f"{sum(trial.success for trial in trials)}, {sum(trial.collided > 0 for trial in trials)}"
 
 

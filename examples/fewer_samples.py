@@ -1,4 +1,4 @@
-"""What D4orm needs to its first solution with fewer steps, fewer samples, or fewer of these while the noise is small.
+"""Cost of D4orm's first solution with fewer steps, fewer samples, or fewer of these while the noise is small.
 
     python examples/fewer_samples.py --seeds 50 --out fewer_samples
 
@@ -45,7 +45,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 
 
 def samples_per_step(trial: Trial) -> float:
-    """Of every step, on average."""
+    """Return the samples of every step, on average."""
     config = json.loads(trial.config)
     return float(config["num_samples"] * (1 - config["late_steps"] * (1 - config["late_samples"])))
 

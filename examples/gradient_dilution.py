@@ -1,4 +1,4 @@
-"""How the team's common reward drowns each robot's signal, and what a reward of its own changes.
+"""Dilution of each robot's signal in the team's common reward, and the effect of a reward of its own.
 
     python examples/gradient_dilution.py --seeds 20
 
@@ -49,7 +49,7 @@ def crossing(num_robots: int) -> Problem:
 
 
 def robots_that_share(credit: str, num_robots: int) -> int:
-    """How many robots' rewards weight one robot's part of the samples."""
+    """Return the number of robots whose rewards weight one robot's part of the samples."""
     return {"group": min(GROUP, num_robots), "robot": 1}.get(credit, num_robots)
 
 
@@ -71,12 +71,12 @@ class Watched(GroupWeights):
 
 
 def normalised(rewards: np.ndarray) -> np.ndarray:
-    """With mean zero and standard deviation one over the last axis."""
+    """Normalise to mean zero and standard deviation one over the last axis."""
     return (rewards - rewards.mean(axis=-1, keepdims=True)) / rewards.std(axis=-1, keepdims=True)
 
 
 def first_step(rewards: np.ndarray, weights: np.ndarray) -> dict[str, float]:
-    """Of ``(K, M)`` normalised rewards and weights: how many samples count, and the weighted mean reward."""
+    """Describe ``(K, M)`` normalised rewards and weights: how many samples count, and the weighted mean reward."""
     return {
         "effective_samples": float((1 / (weights**2).sum(axis=1)).mean()),
         "own_reward": float((weights * rewards).sum(axis=1).mean()),
@@ -85,13 +85,13 @@ def first_step(rewards: np.ndarray, weights: np.ndarray) -> dict[str, float]:
 
 @cache
 def normal_limit(num_samples: int, draws: int = 400) -> dict[str, float]:
-    """What :func:`first_step` is for rewards that are normally distributed, such as the sum of very many robots'."""
+    """Return :func:`first_step` for rewards that are normally distributed, such as the sum of very many robots'."""
     rewards = normalised(np.random.default_rng(0).standard_normal((draws, num_samples)))
     return first_step(rewards, np.asarray(SoftmaxWeights(TEMPERATURE)(rewards, np), np.float64))
 
 
 def iteration(num_robots: int, credit: str, num_samples: int, num_steps: int, seed: int) -> dict[str, Any]:
-    """What the first step's weights were, and what one iteration came to."""
+    """Return the first step's weights, and the result of one iteration."""
     engine, problem = get_sampling_engine("cpu"), crossing(num_robots)
     base = np.zeros((problem.horizon, num_robots, problem.control_size), np.float32)
     task = SamplingTask(problem, base, collisions=False, credit="robot")

@@ -1,4 +1,4 @@
-"""From a planner to a policy: a network learns what D4orm-C2F does, first by cloning, then by DAgger, then by PPO.
+"""Imitation of a planner: a network learns what D4orm-C2F does, first by cloning, then by DAgger, then by PPO.
 
     python examples/imitate_expert.py --seeds 3
     python examples/imitate_expert.py --trials data/imitate_expert.parquet
@@ -69,7 +69,7 @@ def report(what: str, done: int, total: int) -> None:
 
 
 def summary(rows: Rows) -> list[dict[str, object]]:
-    """What all seeds came to: after each round of the imitation, and after the first and the last lesson of PPO.
+    """Summarise all seeds: after each round of the imitation, and after the first and the last stage of PPO.
 
     A round learns from so many moments of robots as its episodes happen to have, which differ from seed to seed.
     """

@@ -32,7 +32,7 @@ REACH = 5.0
 
 
 class Sample(NamedTuple):
-    """What was seen, done and got, each with the leading axes time, world and robot."""
+    """Batch of experience, each array with the leading axes time, world and robot."""
 
     observation: Any
     action: Any

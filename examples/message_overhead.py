@@ -1,4 +1,4 @@
-"""What a message between two nodes of D-D4orm costs: writing, sending, reading, and judging what it claims.
+"""Cost of a message between two nodes of D-D4orm: writing, sending, reading, and judging what it claims.
 
     python examples/message_overhead.py --repetitions 500
 

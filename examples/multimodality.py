@@ -1,4 +1,4 @@
-"""Which kinds of solution a planner finds: two robots swap places around an obstacle (the paper's appendix A).
+"""Kinds of solution that a planner finds: two robots swap places around an obstacle (the paper's appendix A).
 
     python examples/multimodality.py --seeds 100
 
@@ -85,7 +85,7 @@ def solve(problem: Problem, seeds: int, **limits: Any) -> list[dict[str, Any]]:
 
 
 def solutions(rows: Sequence[Row], label: str) -> list[Row]:
-    """Those of a planner."""
+    """Return the solutions of a planner."""
     return [row for row in rows if row["planner"] == label and row["solved"]]
 
 
@@ -95,7 +95,7 @@ def path_of(row: Row) -> np.ndarray:
 
 
 def principal_components(paths: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Where plans ``(T, K, 2)`` lie ``(S, 2)`` [m] in the two directions in which they differ most.
+    """Project plans ``(T, K, 2)`` to ``(S, 2)`` [m], the two directions in which they differ most.
 
     Also the ``(2,)`` shares of the variance.
     """

@@ -1,4 +1,4 @@
-"""How many kinds of solution planners find for a whole team on a circle (the paper's appendix A, its harder problem).
+"""Kinds of solution that planners find for a whole team on a circle (the paper's appendix A, its harder problem).
 
     python examples/multimodality_team.py --seeds 30
 
@@ -24,7 +24,7 @@ from d4orm_env import make_problem
 
 
 def signature(positions: np.ndarray) -> tuple[bool, ...]:
-    """Of a plan ``(T, K, 2)``, for every pair of robots: whether the one goes round the other anticlockwise."""
+    """Return, for every pair of robots of a plan ``(T, K, 2)``, whether the one goes round the other anticlockwise."""
     pairs = combinations(range(positions.shape[1]), 2)
     return tuple(winding(positions[:, second] - positions[:, first]) > 0 for first, second in pairs)
 

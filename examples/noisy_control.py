@@ -23,7 +23,7 @@ POLICIES = {"hybrid": "open loop: the plan of the hybrid planner", "d4orm-c2f": 
 
 @dataclass(frozen=True)
 class Execution:
-    """What happened in one episode of ``T`` steps."""
+    """Record of one episode of ``T`` steps."""
 
     positions: np.ndarray
     """``(T+1, K, d)`` [m]."""

@@ -1,4 +1,4 @@
-"""What the study scripts share: their arguments, and writing tables and plots so that no file is ever half-written."""
+"""Common parts of the study scripts: arguments, and writing tables and plots so that no file is ever half-written."""
 
 from __future__ import annotations
 

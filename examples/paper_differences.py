@@ -1,4 +1,4 @@
-"""What each difference between the paper's D4orm and this project's defaults does, one at a time.
+"""Effect of each difference between the paper's D4orm and this project's defaults, one at a time.
 
     python examples/paper_differences.py --seeds 50 --out paper_differences
 
@@ -47,7 +47,7 @@ SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
         "defaults, by the team's reward": {"credit": "team", "penalty": 1.0},
     },
 }
-"""By what they are compared with."""
+"""Settings by what they are compared with."""
 
 
 def run(sizes: Mapping[str, Sequence[int]], seeds: int, own: dict[str, Any], out: Path) -> list[Trial]:

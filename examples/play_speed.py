@@ -1,4 +1,4 @@
-"""How fast `d4orm play` is: control loops, frames that are sent and drawn, and from a drop to the new plan.
+"""Speed of `d4orm play`: control loops, frames that are sent and drawn, and from a drop to the new plan.
 
     python examples/play_speed.py --seconds 30
     python examples/play_speed.py --seconds 30 --browser
@@ -56,7 +56,7 @@ class Client:
             self._received += b"/robots" in zstandard.decompress(data[16 : 16 + size])
 
     def frames(self) -> dict[str, float]:
-        """How many there were up to now."""
+        """Return the number up to now."""
         return {"frames received": self._received}
 
     def close(self) -> None:
@@ -76,7 +76,7 @@ class Browser:
         page.evaluate("window.drawn = 0; (function count() { drawn++; requestAnimationFrame(count); })()")
 
     def frames(self) -> dict[str, float]:
-        """How many there were up to now: chances to draw, and scenes drawn."""
+        """Return the number up to now: chances to draw, and scenes drawn."""
         chances, scenes = self._page.evaluate("[drawn, __viserTestpoints.rendererInfo.render.frame]")
         return {"animation frames": chances, "scenes drawn": scenes}
 
@@ -99,7 +99,7 @@ def looking(address: str, in_browser: bool) -> Iterator[Client | Browser]:
 
 
 class Watched(NamedTuple):
-    """What was seen of the control loops, one after the other."""
+    """Measurements of the control loops, one after the other."""
 
     milliseconds: NDArray[np.float64]
     megabytes: NDArray[np.float64]
@@ -133,7 +133,7 @@ def drop(session: Session, random: np.random.Generator) -> float:
 
 
 def memory() -> float:
-    """What this process holds [MB], on Linux."""
+    """Return the memory of this process [MB], on Linux."""
     pages = Path("/proc/self/statm")
     return int(pages.read_text().split()[1]) * 4096 / 1e6 if pages.exists() else float("nan")
 

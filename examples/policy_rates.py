@@ -1,4 +1,4 @@
-"""How often the learned policies of the package bring teams home, on instances that no training saw.
+"""Success rates of the package's learned policies, on instances that no training saw.
 
     python examples/policy_rates.py --seeds 100
 

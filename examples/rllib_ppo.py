@@ -38,7 +38,7 @@ class Successes(RLlibCallback):
 
 
 def settings(env_config: dict[str, Any]) -> PPOConfig:
-    """Of the algorithm: many worlds in one process, and small networks."""
+    """Return the algorithm's settings: many worlds in one process, and small networks."""
     config = PPOConfig().environment(RLlibNavigation, env_config=env_config)
     config.env_runners(num_env_runners=0, num_envs_per_env_runner=WORLDS, rollout_fragment_length=32)
     config.multi_agent(policies={"robot"}, policy_mapping_fn=lambda agent, episode, **others: "robot")

@@ -1,4 +1,4 @@
-"""How planning time of D4orm-D grows with the team at constant density.
+"""Planning time of D4orm-D by team size at constant density.
 
     python examples/scaling.py --seeds 3
     python examples/scaling.py --seeds 1 --num-robots 2000

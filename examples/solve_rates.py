@@ -1,4 +1,4 @@
-"""How often, how soon and how well the planners solve their problems: tables of the README and of the planners' pages.
+"""Success, time and quality of the planners on their problems: tables of the README and of the planners' pages.
 
     python examples/solve_rates.py --seeds 20
     python examples/solve_rates.py --seeds 5 --sets few --planner mmd
@@ -104,9 +104,9 @@ README = {
     "big": ("circle, 16", "random, 64 on 8 x 8 m", "random, 200", "random, 1000", "circle of 18 m, 100"),
     "walls": ("rooms, 20", "maze, 20", "warehouse, 100"),
 }
-"""What the README shows."""
+"""Rows that the README shows."""
 JITTER = 0.005
-"""Of starts in the AMSwarm comparison [m]."""
+"""Jitter of starts in the AMSwarm comparison [m]."""
 
 
 def instance(scenario: str, settings: Mapping[str, Any], seed: int) -> Problem:

@@ -35,7 +35,7 @@ SEEN, ACTION, REWARD, VALUE = (("robots", name) for name in ("seen", "action", "
 
 
 def scaled() -> TensorDictModule:
-    """What networks see of observations."""
+    """Return a module that scales observations for the networks."""
     return TensorDictModule(
         lambda observation: observation.clamp(-REACH, REACH) / REACH, [("robots", "observation")], [SEEN]
     )
@@ -51,7 +51,7 @@ def network(env: TorchRLNavigation, outputs: int, centralised: bool) -> MultiAge
 
 
 def make_actor(env: TorchRLNavigation) -> ProbabilisticActor:
-    """What robots do."""
+    """Return the robots' actor."""
     limits = env.action_spec["robots", "action"].space
     parameters = [("robots", "loc"), ("robots", "scale")]
     means = torch.nn.Sequential(network(env, 2 * limits.high.shape[-1], False), NormalParamExtractor())

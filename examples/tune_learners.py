@@ -33,7 +33,7 @@ TRAININGS: Mapping[str, TrainingSettings] = {
 }
 """The first look of each."""
 LONGER = (1, 2)
-"""How many times as long a training of each round is."""
+"""Factors by which a training of each round is longer."""
 SPACES: Mapping[str, Mapping[str, Between | OneOf]] = {
     "ppo": {"learning_rate": Between(1e-4, 2e-3), "n_epochs": OneOf((2, 4, 8)), "clip_range": OneOf((0.1, 0.2, 0.3)),
             "ent_coef": OneOf((0.0, 1e-3, 1e-2)), "gae_lambda": OneOf((0.9, 0.95, 0.98))},

@@ -120,7 +120,7 @@ def tune(method: str, number: int, seeds: int, budget: int, out: Path) -> list[T
 
 
 def described(method: str, settings: Mapping[str, Any]) -> str:
-    """What is tuned of these settings."""
+    """Describe those of these settings that are tuned."""
     return ", ".join(f"{name}={settings[name]}" for name in SPACES[method])
 
 
@@ -143,7 +143,7 @@ def rows_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:
 
 
 def shortlist(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Of every method the settings that came furthest, and the preset."""
+    """Return every method's settings that came furthest, and the preset."""
     furthest: dict[str, int] = {}
     for row in rows:
         furthest[row["method"]] = max(row["trials"], furthest.get(row["method"], 0))

@@ -24,7 +24,7 @@ CASES = (("random", 8), ("random", 16), ("circle", 8), ("circle", 16))
 PLANNERS = ("hybrid", "d4orm", "d4orm-c2f")
 GUESSES = (None, "ppo")
 LIMIT = 5.0
-"""Of planning [s]."""
+"""Time limit of planning [s]."""
 
 
 def solve(planner: str, problem: Problem, seed: int, guess: str | None) -> dict[str, Any]:

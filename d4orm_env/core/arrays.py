@@ -13,9 +13,9 @@ FloatArray = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 Floats = NDArray[np.float64]
-"""Where float32 is not enough."""
+"""Arrays where float32 is not enough."""
 Ints = NDArray[np.int32]
-"""Where they must not take more room."""
+"""Arrays that must not take more room."""
 Whole = int | np.int64
 """A number of something in compiled code, which tells no int from an int64."""
 

@@ -1,4 +1,4 @@
-"""Where an execution was disturbed, for pictures of it."""
+"""Disturbances of an execution, for pictures of it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray
 
 @dataclass(frozen=True, eq=False)
 class DisturbanceEvents:
-    """What happened to a team in ``T`` steps that it did not do itself.
+    """Disturbances that a team met in ``T`` steps.
 
     Attributes:
         pushed: ``(T + 1, K, d)`` velocity that the step before gave to each robot [m/s]; zero for none.

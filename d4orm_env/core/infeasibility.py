@@ -19,11 +19,11 @@ from d4orm_env.dynamics.models import MODEL_CODES, NUM_BUILT_IN
 from d4orm_env.dynamics.robot_model import ACCELERATION
 
 ROUNDING = 64 * 2.0**-23
-"""What float32 may be off by, as a share of the largest coordinate or of radius and margin."""
+"""Rounding error of float32, as a share of the largest coordinate or of radius and margin."""
 MAX_CELLS = 2**18
 """Most cells; coarser ones prove less."""
 HALVINGS = 3
-"""How many times cells are halved that are as large as the smallest radius and margin."""
+"""Number of times that cells as large as the smallest radius and margin are halved."""
 SIMILAR = 1.1
 """Robots whose radii differ by less are judged by the smallest of them."""
 

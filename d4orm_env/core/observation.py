@@ -1,4 +1,4 @@
-"""What one robot sees of the world: itself, its goal, its nearest neighbours and the nearest obstacles.
+"""Observation of one robot: itself, its goal, its nearest neighbours and the nearest obstacles.
 
 :func:`observe_robot` is written with plain loops over small arrays, so that the CPU engine compiles it as it stands.
 All vectors are in the world's frame, relative to the robot, in SI units.
@@ -16,7 +16,7 @@ from d4orm_env.geometry.world_index import WIDER, WorldIndex
 
 
 class Sensed(NamedTuple):
-    """What there is to see of the robots, and scratch for what one of them sees.
+    """Observable state of the robots, and scratch for the observation of one of them.
 
     Behind the ``K`` robots come ``N`` bodies that move among them and are none.
 

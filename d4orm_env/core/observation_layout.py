@@ -41,7 +41,7 @@ class BoundsSlack(NamedTuple):
 
 
 class OwnParts(NamedTuple):
-    """Where a robot sees itself; ``d`` position dimensions, lengths in m and speeds in m/s."""
+    """Slices of the robot's own part; ``d`` position dimensions, lengths in m and speeds in m/s."""
 
     velocity: slice  # d
     heading: slice  # cosine and sine, both zero for a model without a heading
@@ -55,7 +55,7 @@ class OwnParts(NamedTuple):
 
 
 class NeighborParts(NamedTuple):
-    """Where it sees another robot, in the row of that one; all zeros for an absent one."""
+    """Slices of a neighbour's part; all zeros for an absent one."""
 
     present: slice
     position: slice  # d, relative to its own
@@ -64,7 +64,7 @@ class NeighborParts(NamedTuple):
 
 
 class ObstacleParts(NamedTuple):
-    """Where it sees an obstacle or a wall of the bounds, likewise."""
+    """Slices of the part of an obstacle or a wall of the bounds, likewise."""
 
     present: slice
     position: slice  # d, vector to the nearest point of the surface
@@ -72,7 +72,7 @@ class ObstacleParts(NamedTuple):
 
 
 class PathParts(NamedTuple):
-    """What it sees of its shortest free way, from the first component of that on.
+    """Slices of the part on its shortest path, from the first component of that on.
 
     Attributes:
         direction: ``d`` unit vector along it; zero at the goal.
@@ -88,7 +88,7 @@ Parts: TypeAlias = OwnParts | NeighborParts | ObstacleParts | PathParts
 
 @dataclass(frozen=True)
 class ObservationSlices:
-    """Where the parts of an observation lie: the robot's own, each neighbour's, each obstacle's, and its way's.
+    """Slices of an observation: the robot's own part, each neighbour's, each obstacle's, and the shortest path's.
 
     Attributes:
         dimension: ``d``.
@@ -231,7 +231,7 @@ class ObservationLayout(ObservationSlices):
 
 
 def _slices(*widths: int) -> Iterator[slice]:
-    """Where parts of these widths lie, one after the other."""
+    """Yield the slices of parts of these widths, one after the other."""
     return (slice(begin, end) for begin, end in pairwise(accumulate(widths, initial=0)))
 
 

@@ -37,7 +37,7 @@ _HALF_PI = (
 )
 """pi/2 in parts; the first three have 33 bits, so that their products with a quadrant below 2**20 are exact."""
 _REDUCED_EXACTLY = 2.0**20
-"""From this magnitude on arguments are reduced in whole numbers, one by one."""
+"""Magnitude from which on arguments are reduced in whole numbers, one by one."""
 _PI_BITS = 1200  # the largest float64 has 1024 bits before the point, and 176 are left behind it
 
 _SINE = (
@@ -196,7 +196,7 @@ def standard_normal(generator: np.random.Generator, shape: tuple[int, ...]) -> N
 
 
 NUMPY_OPS = Ops(cos, sin, np.sqrt, np.minimum, np.maximum, arctan2, np.where)
-"""What the robot models need, over NumPy arrays."""
+"""Functions that the robot models need, over NumPy arrays."""
 
 
 def _polynomial(x: Floats, coefficients: tuple[float, ...]) -> Floats:
@@ -261,7 +261,7 @@ def _difference(a: Floats, b: Floats) -> tuple[Floats, Floats]:
 
 
 def _reduced_exactly(x: float) -> tuple[int, float, float]:
-    """As :func:`_reduced`, for one number of any magnitude, in whole numbers."""
+    """Reduce as :func:`_reduced`, for one number of any magnitude, in whole numbers."""
     if not np.isfinite(x):
         return 0, np.nan, 0.0
     numerator, denominator = x.as_integer_ratio()

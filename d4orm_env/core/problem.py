@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from d4orm_env.paths.shortest_paths import ShortestPaths
 
 Arrival = Literal["dock", "stay"]
-"""What it means to arrive."""
+"""Effect of arriving: the robot stays at its goal for good, or drives on."""
 
 MAX_HORIZON, MAX_ROBOT_STEPS = 1_000_000, 50_000_000
 """Most steps of a problem, and most robots times steps: a slip of the finger must not fill the memory."""
@@ -81,8 +81,8 @@ class Problem(Frozen):
         name: Where the problem comes from, for tables and pictures.
         collision_penalty: Taken off a robot's reward per step within the margin of another robot, and of an obstacle
             or a bound; 1 in the paper.
-        arrival: ``"dock"``: a robot that arrives stands there for ever, as in the paper. ``"stay"``: it may be moved
-            again, to make way; all must be at their goals at the end.
+        arrival: ``"dock"``: a robot that arrives stays there for good, as in the paper. ``"stay"``: it may be moved
+            again, to yield; all must be at their goals at the end.
 
     Raises:
         ValueError: If a value is not finite or out of range, a shape is wrong, a number is not positive, a start or
@@ -196,7 +196,7 @@ class Problem(Frozen):
 
     @property
     def docks(self) -> bool:
-        """Whether a robot that has arrived stands there for ever."""
+        """True if a robot that has arrived stays there for good."""
         return self.arrival == "dock"
 
     @property
@@ -259,7 +259,7 @@ class Problem(Frozen):
         return shortest_paths(self)
 
     def check_reachable(self) -> None:
-        """Whether every robot has a way to its goal that keeps its radius and the margin from obstacles and bounds.
+        """Check that every robot has a path to its goal that keeps its radius and the margin from obstacles and bounds.
 
         Other robots do not count. It takes a wavefront for every robot, which is why construction does not ask.
 
@@ -307,7 +307,7 @@ class Problem(Frozen):
 
     @property
     def key_figures(self) -> list[Row]:
-        """What it is, in a few words."""
+        """Return its key figures, in a few words each."""
         world = self.world
         bounds = (
             "open" if world.lower is None else " x ".join(f"{side:g}" for side in np.ptp(world.bounds, axis=0)) + " m"

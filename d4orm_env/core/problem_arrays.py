@@ -29,7 +29,7 @@ class ProblemArrays(NamedTuple):
         margin: ``()``.
         squared_goal_radius: ``()``.
         squared_goal_speed: ``()``, infinite without a limit.
-        docks: ``()`` bool: who has arrived stands there for ever.
+        docks: ``()`` bool: a robot that has arrived stays there for good.
         collision_penalty: ``()``.
     """
 

@@ -1,4 +1,4 @@
-"""What the physics asks of a problem; each refusal is a ``ValueError`` that names the robot."""
+"""Checks of a problem by the physics; each refusal is a ``ValueError`` that names the robot."""
 
 from __future__ import annotations
 

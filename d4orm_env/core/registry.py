@@ -71,7 +71,7 @@ class Registry(Mapping[str, T]):
         return tuple(self._registered)
 
     def origin(self, name: str) -> object:
-        """What was registered under a name, or its import path.
+        """Return what was registered under a name, or its import path.
 
         Raises:
             KeyError: If there is no such name.
@@ -87,7 +87,7 @@ class Registry(Mapping[str, T]):
         return claims[0]
 
     def _same(self, claims: list[object]) -> bool:
-        """Whether all are the same thing, such as one that its module registers and its package offers too."""
+        """Check whether all are the same thing, such as one that its module registers and its package offers too."""
         try:
             first, *others = (self._identity(load_reference(one) if isinstance(one, str) else one) for one in claims)
         except ValueError:
@@ -95,7 +95,7 @@ class Registry(Mapping[str, T]):
         return all(other == first for other in others)
 
     def look_up(self, name: object) -> T:
-        """What has this name.
+        """Return the thing of this name.
 
         Raises:
             ValueError: If nothing has, several lay claim to it, or it cannot be loaded.
@@ -105,7 +105,7 @@ class Registry(Mapping[str, T]):
         return self[name]
 
     def find(self, text: object) -> T:
-        """What a name, or an import path, stands for.
+        """Return the thing that a name, or an import path, stands for.
 
         Raises:
             ValueError: As :meth:`look_up` and :func:`load_reference`.
@@ -146,7 +146,7 @@ class Registry(Mapping[str, T]):
 
 
 def load_reference(text: str) -> object:
-    """What ``"package.module:Name"`` or ``"folder/file.py:Name"`` names; modules of the present folder are found too.
+    """Load ``"package.module:Name"`` or ``"folder/file.py:Name"``; modules of the present folder are found too.
 
     Raises:
         ValueError: If the text has another form, or the module cannot be imported or has no such name.
@@ -196,6 +196,6 @@ def _load_file(path: Path) -> ModuleType:
 
 
 def _place(thing: object) -> object:
-    """Where a class or function is defined; anything else is identified by what it is."""
+    """Return where a class or function is defined; anything else is identified by what it is."""
     name = getattr(thing, "__qualname__", "<")
     return thing if "<" in name else (thing.__module__, name)

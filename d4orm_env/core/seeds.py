@@ -8,7 +8,7 @@ import numpy as np
 
 
 class Stream(IntEnum):
-    """What random numbers are drawn for. The numbers are part of what a seed means, so append.
+    """Purposes that random numbers are drawn for. The numbers are part of what a seed means, so append.
 
     Scenarios draw their instances from ``default_rng([seed, purpose])``, and environments seed themselves as Gymnasium
     has it; neither coincides with any of these.

@@ -1,4 +1,4 @@
-"""What a problem or a motion is, in a line: for tables, and for whoever prints one."""
+"""Summary of a problem or a motion in a line: for tables and for printing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def count(number: int, noun: str) -> str:
 
 
 def team_text(models: Iterable[str]) -> str:
-    """How many robots of which models, the most common first."""
+    """Return the number of robots of each model, the most common first."""
     return ", ".join(f"{number} {name}" for name, number in Counter(models).most_common())
 
 

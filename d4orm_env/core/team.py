@@ -15,9 +15,9 @@ from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, STANDARD_LIMITS, TURN_RATE, Limit, Model
 
 DEFAULT_RADIUS = 0.15
-"""Of a robot [m]."""
+"""Radius of a robot [m]."""
 DEFAULT_LIMITS = (1.0, 1.0, float(np.pi / 2))
-"""Of speed [m/s], acceleration [m/s^2] and turn rate [rad/s]."""
+"""Limits of speed [m/s], acceleration [m/s^2] and turn rate [rad/s]."""
 
 
 @dataclass(frozen=True, eq=False, init=False)

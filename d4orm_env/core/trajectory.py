@@ -1,4 +1,4 @@
-"""What comes out of rolling controls out: states, rewards and flags over time."""
+"""Rollout of controls: states, rewards and flags over time."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Trajectory:
 
     @property
     def title(self) -> str:
-        """How many robots, and for how long."""
+        """Title: how many robots, and for how long."""
         steps, robots = self.controls.shape[:2]
         return f"{count(robots, 'robot')}, {count(steps, 'step')}"
 

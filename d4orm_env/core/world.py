@@ -16,7 +16,7 @@ from d4orm_env.geometry.shapes import Shapes
 from d4orm_env.geometry.world_index import WorldIndex, build_index, is_farther, nearest_distance
 
 LARGEST_ORIGIN = 1e9
-"""Of a world [m]: float64 resolves it to 1e-7."""
+"""Largest coordinate of a world [m]: float64 resolves it to 1e-7."""
 
 _LEVELS, _FEW = 3, 2048
 """Grids of an index that finds obstacles for robots wherever they drive, the last 16 times as wide as the first, where
@@ -138,7 +138,7 @@ class World(Frozen):
 
     @cached_property
     def triangles(self) -> tuple[tuple[tuple[int, ...], ...], ...]:
-        """For each polygon the triangles that fill it, each three numbers of corners."""
+        """Triangles that fill each polygon, each three numbers of corners."""
         return tuple(tuple(map(tuple, triangulate(corners).tolist())) for corners in self.polygons)
 
     @cached_property

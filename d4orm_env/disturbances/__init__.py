@@ -1,8 +1,8 @@
-"""What goes wrong in an execution: on the way of the controls, in what is seen, and in the world.
+"""Disturbances of an execution: of the controls on their way, of what is seen, and of the world.
 
 ``parallel_env(..., disturbances=[Delay(2), Push(0.1, 0.3)])``, and the same in the joint and the batched environment.
 Disturbances act in the order given. Everything random in them follows from the environment's seed: the same in all
-environments to the bit, and one disturbance draws the same whatever stands beside it. Your own is a subclass of
+environments to the bit, and one disturbance draws the same whatever others there are. Your own is a subclass of
 :class:`Disturbance`.
 """
 

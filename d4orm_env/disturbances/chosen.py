@@ -1,4 +1,4 @@
-"""Which disturbances an environment has."""
+"""Choice of an environment's disturbances."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Disturbances = tuple[AnyDisturbance, ...]
 
 
 def checked_disturbances(given: object) -> Disturbances:
-    """What an environment was given, as a tuple.
+    """Return what an environment was given, as a tuple.
 
     Raises:
         ValueError: If it is no list of disturbances.
@@ -33,7 +33,7 @@ def checked_disturbances(given: object) -> Disturbances:
 
 
 def at_work(disturbances: Disturbances, problem: Problem) -> Disturbances:
-    """Those that change anything, so that all others leave the environment as it is to the bit.
+    """Return those that change anything, so that all others leave the environment as it is to the bit.
 
     Raises:
         ValueError: If the robots or the world of the problem cannot have one of them.

@@ -20,14 +20,14 @@ from d4orm_env.disturbances.levels import MAX_DELAY, check_components, per_compo
 
 
 class Drawn(NamedTuple):
-    """What was drawn when the episode began, or is drawn on: ``values`` ``(B, K, .)``."""
+    """Random values of an episode, from its beginning or drawn on: ``values`` ``(B, K, .)``."""
 
     values: FloatArray
 
 
 @dataclass(frozen=True)
 class _Spread:
-    """What ``std`` has to be, one number or one per component."""
+    """Standard deviation ``std``, checked: one number or one per component."""
 
     std: float | tuple[float, ...]
 

@@ -1,4 +1,4 @@
-"""What a disturbance is: a frozen dataclass with some of five methods, and what these are given.
+"""Interface of a disturbance: a frozen dataclass with some of five methods, and their arguments.
 
 Every method works on ``B`` worlds at once, of which a single environment is one, so that all environments disturb alike
 to the bit. All arrays have a leading axis over the worlds.
@@ -19,7 +19,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.draws import Draws
 
 Memory = tuple[NDArray[np.generic], ...]
-"""What a disturbance remembers of an episode: arrays ``(B, ...)``, changed in place. A ``NamedTuple`` names them."""
+"""Memory of a disturbance over an episode: arrays ``(B, ...)``, changed in place. A ``NamedTuple`` names them."""
 
 M = TypeVar("M", bound=Memory)
 
@@ -68,13 +68,13 @@ class Scene(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What is seen of the worlds, in observations and in ``env.state()``.
+    """The worlds as they are seen, in observations and in ``env.state()``.
 
     Attributes:
         states: ``(B, K, n)`` of the robots.
         controls: ``(B, K, m)`` executed last; what first-order robots' speed is read from.
         bodies: ``(B, N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves among the robots and is
-            none; a radius of zero stands for one that nobody sees.
+            none; a radius of zero for one that is not seen.
     """
 
     states: FloatArray
@@ -83,7 +83,7 @@ class Seen(NamedTuple):
 
 
 class DisturbanceEffect(NamedTuple):
-    """What a disturbance has done that judges and pictures have to know; ``None`` for what it never does.
+    """Effect of a disturbance, for evaluators and pictures; ``None`` for what it never does.
 
     Attributes:
         pushed: ``(B, K, d)`` velocity that the last step gave to robots [m/s].
@@ -114,12 +114,12 @@ class Disturbance(Generic[M]):
 
     @property
     def negligible(self) -> bool:
-        """Whether it changes nothing, as at level zero; it is left out then."""
+        """True if it changes nothing, as at level zero; it is left out then."""
         return False
 
     @property
     def replayable(self) -> bool:
-        """Whether executed controls, driven again without it, make the same motion and can be judged alone."""
+        """True if executed controls, driven again without it, make the same motion and can be judged alone."""
         kind = type(self)
         return kind.move is Disturbance.move and kind.limits is Disturbance.limits
 
@@ -127,7 +127,7 @@ class Disturbance(Generic[M]):
         """Raise ``ValueError``, in one line, where the robots or the world cannot have this disturbance."""
 
     def spare(self, problem: Problem) -> BoundsSlack:
-        """By how much it may lead robots, or what is seen of them, out of the bounds that they would keep without it.
+        """Return the slack by which it may lead robots, or what is seen of them, out of their usual bounds.
 
         The spaces grow by so much.
         """
@@ -138,7 +138,7 @@ class Disturbance(Generic[M]):
         return ()  # type: ignore[return-value] # of a disturbance that remembers nothing
 
     def limits(self, limits: FloatArray) -> FloatArray:
-        """What the limits ``(K, L)`` of the robots truly are, see :attr:`d4orm_env.core.team.Team.limits`."""
+        """Return the true limits ``(K, L)`` of the robots, see :attr:`d4orm_env.core.team.Team.limits`."""
         return limits
 
     def command(self, controls: FloatArray, memory: M, scene: Scene, draws: Draws) -> FloatArray:
@@ -150,20 +150,20 @@ class Disturbance(Generic[M]):
     ) -> tuple[FloatArray, FloatArray]:
         """States ``(B, K, n)`` and controls ``(B, K, m)`` that the step truly begins from.
 
-        States of robots that stand docked are left as they are, whatever this returns.
+        States of docked robots are left as they are, whatever this returns.
         """
         return states, controls
 
     def see(self, seen: Seen, memory: M, scene: Scene, draws: Draws) -> Seen:
-        """What is seen of the worlds; called once at a reset and after every step."""
+        """Return the worlds as they are seen; called once at a reset and after every step."""
         return seen
 
     def observe(self, observations: FloatArray, layout: ObservationLayout) -> FloatArray:
-        """What robots observe ``(B, K, D)`` of what is seen."""
+        """Return the robots' observations ``(B, K, D)`` of what is seen."""
         return observations
 
     def effect(self, memory: M, scene: Scene) -> DisturbanceEffect:
-        """What it has done up to now."""
+        """Return its effect up to now."""
         return DisturbanceEffect()
 
 

@@ -52,7 +52,7 @@ def register_disturbance(name: str, kind: type[AnyDisturbance] | str) -> None:
 
 
 class Level(NamedTuple):
-    """What a name such as ``push(rate=0.5).speed`` stands for.
+    """Meaning of a name such as ``push(rate=0.5).speed``.
 
     Attributes:
         kind: The kind of disturbance.
@@ -154,7 +154,7 @@ def _make(kind: type[AnyDisturbance], values: Mapping[str, object], text: str) -
 
 
 def name_of(disturbance: AnyDisturbance) -> str:
-    """What its kind is called here, or where it can be imported from."""
+    """Return the name of its kind here, or its import path."""
     kind = type(disturbance)
     for name in DISTURBANCES:
         if DISTURBANCES.origin(name) in (kind, f"{kind.__module__}:{kind.__qualname__}"):

@@ -25,7 +25,7 @@ _FLOAT32 = np.dtype(np.float32)
 
 
 class _Purpose(IntEnum):
-    """What a disturbance draws for; the numbers are part of what a seed means, so append."""
+    """Purposes that a disturbance draws for; the numbers are part of what a seed means, so append."""
 
     BEGIN = 0
     COMMAND = 1
@@ -61,7 +61,7 @@ class _ActiveDisturbance:
         return memory
 
     def has(self, method: str) -> bool:
-        """Whether it does anything there."""
+        """Check whether it overrides a method."""
         return getattr(type(self.disturbance), method) is not getattr(Disturbance, method)
 
 
@@ -103,7 +103,7 @@ class DisturbedWorlds:
 
     @property
     def alters_sight(self) -> bool:
-        """Whether what is seen is not simply what there is of the robots."""
+        """True if what is seen may differ from the true state of the robots."""
         return bool(self._seeing or self._observing or self._bodies.shape[1])
 
     def true_limits(self, limits: FloatArray) -> FloatArray:
@@ -123,7 +123,7 @@ class DisturbedWorlds:
         arrived: BoolArray,
         steps: Steps,
     ) -> Scene:
-        """The worlds as they stand; arguments as the attributes of :class:`Scene`."""
+        """The worlds as they are; arguments as the attributes of :class:`Scene`."""
         return Scene(self.problem, self.max_cycles, start, goal, states, controls, arrived, steps, self._bodies)
 
     def begin(self, worlds: Worlds, seeds: Sequence[int], start: FloatArray, goal: FloatArray) -> None:
@@ -184,7 +184,7 @@ class DisturbedWorlds:
         return states, controls
 
     def effect(self, scene: Scene) -> DisturbanceEffect:
-        """What all have done together up to now."""
+        """Return the joint effect of all up to now."""
         effects = [one.disturbance.effect(one.memory, scene) for one in self._effective]
         return DisturbanceEffect(
             pushed=_together(np.add, [effect.pushed for effect in effects]),
@@ -194,7 +194,7 @@ class DisturbedWorlds:
         )
 
     def touched(self, states: FloatArray) -> tuple[BoolArray, BoolArray]:
-        """Which robots in ``states`` ``(B, K, n)`` touch a body that is none, and which are near one.
+        """Find the robots in ``states`` ``(B, K, n)`` that touch a dynamic obstacle, and those that are near one.
 
         Returns:
             Two arrays ``(B, K)`` bool; near is within the margin.
@@ -204,7 +204,7 @@ class DisturbedWorlds:
         return touched, near
 
     def see(self, scene: Scene, worlds: Worlds | None = None) -> Seen:
-        """What is seen of all worlds, or of some, as they stand in ``scene``, which is always of all.
+        """Return the view of all worlds, or of some, as they are in ``scene``, which is always of all.
 
         Raises:
             ValueError: If a disturbance returns another shape.
@@ -253,13 +253,13 @@ def _judge() -> Callable[..., None]:
 
 
 def _together(join: Callable[[T, T], T], parts: Sequence[T | None]) -> T | None:
-    """What several disturbances have done; ``None`` if none did."""
+    """Join the effects of several disturbances; ``None`` if there is none."""
     done = [part for part in parts if part is not None]
     return reduce(join, done) if done else None
 
 
 def _checked(values: ArrayLike, shape: tuple[int, ...], one: _ActiveDisturbance, method: str) -> FloatArray:
-    """What a disturbance returned, as float32."""
+    """Return a disturbance's result as float32, its shape checked."""
     array = values if isinstance(values, np.ndarray) and values.dtype == _FLOAT32 else as_float32(values)
     if array.shape != shape:
         name = type(one.disturbance).__name__

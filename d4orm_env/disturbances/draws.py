@@ -1,4 +1,4 @@
-"""What disturbances draw from: every disturbance of every world has random numbers of its own."""
+"""Random numbers of disturbances: every disturbance of every world has its own."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ Keys = NDArray[np.uint32]
 Steps = NDArray[np.int64]
 Kernel = Callable[..., None]
 Ahead = dict[tuple[int, int, int, tuple[int, ...]], tuple[int, FloatArray]]
-"""What a single world has drawn ahead in its episode: by kind of number, stream, call and shape the first step, and
+"""Numbers that a single world has drawn ahead in its episode: by kind of number, stream, call and shape the first step,
+and rows of numbers, one for each step from there on.
 rows of numbers, one for each step from there on."""
 
 _NORMAL, _UNIFORM = range(2)
@@ -45,7 +46,7 @@ class Draws:
     """Random numbers of one disturbance at one moment of ``B`` worlds.
 
     They are a function of the world's episode, its step, the disturbance and the number of the call, and of nothing
-    else: a world draws the same alone and in any batch, and a disturbance the same whatever stands beside it.
+    else: a world draws the same alone and in any batch, and a disturbance the same whatever others there are.
 
     Args:
         keys: ``(B, 2)`` keys of the episodes, see :func:`episode_keys`.

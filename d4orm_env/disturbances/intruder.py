@@ -1,4 +1,4 @@
-"""Bodies that drive through the team and obey nobody."""
+"""Dynamic obstacles that drive through the team without regard for it."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class Intruder(Disturbance[Courses]):
     Robots see them as they see robots, and ``env.state()`` ends with them, see :mod:`d4orm_env.envs.joint_state`.
     Touching one is a collision, and the paper's reward of a robot within the margin of one is 1 less.
 
-    The area is the ball round all starts and goals, and there are always ``count`` of them in it: who has left enters
-    anew somewhere else, and at first they are anywhere on their lines. Obstacles and walls do not stop them. A line
-    passes through a random point between starts and goals in a random direction, but not where it would meet robots
-    that stand at their starts or goals, for these cannot make way; if sixteen tries find no such line, it is the one
+    The area is the ball round all starts and goals, and there are always ``count`` of them in it: one that has left
+    enters anew somewhere else, and at first they are anywhere on their lines. Obstacles and walls do not stop them. A
+    line passes through a random point between starts and goals in a random direction, but not where it would meet
+    robots at rest at their starts or goals, for these cannot yield; if sixteen tries find no such line, it is the one
     that stays farthest from them.
 
     Attributes:
@@ -68,7 +68,7 @@ class Intruder(Disturbance[Courses]):
         return BoundsSlack(distance=2 * self._room(problem) + self.speed * problem.dt, speed=faster, radius=self.radius)
 
     def _room(self, problem: Problem) -> float:
-        """What keeps an intruder clear of any robot [m]."""
+        """Return the distance that keeps an intruder clear of any robot [m]."""
         return self.radius + float(problem.team.radius.max()) + 2 * problem.margin
 
     def begin(self, scene: Scene, draws: Draws) -> Courses:

@@ -91,7 +91,7 @@ class StateNoise(Disturbance[Scales]):
 
 
 class Past(NamedTuple):
-    """What was seen last, in rings ``(B, L, ...)``; moment ``t`` has place ``t mod L``."""
+    """Last measurements, in rings ``(B, L, ...)``; moment ``t`` has position ``t mod L``."""
 
     states: FloatArray
     controls: FloatArray
@@ -100,8 +100,8 @@ class Past(NamedTuple):
 
 @dataclass(frozen=True)
 class StateDelay(Disturbance[Past]):
-    """What is seen is some time steps old: states, and the controls executed last. Goals, who has arrived and the clock
-    are known at once. Until the first measurement has come everything is seen as it began.
+    """Delay of measurements: states, and the controls executed last. Goals, who has arrived and the clock are known at
+    once. Until the first measurement has come everything is seen as it began.
 
     Attributes:
         steps: Time steps, at most 1000.

@@ -1,4 +1,4 @@
-"""What disturbances have done as marks for pictures."""
+"""Effects of disturbances as events for pictures."""
 
 from __future__ import annotations
 

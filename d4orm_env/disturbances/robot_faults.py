@@ -111,14 +111,14 @@ class Stops(NamedTuple):
 
 @dataclass(frozen=True)
 class Stall(Disturbance[Stops]):
-    """A robot brakes and stands, whatever it is told; its body stays. It happens to a robot once in an episode at most,
+    """A robot brakes and stops, whatever it is told; its body stays. It happens to a robot once in an episode at most,
     at a time uniform over the first half of the episode's longest duration.
 
-    One that stands for good need not arrive for the episode to be a success; all others have to.
+    One that stalls for good need not arrive for the episode to be a success; all others have to.
 
     Attributes:
         probability: That it happens to a robot in an episode, from 0 to 1.
-        duration: How long it stands [s]; infinite for good.
+        duration: Time for which it stalls [s]; infinite for good.
         robots: It may happen to so many only, chosen at random in every episode; to all by default.
             ``Stall(1.0, robots=1)`` is one robot of the team that is sure to stall.
     """

@@ -1,7 +1,7 @@
 """A car, the kinematic bicycle: ``x = [px, py, heading, speed, steering]``, ``u = [acceleration, steering rate]``.
 
 The position is the middle of the rear axle. The heading turns at ``speed tan(steering) / wheelbase``, so that a car
-cannot turn where it stands. Source: S. M. LaValle, *Planning Algorithms*, section 13.1.2.1, with the speed and the
+cannot turn on the spot. Source: S. M. LaValle, *Planning Algorithms*, section 13.1.2.1, with the speed and the
 steering angle as states.
 """
 

@@ -10,17 +10,17 @@ from d4orm_env.dynamics.robot_model import Flag, Number, Ops, Truth, Vector
 
 
 def axis_gap(x: Number, lower: Number, upper: Number, zero: Number, ops: Ops) -> Number:
-    """How far ``x`` lies outside the interval from ``lower`` to ``upper``; zero inside it."""
+    """Return the distance of ``x`` from the interval from ``lower`` to ``upper``; zero inside it."""
     return ops.maximum(ops.maximum(lower - x, x - upper), zero)
 
 
 def leaves(x: Number, reach: Number, lower: Number, upper: Number) -> Flag:
-    """Whether a body of that reach at ``x`` touches or leaves the interval from ``lower`` to ``upper``."""
+    """Check whether a body of radius ``reach`` at ``x`` touches or leaves the interval from ``lower`` to ``upper``."""
     return (x - reach <= lower) | (x + reach >= upper)
 
 
 def meets_edge(x: Number, y: Number, along_x: Number, along_y: Number, reach: Number, zero: Number, ops: Ops) -> Truth:
-    """Whether a disc of that reach at ``(x, y)`` touches the edge from the origin to ``(along_x, along_y)``."""
+    """Check whether a disc of radius ``reach`` at ``(x, y)`` touches the edge from the origin to the end ``along``."""
     square = along_x * along_x + along_y * along_y
     share = ops.minimum(ops.maximum(x * along_x + y * along_y, zero), square) / square
     gap_x, gap_y = x - share * along_x, y - share * along_y
@@ -28,12 +28,12 @@ def meets_edge(x: Number, y: Number, along_x: Number, along_y: Number, reach: Nu
 
 
 def lies_left(x: Number, y: Number, along_x: Number, along_y: Number, zero: Number) -> Truth:
-    """Whether ``(x, y)`` lies on the line from the origin to ``(along_x, along_y)`` or to the left of it."""
+    """Check whether ``(x, y)`` lies on or left of the line from the origin to ``(along_x, along_y)``."""
     return along_x * y - along_y * x >= zero
 
 
 def meets_triangle(corners: Vector, x: Number, y: Number, reach: Number, zero: Number, ops: Ops) -> Flag:
-    """Whether a disc of that reach at ``(x, y)`` touches a triangle, ``corners`` being ``x, y`` of each in turn."""
+    """Check whether a disc of radius ``reach`` at ``(x, y)`` touches a triangle, given by its corners' ``x, y``."""
     ax, ay, bx, by, cx, cy = corners
     edges = (
         meets_edge(x - ax, y - ay, bx - ax, by - ay, reach, zero, ops)

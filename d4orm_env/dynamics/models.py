@@ -25,7 +25,7 @@ from d4orm_env.dynamics.velocity2d import VELOCITY2D
 _BUILT_IN = (HOLONOMIC2D, HOLONOMIC3D, VELOCITY2D, DIFFERENTIAL_DRIVE, UNICYCLE, CAR)
 
 MODEL_CODES: dict[str, int] = {model.name: code for code, model in enumerate(_BUILT_IN)}
-"""What the engines call models by; a model gets its code when it is registered, or loaded from another package."""
+"""The engines' number of each model, given when it is registered or loaded from another package."""
 
 NUM_BUILT_IN = len(_BUILT_IN)
 """Codes from this one on go to models in the order in which this process registers them."""

@@ -1,4 +1,4 @@
-"""What a robot model is: its functions, each written once in scalar style, and what they share.
+"""A robot model: its functions, each written once in scalar style, and what they share.
 
 A model is a handful of pure functions on tuples of numbers. They contain no loops, no array library and no float
 literals, so that the CPU engine compiles them with numba, the JAX engine traces them over arrays whose last axis is the
@@ -30,7 +30,7 @@ Operand: TypeAlias = Any
 
 
 class Truth(Protocol):
-    """What comparing two :class:`Number` gives."""
+    """The result of comparing two :class:`Number`."""
 
     def __and__(self, other: Operand, /) -> Truth: ...
     def __or__(self, other: Operand, /) -> Truth: ...
@@ -41,7 +41,7 @@ Flag: TypeAlias = Any
 
 
 class Number(Protocol):
-    """What the physics computes with: a number of Python or numba, an array of NumPy or JAX, a symbol of CasADi."""
+    """A number as the physics has it: of Python or numba, an array of NumPy or JAX, a symbol of CasADi."""
 
     def __neg__(self) -> Self: ...
     def __add__(self, other: Operand, /) -> Self: ...
@@ -94,7 +94,7 @@ ModelFunction: TypeAlias = Callable[..., Any]
 
 
 class ModelFunctions(NamedTuple):
-    """What a model computes.
+    """The functions of a model.
 
     ``x`` is the state tuple, ``u`` the control tuple, ``limits`` the robot's limits: speed, acceleration and turn rate,
     and then those of :attr:`Model.own_limits`.
@@ -109,7 +109,7 @@ class ModelFunctions(NamedTuple):
     velocity: ModelFunction
     """``(x, u, limits, ops) -> `` velocity vector in the world frame [m/s]."""
     rest: ModelFunction
-    """``(x, zero) -> x`` standing still at the same place and heading."""
+    """``(x, zero) -> x`` at rest at the same position and heading."""
     approach: ModelFunction
     """``(x, goal, limits, h, ops) -> `` fastest velocity straight to the goal from which it can stop there [m/s]."""
     track: ModelFunction
@@ -248,12 +248,12 @@ class Model:
 
     @property
     def first_order(self) -> bool:
-        """Whether it takes any velocity at once, so that its state holds none."""
+        """True if it takes any velocity at once, so that its state holds none."""
         return not self.speed_indices
 
     @property
     def turns_in_place(self) -> bool:
-        """Whether it can turn where it stands, or need not turn at all."""
+        """True if it can turn on the spot, or need not turn at all."""
         return self.heading_index is None or self._turn_rate([1.0] * len(self.limit_names), moving=False) > 0
 
     def turn_rate(self, limits: FloatArray) -> float:
@@ -285,7 +285,7 @@ def norm_scale(square: Number, limit: Number, ops: Ops) -> Number:
 
 
 def control_scale(square: Number, limit: Number, ops: Ops) -> Number:
-    """As :func:`norm_scale`; NaN where the square has overflowed, lest the control pass for none at all."""
+    """Return :func:`norm_scale`; NaN where the square has overflowed, lest the control pass for none at all."""
     return norm_scale(square, limit, ops) + (square - square)
 
 

@@ -2,8 +2,8 @@
 
 The order is the definition of a step for every engine: the control is clipped to the limits, RK4 integrates the model
 over ``dt``, the speed limit is applied, and a robot within its goal radius at no more than the goal speed has arrived.
-From then on it stands where it docked (paper, section III; docking as in the paper's reference code), unless the
-problem says that who has arrived may be moved again: then it has arrived for as long as it is there.
+From then on it is at rest where it docked (paper, section III; docking as in the paper's reference code), unless the
+problem says that a robot may be moved again: then it has arrived for as long as it is there.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ def advance(
 def arrives(
     squared_distance: Number, squared_speed: Number, squared_goal_radius: Number, squared_goal_speed: Number
 ) -> Flag:
-    """Whether a robot at this distance from its goal, at this speed, docks there."""
+    """Check whether a robot at this distance from its goal, at this speed, arrives there."""
     return (squared_distance <= squared_goal_radius) & (squared_speed <= squared_goal_speed)
 
 
 def stands(arrived: Truth, docks: Truth) -> Flag:
-    """Whether a robot that has arrived stays where it is, whatever its control; ``docks`` says whether any does."""
+    """Check whether a robot that has arrived stays at rest, whatever its control; ``docks`` says whether any does."""
     return arrived & docks

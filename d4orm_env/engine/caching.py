@@ -143,7 +143,7 @@ class _SourceKeyedCache(FunctionCache):
             super().save_overload(sig, data)
 
     def is_kept(self) -> bool:
-        """Whether anything is, for the sources as they are now."""
+        """True if anything is kept, for the sources as they are now."""
         return any(
             key[-1] == self._source_key and self._cache_file.load(key) is not None
             for key in self._cache_file._load_index()
@@ -196,6 +196,6 @@ def check_can_be_kept() -> None:
 
 
 def has_to_be_compiled(kernel: Kernel[..., object]) -> bool:
-    """Whether a kernel of :func:`cached_kernel` could be kept on disk and has not been yet, as its sources are now."""
+    """Check whether a kernel of :func:`cached_kernel` could be kept on disk and is not yet, for the present sources."""
     cache = getattr(kernel, "_cache", None)
     return isinstance(cache, _SourceKeyedCache) and not cache.is_kept()

@@ -1,4 +1,4 @@
-"""How kernels are compiled, and what of :mod:`d4orm_env.core` they may call."""
+"""Compilation of kernels, and of the functions of :mod:`d4orm_env.core` that they may call."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ fuse, sums are not regrouped, nothing is estimated; so a kernel gives the same b
 registers. What it costs is measured in docs/performance.md."""
 
 UNCOUNTED = OPTIONS | {"_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-"""For everything that kernels call: without numba's reference counts, which would cost more than the sums they
+"""Options for everything that kernels call: without numba's reference counts, which would cost more than the sums they
 surround, and without what Python would call them by, which takes a fifth to a third of the time of compiling. Such
 functions cannot make arrays, and a call from Python ends the process: tests call them from compiled functions."""
 compiled: Compiler = numba.njit(nogil=True, **UNCOUNTED)
 
 INLINED = UNCOUNTED | {"forceinline": True}
-"""For functions that take functions (a model, ``Ops``): inlining leaves no function pointer behind, so that numba can
+"""Options for functions that take functions (a model, ``Ops``): inlining leaves no function pointer, so that numba can
 keep the kernels on disk. And for those that take a problem's arrays, which are a long argument to pass by value."""
 inlined: Compiler = numba.njit(nogil=True, **INLINED)
 for _function in (

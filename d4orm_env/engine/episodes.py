@@ -27,7 +27,7 @@ from d4orm_env.engine.tiles import (
 from d4orm_env.engine.world_tiles import judge, load, load_world, store_world
 
 STEP, RESET, LOOK, SKIP = (np.uint8(order) for order in range(4))
-"""What to do with a world: step it, put it back to its start, only observe it, or leave it alone altogether."""
+"""Orders for a world: step it, put it back to its start, only observe it, or leave it alone altogether."""
 
 
 class WorldBatch(NamedTuple):
@@ -44,7 +44,7 @@ class WorldBatch(NamedTuple):
         distance: ``(B, K)`` to the goals.
         collided: ``(B, K)`` bool, hard contact.
         violated: ``(B, K)`` bool, within the margin.
-        rewards: ``(B, K)`` of each robot where it stands now.
+        rewards: ``(B, K)`` of each robot where it is now.
         reward: ``(B,)`` float64 mean of the team in the last step; zero at a reset.
         terminated: ``(B,)`` bool: all have docked.
         truncated: ``(B,)`` bool: out of time before that.

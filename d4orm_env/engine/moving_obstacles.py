@@ -1,4 +1,4 @@
-"""What robots meet that is no robot: bodies that move among them."""
+"""Dynamic obstacles: bodies that move among the robots."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from d4orm_env.engine.compiling import OPTIONS
 def meet_bodies(
     states: FloatArray, radius: FloatArray, bodies: FloatArray, margin: np.float32, touched: BoolArray, near: BoolArray
 ) -> None:
-    """Which robots are in contact with a body, and which within the margin of one.
+    """Find the robots in contact with a body, and those within the margin of one.
 
     Args:
         states: ``(B, K, n)``, positions first [m].

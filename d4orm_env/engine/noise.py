@@ -22,7 +22,7 @@ Word: TypeAlias = Any
 
 
 class BitOps(NamedTuple):
-    """What the noise needs from whichever library compiles it."""
+    """Bit operations that the noise needs from whichever library compiles it."""
 
     uint32: Callable[..., Word]
     """Wrap to 32 bits."""

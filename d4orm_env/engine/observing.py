@@ -55,7 +55,7 @@ def allocate_sensed(
 
 
 class ObservationSpec(NamedTuple):
-    """What an observation is made of, see :class:`~d4orm_env.core.observation_layout.ObservationLayout`.
+    """Contents of an observation, see :class:`~d4orm_env.core.observation_layout.ObservationLayout`.
 
     Attributes:
         bounds: ``(2, D)`` lowest and highest observation.

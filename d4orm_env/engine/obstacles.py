@@ -66,7 +66,7 @@ def _touches(
     y: np.float32,
     z: np.float32,
 ) -> bool:
-    """Whether a body of this reach touches one of the obstacles that its cell knows."""
+    """Check whether a body of this radius touches one of the obstacles that its cell knows."""
     for number in range(index.first[cell], index.first[cell + 1]):
         item = index.items[number]
         if item < boxes.shape[0]:
@@ -79,7 +79,7 @@ def _touches(
 
 @inlined
 def is_closed(arrays: ProblemArrays) -> bool:
-    """Whether there are obstacles or bounds at all."""
+    """Check whether there are obstacles or bounds at all."""
     closed = arrays.grid.clearance.shape[0] > 0
     for axis in range(arrays.goal.shape[1]):
         closed |= arrays.bounds[0, axis] > -np.inf or arrays.bounds[1, axis] < np.inf
@@ -88,7 +88,7 @@ def is_closed(arrays: ProblemArrays) -> bool:
 
 @inlined
 def touches_static(arrays: ProblemArrays, reach: np.float32, place: FloatArray) -> bool:
-    """Whether a body of this reach touches an obstacle or the bounds where its centre is at ``place`` ``(d,)``."""
+    """Check whether a body of this radius, centred at ``place`` ``(d,)``, touches an obstacle or the bounds."""
     index = arrays.grid
     for axis in range(place.shape[0]):
         if collision.leaves(place[axis], reach, arrays.bounds[0, axis], arrays.bounds[1, axis]):
@@ -115,7 +115,7 @@ def _near_indexed(
     places: FloatArray,
     spare: FloatArray,
 ) -> np.uint64:
-    """Where a body of this reach, its centre in the first rows of ``places``, touches an obstacle."""
+    """Return where a body of this radius, centred at the first rows of ``places``, touches an obstacle."""
     use_wide_registers()
     third = 2 * TILE if index.low.shape[0] == 3 else 0
     cells = spare[TILE : 2 * TILE].view(np.uint32)
@@ -141,7 +141,7 @@ def _near_indexed(
 
 @inlined
 def near_obstacles(arrays: ProblemArrays, reach: np.float32, places: FloatArray, spare: FloatArray) -> np.uint64:
-    """Where a body of this reach, its centre in the first rows of ``places``, touches an obstacle or the bounds.
+    """Return where a body of this radius, centred at the first rows of ``places``, touches an obstacle or the bounds.
 
     ``spare`` is two rows to overwrite.
     """
@@ -168,7 +168,7 @@ def may_touch(
     axis_step: int,
     spare: FloatArray,
 ) -> bool:
-    """Whether a body may touch an obstacle anywhere in the lanes of :func:`~d4orm_env.engine.simd.enclose`.
+    """Check whether a body may touch an obstacle anywhere in the lanes of :func:`~d4orm_env.engine.simd.enclose`.
 
     Args:
         index: Where the obstacles are; there must be some.

@@ -17,7 +17,7 @@ from d4orm_env.engine.tile_layout import Row
 
 
 class Drawing(NamedTuple):
-    """What the samples of a denoising step are drawn from.
+    """Distribution of the samples of a denoising step.
 
     Attributes:
         offset: ``(H, K, m)`` base controls plus mean deformation.

@@ -22,12 +22,12 @@ from numba.core.typing.templates import Signature
 from d4orm_env.core.arrays import FloatArray, Whole
 
 Generator: TypeAlias = Callable[[BaseContext, IRBuilder, Signature, tuple[Value, ...]], Value]
-"""What writes a function's instructions."""
+"""Writer of a function's instructions."""
 Instructions: TypeAlias = tuple[Signature, Generator]
-"""How numba is told of a function: by its signature, and what writes it."""
+"""A function as numba is told of it: its signature, and the writer of its instructions."""
 
 intrinsic: Callable[[Callable[..., Instructions]], Callable[..., Any]] = extending.intrinsic
-"""In compiled code it is called with numbers and arrays instead of their types, and without the first argument."""
+"""Decorator; compiled code calls the result with numbers and arrays instead of types, without the first argument."""
 
 TILE = 64
 """Worlds per tile, as many as a mask has bits."""
@@ -285,7 +285,7 @@ add_turned, add_turned_squares = _add_turned(1), _add_turned(2)
 
 @intrinsic
 def at_most(typing_context: TypingContext, w: Type, offset: Type, bound: Type) -> Instructions:
-    """Where ``w[offset:offset + TILE] <= bound``, as a mask."""
+    """Return the mask of ``w[offset:offset + TILE] <= bound``."""
 
     def generate(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: tuple[Value, ...]) -> Value:
         array, start, limit = arguments

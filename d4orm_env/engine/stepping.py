@@ -26,7 +26,7 @@ from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.tile_layout import PICK, SQUARED_GAP, SQUARED_NORM, Row
 
 Docking: TypeAlias = tuple[np.float32, np.float32, np.bool_]
-"""Squares of the goal radius and of the goal speed, and whether who has arrived stands there for ever."""
+"""Squares of the goal radius and of the goal speed, and whether a robot that has arrived stays there for good."""
 Mover: TypeAlias = Callable[[bool, Row, Row, Row, TimeStep], Row]
 Docker: TypeAlias = Callable[[bool, Row, Row, Row, Row, Docking], tuple[Row, np.float32, bool]]
 

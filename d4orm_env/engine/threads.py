@@ -33,12 +33,12 @@ def available_cores() -> int:
 
 
 Task: TypeAlias = tuple[Callable[[IntArray], None], IntArray, SimpleQueue[BaseException | None]]
-"""What is to be done, for which part, and where to say that it is, or what went wrong."""
+"""A function, its part of the work, and the queue to report on: that it is done, or the exception."""
 
 
 @lru_cache(maxsize=8)
 def _queue(num_threads: int, process: int) -> SimpleQueue[Task]:
-    """What threads shared by all engines of a process wait for work at; a forked child gets its own.
+    """Return the work queue of the threads that all engines of a process share; a forked child gets its own.
 
     A denoising step hands out work twice, and an executor takes twice as long to.
     """

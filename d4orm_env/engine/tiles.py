@@ -105,7 +105,7 @@ def measure_goal_distance(num_robots: int, dimension: int, w: FloatArray) -> Non
 
 @inlined
 def near_pair(reach: np.float32, a: int, b: int, dimension: int, w: FloatArray) -> np.uint64:
-    """Where two centres, in the rows of ``w`` from ``a`` and from ``b`` on, are within ``reach`` of each other."""
+    """Return where two centres, in the rows of ``w`` from ``a`` and from ``b`` on, are within ``reach``."""
     if dimension == 2:
         return within_2(w, a, b, reach * reach)
     return within_3(w, a, b, reach * reach)
@@ -124,7 +124,7 @@ def mark_pairs(arrays: ProblemArrays, extra: np.float32, w: FloatArray, near: ND
 
 @inlined
 def near_round(reach: np.float32, centre: FloatArray, axes: int, places: FloatArray, spare: FloatArray) -> np.uint64:
-    """Where the first rows of ``places`` are within ``reach`` of a centre, over two or three axes.
+    """Return where the first rows of ``places`` are within ``reach`` of a centre, over two or three axes.
 
     ``spare`` is a row to overwrite.
     """

@@ -1,4 +1,4 @@
-"""What an engine is: what it is asked for, and what it answers."""
+"""Interface of an engine: its inputs and its results."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Engine(Protocol):
 
 
 class ObservationInputs(NamedTuple):
-    """What there is to see of ``B`` worlds.
+    """Inputs to the observations of ``B`` worlds.
 
     Attributes:
         goal: ``(B, K, d)`` [m].
@@ -77,7 +77,7 @@ class ObservationInputs(NamedTuple):
         control: ``(B, K, m)`` executed last.
         docked: ``(B, K)`` bool.
         bodies: ``(B, N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves among the robots and is
-            none; a radius of zero stands for one that is not seen.
+            none; a radius of zero for one that is not seen.
         time_left: ``(B,)`` share of the time left, 1 to 0.
     """
 
@@ -98,7 +98,7 @@ class ObservationInputs(NamedTuple):
         time_left: float,
         bodies: FloatArray | None = None,
     ) -> ObservationInputs:
-        """Of one world, in arrays of its own: kernels are compiled anew for read-only ones."""
+        """Make those of one world, in arrays of its own: kernels are compiled anew for read-only ones."""
         if bodies is None:
             bodies = np.empty((0, 2 * goal.shape[1] + 1), np.float32)
         one = np.newaxis
@@ -120,7 +120,7 @@ class WorldEngine(Engine, Protocol):
     """An engine with what environments need as well."""
 
     def contacts(self, arrays: ProblemArrays, states: FloatArray) -> tuple[BoolArray, BoolArray]:
-        """``(collided (K,), margin_violated (K,))`` of a team standing at ``states`` ``(K, n)``."""
+        """``(collided (K,), margin_violated (K,))`` of a team at rest at ``states`` ``(K, n)``."""
         ...
 
     def observe_worlds(

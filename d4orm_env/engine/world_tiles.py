@@ -43,7 +43,7 @@ class WorldArrays(NamedTuple):
         docked: ``(B, K)`` bool.
         collided: ``(B, K)`` bool, hard contact.
         violated: ``(B, K)`` bool, within the margin.
-        rewards: ``(B, K)`` of each robot where it stands.
+        rewards: ``(B, K)`` of each robot where it is.
     """
 
     goal: FloatArray

@@ -1,4 +1,4 @@
-"""What the environments of one team share: a simulation, and pictures of it."""
+"""Base of the environments of one team: a simulation, and pictures of it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class BaseEnv:
         self.metadata = type(self).metadata | {"render_fps": max(1, round(1 / self.problem.dt))}
 
     def _make_simulation(self, options: EnvOptions) -> Simulation:
-        """What the environment runs; one with another physics overrides it."""
+        """Make the environment's simulation; one with another physics overrides it."""
         return Simulation(options)
 
     def _make_viewer(self, options: EnvOptions) -> Viewer:
@@ -36,7 +36,7 @@ class BaseEnv:
 
     @property
     def lifelong(self) -> bool:
-        """Whether robots that arrive get fresh goals instead of docking."""
+        """True if robots that arrive get fresh goals instead of staying there."""
         return self._simulation.lifelong
 
     def state(self) -> FloatArray:
@@ -56,7 +56,7 @@ class BaseEnv:
         return self._simulation.true_state()
 
     def effect(self) -> DisturbanceEffect:
-        """What disturbances have done up to now, as arrays with one world as their first axis.
+        """Return the effect of the disturbances up to now, as arrays with one world as their first axis.
 
         Raises:
             RuntimeError: Before the first reset.
@@ -76,7 +76,7 @@ class BaseEnv:
         return self._viewer.render(self._simulation)
 
     def _show(self) -> None:
-        """Draw what has just happened, if somebody looks."""
+        """Draw what has just happened, if it is shown."""
         if self.render_mode == "human":
             self.render()
 

@@ -66,7 +66,7 @@ class EpisodeRecord:
 
 
 class EpisodeCounts(NamedTuple):
-    """What is counted of an episode of one world or, with leading axes, of many.
+    """Counts of an episode of one world or, with leading axes, of many.
 
     Attributes:
         steps: ``(...)`` steps taken.

@@ -1,4 +1,4 @@
-"""What users hand to environments, checked."""
+"""Checks of users' input to environments."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def checked_states(
 
 
 def usable(actions: FloatArray) -> BoolArray:
-    """Where actions are finite, and at most :data:`MAX_ACTION` in magnitude."""
+    """Return where actions are finite, and at most :data:`MAX_ACTION` in magnitude."""
     within: BoolArray = np.abs(actions) <= MAX_ACTION
     return within
 

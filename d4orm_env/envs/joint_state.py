@@ -14,7 +14,7 @@ bodies                ``N * b``   position, velocity and radius of bodies that m
 ====================  ==========  =====================================================================
 
 with ``b = 2 d + 1``. Bodies there are only under a disturbance that brings them, such as
-:class:`~d4orm_env.disturbances.Intruder`; one that nobody sees is all zeros. With disturbances of what is seen states,
+:class:`~d4orm_env.disturbances.Intruder`; one that is not seen is all zeros. With disturbances of what is seen states,
 controls and bodies are those seen.
 
 Together with the problem that is all there is to know about an episode's present, so a planner can go on from it.
@@ -97,7 +97,7 @@ def split_state(problem: Problem, state: ArrayLike) -> JointState:
 
 
 def _fits(rest: FloatArray, team_size: int, body: int) -> bool:
-    """Whether the end of a state vector is that of such a team: flags, steps, bodies of ``body`` numbers."""
+    """Check whether the end of a state vector is that of such a team: flags, steps, bodies of ``body`` numbers."""
     flags, steps, bodies = rest[:team_size], rest[team_size : team_size + 1], rest[team_size + 1 :]
     if len(steps) == 0 or len(bodies) % body:
         return False

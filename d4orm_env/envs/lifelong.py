@@ -57,7 +57,7 @@ def fresh_goal(
 
     Args:
         problem: The problem; its goals are not looked at.
-        robot: Who gets the goal.
+        robot: The robot that gets the goal.
         positions: ``(K, d)`` where the robots are [m].
         goals: ``(K, d)`` present goals; ``robot``'s own is ignored.
         random: Where the draws come from.

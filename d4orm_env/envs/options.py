@@ -24,7 +24,7 @@ __all__ = ["EnvOptions"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EnvOptions:
-    """What an environment is made of; every environment takes these as keyword arguments.
+    """Options of an environment; every environment takes these as keyword arguments.
 
     Attributes:
         scenario: ``"circle"`` unless a problem is given. The name of a scenario, the path of a YAML file, a callable
@@ -73,7 +73,7 @@ class EnvOptions:
 
     @classmethod
     def of(cls, **arguments: Any) -> EnvOptions:
-        """From the keyword arguments of an environment.
+        """Make options from the keyword arguments of an environment.
 
         Raises:
             TypeError: For one that neither the environments nor the scenario have; the message lists those they have.
@@ -129,7 +129,7 @@ class EnvOptions:
 
     @property
     def vouched(self) -> bool:
-        """Whether the scenario is known to draw instances that differ in places and obstacles only."""
+        """True if the scenario is known to draw instances that differ in positions and obstacles only."""
         return self.problem is None and find_scenario(self._scenario).draws
 
     def instances(self) -> tuple[Problem, Callable[[int], Problem] | None]:

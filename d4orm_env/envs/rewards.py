@@ -1,4 +1,4 @@
-"""What a step is worth: the paper's reward, one to learn from, and those that users bring."""
+"""Rewards of a step: the paper's, one to learn from, and those of users."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def find_reward(reward: str | RewardFunction) -> RewardFunction | None:
 
 
 def term_names(function: RewardFunction | None) -> tuple[str, ...]:
-    """What a reward that has ``terms`` calls them; others have none."""
+    """Return the names of the terms of a reward that has ``terms``; others have none."""
     return tuple(getattr(function, "term_names", ()))
 
 

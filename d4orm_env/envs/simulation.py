@@ -109,7 +109,7 @@ class Simulation:
 
     @property
     def out_of_time(self) -> bool:
-        """Whether ``max_cycles`` steps have been taken."""
+        """True if ``max_cycles`` steps have been taken."""
         return self.steps >= self.max_cycles
 
     @property
@@ -119,7 +119,7 @@ class Simulation:
 
     @property
     def redraws(self) -> bool:
-        """Whether every reset draws a new instance."""
+        """True if every reset draws a new instance."""
         return self._redraw is not None
 
     def draw_instance(self, random: np.random.Generator) -> Problem:
@@ -263,19 +263,19 @@ class Simulation:
         return self.record.metrics(None if lost is None else lost[0])
 
     def effect(self) -> DisturbanceEffect:
-        """What disturbances have done up to now, as of a batch of one world."""
+        """Return the effect of the disturbances up to now, as of a batch of one world."""
         self.require_reset()
         return DisturbanceEffect() if self._disturbed is None else self._disturbed.effect(self._scene())
 
     @property
     def finished(self) -> BoolArray:
-        """``(K,)`` robots that are done: those that have docked or, where nobody docks, all once all are there."""
+        """``(K,)`` robots that are done: those that have docked or, where none docks, all once all are there."""
         if self.lifelong:
             return np.zeros_like(self.arrived)
         return self.arrived if self.problem.docks else self.arrived & self.arrived.all()
 
     def marks(self) -> DisturbanceEvents | None:
-        """Where the present moment is disturbed, as far as it can be drawn; ``None`` without disturbances."""
+        """Return the disturbances of the present moment, as far as they can be drawn; ``None`` without any."""
         return marks_of([self.effect()], self.problem) if self.disturbances else None
 
     def _disturb(self, seed: int) -> None:
@@ -295,7 +295,7 @@ class Simulation:
         return self._disturbed.scene(start, goal, self.states[None], self.controls[None], self.arrived[None], steps)
 
     def _contacts(self) -> tuple[BoolArray, BoolArray]:
-        """``(K,)`` who is in contact, and who within the margin, where all stand now."""
+        """``(K,)`` robots in contact, and within the margin, where all are now."""
         collided, violated = self._engine.contacts(self.arrays, self.states)
         if self._disturbed is None or not self._disturbed.bodies.shape[1]:
             return collided, violated

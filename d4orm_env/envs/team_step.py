@@ -1,4 +1,4 @@
-"""What a step tells about a team, and the infos that environments make of it."""
+"""Result of a step for a team, and the infos that environments make of it."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any, NamedTuple, TypeAlias
 from d4orm_env.core.arrays import BoolArray, FloatArray
 
 Info: TypeAlias = dict[str, Any]
-"""What an environment says beside observations and rewards, by name."""
+"""Results of an environment beside observations and rewards, by name."""
 AgentInfos: TypeAlias = dict[str, Info]
 """The same by agent."""
 
 
 class TeamStep(NamedTuple):
-    """What a step or a reset tells about the team; every array is the caller's to keep.
+    """Result of a step or a reset for the team; every array is the caller's to keep.
 
     Attributes:
         observations: ``(K, D)`` local observations.

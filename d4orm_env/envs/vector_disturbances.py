@@ -1,4 +1,4 @@
-"""What disturbances do to the worlds of a batch."""
+"""Disturbances of the worlds of a batch."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class DisturbedBatch:
 
     @property
     def alters_sight(self) -> bool:
-        """Whether what is seen is not simply what the kernel that steps the worlds knows of the robots."""
+        """True if what is seen may differ from what the kernel that steps the worlds knows of the robots."""
         return self._disturbed.alters_sight or self._disturbed.alters_limits
 
     @property
@@ -50,7 +50,7 @@ class DisturbedBatch:
 
     @property
     def seen(self) -> Seen:
-        """What is seen of all worlds, which is what there is unless something alters it."""
+        """Return the view of all worlds, which is the truth unless something alters it."""
         worlds = self._worlds
         return self._seen or Seen(worlds.state, worlds.control, self._disturbed.bodies)
 
@@ -65,7 +65,7 @@ class DisturbedBatch:
             self._disturbed.begin(worlds, seeds[worlds].tolist(), start, goal)
 
     def act(self, controls: FloatArray) -> FloatArray:
-        """What becomes of ``controls`` ``(B, K, m)`` at the beginning of a step, in which states may change too."""
+        """Disturb ``controls`` ``(B, K, m)`` at the beginning of a step, in which states may change too."""
         if self._nothing:
             return controls
         states, controls = self._disturbed.act(self._scene, controls)
@@ -89,7 +89,7 @@ class DisturbedBatch:
         worlds.violated[:] |= near
 
     def look(self, worlds: Worlds) -> ObservationInputs:
-        """What there is to see of these worlds now, or is believed to be."""
+        """Return the inputs to the observations of these worlds now, true or believed."""
         from d4orm_env.engine.types import ObservationInputs
 
         batch = self._worlds

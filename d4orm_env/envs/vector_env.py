@@ -36,7 +36,7 @@ __all__ = ["NavigationVectorEnv"]
 
 MAX_WORLDS = 1_000_000
 _READ_BEFORE = ("state", "distance", "docked", "total_reward")
-"""What rewards are computed from that a step overwrites."""
+"""Inputs of rewards that a step overwrites."""
 
 
 class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray[np.generic]]):
@@ -138,7 +138,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
 
     @property
     def autoreset_mode(self) -> AutoresetMode:
-        """When a world whose episode has ended is reset; also in ``metadata``."""
+        """Moment at which a world whose episode has ended is reset; also in ``metadata``."""
         return self._mode
 
     @property
@@ -148,7 +148,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
 
     @property
     def layout(self) -> ObservationLayout:
-        """What the components of one robot's observation mean."""
+        """Layout of one robot's observation."""
         return self._template.layout
 
     def reset(

@@ -24,7 +24,7 @@ def masked(values: Mapping[str, NDArray[np.generic]], mask: BoolArray) -> Info:
 
 
 def final_infos(observations: FloatArray, infos: Info, ended: BoolArray) -> Info:
-    """What is kept of episodes that have ended, before their worlds are reset.
+    """Return what is kept of episodes that have ended, before their worlds are reset.
 
     Args:
         observations: ``(B, K * D)``.

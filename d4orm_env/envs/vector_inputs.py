@@ -1,4 +1,4 @@
-"""What users hand to the batched environment, checked; it says what is raised."""
+"""Checks of users' input to the batched environment; it says what is raised."""
 
 from __future__ import annotations
 

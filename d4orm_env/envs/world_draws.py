@@ -1,4 +1,4 @@
-"""What the worlds of a batch draw: instances and disturbances, each world as a single environment does."""
+"""Instances and disturbances of the worlds of a batch, drawn by each world as by a single environment."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.envs.simulation import Simulation
 
 OWN_ARRAYS = ("start", "goal", "inverse_initial_distance")
-"""What differs from world to world in one kernel call."""
+"""Arrays that differ from world to world in one kernel call."""
 WORLD_ARRAYS = ("boxes", "triangles", "bounds")
-"""What may differ too, at the price of a call for each world; all the rest of a problem is shared."""
+"""Arrays that may differ too, at the price of a call for each world; all the rest of a problem is shared."""
 
 
 class WorldDraws:
@@ -81,6 +81,6 @@ class WorldDraws:
         return drawn
 
     def differing(self, problem: Problem, names: Iterable[str] = WORLD_ARRAYS) -> list[str]:
-        """Those of the arrays in which a problem differs from the first."""
+        """Return the arrays in which a problem differs from the first."""
         one, other = problem.arrays, self._first.arrays
         return [name for name in names if not np.array_equal(getattr(one, name), getattr(other, name))]

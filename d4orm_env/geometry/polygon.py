@@ -11,7 +11,7 @@ from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.geometry.simple_polygon import first_crossing
 
 MAX_CORNERS, MAX_ALL_CORNERS = 2_000, 30_000
-"""Of one polygon, as of a way of OpenStreetMap, for cutting one into triangles may take quadratic time; and of all."""
+"""Limits of one polygon, as of a way of OpenStreetMap, for its triangulation may take quadratic time; and of all."""
 
 
 def check_polygon(corners: FloatArray, name: str) -> None:
@@ -91,7 +91,7 @@ class _Ears:
         return [*found, [corner for corner in self._ring if corner in self._turn]]
 
     def _entry(self, corner: int) -> tuple[float, int, int]:
-        """What the order goes by: corners that lie in line, then large turns, then the order round the ring."""
+        """Return the sort key: corners that lie in line, then large turns, then the order round the ring."""
         turn = self._turn[corner]
         return -turn if turn else -np.inf, self._rank[corner], corner
 

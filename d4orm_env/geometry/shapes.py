@@ -34,7 +34,7 @@ class Shapes:
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """Number of shapes."""
         return len(self.boxes) + len(self.triangles)
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Whether a polygon is simple, by a sweep line in O(n log n) with exact arithmetic.
+"""Test for simple polygons, by a sweep line in O(n log n) with exact arithmetic.
 
 After M. I. Shamos and D. Hoey, "Geometric Intersection Problems", FOCS 1976. Corners are swept in the order of x, then
 y, so that upright edges are no special case. What touches counts as crossing, but for neighbours in the corner that
@@ -100,7 +100,7 @@ class _Sweep:
         return orientation(*self._ends[edge], place)
 
     def _meet(self, one: int, other: int) -> bool:
-        """Whether two edges have a point in common, but for the corner of neighbours: these show at a corner."""
+        """Check whether two edges have a point in common, but for the corner of neighbours: these show at a corner."""
         if (one - other) % self._count in (1, self._count - 1):
             return False
         (a, b), (c, d) = self._ends[one], self._ends[other]

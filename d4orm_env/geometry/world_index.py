@@ -1,4 +1,4 @@
-"""Where the obstacles are: a grid that answers for any point which of them can be nearest, however many there are.
+"""Index of the obstacles: a grid that tells for any point which of them can be nearest, however many there are.
 
 Every cell keeps the clearance at its centre and the obstacles that are nearest to some point in it. Clearance changes
 by no more than the distance between two points (it is 1-Lipschitz), so what it is at the centre decides nearly every
@@ -29,7 +29,7 @@ FREE_CELLS, CELLS_PER_OBSTACLE = 2**15, 2**8
 """No more cells than these allow: more would take longer to make than they save."""
 
 WIDER = 4
-"""How much wider each grid of an index is than the one before it."""
+"""Ratio of the cell sizes of one grid of an index and the next."""
 
 CROWDED = 8
 """Obstacles of a cell beyond which it is worthwhile to look closer at which of them count."""
@@ -262,7 +262,7 @@ def _refined(
 def _hidden(
     shapes: Shapes, centre: Floats, cells: _Cells, distance: Floats, width: float, rounding: float
 ) -> NDArray[np.bool_]:
-    """Which pairs of a crowded cell and a box do not count, because the obstacle that is nearest to the cell's centre,
+    """Mark the pairs of a crowded cell and a box that do not count: the obstacle nearest to the cell's centre,
     or to one of its corners, is nearer everywhere in the cell.
 
     Distance from a convex shape is a convex function: no less than its tangent at the centre. Another one's, taken
@@ -284,8 +284,8 @@ def _hidden(
 
 
 class _Turn(NamedTuple):
-    """How far apart the directions to two obstacles can be. All lie in a ball of this middle and radius, along the axes
-    on which they end.
+    """Bound on the angle between the directions to two obstacles. All lie in a ball of this middle and radius, along
+    the axes on which they end.
     """
 
     axes: NDArray[np.bool_]

@@ -30,7 +30,7 @@ __all__ = ["NavigationTask"]
 class NavigationTask(TaskClass):
     """A scenario, in as many worlds as an experiment asks for, stepped in one compiled call.
 
-    Its success rate, the share of finished episodes in which all arrived and nobody ever touched anything, is logged as
+    Its success rate, the share of finished episodes in which all arrived without a collision, is logged as
     ``success_rate``.
 
     Args:
@@ -41,7 +41,7 @@ class NavigationTask(TaskClass):
     def get_env_fun(
         self, num_envs: int, continuous_actions: bool, seed: int | None, device: str
     ) -> Callable[[], TorchRLNavigation]:
-        """What makes the environment; see BenchMARL."""
+        """Return a function that makes the environment; see BenchMARL."""
         config = dict(self.config)
         return lambda: TorchRLNavigation(num_envs, self.name, seed=seed, device=device, **config)
 

@@ -26,13 +26,13 @@ __all__ = ["RLlibNavigation"]
 
 
 class RLlibNavigation(MultiAgentEnv):
-    """A :class:`~d4orm_env.navigation_v0.parallel_env` whose episodes end for all when nobody acts any more.
+    """A :class:`~d4orm_env.navigation_v0.parallel_env` whose episodes end for all when none acts any more.
 
     A robot that arrives is terminated and acts no more. ``terminateds["__all__"]`` says that all have arrived,
-    ``truncateds["__all__"]`` that time is up for somebody. RLlib's own ``ParallelPettingZooEnv`` says neither where one
-    robot arrives in the very step in which time is up for another.
+    ``truncateds["__all__"]`` that time is up for some robot. RLlib's own ``ParallelPettingZooEnv`` says neither where
+    one robot arrives in the very step in which time is up for another.
 
-    ``infos`` have ``is_success`` besides: whether all have arrived and nobody has ever touched anything.
+    ``infos`` have ``is_success`` besides: whether all have arrived without a collision.
 
     Args:
         config: Arguments of :class:`~d4orm_env.navigation_v0.parallel_env`, as RLlib gives its ``env_config``.

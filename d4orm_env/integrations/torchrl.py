@@ -31,7 +31,7 @@ except ModuleNotFoundError as error:
 __all__ = ["GROUP", "TorchRLNavigation"]
 
 GROUP = "robots"
-"""What the robots' part of a tensordict is called."""
+"""Name of the robots' part of a tensordict."""
 _INFO = ("acting", "collided", "success")
 
 
@@ -41,10 +41,10 @@ class TorchRLNavigation(EnvBase):
     Under ``"robots"`` are ``observation`` ``(B, K, D)``, ``action`` ``(B, K, m)`` in physical units, ``reward``
     ``(B, K, 1)``, zero for robots that have arrived, and ``info``, flags ``(B, K, 1)``: ``acting``, whether the robot
     has yet to arrive, so that its action counts; ``collided``, whether it touches something now; and ``success``,
-    whether its whole team has arrived and nobody has ever touched anything.
+    whether its whole team has arrived without a collision.
 
     An episode is the team's: ``terminated`` when all have arrived, ``truncated`` when time is up, ``(B, 1)`` each. A
-    robot that has arrived stands there until then.
+    robot that has arrived stays there until then.
 
     Args:
         num_worlds: ``B``.
@@ -99,7 +99,7 @@ class TorchRLNavigation(EnvBase):
         return Binary(1, (*shape, 1), device=self.device, dtype=torch.bool)
 
     def _box(self, low: FloatArray, high: FloatArray) -> Bounded:
-        """Of what every robot has ``n`` numbers of, between bounds ``(n,)`` or ``(K, n)``."""
+        """Return the spec of ``n`` numbers for every robot, between bounds ``(n,)`` or ``(K, n)``."""
         shape = (*self._shape, low.shape[-1])
         ends = (torch.as_tensor(np.broadcast_to(end, shape).copy(), device=self.device) for end in (low, high))
         return Bounded(*ends, shape, device=self.device, dtype=torch.float32)
@@ -151,7 +151,7 @@ class TorchRLNavigation(EnvBase):
         return TensorDict({GROUP: robots, **rows}, self.batch_size, device=self.device)
 
     def _tensor(self, values: ArrayLike) -> torch.Tensor:
-        """Of the values as they are now."""
+        """Copy the values as they are now."""
         return torch.as_tensor(np.array(values), device=self.device)
 
     def close(self, **options: object) -> None:

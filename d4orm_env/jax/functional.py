@@ -36,7 +36,7 @@ __all__ = ["State", "Step", "observe", "reset", "step"]
 
 
 class State(NamedTuple):
-    """Where a team is.
+    """State of a team.
 
     Attributes:
         states: ``(K, n)``.
@@ -52,7 +52,7 @@ class State(NamedTuple):
 
 
 class Step(NamedTuple):
-    """What one step brought.
+    """Result of one step.
 
     Attributes:
         rewards: ``(K,)``.
@@ -135,7 +135,7 @@ def step(
 
 
 def _reward_input(problem: Problem, state: State, after: State, happened: Step, distances: jax.Array) -> RewardInput:
-    """What a reward is told of a step that began in ``state``, at these distances ``(K,)`` from the goals."""
+    """Return a reward's input for a step that began in ``state``, at these distances ``(K,)`` from the goals."""
     arrays = _arrays(problem)
     traced: dict[str, Any] = {
         "previous_states": state.states,
@@ -155,7 +155,7 @@ def _reward_input(problem: Problem, state: State, after: State, happened: Step, 
 
 
 def observe(problem: Problem, state: State, layout: ObservationLayout, max_cycles: int | None = None) -> jax.Array:
-    """What every robot sees, as in the environments.
+    """Return every robot's observation, as in the environments.
 
     Args:
         problem: The problem.

@@ -37,7 +37,7 @@ class EnvState(NamedTuple):
     Attributes:
         team: Where the team is.
         instance: ``()`` int32, which of the instances it runs.
-        touched: ``(K,)`` bool: who has been in contact.
+        touched: ``(K,)`` bool: has been in contact.
     """
 
     team: functional.State
@@ -46,13 +46,13 @@ class EnvState(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """What a step brought.
+    """Result of one step.
 
     Attributes:
         observations: ``(K, D)``; after the end of an episode those of the next one.
         rewards: ``(K,)`` of all robots, docked ones too, as ``robot_rewards`` of the batched environment.
-        acted: ``(K,)`` bool: who was still under way when the step began.
-        finished: ``(K,)`` bool: who is done, which is terminated.
+        acted: ``(K,)`` bool: was still under way when the step began.
+        finished: ``(K,)`` bool: is done, which is terminated.
         done: ``()`` bool: the episode is over; all have finished, or the time is up.
         success: ``()`` bool: all have arrived, and none was ever in contact.
         step: What happened, as :func:`d4orm_env.jax.functional.step` tells it.

@@ -54,9 +54,9 @@ class Worlds(NamedTuple):
 
 
 Given: TypeAlias = Array | FloatArray
-"""Of the problem: inside a compiled function it is traced."""
+"""An array of the problem: inside a compiled function it is traced."""
 Verdict: TypeAlias = tuple[Array, Array, Array]
-"""Who collided, who violated the margin, and rewards, each ``(K, S)``."""
+"""Flags of collision and of margin violation, and rewards, each ``(K, S)``."""
 
 
 def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, control: Array) -> Worlds:
@@ -131,7 +131,7 @@ FEW = 8
 
 
 def _touches_box(box: Given, reach: Given, place: Array) -> Array:
-    """Where places ``(K, ., d, S)`` are within reach of rounded boxes, ``box`` being their ``2 d + 1`` columns."""
+    """Return where places ``(K, ., d, S)`` are within reach of rounded boxes, given as ``2 d + 1`` columns."""
     d, gap2 = place.shape[-2], jnp.float32(0)
     for axis in range(d):
         gap = collision.axis_gap(place[..., axis, :], box[axis], box[d + axis], jnp.float32(0), OPS)
@@ -192,7 +192,7 @@ def rewards_of(arrays: ProblemArrays, place: Array, pair_violation: Array, obsta
 
 
 def judge(arrays: ProblemArrays, place: Array) -> Verdict:
-    """``(collided, margin violated, reward)`` of teams standing at ``place`` ``(K, d, S)``, each ``(K, S)``."""
+    """``(collided, margin violated, reward)`` of teams at rest at ``place`` ``(K, d, S)``, each ``(K, S)``."""
     zero = jnp.float32(0)
     contact = robot_contacts(arrays, place, zero) | obstacle_contacts(arrays, place, zero)
     pair, obstacle = robot_contacts(arrays, place, arrays.margin), obstacle_contacts(arrays, place, arrays.margin)

@@ -1,4 +1,4 @@
-"""What robots see, in JAX: :mod:`d4orm_env.core.observation` as pure array functions of one world."""
+"""Observations in JAX: :mod:`d4orm_env.core.observation` as pure array functions of one world."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class _Nearest(NamedTuple):
         return _Nearest(tuple(keys), tuple(rows))
 
     def with_all(self, look: Callable[[T], tuple[Array, Columns]], things: T) -> _Nearest:
-        """With all ``things``, arrays whose first axis they are on; ``look`` gives key and columns of one."""
+        """Add all ``things``, arrays whose first axis they are on; ``look`` gives key and columns of one."""
         scan = partial(jax.lax.scan, unroll=UNROLLED)
         return scan(lambda nearest, thing: (nearest.with_another(*look(thing)), None), self, things)[0]
 

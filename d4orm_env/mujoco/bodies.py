@@ -21,12 +21,12 @@ from d4orm_env.mujoco.wheels import GRAVITY, WheelCommands, WheelControl
 Robots = NDArray[np.intp]
 
 _HELD = 1e6
-"""What a docked robot weighs more, per degree of freedom [kg]: nothing moves it."""
+"""Weight added to a docked robot, per degree of freedom [kg]: nothing moves it."""
 _SPIN, _FREE_DOFS, _FREE_PLACE = 2, 6, 7
 
 
 class Moved(NamedTuple):
-    """What a step came to.
+    """Result of a step.
 
     Attributes:
         states: ``(K, n)`` as the problem's models have them.
@@ -70,7 +70,7 @@ class TeamBodies:
         self.begin()
 
     def begin(self) -> None:
-        """Put everybody at the start, at whatever speed the problem says, and let go of those that were held."""
+        """Put all robots at the start, at whatever speed the problem says, and let go of those that were held."""
         mujoco.mj_resetData(self.scene.model, self.data)
         self._held[:] = False
         self.scene.model.dof_armature[:] = 0
@@ -197,7 +197,7 @@ class TeamBodies:
         self.data.qfrc_applied[self._wheel_dofs] = torque
 
     def _commands(self, controls: FloatArray, states: FloatArray, limits: FloatArray) -> WheelCommands:
-        """What the drives are told: a turn rate, and a speed, or an acceleration from the speed wanted last."""
+        """Return the drives' commands: a turn rate, and a speed, or an acceleration from the speed wanted last."""
         rows = []
         for robot in self._drives.tolist():
             first, second = controls[robot, :2].tolist()

@@ -22,13 +22,13 @@ class parallel_env(navigation_v0.parallel_env):
 
     Observations, actions, infos, docking, rewards and metrics are the same; what differs is how robots move. Planar
     problems of ``holonomic2d`` and ``velocity2d``, which are pushed pucks, and of ``differential_drive`` and
-    ``unicycle``, which stand on two wheels and a caster. ``collided`` is contact at any moment of a step.
+    ``unicycle``, which have two wheels and a caster. ``collided`` is contact at any moment of a step.
 
     Args:
         scenario: As in :class:`~d4orm_env.envs.options.EnvOptions`, like all arguments not named here.
         num_robots: Size of the team.
         physics: What the bodies are made of.
-        renderer: Who draws ``"rgb_array"`` frames: ``"mujoco"``; ``"pictures"``, which are those of the other
+        renderer: Renderer of ``"rgb_array"`` frames: ``"mujoco"``; ``"pictures"``, which are those of the other
             environments; or by default ``"auto"``, MuJoCo where EGL or OSMesa is there, else pictures. A window is
             always of pictures.
         **options: Further attributes of :class:`~d4orm_env.envs.options.EnvOptions`, and arguments of the scenario.

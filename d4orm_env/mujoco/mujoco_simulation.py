@@ -94,7 +94,7 @@ class MujocoSimulation(Simulation):
         return self._judged(arrays, states, controls, arrived, touched)
 
     def _limited(self, controls: FloatArray, limits: FloatArray, standing: BoolArray) -> FloatArray:
-        """``controls`` within the robots' limits, zero for those that stand."""
+        """``controls`` within the robots' limits, zero for those at rest."""
         limited: FloatArray = np.zeros(controls.shape, np.float32)
         for robot in np.flatnonzero(~standing):
             model = self.problem.team.robot_models[robot]
@@ -103,7 +103,7 @@ class MujocoSimulation(Simulation):
         return limited
 
     def _measured(self, states: FloatArray, standing: BoolArray) -> FloatArray:
-        """What is known of the bodies: those that stand do so where they docked, and no speed is beyond the spaces."""
+        """Return the known states: robots at rest are where they docked, and no speed is beyond the spaces."""
         states = np.where(standing[:, None], self.states, states)
         most = self._spare.speed + self.problem.team.max_speed
         for robot, model in enumerate(self.problem.team.robot_models):
@@ -114,7 +114,7 @@ class MujocoSimulation(Simulation):
     def _judged(
         self, arrays: ProblemArrays, states: FloatArray, controls: FloatArray, arrived: BoolArray, touched: BoolArray
     ) -> StepResult:
-        """What a step came to: flags and rewards of a team that stands where it is now, and who was touched."""
+        """Return the result of a step: flags and rewards of a team at rest where it is now, and who was touched."""
         still = np.ones(len(states), np.bool_)
         verdict = self._engine.step(arrays._replace(docks=np.bool_(True)), states, still, np.zeros_like(controls))
         judged = verdict._replace(states=states, controls=controls, arrived=arrived)

@@ -8,7 +8,7 @@ from d4orm_env.mujoco.camera import Camera, NoCameraError
 from d4orm_env.mujoco.mujoco_simulation import MujocoSimulation
 
 RENDERERS = ("auto", "mujoco", "pictures")
-"""Who may draw frames."""
+"""Renderers of frames."""
 
 
 class MujocoViewer(Viewer):

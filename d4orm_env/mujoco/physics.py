@@ -1,4 +1,4 @@
-"""What the bodies are made of, and how finely their motion is integrated."""
+"""Material of the bodies, and time step of their integration."""
 
 from __future__ import annotations
 

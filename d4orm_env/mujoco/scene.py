@@ -51,7 +51,7 @@ class MujocoScene(NamedTuple):
 
 OBSTACLE, NOT_SOLID = -1, -2
 LEAST_RADIUS = 1e-3
-"""Of a robot [m]: MuJoCo divides by masses."""
+"""Least radius of a robot [m]: MuJoCo divides by masses."""
 
 
 def check_problem(problem: Problem) -> None:
@@ -187,7 +187,7 @@ def _walls(lower: list[float], upper: list[float]) -> list[list[float]]:
 
 
 def colour(robot: int) -> list[float]:
-    """Of a robot and its goal: red, green, blue and opacity, from 0 to 1."""
+    """Return the colour of a robot and its goal: red, green, blue and opacity, from 0 to 1."""
     return [*_PALETTE[robot % len(_PALETTE)], 1.0]
 
 

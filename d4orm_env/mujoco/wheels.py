@@ -21,7 +21,7 @@ GRAVITY = 9.81
 
 
 class WheelCommands(NamedTuple):
-    """What ``D`` drives are to do from the beginning of a step on, each ``(D,)``.
+    """Commands of ``D`` drives from the beginning of a step on, each ``(D,)``.
 
     Attributes:
         speed: At the beginning [m/s].

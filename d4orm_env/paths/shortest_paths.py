@@ -28,9 +28,9 @@ MAX_POINTS = 2**24
 STEP = 0.5
 """Distance of neighbouring nodes, as a share of the robot's radius and margin."""
 STRETCH = 1.05
-"""By how much coarser the next grid is that is tried where one has too many points, at least."""
+"""Least factor by which the next grid is coarser where one has too many points."""
 REFINEMENTS = 2
-"""How often a robot that seems to have no way is tried again on a grid that is twice as fine."""
+"""Number of times that a robot without a path is tried again, each time on a grid that is twice as fine."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +93,7 @@ class ShortestPaths:
         return way[np.append(True, (np.diff(way, axis=0) != 0).any(axis=1))]
 
     def _look(self, points: ArrayLike) -> tuple[Floats, Floats]:
-        """Where to go first, and how far it is in all."""
+        """Return the next position to head for, and the whole distance."""
         places: Floats = np.asarray(points, np.float64)
         goal = self.problem.goal.astype(np.float64)
         if self._world is None:
@@ -107,7 +107,7 @@ class ShortestPaths:
 
 
 def _find(world: tuple[Space, Fields], robot: int, places: Floats) -> tuple[Floats, Floats, NDArray[np.int32]]:
-    """Where robots from this number on go first from places ``(R, Q, 3)``, how far it is in all, and their anchors."""
+    """Return next positions for robots from this number on at ``(R, Q, 3)``, the whole distances, and their anchors."""
     from d4orm_env.paths.wavefront import look
 
     shape = places.shape[:2]

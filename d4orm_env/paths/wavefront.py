@@ -26,10 +26,10 @@ from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
 
 _HALVINGS = 6
-"""Of the angle by which a blocked line is turned, and of the length by which a corner is cut."""
+"""Number of halvings of the angle by which a blocked line is turned, and of the length by which a corner is cut."""
 _PUSHES, _SPARE = 4, 0.03
-"""How often a node is pushed away from an obstacle, and how much farther than need be, as a share of the reach; a third
-of it each time, so as to end in the middle of narrow gaps."""
+"""Number of times a node is pushed away from an obstacle, and the excess of a push, as a share of the reach; a third of
+it each time, so as to end in the middle of narrow gaps."""
 _TOLERANCE = 5e-6
 """Rounding of clearances, as a share of the reach."""
 _NOBODY = np.int32(-1)
@@ -94,7 +94,7 @@ class Lattice(NamedTuple):
 
 
 class Front(NamedTuple):
-    """Where a wavefront came from.
+    """A wavefront and its anchors.
 
     Attributes:
         anchor: ``(N,)`` int32 the anchor that each node sees; -1 for a node out of reach.
@@ -273,7 +273,7 @@ def _distance(a: Place, b: Place) -> float:
 
 @compiled
 def _sees(space: Space, reach: float, a: Place, own_a: float, b: Place, own_b: float) -> bool:
-    """Whether a line is free.
+    """Check whether a line is free.
 
     ``own_a`` and ``own_b`` are the clearances at the ends: a place that lies nearer to something than ``reach`` is left
     on lines that come no nearer than it is.
@@ -416,7 +416,7 @@ def settle_nodes(space: Space, lattice: Lattice, reach: float) -> int:
 
 
 class _Nodes(NamedTuple):
-    """What is known of the nodes.
+    """State of the nodes.
 
     Attributes:
         value: ``(N,)`` length of the way [m].
@@ -437,7 +437,7 @@ class _Nodes(NamedTuple):
 
 @inlined
 def _kept(anchor: Whole, own_goal: float, reach: float) -> float:
-    """What is kept around an anchor: all but the goal are clear."""
+    """Return the clearance kept around an anchor: all but the goal are clear."""
     return own_goal if anchor == 0 else reach
 
 
@@ -619,7 +619,7 @@ def gather(reach: Floats, lattices: Sequence[Lattice], number: IntArray, fronts:
 
 
 def _beginnings(arrays: list[np.ndarray]) -> IntArray:
-    """Where each begins when they stand one behind the other, and where the last one ends."""
+    """Return the offset of each when they lie one behind the other, and the end of the last one."""
     return np.cumsum([0, *map(len, arrays)])
 
 
@@ -630,7 +630,7 @@ def _joined(arrays: list[np.ndarray]) -> Any:
 
 @compiled
 def _look_from(space: Space, fields: Fields, robot: int, q: Place) -> tuple[Place, float, np.int32]:
-    """Where a robot at ``q`` goes first, the length of the whole way, and the anchor."""
+    """Return the next position for a robot at ``q``, the length of the whole path, and the anchor."""
     reach, lattice, first = fields.reach[robot], fields.lattice[robot], fields.first_point[robot]
     step, size, first_place = fields.step[lattice], fields.size[lattice], fields.first_place[lattice]
     first_node, first_anchor = fields.first_node[lattice], fields.first_anchor[robot]
@@ -676,7 +676,7 @@ def look(
     Args:
         space: The world.
         fields: The wavefronts of all robots.
-        first: Number of the first of these robots, who follow each other.
+        first: Number of the first of these robots, which follow each other.
         places: ``(R, Q, 3)``.
         target: ``(R, Q, 3)`` where to go first, the place itself where there is no way; output.
         length: ``(R, Q)`` of the whole way; infinite where there is none, output.
@@ -691,7 +691,7 @@ def look(
 
 @compiled
 def is_free_line(space: Space, reach: float, tail: Floats, head: Floats) -> bool:
-    """Whether a body of this reach moves freely straight from one place to another.
+    """Check whether a body of this radius moves freely straight from one position to another.
 
     An end that lies nearer than that to something is left and reached on a line that comes no nearer.
     """

@@ -83,7 +83,7 @@ def _frame_rate(problem: Problem, fps: float | None, speed: float, most: float) 
 def frame_steps(
     problem: Problem, trajectory: Trajectory, fps: float, speed: float, max_frames: int
 ) -> tuple[NDArray[np.int64], float]:
-    """Which time step each frame shows, and the frames per second after ``max_frames`` has been kept to."""
+    """Return the time step that each frame shows, and the frames per second after ``max_frames`` has been kept to."""
     whole_number(max_frames, "max_frames", 2)
     last = len(trajectory.states) - 1
     everyone = arrival_times(trajectory.arrived, problem.dt).max()

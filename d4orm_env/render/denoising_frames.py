@@ -1,4 +1,4 @@
-"""How a plan came about, as pictures and replays show it: a candidate at a time, from noise to clean ways."""
+"""Denoising as pictures and replays show it: a candidate at a time, from noise to clean paths."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where an execution was disturbed: pushes as arrows, robots that have stalled as crosses, intruders as grey bodies."""
+"""Disturbances in pictures: pushes as arrows, robots that have stalled as crosses, intruders as grey bodies."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from d4orm_env.render.panels import BODY, INK, PUSH, Array, Axes2D
 _ARROW_SECONDS = 1.0
 """An arrow is as long as the way at its speed in this time."""
 _SHOWN_SECONDS = 0.5
-"""How long a moving picture shows a push."""
+"""Time for which a moving picture shows a push."""
 
 
 class MarkLayer:

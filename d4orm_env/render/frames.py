@@ -185,7 +185,7 @@ class WindowRenderer:
 
     @property
     def has_window(self) -> bool:
-        """Whether there is a window: not without a display, nor after the user closed it."""
+        """True if there is a window: not without a display, nor after the user closed it."""
         return self._manager is not None
 
     @own_style()

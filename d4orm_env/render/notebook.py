@@ -1,4 +1,4 @@
-"""What notebooks show of a problem, a motion, a plan or an episode: a picture and key figures, as HTML."""
+"""Notebook display of a problem, a motion, a plan or an episode: a picture and key figures, as HTML."""
 
 from __future__ import annotations
 

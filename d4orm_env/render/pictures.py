@@ -35,13 +35,13 @@ PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
 
 
 def _contact_starts(collided: Array) -> Array:
-    """Where in ``(T, K)`` flags a contact begins."""
+    """Return where in ``(T, K)`` flags a contact begins."""
     starts: Array = collided & ~np.concatenate([np.zeros_like(collided[:1]), collided[:-1]])
     return starts
 
 
 def contact_points(trajectory: Trajectory) -> list[Array]:
-    """For every time, the ``(N, d)`` positions at which a robot has come into contact up to then."""
+    """Return, for every time, the ``(N, d)`` positions at which a robot has come into contact up to then."""
     starts = _contact_starts(np.asarray(trajectory.collided))
     return [np.asarray(trajectory.positions)[: t + 1][starts[: t + 1]] for t in range(len(starts))]
 
@@ -140,7 +140,7 @@ def plot(problem: Problem, trajectory: Trajectory | None = None, axes: Axes | No
 
     Args:
         problem: What to draw.
-        trajectory: A motion that belongs to it; without one the team stands at its starts.
+        trajectory: A motion that belongs to it; without one the team is at its starts.
         axes: Where to draw; for a spatial problem ``projection="3d"``, or flat for a view from above. By default axes
             of a new figure of ``matplotlib.pyplot``, so that notebooks and ``pyplot.show()`` show it.
 

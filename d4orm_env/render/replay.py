@@ -26,9 +26,9 @@ REPLAY_SUFFIXES = (".html",)
 
 _NOTEBOOK_HEIGHT = 640
 _AFTERMATH = 1.0
-"""How long a replay goes on when everybody has arrived [s]."""
+"""Time that a replay goes on when all have arrived [s]."""
 _NO_CLEARANCE = 1e9
-"""What stands for an infinite distance [m]."""
+"""Number that stands for an infinite distance [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +196,7 @@ def _denoising(denoising: Denoising) -> dict[str, object]:
 
 
 def _bodies(problem: Problem, bodies: FloatArray, steps: int, end: int) -> dict[str, object]:
-    """Where what is no robot is, and its radius."""
+    """Return the positions and radius of dynamic obstacles."""
     d = problem.dimension
     if bodies.ndim != 3 or len(bodies) != steps or bodies.shape[2] != 2 * d + 1 or not np.isfinite(bodies).all():
         raise ValueError(
@@ -207,7 +207,7 @@ def _bodies(problem: Problem, bodies: FloatArray, steps: int, end: int) -> dict[
 
 
 def _end(problem: Problem, trajectory: Trajectory) -> int:
-    """How many moments there is something to see at."""
+    """Return the number of moments at which there is something to see."""
     everyone = arrival_times(trajectory.arrived, problem.dt).max()
     last = len(trajectory.states) - 1
     return last + 1 if np.isinf(everyone) else min(last, round((everyone + _AFTERMATH) / problem.dt)) + 1

@@ -1,4 +1,4 @@
-"""How all is drawn that this package draws, whatever the user's rcParams say."""
+"""Style of all that this package draws, whatever the user's rcParams say."""
 
 from __future__ import annotations
 

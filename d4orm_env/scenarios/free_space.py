@@ -1,4 +1,4 @@
-"""Where the robots of a team can drive among obstacles."""
+"""Free space for the robots of a team among obstacles."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class FreeSpace:
         return places
 
     def contains(self, place: Points) -> bool:
-        """Whether the lattice point nearest to a place belongs to the region."""
+        """Check whether the lattice point nearest to a position belongs to the region."""
         index = np.round((place - self.low) / self.step).astype(int)
         within = ((index >= 0) & (index < self.inside.shape)).all()
         return bool(within and self.inside[tuple(index)])

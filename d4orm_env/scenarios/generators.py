@@ -22,7 +22,7 @@ def circle(settings: Settings, *, diameter: float = 5.0) -> Problem:
     """Robots evenly on a circle, each with its goal at the antipodal point.
 
     The paper's benchmark (section IV-B). Robot ``k`` starts at the angle ``2 pi k / K``. Nothing in it is random but
-    obstacles. A team of ``holonomic3d`` robots stands on the circle in the plane z = 0. Random obstacles lie inside the
+    obstacles. A team of ``holonomic3d`` robots is on the circle in the plane z = 0. Random obstacles lie inside the
     circle.
 
     Args:
@@ -67,7 +67,7 @@ def random(settings: Settings, *, size: float | None = None) -> Problem:
 def four_obstacles(settings: Settings, *, diameter: float = 5.0, obstacle_distance: float = 1.0) -> Problem:
     """The circle with four round obstacles about its centre.
 
-    The paper gives no coordinates for its "2D Holo 4 Obs". Here the obstacles stand at ``(+-1, 0)`` and ``(0, +-1)``,
+    The paper gives no coordinates for its "2D Holo 4 Obs". Here the obstacles are at ``(+-1, 0)`` and ``(0, +-1)``,
     radius 0.15 m (``obstacle_radius``): on the straight ways of robots 0, K/4, K/2 and 3K/4, and around the point where
     all ways cross. In 3D they are vertical cylinders. Random obstacles come on top.
 
@@ -102,7 +102,7 @@ def heterogeneous(settings: Settings, *, diameter: float = 5.0) -> Problem:
 def swap(settings: Settings, *, distance: float = 5.0, spacing: float | None = None) -> Problem:
     """Two rows of robots that face each other and exchange places.
 
-    Every robot's goal is straight across, where the robot that faces it stands. With an odd number the first row is one
+    Every robot's goal is straight across, where the robot that faces it starts. With an odd number the first row is one
     longer. Random obstacles lie between the rows.
 
     Args:

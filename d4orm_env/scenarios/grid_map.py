@@ -22,7 +22,7 @@ ROUNDING = 1e-3
 """More than float32 rounds away over a map, as a share."""
 
 MOST_PARTS = 8
-"""Lattice points per half of a cell at most; who needs more does not fit."""
+"""Lattice points per half of a cell at most; a team that needs more does not fit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ class GridMap:
 
 
 def float32_resolves(coordinate: float, cell: float) -> bool:
-    """Whether float32 holds so large a coordinate to a hundredth of a cell [m], as starts to one of the goal radius."""
+    """Check whether float32 holds so large a coordinate to a hundredth of a cell [m], as starts to the goal radius."""
     return coordinate <= LARGEST and bool(RESOLUTION * np.spacing(np.float32(coordinate)) <= cell)
 
 

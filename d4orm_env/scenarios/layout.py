@@ -1,4 +1,4 @@
-"""From the places of robots and obstacles to a problem: headings, horizon, random obstacles, the final check."""
+"""Layout of robots and obstacles, made into a problem: headings, horizon, random obstacles, the final check."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ HORIZON_SLACK = 1.6
 
 @dataclass(frozen=True)
 class Layout:
-    """Where a scenario puts things.
+    """Positions of a scenario's robots and obstacles.
 
     Attributes:
         starts: ``(K, d)`` start positions [m].

@@ -45,7 +45,7 @@ def load_map(path: PathLike, cell: float = 0.6) -> World:
 
 
 def read_map(path: PathLike, cell: float = 0.6) -> GridMap:
-    """As :func:`load_map`; the same object for the same content."""
+    """Read a map as :func:`load_map`; the same object for the same content."""
     cell = bounded(cell, "cell")
     if not isinstance(path, str | os.PathLike):
         raise ValueError(f"the path of a map must be text or a path, not {shown(path)}")

@@ -21,7 +21,7 @@ from d4orm_env.scenarios.settings import Settings, bounded, require_plane
 from d4orm_env.scenarios.well_formed import lattice_step, populate
 
 SIDE, ROBOTS = 6.0, 20
-"""Of the maps [m], the publication's being 2 wide, for so many robots at most; more have as much room each."""
+"""Side of the maps [m], the publication's being 2, and most robots for it; more have as much room each."""
 
 Box = tuple[float, float, float, float]
 """Centre and sides in a map from -1 to 1."""

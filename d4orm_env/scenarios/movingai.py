@@ -15,7 +15,7 @@ from d4orm_env.scenarios.grid_map import MAX_CELLS, GridMap
 PASSABLE, BLOCKED = b".GSE", b"@OTW"
 """Ground, swamp or service points, emitters; out of bounds, trees and water."""
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
-"""What some editors put before UTF-8 text."""
+"""Prefix that some editors put before UTF-8 text."""
 
 
 def parse_map(content: bytes, cell: float) -> GridMap:

@@ -65,7 +65,7 @@ def _grid_map(blocked: bytes, shape: tuple[int, int], resolution: float, low: tu
 
 
 def _occupancy(content: bytes, mode: Mode, negate: bool) -> Floats:
-    """How occupied each cell is, from 0 to 1, and infinite where that is unknown, ``(rows, columns)``.
+    """Return the occupancy of each cell, from 0 to 1, and infinite where that is unknown, ``(rows, columns)``.
 
     Colours and ``negate`` count as in map_server and nav2 (loadMapFromFile), and alpha so that it never makes a cell
     free. Trinary: averaged in with the colours, as they do, but for an opaque pixel, which is as in an image without
@@ -116,7 +116,7 @@ def _brightness(colours: np.ndarray) -> Floats:
 
 
 def _mode(value: object) -> Mode:
-    """As nav2 reads it: in letters of either case."""
+    """Check a mode as nav2 does: in letters of either case."""
     for mode in get_args(Mode):
         if isinstance(value, str) and value.lower() == mode:
             return mode

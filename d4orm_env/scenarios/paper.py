@@ -21,7 +21,7 @@ from d4orm_env.scenarios.settings import OBSTACLES, STARTS_AND_GOALS, Settings, 
 SINGLE_RADIUS = 0.5
 """Radius of a single obstacle [m]."""
 SIDE, NEAREST, FURTHEST = 10.0, 5.0, 6.0
-"""Of the random square, and how far a robot starts from its goal [m]."""
+"""Side of the random square, and least and largest distance of a start from its goal [m]."""
 SPACING = 6
 """Least distance of two random starts, in robots' radii."""
 RESTARTS, CANDIDATES = 20, 1000

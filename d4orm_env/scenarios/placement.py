@@ -24,7 +24,7 @@ DENSITY = {2: 0.4, 3: 0.25}
 
 
 class Area(NamedTuple):
-    """Where points are drawn from: a box, or the ellipse (ellipsoid) inside it.
+    """Region that points are drawn from: a box, or the ellipse (ellipsoid) inside it.
 
     Attributes:
         half_extent: ``(d,)`` half the sides of the box [m].

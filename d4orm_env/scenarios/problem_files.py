@@ -64,7 +64,7 @@ def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:
 
 
 def scenario_text(problem: Problem) -> str:
-    """What :func:`save_problem` writes: one line for each robot and obstacle."""
+    """Return the text that :func:`save_problem` writes: one line for each robot and obstacle."""
     lines = []
     for key, value in describe(problem).items():
         if isinstance(value, list):
@@ -82,7 +82,7 @@ def scenario_text(problem: Problem) -> str:
 
 
 def _flow(value: object) -> str:
-    """On one line; text in quotes."""
+    """Write a value on one line; text in quotes."""
     style = '"' if isinstance(value, str) else None
     text: str = yaml.safe_dump(
         value, width=2**31 - 1, sort_keys=False, explicit_end=False, default_style=style, default_flow_style=True

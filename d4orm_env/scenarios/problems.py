@@ -29,7 +29,7 @@ class _File:
 
 
 def is_scenario_file(scenario: object) -> TypeGuard[str | os.PathLike[str]]:
-    """Whether what is given as a scenario is the path of a file."""
+    """Check whether a scenario is given as the path of a file."""
     if isinstance(scenario, str):
         return is_yaml_path(scenario)
     return isinstance(scenario, os.PathLike)
@@ -51,7 +51,7 @@ def find_scenario(scenario: ScenarioLike) -> Scenario:
 
 
 def unknown_argument(scenario: ScenarioLike | None, names: Iterable[str], others: Iterable[str] = ()) -> str:
-    """What is wrong with the first of ``names`` that is no argument of that scenario; the empty string if none is.
+    """Describe the first of ``names`` that is no argument of that scenario; the empty string if there is none.
 
     Args:
         scenario: As for :func:`make_problem`; ``None`` is any of the registered ones.

@@ -1,4 +1,4 @@
-"""What a scenario is: a function that makes problems, the package's own or a user's."""
+"""Scenario: a function that makes problems, the package's own or a user's."""
 
 from __future__ import annotations
 
@@ -94,23 +94,23 @@ class Scenario:
 
     @property
     def takes_any(self) -> bool:
-        """Whether the generator looks at its settings itself."""
+        """True if the generator looks at its settings itself."""
         several = any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in self._parameters)
         return several and not isinstance(self.generator, BuiltIn)
 
     @property
     def draws(self) -> bool:
-        """Whether every seed is known to give other places, and never another team."""
+        """True if every seed is known to give other positions, and never another team."""
         return isinstance(self.generator, BuiltIn) and self.generator.draws
 
     @property
     def has_own_size(self) -> bool:
-        """Whether the generator has a team size of its own, for when none is asked for."""
+        """True if the generator has a team size of its own, for when none is asked for."""
         second = self._parameters[1:2]
         return bool(second) and second[0].default is not inspect.Parameter.empty
 
     def complaint(self, names: Iterable[str], others: Iterable[str] = ()) -> str:
-        """What is wrong with the first of ``names`` that is no argument of this; the empty string if none is.
+        """Describe the first of ``names`` that is no argument of this; the empty string if there is none.
 
         Args:
             names: The arguments given.
@@ -149,7 +149,7 @@ class Scenario:
 
 
 def complain(owner: str, known: Iterable[str], names: Iterable[str]) -> str:
-    """What is wrong with the first of ``names`` that is not ``known``; the empty string if all are."""
+    """Describe the first of ``names`` that is not ``known``; the empty string if there is none."""
     known = sorted(known)
     for name in names:
         if name not in known:

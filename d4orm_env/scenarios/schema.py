@@ -1,4 +1,4 @@
-"""What a scenario file may hold, and the problem it means.
+"""Schema of a scenario file, and the problem it means.
 
 The public description is the documented example ``examples/scenarios/mixed_team.yaml``.
 """
@@ -240,7 +240,7 @@ PARTS: dict[tuple[str, ...], type[BaseModel]] = {
 
 
 def start_fields(model: Model) -> tuple[str, ...]:
-    """What a start state of that model holds beside its position: named parts, or ``state`` for all that there is."""
+    """Return the parts of a start state of that model beside its position, or ``state`` for all that there is."""
     rest = model.state_names[model.dimension :]
     if rest in ((), ("heading",), ("heading", "speed")):
         return rest

@@ -41,7 +41,7 @@ class Settings:
         horizon: Number of steps; ``None`` follows :func:`~d4orm_env.scenarios.layout.default_horizon`.
         goal_radius: A robot within it has arrived [m].
         goal_speed: Speed at which a robot may still dock [m/s]; ``None`` is no limit.
-        arrival: ``"dock"``: who arrives stands there for ever. ``"stay"``: it may be moved again, to make way.
+        arrival: ``"dock"``: a robot that arrives stays there for good. ``"stay"``: it may be moved again.
         collision_penalty: Taken off the reward per step within the margin of a robot, and of an obstacle.
         max_speed: Speed limit [m/s], one or ``K``.
         max_acceleration: Acceleration limit [m/s^2], one or ``K``.

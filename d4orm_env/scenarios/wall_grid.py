@@ -18,7 +18,7 @@ SAMPLES, TRIES = 16, 1000
 
 
 class Openings(NamedTuple):
-    """Which walls between ``columns`` times ``rows`` squares are open; all squares are connected.
+    """Openings in the walls between ``columns`` times ``rows`` squares; all squares are connected.
 
     Attributes:
         right: ``(rows, columns - 1)`` between a square and the next to its right.

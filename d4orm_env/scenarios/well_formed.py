@@ -1,4 +1,4 @@
-"""Starts and goals among walls, such that everybody gets by: a robot never has to wait for one that stands.
+"""Starts and goals among walls, such that every robot gets by those at rest.
 
 Such an instance is called well-formed (Cap, Novak, Kleiner and Selecky, 2015): each robot has a way from its start to
 its goal that keeps clear of all other starts and goals. One after another, in any order, all of them arrive, and none
@@ -28,7 +28,7 @@ ENOUGH_POINTS = 2**18
 """Lattice points that do where nothing is narrow."""
 
 WINDOW = {2: 32, 3: 8}
-"""How many lattice points away a way round a place is looked for at least."""
+"""Least distance, in lattice points, within which a way round a place is looked for."""
 
 TRIES, ROUNDS = 200, 3
 """Places looked at for each start or goal in one attempt to find all of them, and attempts."""
@@ -39,7 +39,7 @@ class _Placing:
 
     Args:
         inside: The region.
-        separation: How far those who pass by stay away from a place, in steps of the lattice.
+        separation: Distance of robots that pass by from a place, in steps of the lattice.
         most: How many places there will be.
     """
 
@@ -58,7 +58,7 @@ class _Placing:
         self._disc = self._wide_disc[self._about(np.zeros(inside.ndim, np.int64), self._narrow)]
 
     def add(self, place: NDArray[np.int64]) -> bool:
-        """Take a place if that leaves everybody a way."""
+        """Take a place if that leaves every robot a path."""
         if self._taken[tuple(place + self._wide)] or not self._goes_round(place):
             return False
         taken = self._taken[self._about(place, self._narrow)]
@@ -75,7 +75,7 @@ class _Placing:
         return tuple(slice(index + self._wide - window, index + self._wide + window + 1) for index in place)
 
     def _goes_round(self, place: NDArray[np.int64]) -> bool:
-        """Whether all that a new disc touches of the untaken region is connected around it."""
+        """Check whether all that a new disc touches of the untaken region is connected around it."""
         about = self._about(place, self._wide)
         untaken = self._free[about] & (self._taken[about] == 0)
         regions, _ = self._label(untaken & ~self._wide_disc)
@@ -83,7 +83,7 @@ class _Placing:
         return len(np.unique(touched[touched > 0])) == 1
 
     def _in_touch(self, place: NDArray[np.int64]) -> bool:
-        """Whether a robot gets from a place to the untaken region through no disc but its own."""
+        """Check whether a robot gets from a place to the untaken region through no disc but its own."""
         about = self._about(place, self._narrow)
         free, taken = self._free[about], self._taken[about]
         untaken = free & (taken == 0)
@@ -94,7 +94,7 @@ class _Placing:
 def draw_places(
     random: np.random.Generator, space: FreeSpace, groups: Sequence[tuple[Mask | None, int]], separation: float
 ) -> Points:
-    """Random places, far enough apart that a robot gets from each to each while robots stand on all others.
+    """Random places, far enough apart that a robot gets from each to each while robots are on all others.
 
     Args:
         random: Where the draws come from.
@@ -121,7 +121,7 @@ def draw_places(
 
 
 def reserve_of(settings: Settings) -> float:
-    """What is left free beside the margin [m]."""
+    """Return the distance left free beside the margin [m]."""
     return RESERVE * settings.team.largest_radius
 
 

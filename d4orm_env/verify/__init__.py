@@ -43,12 +43,12 @@ def verify(problem: Problem, controls: ArrayLike) -> VerificationReport:
     ``CHORD_ERROR`` of its radius for each moving robot, by default 0.01 mm. Controls above the limits are reported, and
     clipped before they are executed, as the robot would.
 
-    Docking is decided at the end of each step; from then on the robot stands where it is and its controls are ignored.
+    Docking is decided at the end of each step; from then on the robot is at rest and its controls are ignored.
     The environments decide it in float32. Where a robot ends a step so close to the goal radius, or at a speed so close
     to the goal speed, that rounding decides (see :mod:`d4orm_env.verify.docking`), both readings are judged, that it
-    docks there and that it drives on, and the plan is fine only if everyone arrives and nobody touches in all of them.
+    docks there and that it drives on, and the plan is fine only if all arrive without a collision in all of them.
 
-    Where arrival is to stay rather than to dock, nobody stands for ever: a robot must be at its goal, beyond what
+    Where arrival is to stay rather than to dock, goals do not absorb: a robot must be at its goal, beyond what
     rounding decides, from some step to the last.
 
     Controls that are not finite define no motion: they are reported, and nothing else is judged. So are robots that
@@ -98,7 +98,7 @@ def _judged(problem: Problem, motion: TeamMotion, course: _Course) -> Verificati
 
 
 class _Course:
-    """Where all robots are over the whole horizon, some steps at a time."""
+    """Positions of all robots over the whole horizon, some steps at a time."""
 
     def __init__(self, motion: TeamMotion, sub_steps: int, start: Floats) -> None:
         self._motion, self._sub_steps = motion, sub_steps
@@ -115,7 +115,7 @@ class _Course:
         return (slice(first, first + size) for first in range(0, horizon, size))
 
     def stretches(self, docking: Docking, num_pairs: int) -> Iterator[Stretch]:
-        """All steps, with a body for every reading of every robot, standing from where it docks."""
+        """All steps, with a body for every reading of every robot, at rest once it docks."""
         horizon, dt, robot = len(self.ends) - 1, self._motion.dt, docking.robot
         stop = np.minimum(docking.steps, horizon)
         docked = self.ends[stop, robot]

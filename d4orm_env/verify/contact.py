@@ -1,4 +1,4 @@
-"""What bodies come close to, and when: closest approach over continuous time.
+"""Closest approach of bodies over continuous time, and its time.
 
 The motion is cut into sub-steps so short that each curve departs from its chord by at most ``CHORD_ERROR`` of the
 radius, and on the chords the closest approach is solved exactly.
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 Indices = NDArray[np.intp]
 
 _ROUNDING = 2.0**-30
-"""Of distances, as a share of how far anybody gets."""
+"""Rounding of distances, as a share of how far any robot gets."""
 _WIDER = 1 + 2.0**-17
-"""By how much boxes are stretched for rounding."""
+"""Factor by which boxes are stretched for rounding."""
 
 BLOCKS = (128, 32, 8, 1)
 """Steps that are judged at once, from many to one."""
@@ -63,7 +63,7 @@ class Stretch:
         return self.path[steps, :, bodies]
 
     def times(self, steps: Indices, sub_steps: Indices, fraction: Floats) -> Floats:
-        """When that fraction of that sub-step of that step has passed [s]."""
+        """Return the time at which that fraction of that sub-step of that step has passed [s]."""
         sub_step = self.dt / (self.path.shape[1] - 1)
         times: Floats = self.start + steps * self.dt + (sub_steps + fraction) * sub_step
         return times
@@ -89,7 +89,7 @@ class Watch(ABC):
 
     @abstractmethod
     def bodies(self, pairs: Indices) -> Sequence[Indices]:
-        """Whose motion changes the gaps of these pairs."""
+        """Return the bodies whose motion changes the gaps of these pairs."""
 
     @abstractmethod
     def approach(self, stretch: Stretch, steps: Indices, pairs: Indices) -> tuple[Floats, Floats]:
@@ -220,7 +220,7 @@ class Pairs(Watch):
 
 
 class Static(Watch):
-    """Robots against things that stand, one column each."""
+    """Robots against static things, one column each."""
 
     def __init__(self, kind: str, robot: Indices, radius: Floats, names: Sequence[str]) -> None:
         rows, columns = (index.ravel() for index in np.indices((len(robot), len(names))))
@@ -322,7 +322,7 @@ class Bounds(Static):
 
 
 def surroundings(world: World, robot: Indices, radius: Floats) -> list[Watch]:
-    """What watches for each kind of obstacle there is, and for the bounds."""
+    """Return a watch for each kind of obstacle there is, and for the bounds."""
     watches: list[Watch] = []
     for shape in ("circles", "spheres", "cylinders"):
         obstacles = np.asarray(getattr(world, shape), np.float64)

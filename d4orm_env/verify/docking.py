@@ -1,4 +1,4 @@
-"""When robots dock, where rounding decides it in every way that it could.
+"""Docking of robots, where rounding decides it in every way that it could.
 
 The engines decide docking in float32. A robot that ends a step so close to its goal radius, or to the goal speed, that
 their rounding could decide either way has several *readings*: it docks there, or drives on, until a step at which it
@@ -50,7 +50,7 @@ class Docking:
     violations: list[Violation]
 
     def note(self, robot: int, dt: float) -> str:
-        """What to say of a robot with several readings, for the details of a violation."""
+        """Describe a robot with several readings, for the details of a violation."""
         steps = self.steps[self.robot == robot]
         if len(steps) == 1:
             return ""
@@ -82,7 +82,7 @@ def find_docking(problem: Problem, motion: TeamMotion, ends: Floats) -> Docking:
 
 
 def _staying(problem: Problem, motion: TeamMotion, distance: Floats, certain: NDArray[np.bool_]) -> Docking:
-    """Nobody docks: a robot has arrived when it is at its goal, beyond doubt, from some step to the last."""
+    """Goals do not absorb: a robot has arrived when it is at its goal, beyond doubt, from some step to the last."""
     horizon, num_robots = distance.shape
     away = horizon - np.argmax(~certain[::-1], axis=0)
     since = np.where(certain.all(axis=0), 1, away + 1)

@@ -52,7 +52,7 @@ def box_distance(points: Floats, boxes: Floats) -> Floats:
 
 
 def box_approach(start: Floats, end: Floats, boxes: Floats) -> tuple[Floats, Floats]:
-    """As :func:`closest_approach`, for the signed distance to boxes.
+    """Return what :func:`closest_approach` does, for the signed distance to boxes.
 
     That distance is convex along a chord, so its minimum lies next to the best of any grid of points: a search in ever
     finer grids brackets it without fail.
@@ -89,8 +89,8 @@ def polygon_distance(points: Floats, corners: Floats) -> Floats:
 
 
 def polygon_approach(start: Floats, end: Floats, corners: Floats) -> tuple[Floats, Floats]:
-    """As :func:`closest_approach`, for the signed distance to a simple polygon; where a chord crosses its outline from
-    outside to outside, zero at the crossing.
+    """Return what :func:`closest_approach` does, for the signed distance to a simple polygon; where a chord crosses its
+    outline from outside to outside, zero at the crossing.
     """
     before, after = polygon_distance(start, corners), polygon_distance(end, corners)
     smallest, fraction = np.minimum(before, after), (after < before).astype(np.float64)

@@ -1,4 +1,4 @@
-"""How robots of a model that has no equations in :mod:`~d4orm_env.verify.motion` move: its derivative, in float64.
+"""Motion of robots whose model has no equations in :mod:`~d4orm_env.verify.motion`: its derivative, in float64.
 
 Of such a model the judge takes its word for the derivative, the limits and the velocity, and integrates anew: classical
 Runge-Kutta in many sub-steps of a control step, with the same bits on every processor.
@@ -25,7 +25,7 @@ SUB_STEPS = 20
 STATE_ERROR = 1e-7
 """Largest error of a control step's integration that one with more sub-steps reveals, in units of states."""
 GAP = 1e-10
-"""What steps may miss each other by in the end, in units of states, or as a share of the largest state."""
+"""Error that steps may have in the end, in units of states, or as a share of the largest state."""
 CORRECTIONS = 5
 """Times that it is tried to make good what they miss each other by: two suffice mostly."""
 ASIDE = 1e-6
@@ -97,7 +97,7 @@ class Integrated:
         return np.stack(states, axis=1)
 
     def _sub_steps(self, begins: Floats) -> int:
-        """How many sub-steps a step takes; ``begins`` ``(n, H, R)`` are about where steps begin."""
+        """Return the number of sub-steps of a step; ``begins`` ``(n, H, R)`` are about where steps begin."""
         sub_steps = 2
         while sub_steps < SUB_STEPS:
             coarse, fine = (self._integrated(begins, self._commands, times * sub_steps) for times in (1, 2))

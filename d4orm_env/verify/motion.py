@@ -1,4 +1,4 @@
-"""How robots move under a plan, written again in float64: clipping, the models in continuous time, the speed limit.
+"""Motion of robots under a plan, written again in float64: clipping, the models in continuous time, the speed limit.
 
 Within a control step holonomic robots move on parabolas, integrated in closed form; the heading and speed of a
 differential drive are linear in time and its position is their Simpson quadrature. Other models are
@@ -88,7 +88,7 @@ class TeamMotion:
         return limits
 
     def limited_quantity(self, robot: int, column: int) -> str:
-        """What a column of :attr:`limits` limits, with its unit."""
+        """Return the quantity that a column of :attr:`limits` limits, with its unit."""
         if robot in self._names:
             return self._names[robot][column]
         if self.wheeled[robot]:

@@ -1,4 +1,4 @@
-"""What :func:`d4orm_env.verify.verify` reports."""
+"""Report of :func:`d4orm_env.verify.verify`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Violation:
 
 @dataclass(frozen=True, eq=False)
 class VerificationReport:
-    """What :func:`~d4orm_env.verify.verify` found.
+    """Findings of :func:`~d4orm_env.verify.verify`.
 
     Attributes:
         min_separation: Smallest gap between the surfaces of two robots over continuous time, negative where they
@@ -51,5 +51,5 @@ class VerificationReport:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is wrong."""
+        """True if nothing is wrong."""
         return not self.violations

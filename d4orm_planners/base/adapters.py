@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 __all__ = ["SharedPolicy", "from_rllib", "from_sb3", "from_torchrl"]
 
 Key: TypeAlias = str | tuple[str, ...]
-"""Of a ``TensorDict``."""
+"""A key of a ``TensorDict``."""
 
 Model: TypeAlias = Any
-"""Of a library that need not be installed."""
+"""A model of a library that need not be installed."""
 
 
 class SharedPolicy(Policy):

@@ -26,7 +26,7 @@ class Candidate:
         controls: ``(H, K, m)`` as executed: inside the limits, zero once docked.
         trajectory: Their rollout.
         failed: ``(K,)`` robots that do not arrive, or violate the margin at some step that was checked.
-        report: What :func:`d4orm_env.verify` says; ``None`` where somebody fails at any step, and it was not asked.
+        report: What :func:`d4orm_env.verify` says; ``None`` where a robot fails at any step, and it was not asked.
     """
 
     planned: FloatArray
@@ -37,7 +37,7 @@ class Candidate:
 
     @property
     def solved(self) -> bool:
-        """Whether everyone arrives, the margin is kept at every step, and :func:`d4orm_env.verify` agrees."""
+        """True if all arrive, the margin is kept at every step, and :func:`d4orm_env.verify` agrees."""
         return self.report is not None and self.report.ok
 
     @property
@@ -60,7 +60,7 @@ class Candidate:
 
 
 def evaluate_controls(engine: Engine, problem: Problem, controls: FloatArray, check_interval: int = 1) -> Candidate:
-    """Roll controls ``(H, K, m)`` out and judge them: who fails by every so-manyth step, the solution by all."""
+    """Roll controls ``(H, K, m)`` out and judge them: failures at some steps, a solution at all."""
     reach = PLAN_REACH * problem.team.control_limits
     bounded = np.clip(controls, -reach, reach)
     trajectory = engine.rollout(problem, bounded)

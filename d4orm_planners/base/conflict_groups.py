@@ -1,4 +1,4 @@
-"""Which robots of an infeasible plan to replan together (paper, section V, failure-aware grouping): pure functions."""
+"""Groups of robots of an infeasible plan to replan together (paper, section V, failure-aware grouping)."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 
 Graph: TypeAlias = tuple[frozenset[int], ...]
-"""For each robot those that it is in conflict with."""
+"""The robots that each robot is in conflict with."""
 
 Groups = tuple[tuple[int, ...], ...]
 
 
 def conflicts(positions: FloatArray, radius: ArrayLike, margin: float) -> Graph:
-    """Which robots come within the margin of each other at any step after the start.
+    """Find the robots that come within the margin of each other at any step after the start.
 
     Args:
         positions: ``(H+1, K, d)`` [m].
@@ -91,7 +91,7 @@ def failure_groups(failed: BoolArray, graph: Graph) -> Groups:
 
 
 def independent_robots(candidates: Iterable[int], graph: Graph) -> tuple[int, ...]:
-    """Those of the candidates, taken in order, that conflict with none taken before; sorted.
+    """Return those candidates, taken in order, that conflict with none taken before; sorted.
 
     Args:
         candidates: Robots, the most wanted first.

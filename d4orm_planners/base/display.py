@@ -1,4 +1,4 @@
-"""What plans and episodes have in common for whoever looks at them: text, pictures, replays."""
+"""Display of plans and episodes: text, pictures, replays."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class DisplayMixin:
         return plot(self.problem, self.trajectory, axes)
 
     def motion(self: _HasMotion, title: str | None = None, denoising: Denoising | None = None) -> ReplayMotion:
-        """What a replay shows; :class:`d4orm_env.render.replay.Replay` puts several side by side.
+        """Return the motion of a replay; :class:`d4orm_env.render.replay.Replay` puts several side by side.
 
         Args:
             title: What to call it there; by default what it is called everywhere.

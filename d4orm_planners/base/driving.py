@@ -1,4 +1,4 @@
-"""Who drives a policy: one thread at a time, and one episode at a time."""
+"""Driver of a policy: one thread at a time, and one episode at a time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import wraps
 from typing import Any
 
 ATTRIBUTE = "_driving"
-"""Where a policy has its :class:`Driving`, which its copies do not share."""
+"""Attribute of a policy's :class:`Driving`, which its copies do not share."""
 _REMEDY = "make a policy for every thread, with make_policy() or copy.copy()"
 
 

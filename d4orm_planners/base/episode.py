@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
 
 PHYSICS = ("model", "mujoco")
-"""What moves robots: the equations that planners know, or rigid bodies in MuJoCo."""
+"""Physics that moves robots: the equations that planners know, or rigid bodies in MuJoCo."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Episode(DisplayMixin):
-    """What happened.
+    """Record of an episode.
 
     Attributes:
         problem: What the environment ran.
@@ -53,13 +53,13 @@ class Episode(DisplayMixin):
 
     @property
     def title(self) -> str:
-        """What happened where."""
+        """Title: policy and problem."""
         seconds = len(self.trajectory.controls) * self.problem.dt
         return f"{self.problem.name}, {count(self.problem.num_robots, 'robot')}, {seconds:.1f} s"
 
     @property
     def key_figures(self) -> list[Row]:
-        """How the team did."""
+        """Return the team's key figures."""
         return outcome_rows(self.metrics, self.problem.num_robots)
 
     @property
@@ -154,7 +154,7 @@ def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0) -> Episode:
 
 
 class _Outcome(NamedTuple):
-    """What a step did to every robot, each ``(K,)``."""
+    """Outcome of a step for every robot, each ``(K,)``."""
 
     rewards: FloatArray
     collided: BoolArray
@@ -162,7 +162,7 @@ class _Outcome(NamedTuple):
 
 
 def _outcome(env: ParallelEnv, rewards: dict[str, float]) -> _Outcome:
-    """What the last step did to all robots, those that have left and may be run into included."""
+    """Return the outcome of the last step for all robots, those that have left and may be run into included."""
     step = env.unwrapped.last_step
     outcome = _Outcome(step.rewards.copy(), step.collided, step.margin_violated)
     for agent, reward in rewards.items():  # as wrappers have made them
@@ -171,7 +171,7 @@ def _outcome(env: ParallelEnv, rewards: dict[str, float]) -> _Outcome:
 
 
 def _trajectory(problem: Problem, joints: list[JointState], outcomes: list[_Outcome]) -> Trajectory:
-    """What was seen at the reset and after every step, as one trajectory."""
+    """Join the reset and all steps to one trajectory."""
     states = np.stack([joint.states for joint in joints])
     return Trajectory(
         states=states,

@@ -6,7 +6,7 @@ Names of scenarios and policies, messages of errors and whatever else a store of
 from __future__ import annotations
 
 _MARKDOWN = "\\`*{}[]<>|~&"
-"""What begins markup within a line, that of MDX included, which has code in braces."""
+"""Characters that begin markup within a line, that of MDX included, which has code in braces."""
 _FORMULA = "=+-@"
 
 

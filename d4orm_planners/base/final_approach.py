@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 EARLIER = (1, 2, 4, 8)
 """Steps before its arrival from which on a robot drives otherwise."""
 SHARES = (1.0, 0.5, 0.75, 0.25)
-"""Of its control in the first of these steps that it takes: a stride that ends at the radius must begin elsewhere."""
+"""Shares of its control in the first of these steps: a stride that ends at the radius must begin elsewhere."""
 
 
 def drive_further_in(search: SolveRun, candidate: Candidate, judge: Callable[[FloatArray], Candidate]) -> Candidate:
@@ -49,7 +49,7 @@ def drive_further_in(search: SolveRun, candidate: Candidate, judge: Callable[[Fl
 
 
 def _driven(search: SolveRun, candidate: Candidate, robot: int, step: int, share: float) -> FloatArray:
-    """The team's controls, where a robot takes a share of its control at a step and drives straight home from there."""
+    """The team's controls, where a robot takes a share of its control at a step and then drives to the goal."""
     part, controls = search.problem.select([robot]), candidate.controls.copy()
     own = np.ascontiguousarray(controls[:, [robot], : part.control_size])
     own[step] *= np.float32(share)

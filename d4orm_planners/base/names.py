@@ -10,7 +10,7 @@ from d4orm_planners.base.planner import Planner
 
 
 def is_planner_class(thing: object) -> TypeGuard[type[Planner]]:
-    """Whether a thing is a subclass of Planner."""
+    """Check whether a thing is a subclass of Planner."""
     return isinstance(thing, type) and issubclass(thing, Planner)
 
 

@@ -30,15 +30,15 @@ from d4orm_planners.base.display import DisplayMixin
 from d4orm_planners.base.provenance import Provenance
 
 Status = Literal["solved", "iteration_limit", "time_limit", "stopped", "interrupted", "infeasible", "refuted"]
-"""How a search ended; see :class:`Plan`."""
+"""End of a search; see :class:`Plan`."""
 
 FORMAT = "d4orm-plan-1"
 
 HEADER_BYTES = 64 * 2**20
-"""Of a plan file's header, which has the problem and the history, at most."""
+"""Largest header of a plan file, which has the problem and the history."""
 
 TOLERANCE = 1e-3
-"""What a file's trajectory may differ from what its controls lead to, in SI units for robots of the default size:
+"""Deviation allowed between a file's trajectory and its controls' rollout, in SI units for robots of the default size:
 processors round differently."""
 
 
@@ -135,7 +135,7 @@ class Plan(DisplayMixin):
 
     @cached_property
     def verified(self) -> bool:
-        """Whether :func:`d4orm_env.verify` finds no fault with the controls; judged when it is first asked for."""
+        """True if :func:`d4orm_env.verify` finds no fault with the controls; judged when it is first asked for."""
         return self._report.ok
 
     @cached_property
@@ -151,9 +151,9 @@ class Plan(DisplayMixin):
 
     @property
     def failures(self) -> dict[str, str]:
-        """Which robots the plan leaves unsolved, and why: a sentence for each, by agent name; empty if it is solved.
+        """The robots that the plan leaves unsolved, and why: a sentence for each, by agent name; empty if it is solved.
 
-        It is the proof where there is one; else what each does wrong at the steps, or if nobody does anything, what
+        It is the proof where there is one; else what each does wrong at the steps, or if none does anything, what
         :func:`d4orm_env.verify` found.
         """
         if self.solved:
@@ -169,7 +169,7 @@ class Plan(DisplayMixin):
         return {f"robot_{robot}": "; ".join(reasons[robot]) for robot in sorted(reasons)}
 
     def _faults(self) -> dict[int, list[str]]:
-        """What robots do wrong at the steps."""
+        """Return the faults of robots at the steps."""
         problem, trajectory = self.problem, self.trajectory
         reach = np.asarray(problem.team.radius) + problem.margin
         near = conflicts(trajectory.positions, problem.team.radius, problem.margin)
@@ -193,14 +193,14 @@ class Plan(DisplayMixin):
 
     @property
     def title(self) -> str:
-        """What was planned by what, and how that ended."""
+        """Title: planner, problem and status."""
         spent = f"{count(self.iterations, 'iteration')}, {self.wall_time:.2f} s"
         team = f"{self.problem.name}, {count(self.problem.num_robots, 'robot')}"
         return f"{team} by {self.planner}: {self.status.replace('_', ' ')} after {spent}"
 
     @property
     def key_figures(self) -> list[Row]:
-        """What the plan leads to."""
+        """Return the plan's key figures."""
         return outcome_rows(self.metrics, self.problem.num_robots)
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -274,7 +274,7 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
 
 
 def failed_robots(trajectory: Trajectory, check_interval: int = 1) -> BoolArray:
-    """``(K,)`` who does not arrive, or violates the margin at some ``check_interval``-th step.
+    """``(K,)`` robots that do not arrive, or violate the margin at some ``check_interval``-th step.
 
     The start itself cannot be planned away, so it does not count.
     """
@@ -334,7 +334,7 @@ def _checked_trajectory(problem: Problem, archive: ArrayArchive) -> Trajectory:
 
 
 def _agree(problem: Problem, claimed: Trajectory, actual: Trajectory) -> bool:
-    """Whether two trajectories are the same but for rounding."""
+    """Check whether two trajectories are the same but for rounding."""
     size = problem.team.largest_radius / DEFAULT_RADIUS
     return all(
         np.allclose(

@@ -21,7 +21,7 @@ from d4orm_planners.engine.sampling_types import StepWatcher
 Callback = Callable[[IterationRecord], object]
 
 State: TypeAlias = Any
-"""What a planner keeps from one iteration to the next: a type of its own."""
+"""A planner's state from one iteration to the next: a type of its own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +42,7 @@ class PlannerConfig(CheckedSettings):
 
 @dataclass(frozen=True)
 class Iteration:
-    """What a planner's iteration hands to the loop.
+    """Result of a planner's iteration.
 
     Attributes:
         controls: ``(H, K, m)`` the new candidate.

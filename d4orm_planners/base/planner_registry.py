@@ -19,12 +19,12 @@ RECOMMENDED = "hybrid"
 """The planner that solves most problems, and soonest."""
 
 Presets: TypeAlias = Mapping[str, Mapping[str, object]]
-"""By name, settings."""
+"""Settings by preset."""
 
 Config = TypeVar("Config", bound=CheckedSettings)
 
 PolicyLike: TypeAlias = str | Policy | Planner | type[object] | Callable[..., object]
-"""What :func:`make_policy` takes; other objects with ``reset`` and ``act`` as well."""
+"""A policy as :func:`make_policy` takes it; other objects with ``reset`` and ``act`` as well."""
 
 
 def list_planners() -> tuple[str, ...]:
@@ -98,7 +98,7 @@ def make_policy(name: PolicyLike, **config: Any) -> Policy:
 
 
 def find_policy(policy: object) -> object:
-    """What stands behind a policy's name or import path; anything but text is returned as it is.
+    """Return the thing that a policy's name or import path stands for; anything but text is returned as it is.
 
     Raises:
         ValueError: If there is no such policy.
@@ -120,12 +120,12 @@ def find_policy(policy: object) -> object:
 
 
 def is_brought(policy: object) -> bool:
-    """Whether a policy is given itself, rather than by name or import path."""
+    """Check whether a policy is given itself, rather than by name or import path."""
     return callable(policy) or isinstance(policy, Planner) or _acts(policy)
 
 
 def origin(policy: object) -> object:
-    """What :func:`make_policy` takes for a policy in any process, whatever was registered there."""
+    """Return what :func:`make_policy` takes for a policy in any process, whatever was registered there."""
     for table in (PLANNERS, POLICIES):
         if isinstance(policy, str) and policy in table:
             return table.origin(policy)
@@ -133,13 +133,13 @@ def origin(policy: object) -> object:
 
 
 def is_planned(policy: object) -> bool:
-    """Whether a policy is a planner, whose plan is executed open loop."""
+    """Check whether a policy is a planner, whose plan is executed open loop."""
     kind = find_policy(policy)
     return is_planner_class(kind) or isinstance(kind, Planner)
 
 
 def makes_policy(kind: object) -> TypeGuard[Callable[..., object]]:
-    """Whether something that :func:`find_policy` found takes settings and makes a policy, rather than acts itself."""
+    """Check whether something from :func:`find_policy` takes settings and makes a policy, rather than acts itself."""
     return isinstance(kind, type) or (not _acts(kind) and callable(kind) and _required(kind) == 0)
 
 
@@ -202,7 +202,7 @@ def policy_settings(name: object, **config: Any) -> dict[str, object]:
 
 
 def _presets(kind: object) -> Presets:
-    """Of a planner's or policy's class; none where it has none."""
+    """Return the presets of a planner's or policy's class; none where it has none."""
     presets: Presets = getattr(kind, "presets", {})
     return presets
 
@@ -255,7 +255,7 @@ def _acts(thing: object) -> TypeGuard[Policy]:
 
 
 def _as_policy(thing: Any, owner: str) -> Policy:
-    """What acts itself, as a policy.
+    """Wrap what acts itself as a policy.
 
     Raises:
         ValueError: If it does not.
@@ -274,7 +274,7 @@ def _as_policy(thing: Any, owner: str) -> Policy:
 
 
 def _required(function: Callable[..., object]) -> int | None:
-    """How many positional parameters a function requires; ``None`` if that says nothing about it."""
+    """Return the number of positional parameters that a function requires; ``None`` if that says nothing about it."""
     try:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
@@ -322,7 +322,7 @@ def _time_limit(config: dict[str, object]) -> float | None:
 
 
 def _called(thing: object) -> str:
-    """What to call a policy in messages."""
+    """Return the name of a policy for messages."""
     return thing if isinstance(thing, str) else getattr(thing, "__name__", type(thing).__name__)
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 Observations = dict[str, FloatArray]
 Actions = dict[str, FloatArray]
-"""By agent."""
+"""Actions by agent."""
 
 
 class Policy(ABC):
@@ -83,7 +83,7 @@ class Policy(ABC):
         """
 
     def identity(self) -> dict[str, object]:
-        """What a store of trials tells this instance from others of its class by, as JSON has it.
+        """Identity that a store of trials tells this instance by from others of its class, as JSON has it.
 
         By default the settings in ``config``, if it has any, else its attributes that are numbers or text.
         """
@@ -120,7 +120,7 @@ class StatePolicy(Policy):
         return {agent: controls[robot] for agent, robot in zip(observations, robot_indices(observations))}
 
     def _begin(self, env: ParallelEnv, seed: int) -> None:
-        """What the policy does at a reset beyond looking at the problem."""
+        """Prepare for an episode, beyond looking at the problem."""
 
     @abstractmethod
     def _controls(self, joint: JointState) -> FloatArray:
@@ -138,7 +138,7 @@ def require_reset(policy: Policy) -> None:
 
 
 def robot_indices(agents: Iterable[str]) -> list[int]:
-    """Which robots the agents ``"robot_0"``, ... are."""
+    """Return the numbers of the robots ``"robot_0"``, ..."""
     return [int(agent.rsplit("_", 1)[1]) for agent in agents]
 
 

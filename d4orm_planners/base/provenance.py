@@ -1,4 +1,4 @@
-"""Where a plan comes from, for whoever reads it later: settings, version and machine."""
+"""Provenance of a plan, for later readers: settings, version and machine."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from d4orm_planners.base.machine import describe_machine
 
 @dataclass(frozen=True, kw_only=True)
 class Provenance:
-    """What made a plan, beside its planner's name and the seed.
+    """Origin of a plan, beside its planner's name and the seed.
 
     Attributes:
         preset: Of :func:`~d4orm_planners.make_planner`; ``None`` for the defaults.
@@ -35,7 +35,7 @@ class Provenance:
 
     @classmethod
     def here(cls, preset: str | None, settings: Mapping[str, object]) -> Provenance:
-        """Of what a planner with this preset and these settings makes here and now."""
+        """Return that of a plan made by a planner with this preset and these settings here and now."""
         plain = json.loads(json.dumps(settings, default=str))
         return cls(preset=preset, settings=plain, version=__version__, machine=_machine())
 

@@ -58,7 +58,7 @@ def _variance(value: float) -> float:
 
 
 def one_of(choices: Iterable[str]) -> AfterValidator:
-    """Of a text: it must be one of these."""
+    """Return a check that a text is one of these."""
     known = tuple(choices)
 
     def check(value: str) -> str:
@@ -73,7 +73,7 @@ Whole = Annotated[int, BeforeValidator(_whole), Field(le=LARGEST_WHOLE)]
 Count = Annotated[Whole, Field(ge=1)]
 Samples = Annotated[Whole, Field(ge=2, le=10**7)]
 Steps = Annotated[Whole, Field(ge=1, le=10**6)]
-"""Of samples and steps there are no more than memory and patience can hold."""
+"""A number of samples or steps, no more than memory and patience can hold."""
 Number = Annotated[float, BeforeValidator(_number), Field(le=LARGEST_NUMBER)]
 Positive = Annotated[Number, Field(gt=0)]
 Seconds = Annotated[Number, Field(ge=0, le=LARGEST)]
@@ -91,7 +91,7 @@ NOTHING: Mapping[str, object] = MappingProxyType({})
 
 @dataclass(frozen=True, kw_only=True)
 class CheckedSettings:
-    """What settings have in common; a subclass is a frozen dataclass with fields of the types above.
+    """Base of settings; a subclass is a frozen dataclass with fields of the types above.
 
     Raises:
         ValueError: If a value makes no sense; one line that names the setting, the value and what was expected.
@@ -156,7 +156,7 @@ _EXPECTED = {
     "bool_type": "True or False",
     "string_type": "text",
 }
-"""By pydantic's kinds of errors; others keep its own words."""
+"""Expectations by pydantic's kinds of errors; others keep its own words."""
 
 _PLAIN = {"above 0": "positive", "at least 0": "zero or more"}
 

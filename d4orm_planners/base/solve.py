@@ -45,7 +45,7 @@ class SolveRun:
         initial_controls: ``(H, K, m)`` to start from; zeros by default.
         engine: What rolls out and samples, if not the planner's own.
         judge: What makes a candidate of an iteration's controls, if not :func:`evaluate_controls`.
-        check_interval: Only at every so-manyth step is looked who fails (paper, section VI-A); a solution keeps the
+        check_interval: Failures are looked for at every so many steps only (paper, section VI-A); a solution keeps the
             margin at all steps.
 
     Attributes:
@@ -111,11 +111,11 @@ class SolveRun:
 
     @property
     def is_over(self) -> bool:
-        """Whether there is a solution, and nobody asks for a better one."""
+        """True if there is a solution, and no better one is asked for."""
         return self.best.solved and not self.planner.config.improve
 
     def should_stop(self) -> bool:
-        """Whether an iteration must come to its end as it is."""
+        """Check whether an iteration must come to its end as it is."""
         return self.time_left == 0 or self.cancelled.is_set()
 
     def denoise(

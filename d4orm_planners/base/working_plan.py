@@ -20,7 +20,7 @@ Costs = NDArray[np.float64]
 
 
 class WorkingPlan:
-    """What the team does, to be changed for some robots around all others.
+    """The team's plan, to be changed for some robots around all others.
 
     Args:
         search: The search.
@@ -32,7 +32,7 @@ class WorkingPlan:
         states: ``(H+1, K, n)``.
         arrived: ``(K,)`` whether each ends at its goal.
         refused: ``(K,)`` step of the fault that the report finds with each; ``H + 1`` for none, or once it moves.
-        index: Where everybody is.
+        index: Positions of all robots.
     """
 
     def __init__(self, search: SolveRun, trajectory: Trajectory, report: VerificationReport | None = None) -> None:
@@ -64,7 +64,7 @@ class WorkingPlan:
         return self.index.positions
 
     def conflicts(self) -> Graph:
-        """Who comes within the margin of whom after the start, at the steps that are checked."""
+        """Return which robots come within the margin of each other after the start, at the steps that are checked."""
         return graph_of(self.problem.num_robots, self._checked.pairs())
 
     def move(self, robots: ArrayLike, controls: FloatArray, states: FloatArray, arrived: ArrayLike) -> None:
@@ -81,7 +81,7 @@ class WorkingPlan:
             self._checked.move(index, states[:: self._interval, :, : self.problem.dimension])
 
     def faults(self, robots: ArrayLike) -> tuple[Costs, IntArray]:
-        """What robots ``(R,)`` do wrong at present, at the steps that are checked.
+        """Return the faults of robots ``(R,)`` at present, at the steps that are checked.
 
         Returns:
             ``(R,)`` counted in robots met: a missed goal and contact with an obstacle amount to several, docking where

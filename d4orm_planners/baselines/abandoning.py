@@ -10,10 +10,10 @@ from typing import TypeVar
 Result = TypeVar("Result")
 
 LOOK = 0.01
-"""How often the caller is asked whether to stop [s]."""
+"""Period of asking the caller whether to stop [s]."""
 
 GRACE = 0.05
-"""How long work that was asked to end is waited for [s]."""
+"""Time that work which was asked to end is waited for [s]."""
 
 
 def run_or_abandon(work: Callable[[Callable[[], bool]], Result], should_stop: Callable[[], bool]) -> Result | None:

@@ -25,13 +25,13 @@ from d4orm_env.dynamics.transition import TimeStep
 from d4orm_planners.baselines.abandoning import run_or_abandon
 
 OBJECTIVE_SCALE = 10.0
-"""Of the mean cost of a step, so that IPOPT's tolerance tells good motions from bad ones."""
+"""Scale of the mean cost of a step, so that IPOPT's tolerance tells good motions from bad ones."""
 
 FEASIBILITY = 1e-5
 """Largest violation of a constraint that IPOPT may leave, in the program's units; the clearance makes up for it."""
 
 ABANDONED = "Abandoned_At_Time_Limit"
-"""How a run ended that was left before IPOPT could end it."""
+"""Status of a run that was left before IPOPT could end it."""
 
 TINY = 1e-9
 """Added to squared distances, since the square root has no derivative at zero, in the program's units."""
@@ -52,7 +52,7 @@ Rows = tuple[Expression, float, float]
 
 
 class CollocatedMotion(NamedTuple):
-    """What the program decides on.
+    """Decision variables of the program.
 
     Attributes:
         states: ``(H+1, K, n)``, the start first.
@@ -116,7 +116,7 @@ class TeamProgram:
         Args:
             guess: Where IPOPT starts.
             contacts: What is kept clear of what, and when.
-            docks: ``(K,)`` steps by which the robots are at their goals, and from which on they stand there.
+            docks: ``(K,)`` steps by which the robots are at their goals, and from which on they stay there.
             options: IPOPT's.
             should_stop: Asked every hundredth of a second whether to end; it ends within a tenth, even where writing
                 the program or one of IPOPT's iterations takes longer.
@@ -164,7 +164,7 @@ class TeamProgram:
         return str(solver.stats()["return_status"])
 
     def contacts(self, motion: CollocatedMotion, lookout: float | None) -> Contacts:
-        """What comes within ``lookout`` [m] of the distance to keep, and when; everything always, for ``None``."""
+        """Find what comes within ``lookout`` [m] of the distance to keep, and when; everything always, for ``None``."""
         steps = np.arange(1, self.problem.horizon + 1)
         if lookout is None:
             return dict.fromkeys(self._encounters(), steps)
@@ -188,7 +188,7 @@ class TeamProgram:
         return self._norm(places[robot] - places[body])
 
     def _units(self) -> tuple[list[Floats], list[Floats]]:
-        """What every component of each robot's state and control is measured in: only lengths have a unit."""
+        """Return the units of every component of each robot's state and control: only lengths have one."""
         states, controls = [], []
         for model in self.models:
             lengths = [*range(model.dimension), *model.speed_indices]
@@ -211,7 +211,7 @@ class TeamProgram:
         return float(max(radius + self.problem.margin, np.hypot(radius, chord / 2)) + self.clearance)
 
     def _obstacles(self) -> Iterator[Expression]:
-        """For each obstacle the distance to its surface, negative inside, as a function of columns of points."""
+        """Yield, per obstacle, the distance to its surface, negative inside, as a function of columns of points."""
         ca, world = self.casadi, self.problem.world
         dimension = world.dimension
         for centre, radius, axes in chain(
@@ -352,7 +352,7 @@ class TeamProgram:
 def _stopper(
     casadi: Any, sizes: dict[str, int], keep: Callable[[Expression], None], ends: Callable[[], bool]
 ) -> Expression:
-    """What IPOPT calls after every iteration of a program of these sizes, and what ends it once ``ends()`` is true."""
+    """Return a callback for IPOPT, after every iteration of a program of these sizes, to end it at ``ends()``."""
 
     class Stopper(casadi.Callback):
         def __init__(self) -> None:

@@ -9,7 +9,7 @@ from d4orm_planners.tracking.steering import drive_to_goal
 
 
 class GoToGoal(StatePolicy):
-    """Drives straight to the goal and brakes for it, as if nobody else were there."""
+    """Drives straight to the goal and brakes for it, as if it were alone."""
 
     name = "go-to-goal"
 

@@ -41,7 +41,7 @@ class IpoptConfig(PlannerConfig):
             steps of the fastest robot at full speed; ``None`` keeps them clear of everything at every step, as in the
             paper.
         rounds: Solves per restart. As long as the rollout does not keep the margin, the next one begins where the last
-            one ended; what came near is minded too, and robots stand where they docked. The paper solves once.
+            one ended; what came near is minded too, and robots stay where they docked. The paper solves once.
         clearance: Added to every distance to keep, for what rounding and tolerances take away, in the same steps.
         tolerance: IPOPT's, on the scaled optimality error.
         barrier: IPOPT's first barrier parameter.

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
 
 CORNERS = 16
-"""Of the polygons that stand for round obstacles and docked robots."""
+"""Corners of the polygons that stand for round obstacles and docked robots."""
 
 
 Neighbors = Annotated[Whole, Field(ge=0, le=10**6)]

@@ -1,1 +1,1 @@
-"""How fast the engines, the environments and the planners are on this machine."""
+"""Benchmark of the engines, the environments and the planners on this machine."""

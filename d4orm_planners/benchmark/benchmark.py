@@ -49,7 +49,7 @@ def circle(num_robots: int, model: str, horizon: int) -> Problem:
 
 
 def diameter(num_robots: int) -> float:
-    """Of the circle [m]: 18 m for 100 robots, as in the paper."""
+    """Return the circle's diameter [m]: 18 m for 100 robots, as in the paper."""
     return max(5.0, 0.18 * num_robots)
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
 
 DISTURBANCES: tuple[AnyDisturbance, ...] = (Delay(2), Dropout(0.3), StateNoise(0.02, 0.05))
-"""With what environments are stepped beside those that nothing disturbs."""
+"""Disturbances of environments that are stepped beside those that nothing disturbs."""
 
 RIGID = ("holonomic2d", "differential_drive")
 """Models that are stepped as rigid bodies, where MuJoCo is installed."""

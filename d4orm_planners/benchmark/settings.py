@@ -1,4 +1,4 @@
-"""What to measure, and how long: in full, and for a first look."""
+"""Settings of a benchmark: in full, and for a first look."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ ENGINES = ("cpu", "jax", "plain")
 MODELS = (*COMMON, "unicycle", "car")
 
 Robots = Annotated[Count, Field(le=10_000)]
-"""As many as scenarios make."""
+"""Number of robots, as many as scenarios make."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkSettings(CheckedSettings):
-    """What to measure, and how long.
+    """Settings of a benchmark.
 
     Attributes:
         num_robots: Team sizes.
@@ -96,4 +96,4 @@ QUICK: Mapping[str, object] = {
     "obstacles": (4, 200),
     "map_cells": (32,),
 }
-"""What differs in a benchmark of about a minute, for a first look."""
+"""Settings of a benchmark of about a minute, for a first look."""

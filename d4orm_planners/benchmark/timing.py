@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 Row: TypeAlias = dict[str, Any]
-"""What was measured in one case, by column: numbers, texts and :class:`Spread`."""
+"""Measurement of one case, by column: numbers, texts and :class:`Spread`."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What obstacles cost: iterations, environment steps, verify() and the index of obstacles, beside the open world."""
+"""Cost of obstacles: iterations, environment steps, verify() and the index of obstacles, beside the open world."""
 
 from __future__ import annotations
 

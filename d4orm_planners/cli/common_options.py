@@ -32,7 +32,7 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no t
 
 @dataclass(frozen=True, kw_only=True)
 class ProblemOptions:
-    """Which problem."""
+    """Options on the problem."""
 
     context: typer.Context
     scenario: Annotated[
@@ -79,7 +79,7 @@ class ProblemOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class PictureOptions:
-    """What to draw, and how much to say."""
+    """Options on pictures, and on how much to say."""
 
     picture: Annotated[Path | None, typer.Option("--picture", help="Picture to write: .png, .svg or .pdf.")] = None
     animation: Annotated[Path | None, typer.Option("--animation", help="Animation to write: .gif or .mp4.")] = None

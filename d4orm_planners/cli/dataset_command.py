@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetOptions:
-    """Whose demonstrations, where, and how they are written."""
+    """Options on demonstrations and their files."""
 
     context: typer.Context
     policy: Annotated[str, typer.Option("--policy", "-p", help="Planner, policy or package.module:Name.")] = "d4orm-c2f"
@@ -62,7 +62,7 @@ class DatasetOptions:
     quiet: Quiet = False
 
     def demonstrations(self) -> Demonstrations:
-        """What to record.
+        """Return the demonstrations to record.
 
         Raises:
             ValueError: For an option that makes no sense, or does not go with a scenario file.

@@ -40,7 +40,7 @@ Out = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to, and 
 
 @dataclass(frozen=True, kw_only=True)
 class StudyOptions:
-    """What to compare, and how to run it."""
+    """Options on a study, and on how to run it."""
 
     policies: Annotated[
         list[str] | None,

@@ -23,7 +23,7 @@ ENDLESS = 10**9
 
 @dataclass(frozen=True)
 class NodeTask:
-    """What a node has to do.
+    """Task of a node.
 
     Attributes:
         planner: The planner, as one node.

@@ -1,4 +1,4 @@
-"""What commands print and draw."""
+"""Output of commands, in print and in pictures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def episode_rows(episode: Episode) -> list[tuple[str, str]]:
-    """What happened in an episode."""
+    """Return the key figures of an episode."""
     metrics = episode.metrics
     return [
         ("success", "yes" if metrics["success"] else "no"),
@@ -29,7 +29,7 @@ def episode_rows(episode: Episode) -> list[tuple[str, str]]:
 
 
 def print_plan(plan: Plan) -> None:
-    """How a plan was found and how good it is."""
+    """Print how a plan was found and how good it is."""
     metrics = plan.metrics
     rows = [
         ("solved", "yes" if plan.solved else f"no ({plan.status})"),

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class PlanOptions(PictureOptions, ProblemOptions):
-    """What to plan, with what, and what to write."""
+    """Options on the planner, and on what to write."""
 
     planner: Annotated[
         str | None,

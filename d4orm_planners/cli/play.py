@@ -27,7 +27,7 @@ LAST_WAIT = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class PlayOptions(ProblemOptions):
-    """What to begin with, and where to be found."""
+    """Options on the first scene, and on the page's address."""
 
     policy: Annotated[
         str, typer.Option("--policy", "-p", help="What drives (see `d4orm planners`); several, separated by commas.")
@@ -91,5 +91,5 @@ def quieten_viser() -> None:
 
 
 def has_display() -> bool:
-    """Whether a browser would have something to draw on."""
+    """Check whether a browser would have something to draw on."""
     return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -1,4 +1,4 @@
-"""What a command says: a live line on the terminal while it works, and in the end what it found and wrote."""
+"""Messages of a command: a live line on the terminal while it works, and in the end what it found and wrote."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ReproduceOptions:
-    """Which figure, and which part of it."""
+    """Options on the figure, and on the part of it."""
 
     context: typer.Context
     figure: Annotated[str | None, typer.Argument(help="Which; without it, what there is.")] = None

@@ -27,7 +27,7 @@ STANDARD = (
 
 @dataclass(frozen=True, kw_only=True)
 class RobustnessOptions(StudyOptions):
-    """Those of ``d4orm evaluate``; without levels of noise or disturbances :data:`STANDARD`."""
+    """Options of ``d4orm evaluate``; without levels of noise or disturbances :data:`STANDARD`."""
 
     control_noise_std: NoiseLevels = None
     out: Out = Path("robustness")

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(PictureOptions, ProblemOptions):
-    """What to run, and where."""
+    """Options on the policy and the environment."""
 
     plan_file: Annotated[Path | None, typer.Argument(help="Plan to execute; plans anew without one.")] = None
     policy: Annotated[
@@ -52,7 +52,7 @@ class RunOptions(PictureOptions, ProblemOptions):
     ] = None
 
     def disturbances(self) -> tuple[AnyDisturbance, ...]:
-        """What goes wrong.
+        """Return the disturbances.
 
         Raises:
             ValueError: For an unknown name, or a level that makes no sense.

@@ -33,7 +33,7 @@ _IMITATION_ONLY = ("expert", "expert_settings", "dataset", "episodes", "rounds",
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
-    """What to learn, and where to write it."""
+    """Options on the training, and on its folder."""
 
     context: typer.Context
     algorithm: Annotated[str, typer.Argument(help="ppo or sac, or imitation of an expert.")]
@@ -158,7 +158,7 @@ def _imitation(options: TrainOptions) -> Callable[..., TrainingResult]:
 
 
 def _practice(options: TrainOptions) -> dict[str, object]:
-    """What both have in common."""
+    """Return the settings that both have in common."""
     return {
         **{name: getattr(options, name) for name in ("scenario", "num_robots", "seed", "model", "validation_worlds")},
         "scenario_settings": parse_settings(options.scenario_settings, "--scenario-set"),

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class WarmupReport:
-    """What a warm-up did.
+    """Report of a warm-up.
 
     Attributes:
         seconds: How long it took.

@@ -17,19 +17,19 @@ ENOUGH = 5
 """Times that it has to be, before it is believed to do less."""
 
 AS_STRONG = 0.97
-"""Whoever does that share of it is as strong as its limits say."""
+"""Share of it from which on a robot is as strong as its limits say."""
 
 WEAKEST = 0.3
-"""Nobody is believed to be weaker than that."""
+"""Lowest gain that is believed."""
 
 FORGOTTEN = 0.1
-"""What is lost in a time step of the mean of what is added to commands, ..."""
+"""Share that the mean of what is added to commands loses in a time step, ..."""
 
 FIRST = 4
 """... after the first steps, which count as if so many with nothing added had been before."""
 
 BY_CHANCE = 3.0
-"""How many times its standard error that mean may be, and still be nothing but noise."""
+"""Number of standard errors that mean may be, and still be nothing but noise."""
 
 STEP = 0.05
 """Shares of the limits that are told apart."""

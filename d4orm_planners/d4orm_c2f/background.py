@@ -31,7 +31,7 @@ class Background(Generic[Result]):
         self._job = self._pool.submit(work)
 
     def result(self) -> tuple[bool, Result | None]:
-        """Whether nothing is under way, and what the last job gave, once."""
+        """Return whether nothing is under way, and the last job's result, once."""
         if self._job is None:
             return True, None
         if not self._job.done():
@@ -40,7 +40,7 @@ class Background(Generic[Result]):
         return True, job.result()
 
     def run(self, work: Callable[[], Result], timeout: float) -> Result | None:
-        """What the work gives within the time [s], or ``None``. What is late goes on, and is thrown away."""
+        """Return the result of the work within the time [s], or ``None``. What is late goes on, and is thrown away."""
         end = time.perf_counter() + timeout
         if timeout <= 0:
             return None

@@ -19,7 +19,7 @@ NEAR, STOPS = 10 / 3, 2.0
 """Only what is this near is minded: so many radii of the largest robot, and so many of its stops from full speed."""
 
 PARTING = 2.0
-"""With what is nearer than it should be, robots part at so much of what is missing per second [1/s]."""
+"""Rate at which robots part from what is too near, per distance missing [1/s]."""
 
 SWEEPS = 400
 """Times that every barrier is met at most; by then there are no velocities that keep to all, or hardly any."""
@@ -28,7 +28,7 @@ EXACT = 1e-6
 """Changes of that size are none, as a share of the largest speed limit."""
 
 _STEP = 1 / 150
-"""For the direction away from an obstacle, in radii of the largest robot."""
+"""Step for the direction away from an obstacle, in radii of the largest robot."""
 
 Array = NDArray[np.float64]
 
@@ -36,12 +36,12 @@ Array = NDArray[np.float64]
 def safe_velocities(
     problem: Problem, joint: JointState, wanted: FloatArray, free: BoolArray, gap: float, caution: float = 0.0
 ) -> FloatArray:
-    """Velocities near those wanted, at which everybody can still brake before it touches anything.
+    """Velocities near those wanted, at which all can still brake before a collision.
 
     Two robots may close in on each other no faster than both together can brake within what is left between them,
     ``n (v_i - v_j) >= -sqrt(2 (a_i + a_j) (d - gap))``: the braking-distance barrier of Wang, Ames and Egerstedt
     (Safety barrier certificates for collisions-free multirobot systems, IEEE Trans. Robotics 33, 2017), here for the
-    velocities of the next step. On a body that obeys nobody, a side of the bounds, or the nearest obstacle, the robot
+    velocities of the next step. On a dynamic obstacle, a side of the bounds, or the nearest obstacle, the robot
     does all the braking. Robots of first order can stop within a time step. Taken are the nearest velocities to those
     wanted.
 
@@ -49,7 +49,7 @@ def safe_velocities(
         problem: The robots and obstacles.
         joint: Where everything is.
         wanted: ``(K, d)`` [m/s].
-        free: ``(K,)`` who can be told other velocities; the others stand.
+        free: ``(K,)`` robots that can be told other velocities; the others are at rest.
         gap: What is to be left between surfaces [m].
         caution: Robots may come to be so much faster towards anything than they are told [m/s]. If any, they are also
             taken to go on for a time step before they brake.
@@ -69,7 +69,7 @@ def safe_velocities(
 
 
 class Barriers(NamedTuple):
-    """``normals @ (v_one - v_other) >= least`` for velocities; nobody is -1, and stands.
+    """``normals @ (v_one - v_other) >= least`` for velocities; -1 is no robot, and at rest.
 
     Attributes:
         one: ``(R,)`` robots.
@@ -91,7 +91,7 @@ class Barriers(NamedTuple):
 
 
 def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, caution: float) -> Barriers:
-    """What the velocities of those who are ``free`` have to keep to."""
+    """Return the barriers for the velocities of robots that are ``free``."""
     d = problem.dimension
     places, radius = joint.states[:, :d].astype(np.float64), np.asarray(problem.team.radius, np.float64)
     acceleration, speed = (problem.team.limits[:, limit].astype(np.float64) for limit in (ACCELERATION, SPEED))
@@ -132,7 +132,7 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
 
 
 def _near(problem: Problem) -> float:
-    """How near something must be to be minded [m]."""
+    """Return the distance within which something is minded [m]."""
     speed, acceleration = (problem.team.limits[:, limit].astype(np.float64) for limit in (SPEED, ACCELERATION))
     return NEAR * problem.team.largest_radius + STOPS * float((speed**2 / (2 * acceleration)).max())
 
@@ -172,7 +172,7 @@ def find_nearest(one: Any, other: Any, normals: Any, least: Any, velocities: Any
 
 
 def _walls(problem: Problem, places: Array, robots: list[int], near: float) -> Iterator[tuple[int, Array, float]]:
-    """What stands near robots at ``places`` ``(R, d)``: of which one, the direction away from it, and how far it is."""
+    """Yield what is near robots at ``places`` ``(R, d)``: which robot, the direction away from it, and the distance."""
     d, (lower, upper), shapes = problem.dimension, problem.world.bounds.astype(np.float64), problem.world.shapes
     axes = np.eye(d)
     inward, sides = np.concatenate([axes, -axes]), np.concatenate([places - lower, upper - places], axis=1)

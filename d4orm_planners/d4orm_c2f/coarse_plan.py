@@ -12,11 +12,11 @@ from d4orm_env.core.problem import Problem
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CoarseWaypoints:
-    """What a team follows.
+    """Path that a team follows.
 
     Attributes:
         path: ``(H+1, K, d)`` waypoints, one per time step of the control loop [m].
-        ordered: Whether the ways were found on a roadmap, where who waits for whom decides.
+        ordered: Whether the path was found on a roadmap, where precedence decides.
     """
 
     path: FloatArray
@@ -61,7 +61,7 @@ def interpolate(path: FloatArray, factor: int) -> FloatArray:
 
 
 def nearest_indices(path: FloatArray, positions: FloatArray, last: IntArray, window: int) -> IntArray:
-    """Where on its path every robot is: the index of its nearest waypoint.
+    """Return each robot's position on its path: the index of its nearest waypoint.
 
     Args:
         path: ``(H+1, K, d)`` [m].

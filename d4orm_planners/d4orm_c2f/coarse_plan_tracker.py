@@ -38,7 +38,7 @@ from d4orm_planners.mapf.relay import relay_ways
 from d4orm_planners.tracking.steering import straight_drives
 
 NEARER = 1 / 3
-"""What counts as coming nearer to the goals, all robots together, in radii of the largest one."""
+"""Least progress towards the goals, all robots together, in radii of the largest one."""
 
 
 class CoarsePlanTracker:
@@ -250,7 +250,7 @@ class CoarsePlanTracker:
         return initial
 
     def _barred(self, joint: JointState, docked: BoolArray, asked: BoolArray) -> BoolArray:
-        """``(K,)`` those ``asked`` whose next waypoints, up to the subgoal, lie within robots that stand for good."""
+        """``(K,)`` those ``asked`` whose next waypoints, up to the subgoal, lie within robots at rest for good."""
         robots, barred = np.flatnonzero(asked & ~docked), np.zeros_like(docked)
         path, ahead = self.guidance.path, np.arange(self._config.subgoal_offset + 1)
         waypoints = path[np.minimum(self._indices[robots] + ahead[:, None], len(path) - 1), robots]
@@ -260,14 +260,14 @@ class CoarsePlanTracker:
         return barred
 
     def _waiting(self, joint: JointState) -> BoolArray:
-        """``(K,)`` who is where it should be by now, or ahead of the team, and so has to wait."""
+        """``(K,)`` robots that are where they should be by now, or ahead of the team, and so have to wait."""
         due = self.guidance.path[min(self.index, len(self.guidance.path) - 1)]
         away = np.linalg.norm(joint.states[:, : self.problem.dimension] - due, axis=1)
         waiting: BoolArray = (away < WAITING_WITHIN * self.problem.team.largest_radius) | (self._indices > self.index)
         return waiting
 
     def _is_lost(self, joint: JointState, moving: BoolArray) -> bool:
-        """Whether the robots under way are far from their waypoints, at the end of the path, or get no nearer."""
+        """Check whether the robots under way are far from their waypoints, at the end of the path, or get no nearer."""
         positions = joint.states[:, : self.problem.dimension]
         distance = float(np.linalg.norm((joint.goals - positions)[moving], axis=1).sum())
         if distance < self._nearest - NEARER * self.problem.team.largest_radius:

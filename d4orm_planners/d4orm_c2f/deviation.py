@@ -1,4 +1,4 @@
-"""Where robots are and are expected, how far they come from there, and what room that calls for."""
+"""Deviation of robots from where they are expected, and the margin inflation that it calls for."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from d4orm_planners.d4orm_c2f.state_filter import StateFilter
 from d4orm_planners.tracking.steering import present_velocities
 
 DECAY = 0.98
-"""What is left after a time step of the largest deviation seen."""
+"""Share of the largest deviation seen that is left after a time step."""
 
 MOST = 1.0
 """No more room than this is called for, in radii of the largest robot."""
@@ -31,7 +31,7 @@ STEADY = 0.02
 """Changes of velocity that add up to no more are none, as a share of the largest speed limit."""
 
 AT_ONCE = 1.5
-"""How many times the largest change in a single step may come before that."""
+"""Factor by which the largest change in a single step may exceed that."""
 
 FASTEST = 0.4
 """Changes are not believed to come to more, as a share of the largest speed limit."""
@@ -43,7 +43,7 @@ class Deviation:
     Args:
         problem: The robots.
         engine: What knows how they should move.
-        config: What is to be found out: how late commands are, how noisy states are, who is weak or does not obey.
+        config: To be found out: how late commands and how noisy states are, which robots are weak or do not obey.
         docks: Whether robots dock at their goals, rather than drive through them to others.
 
     Attributes:
@@ -52,7 +52,7 @@ class Deviation:
         problem: The robots with the limits that they are believed to have now.
         lateness: How late commands are executed.
         losses: How often commands are not executed at all.
-        standing: Who has stalled.
+        standing: Robots that have stalled.
     """
 
     def __init__(self, problem: Problem, engine: Engine, config: D4ormC2FConfig, docks: bool) -> None:
@@ -123,7 +123,7 @@ class Deviation:
         self._expected = states[:, : self.problem.dimension], present_velocities(self.problem, states, now)
 
     def arrays(self, joint: JointState) -> ProblemArrays:
-        """By which to step on from there: with the limits that robots are believed to have now."""
+        """Return the arrays to step on from there: with the limits that robots are believed to have now."""
         radius = docking_radius(self.problem, self._docks)
         return self.problem.resumed_at(joint.states, joint.goals, goal_radius=radius).arrays
 
@@ -137,11 +137,11 @@ class Deviation:
 
     @property
     def caution(self) -> float:
-        """How much faster than it should be a robot may soon be, whichever way it goes [m/s]."""
+        """Speed by which a robot may soon be too fast, whichever way it goes [m/s]."""
         return 0.0 if self.drift < STEADY * self._speed else min(self.drift, FASTEST * self._speed)
 
     def room(self, reaction_time: float) -> float:
-        """How far robots get from where they are expected within so many seconds [m].
+        """Return how far robots get from where they are expected within so many seconds [m].
 
         What makes a robot of first order stray is over with the next command to arrive.
         """

@@ -1,4 +1,4 @@
-"""The last metres: robots that are nearly there drive straight home, or away and come again."""
+"""Final approach: robots near their goals drive straight to them, or away and come again."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ NEARBY = 3.0
 """Within how many radii of its turning circle of its goal a robot that cannot turn in place looks for a manoeuvre."""
 
 DIRECTIONS, BEYOND = 16, (0.25, 1.0, 2.0)
-"""In how many directions a manoeuvre may lead away at first, and how far, in radii of the turning circle."""
+"""Number of directions of a manoeuvre at first, and its distances, in radii of the turning circle."""
 
 LENGTH, RESERVE = 8.0, 2.0
-"""How long it may be, in radii of the turning circle, and how much longer it may take than at full speed [s]."""
+"""Most length, in radii of the turning circle, and most time beyond that at full speed [s]."""
 
 
 def docking_radius(problem: Problem, docks: bool) -> float:
-    """The goal radius for rollouts of an episode [m]; who does not dock drives on when it arrives, to its next goal."""
+    """The goal radius for rollouts of an episode [m]; a robot that does not dock drives on to its next goal."""
     return problem.goal_radius if docks else PASSING * problem.goal_radius
 
 
@@ -35,17 +35,17 @@ def drive_home(
 ) -> tuple[FloatArray, BoolArray]:
     """The controls, but straight drives for robots that dock by these no later, or manoeuvres (:func:`come_again`).
 
-    Samples head for a goal only roughly, and who misses it at full speed has to turn.
+    Samples head for a goal only roughly, and a robot that misses it at full speed has to turn.
 
     Args:
         window: The robots from where they are to their goals, over the prediction horizon.
         engine: What rolls out.
         controls: ``(H_predict, K, m)``.
         near: ``(K,)`` whose drives are tried.
-        docked: ``(K,)`` who stands for good.
+        docked: ``(K,)`` robots at rest for good.
 
     Returns:
-        ``(H_predict, K, m)`` controls, and ``(K,)`` who drives home.
+        ``(H_predict, K, m)`` controls, and ``(K,)`` robots on their final approach.
     """
     offsets = window.goal - window.start[:, : window.dimension]
     away = np.linalg.norm(offsets, axis=1, keepdims=True)
@@ -83,16 +83,16 @@ def come_again(
 
     What lies within a robot's turning circles it reaches by driving away from it first, which samples that are paid for
     being near do not do. Among drives by points all around, forwards or in reverse, that one is chosen which is home
-    first and keeps clear of all that stands.
+    first and keeps clear of all at rest.
 
     Args:
         window: The robots from where they are to their goals, over the prediction horizon.
         controls: ``(H_predict, K, m)``.
-        robots: Who looks for one.
-        docked: ``(K,)`` who stands for good.
+        robots: Robots that look for one.
+        docked: ``(K,)`` robots at rest for good.
 
     Returns:
-        ``(H_predict, K, m)`` controls, and ``(K,)`` who has found one.
+        ``(H_predict, K, m)`` controls, and ``(K,)`` robots that have found one.
     """
     coming = np.zeros_like(docked)
     if not len(robots):
@@ -122,7 +122,7 @@ def come_again(
 
 
 def _keeps_clear(window: Problem, positions: FloatArray, robots: IntArray, docked: BoolArray) -> BoolArray:
-    """``(R, V)`` whether ways ``(T, R, V, d)`` keep the margin to all that stands, or come no nearer than at first."""
+    """``(R, V)`` whether ways ``(T, R, V, d)`` keep the margin to all at rest, or come no nearer than at first."""
     radius = np.asarray(window.team.radius, np.float64)
     room = window.world.clearance(positions) - radius[robots, None]
     clear = _no_nearer(room, window)
@@ -139,6 +139,6 @@ def _no_nearer(gaps: Floats, window: Problem) -> BoolArray:
 
 
 def _docking_times(trajectory: Trajectory) -> IntArray:
-    """``(K,)`` time steps until everybody docks; one more than there are for who does not."""
+    """``(K,)`` time steps until each docks; one more than there are for those that do not."""
     steps: IntArray = (~trajectory.arrived).sum(axis=0)
     return steps

@@ -1,4 +1,4 @@
-"""A fine plan over the prediction horizon, and who may follow it: the sampling of one control loop (Algorithm 4)."""
+"""A fine plan over the prediction horizon, and its followers: the sampling of one control loop (Algorithm 4)."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from d4orm_planners.engine.sampling_types import MovingObstacles, SamplingEngine
 from d4orm_planners.tracking.steering import track_velocities
 
 SHORTER = 3
-"""How many times fewer fresh steps a robot takes before it stops if it would violate the margin otherwise."""
+"""Divisor of the fresh steps that a robot takes before it stops if it would violate the margin otherwise."""
 
 
 class Prediction(NamedTuple):
-    """What a control loop comes to.
+    """Prediction of a control loop.
 
     Attributes:
         controls: ``(H_predict + S, K, m)`` with the ``S`` steps that a stop may take.
@@ -34,16 +34,16 @@ class Prediction(NamedTuple):
 
 
 class Situation(NamedTuple):
-    """What a control loop begins with.
+    """State at the beginning of a control loop.
 
     Attributes:
         joint: Where the robots are.
-        docked: ``(K,)`` who stays there.
+        docked: ``(K,)`` robots that stay there.
         subgoals: ``(K, d)`` [m].
         base: ``(H_predict, K, m)`` controls to deform.
         left: ``(T, K, m)`` controls that the robots had in mind, with the stop after them.
         careful: ``(H_predict, K, m)`` controls for robots that are stuck, if any are.
-        stuck: ``(K,)`` who is; they may come as near as half of the margin.
+        stuck: ``(K,)`` robots that are; they may come as near as half of the margin.
         room: Added to the margin of the samples [m].
     """
 
@@ -116,7 +116,7 @@ class Window:
         return near
 
     def _task(self, now: Situation) -> SamplingTask:
-        """Deform the base so that everybody heads for its subgoal, or its goal where that is near."""
+        """Deform the base so that all head for their subgoals, or goals where these are near."""
         problem, config, goals = self.problem, self._config, now.joint.goals
         near = self._near_goals(now)
         window = problem.resumed_at(
@@ -138,7 +138,7 @@ class Window:
         )
 
     def _bodies(self, joint: JointState, horizon: int) -> MovingObstacles | None:
-        """Where bodies that are no robots will be, going on as they do; ``None`` if none is seen."""
+        """Predict the dynamic obstacles, going on as they do; ``None`` if none is seen."""
         d, bodies = self.problem.dimension, joint.bodies
         seen = bodies[bodies[:, -1] > 0] if len(bodies) else bodies
         if not len(seen):
@@ -175,7 +175,7 @@ class Window:
         Those whose controls are ``special`` ``(K,)`` do as sampled before they stop.
 
         What they had in mind was free of violations, and ends at rest. So without disturbances there always is a mix
-        that is free of them too: in the last resort everybody does as before.
+        that is free of them too: in the last resort all do as before.
         """
         horizon = len(fresh)
         before = np.zeros((horizon + self._stop_steps, *fresh.shape[1:]), np.float32)
@@ -200,9 +200,9 @@ class Window:
         return Prediction(controls, trajectory.positions, least_gap(window, trajectory.positions[1:]))
 
     def _violations(self, window: Problem, controls: FloatArray, now: Situation) -> tuple[Trajectory, BoolArray]:
-        """The rollout, and ``(K,)`` who comes too near to anything in it.
+        """The rollout, and ``(K,)`` robots that come too near to anything in it.
 
-        That is within the margin; of half of it for those that are stuck; nearer than now for who is within it already.
+        That is within the margin; of half of it for those that are stuck; nearer than now for those within it already.
         """
         trajectory, radius = self._engine.rollout(window, controls), np.asarray(window.team.radius)
         violated: BoolArray = np.any(trajectory.margin_violated[1:], axis=0)
@@ -216,7 +216,7 @@ class Window:
         return trajectory, violated | self._meets_bodies(now.joint, trajectory, window.margin)
 
     def _meets_bodies(self, joint: JointState, trajectory: Trajectory, margin: float) -> BoolArray:
-        """``(K,)`` who comes within a margin of a body that is no robot."""
+        """``(K,)`` robots that come within a margin of a dynamic obstacle."""
         bodies = self._bodies(joint, len(trajectory.controls))
         if bodies is None:
             return np.zeros(self.problem.num_robots, bool)
@@ -226,7 +226,7 @@ class Window:
         return meets
 
     def touching(self, joint: JointState, docked: BoolArray, controls: FloatArray, gap: float) -> BoolArray:
-        """``(K,)`` who comes within a gap [m] of anything if all execute ``controls`` ``(T, K, m)``, and a stop."""
+        """``(K,)`` robots within a gap [m] of anything if all execute ``controls`` ``(T, K, m)``, and a stop."""
         radius = docking_radius(self.problem, self._docks)
         present = self.problem.resumed_at(
             joint.states, joint.goals, horizon=len(controls), margin=gap, goal_radius=radius

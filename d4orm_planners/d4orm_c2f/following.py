@@ -11,10 +11,10 @@ from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.tracking.steering import track_velocities
 
 STUCK_WITHIN, STUCK_AFTER = 3, 25
-"""How many waypoints a robot has to get on in so many time steps not to be stuck."""
+"""Progress without which a robot is stuck: so many waypoints in so many time steps."""
 
 BARRED_AFTER = 8
-"""The same for robots whose ways lead through those that stand for good, who will not let them pass."""
+"""The same for robots whose paths lead through those at rest for good."""
 
 WAITING_WITHIN = 1.0
 """A robot this near to where it should be by now waits, in radii of the largest one."""
@@ -23,7 +23,7 @@ CAREFUL_FOR = 30
 """Steps for which a robot that was stuck follows its path."""
 
 CATCHING_UP = 2.0
-"""What of its lag a robot makes good in a second [1/s]."""
+"""Share of its lag that a robot makes good in a second [1/s]."""
 
 
 class StagnationMonitor:
@@ -39,12 +39,12 @@ class StagnationMonitor:
         self._careful_until = np.full(len(joint.goals), joint.steps)
 
     def observe(self, step: int, indices: IntArray, waiting: BoolArray) -> tuple[IntArray, BoolArray]:
-        """``(K,)`` steps for which each has not got on, and who is stuck, or was not long ago, and so follows its path.
+        """``(K,)`` steps without progress, and robots that are stuck, or were not long ago, and so follow their paths.
 
         Args:
             step: Time step.
             indices: ``(K,)`` waypoints that the robots are at; lower ones than before are of another path.
-            waiting: ``(K,)`` who is where it should be by now, or ahead of the team.
+            waiting: ``(K,)`` robots that are where they should be by now, or ahead of the team.
         """
         moved = (indices >= self._indices + STUCK_WITHIN) | (indices < self._indices) | waiting
         self._indices[moved], self._since[moved] = indices[moved], step
@@ -56,7 +56,7 @@ class StagnationMonitor:
 def keep_time(
     problem: Problem, engine: Engine, joint: JointState, path: FloatArray, indices: IntArray, horizon: int
 ) -> FloatArray:
-    """Controls that take every robot along its path in the path's own time, as if nobody docked.
+    """Controls that take every robot along its path in the path's own time, as if none docked.
 
     Args:
         problem: The robots; the path has a waypoint per time step of it.

@@ -1,4 +1,4 @@
-"""How late commands are executed: which of those sent before is it that the robots report to have executed."""
+"""Latency of commands: which of those sent before is it that the robots report to have executed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ MOST = 10
 """Steps late that commands may be and still be recognised."""
 
 DECAY = 0.98
-"""What is left of a difference after a time step."""
+"""Share of a difference that is left after a time step."""
 
 BETTER = 0.5
 """A lateness is believed once commands that late differ less than this share from those executed."""
@@ -21,7 +21,7 @@ class Lateness:
     """Remembers the commands that were sent, and compares them with those executed.
 
     Args:
-        team: Who is sent commands.
+        team: Robots that are sent commands.
         known: Steps late that commands are known to be, or ``None`` to find out.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""Which waypoint a robot can drive to straight."""
+"""Waypoint that a robot can drive to straight."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ LEAST = 5
 """Waypoints that a subgoal is ahead all the same: nearer ones hardly pull."""
 
 _SHARES = np.linspace(0, 1, 9)[1:]
-"""Of the straight way, where its clearance from obstacles is looked at."""
+"""Shares of the straight line at which its clearance from obstacles is looked at."""
 
 
 def within_sight(
     problem: Problem, positions: FloatArray, path: FloatArray, indices: IntArray, targets: IntArray, docked: BoolArray,
     walls: bool,
 ) -> IntArray:  # fmt: skip
-    """The furthest waypoint up to its subgoal that a robot can drive to straight, past what stands.
+    """The furthest waypoint up to its subgoal that a robot can drive to straight, past what is at rest.
 
     A subgoal behind a corner, or behind a robot that has docked, would hold it there.
 
@@ -28,7 +28,7 @@ def within_sight(
         path: ``(H+1, K, d)`` [m].
         indices: ``(K,)`` where on the path they are.
         targets: ``(K,)`` their subgoals.
-        docked: ``(K,)`` who stands.
+        docked: ``(K,)`` robots at rest.
         walls: Whether obstacles count too.
 
     Returns:

@@ -39,7 +39,7 @@ class Losses:
         self.run = 0
 
     def observe(self, commanded: FloatArray, executed: FloatArray, going: BoolArray) -> BoolArray:
-        """``(K,)`` who goes on with the command before, or stands as before, whatever it was told.
+        """``(K,)`` robots that go on with the command before, or stay at rest, whatever they were told.
 
         Args:
             commanded: ``(K, m)`` the commands that should have been executed in the last step.

@@ -40,7 +40,7 @@ NEARLY = 1e-3
 
 @dataclass(frozen=True)
 class LoopRecord:
-    """What one control loop did.
+    """Record of one control loop.
 
     Attributes:
         step: The environment's step at which it began.
@@ -92,7 +92,7 @@ class D4ormC2F(StatePolicy):
 
     @property
     def guidance(self) -> CoarseWaypoints:
-        """What is followed at present."""
+        """Coarse plan that is followed at present."""
         return self._guide.guidance
 
     def _begin(self, env: ParallelEnv, seed: int) -> None:
@@ -214,7 +214,7 @@ class D4ormC2F(StatePolicy):
     def _base(self, joint: JointState) -> FloatArray:
         """``(H_predict, K, m)`` controls to deform: what is left of the last loop's.
 
-        Where who waits for whom decides, the coarse plan's own pace is kept instead.
+        Where precedence decides, the coarse plan's own pace is kept instead.
         """
         horizon = self.config.predict_horizon
         if self._guide.guidance.ordered:
@@ -226,7 +226,7 @@ class D4ormC2F(StatePolicy):
         return base
 
     def _see_docked(self, joint: JointState) -> None:
-        """Note who has arrived, and was where it has to be: noise on measurements sends nobody off again."""
+        """Note the robots that have arrived where they have to be: noise on measurements sends none off again."""
         gap = np.linalg.norm(joint.goals - joint.states[:, : self.problem.dimension], axis=1)
         here = joint.arrived & (gap <= self.problem.goal_radius)
         self._homes = np.where(here[:, None], joint.goals, self._homes)

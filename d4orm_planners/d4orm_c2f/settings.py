@@ -61,14 +61,14 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
         subgoal_offset: ``m``, waypoints from where the team is to its subgoal.
         max_lag: Waypoints that a robot may be behind the others without its subgoal staying behind too. ``None`` for
             any number: the subgoals of all are always those of one moment, as in the paper.
-        sight: Whether a subgoal behind what stands is exchanged for the furthest waypoint before it that is in sight.
+        sight: Whether a subgoal behind robots at rest is exchanged for the furthest waypoint in sight before it.
         num_samples: ``M`` of a control loop.
         num_steps: ``N`` of a control loop.
         credit: ``"robot"`` or ``"team"``: whose reward weights the samples of a control loop.
         penalty: Factor of the problem's collision penalty in a control loop, 1 in the paper.
         relative_distance: Whether distances to subgoals count relative to the initial one, as in the paper, rather than
             to how far robots get in ``m`` steps: then a robot next to its subgoal has no more to lose than others.
-        safe_mix: Whether robots follow a fine plan only as far as nobody comes within the margin of anything in it.
+        safe_mix: Whether robots follow a fine plan only as far as it keeps the margin.
         drive_home: Whether robots that dock no later if they drive straight to their goals do so.
         extra_margin: Added to the problem's margin in control loops, as room for disturbances [m].
         reaction_time: The margin in control loops grows by how far robots come within so many seconds from where they
@@ -79,8 +79,8 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
         learn_limits: Whether robots that never do as much as they are asked to are taken to be that much weaker.
         expect_losses: Whether a robot that goes on with its last command is taken to have lost the new one: it is not
             weak, and others may do so too, as often in a row as must be reckoned with.
-        stalls: Whether a robot that brakes or stands whatever it is told is taken for an obstacle, which the others
-            drive around.
+        stalls: Whether a robot that brakes or stays at rest whatever it is told is taken for an obstacle, which the
+            others drive around.
         last_resort: Whether robots whose plan would end in contact are told to brake or to evade instead.
         refine: Whether the guidance is refined while it is followed: in a ``"background"`` thread, ``"sync"`` between
             control loops, which gives the same controls every time, or ``"off"``.

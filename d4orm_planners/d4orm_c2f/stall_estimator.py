@@ -1,4 +1,4 @@
-"""Robots that do not obey any more, but brake and stand: the others drive around them."""
+"""Robots that do not obey any more, but brake and stop: the others drive around them."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ RESISTING = 0.5
 """Braking as hard counts from this share of its limits on, and instead if what it was commanded is as far from it."""
 
 COMMANDED, DONE = 0.2, 0.1
-"""What counts as being commanded something, as a share of a robot's limits; and as doing it, as a share of that."""
+"""Least command that counts, as a share of a robot's limits; and least motion that obeys it, as a share of that."""
 
 MOVED = 2 / 3
-"""How far it gets from there to be back, in radii of the largest robot."""
+"""Distance from there at which it is back, in radii of the largest robot."""
 
 PROBE = 0.1
 """Share of its limits that a robot that has stalled is commanded, so that it is seen when it obeys again."""
 
 
 class Standing:
-    """Watches an episode for robots that brake or stand whatever they are commanded.
+    """Watches an episode for robots that brake or stay at rest whatever they are commanded.
 
     Args:
         problem: The robots.

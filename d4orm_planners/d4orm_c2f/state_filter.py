@@ -1,4 +1,4 @@
-"""What robots' states are, where measurements are noisy: a steady-state Kalman filter that finds out how noisy."""
+"""Filter of noisy measurements of robots' states: a steady-state Kalman filter that finds out how noisy they are."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from d4orm_env.core.problem import Problem
 from d4orm_planners.tracking.steering import by_model
 
 DECAY = 0.98
-"""What is left of what was seen after a time step."""
+"""Share of what was seen that is left after a time step."""
 
 ENOUGH = 40
 """Differences that it takes to say how noisy a component is."""
 
 LEAST_SHARE = 0.1
-"""Of the variance of differences that has to come from measurements for these to be filtered."""
+"""Share of the variance of differences that has to come from measurements for these to be filtered."""
 
 LEAST_GAIN = 0.1
 """No measurement counts less than this."""
@@ -63,7 +63,7 @@ class StateFilter:
             measured: ``(K, n)`` the states as seen.
             led_to: ``(K, n)`` what those seen a time step ago lead to.
             expected: ``(K, n)`` what those estimated a time step ago lead to.
-            going: ``(K,)`` who has not docked.
+            going: ``(K,)`` robots that have not docked.
         """
         difference = self._turned(np.asarray(measured, np.float64) - led_to)
         before, self._before = self._before, difference

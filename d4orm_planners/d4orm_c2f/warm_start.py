@@ -1,4 +1,4 @@
-"""What a policy would do, as the beginning of a coarse plan."""
+"""Rollout of a policy, as the beginning of a coarse plan."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from d4orm_planners.sampling.d4orm import DeformingPlanner
 
 
 class DeformedPlan(WorkingPlan):
-    """What the team does, some robots' controls deformed around all others.
+    """The team's plan, some robots' controls deformed around all others.
 
     Args:
         planner: Whose rules deformations go by.
@@ -70,5 +70,5 @@ class DeformedPlan(WorkingPlan):
         return part, controls, search.engine.rollout(part, controls)
 
     def iteration(self) -> Iteration:
-        """What came of it."""
+        """Return the result."""
         return Iteration(self.controls, self._denoising_steps, self._excluded)

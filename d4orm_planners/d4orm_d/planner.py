@@ -19,11 +19,11 @@ from d4orm_planners.sampling.d4orm import PAPER_DEFORMATION, DeformingPlanner
 from d4orm_planners.tracking.steering import prepare_drives, straight_drives
 
 State = Groups | Repairs
-"""What is kept between iterations, by the way of decoupling."""
+"""State between iterations, by the kind of decoupling."""
 
 
 class D4ormD(DeformingPlanner):
-    """Failure-aware decoupling: replan only the robots that fail, around all others, until nobody fails."""
+    """Failure-aware decoupling: replan only the robots that fail, around all others, until none fails."""
 
     name: ClassVar[str] = "d4orm-d"
     config_class = D4ormDConfig
@@ -48,7 +48,7 @@ class D4ormD(DeformingPlanner):
         return Groups() if self.config.decoupling == "groups" else Repairs.of(search.problem.num_robots)
 
     def iterate(self, search: SolveRun, state: State) -> tuple[State, Iteration]:
-        """See :meth:`Planner.iterate`: the whole team at first and once nobody fails, the failed robots in between."""
+        """See :meth:`Planner.iterate`: the whole team at first and once none fails, the failed robots in between."""
         if search.iteration == 0 and not search.current.controls.any():
             drives = self.straight_start(search.problem)
             return self.whole_team(search, state) if drives is None else (state, Iteration(drives))
@@ -59,7 +59,7 @@ class D4ormD(DeformingPlanner):
         return state, team.iteration()
 
     def whole_team(self, search: SolveRun, state: State) -> tuple[State, Iteration]:
-        """Deform everybody's controls at once; unless in groups, then straight home from wherever that is as good."""
+        """Deform all controls at once; unless in groups, then straight to the goals from wherever that is as good."""
         iteration = self.run(search)
         if not isinstance(state, Repairs):
             return state, iteration
@@ -80,7 +80,7 @@ class D4ormD(DeformingPlanner):
         return replace(task, collisions=search.iteration > 0 or self.config.first_collisions)
 
     def straight_start(self, problem: Problem) -> FloatArray | None:
-        """Controls ``(H, K, m)`` that send everybody straight to its goal, or ``None`` to start with the whole team."""
+        """Controls ``(H, K, m)`` that send all straight to their goals, or ``None`` to start with the whole team."""
         if self.config.start == "auto":
             return straight_start(problem) if self.is_big(problem) else None
         return straight_drives(problem).controls[:, :, 0] if self.config.start == "straight" else None

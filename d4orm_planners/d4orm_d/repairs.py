@@ -1,4 +1,4 @@
-"""Independent repairs: robots without conflicts among them at once, around all others; whoever gets worse stays."""
+"""Independent repairs: robots without conflicts among them at once, around all others; no robot gets worse."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Repairs:
         return Repairs(repair.failures, repair.recency)
 
     def shorten(self, team: DeformedPlan) -> Repairs:
-        """Let everybody turn home as soon as that is no worse."""
+        """Let all robots turn to their goals as soon as that is no worse."""
         repair = _Repair(team, self)
         repair.shorten()
         return Repairs(repair.failures, repair.recency)
@@ -56,7 +56,7 @@ class _Repair:
         self.failures, self.recency = before.failures.copy(), before.recency
 
     def run(self, config: D4ormDConfig) -> None:
-        """Deform who fails, and shorten the ways home once nobody does."""
+        """Deform the robots that fail, and improve final approaches once none does."""
         everybody = np.arange(self.problem.num_robots)
         failed, _ = self.team.faults(everybody)
         if failed.any() and not self.search.should_stop():
@@ -87,7 +87,7 @@ class _Repair:
         self.take_over(robots, part, trajectory)
 
     def shorten(self) -> None:
-        """Let everybody turn home as soon as that is no worse."""
+        """Let all robots turn to their goals as soon as that is no worse."""
         for _ in range(RULES.shortenings):
             if self.search.should_stop():
                 break
@@ -95,7 +95,7 @@ class _Repair:
             self.take_over(range(self.problem.num_robots), self.problem, trajectory)
 
     def next_robots(self, failed: IntArray) -> tuple[tuple[int, ...], str]:
-        """Whom to repair, and by whose reward.
+        """Choose the robots to repair, and whose reward to use.
 
         Of those that fail some without conflicts among them, those that were not repaired lately first, each by its
         own reward.
@@ -120,7 +120,7 @@ class _Repair:
         return robots, "robot"
 
     def take_over(self, robots: Sequence[int], part: Problem, trajectory: Trajectory) -> None:
-        """Let robots do as in the trajectory, or turn to their goals in time; whoever gets worse stays as it was.
+        """Let robots do as in the trajectory, or turn to their goals in time; those that get worse stay as they were.
 
         A deformation ends metres from where it was aimed at after a long way: arriving is what sampling does worst, and
         steering does at once.

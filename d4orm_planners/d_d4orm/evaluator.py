@@ -1,4 +1,4 @@
-"""What the nodes of one process share: their candidates, each judged once, and the word to stop."""
+"""State shared by the nodes of one process: their candidates, each judged once, and the word to stop."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a node has received: the newest candidate of every other node, judged anew, and a count of the rest."""
+"""Messages that a node has received: the newest candidate of every other node, judged anew, and a count of the rest."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Report:
     """A candidate of another node as it was found to be here.
 
     Attributes:
-        node: Who sent it.
+        node: Its sender.
         sequence: Which of its candidates it is.
         candidate: Rolled out and judged by the receiver.
     """

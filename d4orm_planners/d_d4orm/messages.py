@@ -25,7 +25,7 @@ KINDS = (
     "garbage", "truncated", "too_large", "version", "checksum", "problem", "node", "shape", "not_finite", "limits",
     "stale",
 )  # fmt: skip
-"""What is wrong with a message that is dropped. ``"stale"`` is not the codec's to see, but the inbox's."""
+"""Faults of messages that are dropped. ``"stale"`` is not the codec's to see, but the inbox's."""
 
 _HEADER = struct.Struct("<4sHHIQIIId32s")
 _CHECKSUM = struct.Struct("<I")
@@ -36,7 +36,7 @@ class Message:
     """A candidate as a node claims it to be.
 
     Attributes:
-        node: Who sends it, from 0.
+        node: Its sender, from 0.
         sequence: Which of its candidates it is, from 1.
         controls: ``(H, K, m)`` as planned, for the receiver to go on from as the sender would.
         reward: Mean reward.

@@ -32,7 +32,7 @@ def node_seed(seed: int, node: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What the nodes of one solve have in common.
+    """Common task of the nodes of one solve.
 
     Attributes:
         num_nodes: How many nodes there are.
@@ -59,7 +59,7 @@ class Node:
         transport: Its access to the others.
         judge: What rolls out and judges, in common with other nodes of this process.
         sequence: The number before that of its first message; more than any that it sent before, if it did, and on a
-            network the time at which it began, by which two nodes of one number know who was first.
+            network the time at which it began, by which two nodes of one number know which was first.
         observer: Called with every :class:`~d4orm_planners.d_d4orm.node_events.Event`, in the node's own thread.
 
     Attributes:
@@ -168,7 +168,7 @@ class Node:
         self._note("sent", self.number, self._sequence, candidate, size=len(data))
 
     def _all_have(self, candidate: Candidate) -> bool:
-        """Whether each of the others has sent a solution as good as this one."""
+        """Check whether each of the others has sent a solution as good as this one."""
         reward = candidate.trajectory.rewards.mean() - TOLERANCE
         reports = self.inbox.newest
         return all(
@@ -183,7 +183,7 @@ class Node:
         self.search.close()
 
     def _await_others(self, stop: threading.Event, patience: float) -> None:
-        """Gather until everybody heard from the last time is heard from again, or patience ends."""
+        """Gather until all heard from the last time are heard from again, or patience ends."""
         deadline = time.perf_counter() + patience
         heard = self._gather()
         while not (stop.is_set() or heard >= self._awaited):
@@ -195,7 +195,7 @@ class Node:
         self._awaited = heard
 
     def _gather(self, timeout: float = 0.0) -> set[int]:
-        """Who sent something new."""
+        """Return the nodes that sent something new."""
         reports = self.inbox.receive(timeout)
         for report in reports:
             self._note("received", report.node, report.sequence, report.candidate)

@@ -1,4 +1,4 @@
-"""What a node of D-D4orm reports to an observer of its work, for timelines (paper, section VIII-D)."""
+"""Reports of a node of D-D4orm to an observer of its work, for timelines (paper, section VIII-D)."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ GLANCE = 0.05
 
 
 LAST_WAIT = 30.0
-"""Seconds that the end of the process waits for a thread that nobody else waited for: native code must not be cut."""
+"""Seconds that the end of the process waits for a thread that nothing else waited for: native code must not be cut."""
 
 
 class _Job:
@@ -47,7 +47,7 @@ class _Job:
     def start(self) -> None:
         """Begin.
 
-        Ctrl-C may come while the thread starts, so whoever has to wait for it must know of this job before.
+        Ctrl-C may come while the thread starts, so the pool must know of this job before.
         """
         self._begin = time.perf_counter()
         self._thread.start()
@@ -65,12 +65,12 @@ class _Job:
 
     @property
     def running(self) -> bool:
-        """Whether it has begun and is not over."""
+        """True if it has begun and is not over."""
         return self._begin is not None and not self._over.is_set()
 
     @property
     def seconds(self) -> float:
-        """How long it has taken."""
+        """Time that it has taken."""
         if self._begin is None:
             return 0.0
         return (self._end or time.perf_counter()) - self._begin
@@ -145,7 +145,7 @@ class NodePool(ABC):
     def close(self) -> Candidate:
         """Part the nodes, and give the best candidate that they have seen.
 
-        A thread leaves what it is at where it can, and nobody waits longer for it than patience.
+        A thread leaves what it is at where it can, and it is waited for no longer than patience.
         """
         self._judge.stop.set()
         for node in self._nodes:
@@ -160,7 +160,7 @@ class NodePool(ABC):
         return max((node.search.best for node in self._nodes), key=lambda candidate: candidate.rank)
 
     def metrics(self) -> dict[str, float]:
-        """What all nodes together sent, and the share of their time that they waited for each other.
+        """Return the messages sent by all nodes, and the share of their time that they waited for each other.
 
         To be asked for once closed.
         """
@@ -217,7 +217,7 @@ class NodePool(ABC):
         return iteration
 
     def _new_records(self) -> list[IterationRecord]:
-        """What the nodes did since the last time."""
+        """Return records of the nodes' iterations since the last call."""
         new = []
         for node in self._nodes:
             records = node.search.history[self._read[node] :]
@@ -308,7 +308,7 @@ class AsyncNodePool(NodePool):
                 return candidates
 
     def _run(self, improve: bool) -> None:
-        """Start whoever does not run: at first all, later those who stopped at what proved to be no solution here."""
+        """Start idle nodes: at first all, later those that stopped at what proved to be no solution here."""
         self._judge.solution_ends = not improve
         running = [job for job in self._jobs if job.running]
         failed = [job for job in self._jobs if job.error is not None]

@@ -85,7 +85,7 @@ def _loopback_only() -> Iterator[None]:
 
 
 def host_and_port(address: str) -> tuple[str, int]:
-    """What an address names; nothing for one that is no ``host:port``, with ``ray://`` before it or without.
+    """Return host and port of an address; nothing for one that is no ``host:port``, with ``ray://`` or without.
 
     Raises:
         ValueError: If it is no address.

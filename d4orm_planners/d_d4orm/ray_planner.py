@@ -20,7 +20,7 @@ from d4orm_planners.d_d4orm.ray_connection import RayConnection
 from d4orm_planners.engine.select import get_sampling_engine
 
 RESTARTS = 3
-"""How many times an actor that was lost is started again, before its node is done without."""
+"""Number of times that a lost actor is started again, before its node is done without."""
 
 START = 120.0
 """Seconds that actors may take to start and to compile."""
@@ -31,14 +31,14 @@ GLANCE = 0.1
 
 
 class ActorOutcome(NamedTuple):
-    """What an actor made of an iteration.
+    """Outcome of an actor's iteration.
 
     Attributes:
         data: The candidate, a message.
         denoising_steps: Spent on it.
         excluded: See :class:`~d4orm_planners.base.planner.Iteration`.
         compiling: Seconds of it that went into compiling.
-        process: Who did it.
+        process: The process that did it.
     """
 
     data: bytes

@@ -17,11 +17,11 @@ ROUNDS = 50
 
 
 class Numbered(Protocol):
-    """Anything that a node sent, and as its how-manieth."""
+    """Anything that a node sent, and its number."""
 
     @property
     def node(self) -> int:
-        """Who sent it."""
+        """Sender's number."""
         ...
 
     @property

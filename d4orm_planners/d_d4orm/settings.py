@@ -44,7 +44,7 @@ class DD4ormConfig(PlannerConfig):
             (``"max"``), or one of the best of ``k`` clusters (``"k-means"``).
         k: How many candidates it draws from.
         mode: ``"sync"``: all nodes refine, then all exchange; the same seed gives the same plan. ``"async"``: each at
-            its own pace; plans then depend on who is sooner.
+            its own pace; plans then depend on which is sooner.
         patience: Seconds that are waited for stragglers: in asynchronous mode in every round, else beyond the time
             limit of the solve, after which a node is given up.
         transport: ``"local"``: nodes are threads of this process. ``"ray"``: their iterations run in actors of Ray.
@@ -101,7 +101,7 @@ class DD4ormConfig(PlannerConfig):
 
     @property
     def node_planner(self) -> type[NodePlanner]:
-        """What every node refines its candidate with."""
+        """Planner that every node refines its candidate with."""
         return next(kind for kind in NODE_PLANNERS.values() if kind.config_class is type(self.refinement))
 
     def node_planners(self, nodes: int) -> list[NodePlanner]:

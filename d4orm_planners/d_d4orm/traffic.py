@@ -1,4 +1,4 @@
-"""What a node sends, and how long it waits for the others."""
+"""Statistics of a node's messages, and of its waiting for the others."""
 
 from __future__ import annotations
 

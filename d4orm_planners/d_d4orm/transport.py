@@ -1,4 +1,4 @@
-"""How messages travel: the protocol of a transport, and threads of one process as the simplest one."""
+"""Transport of messages: its protocol, and threads of one process as the simplest one."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ class Transport(Protocol):
         ...
 
     def close(self) -> None:
-        """Leave. Whoever waits in :meth:`collect` is woken; closing again does no harm."""
+        """Leave. A call that waits in :meth:`collect` is woken; closing again does no harm."""
         ...
 
 
 class Mailbox:
-    """Where messages wait for one who collects them, whatever thread they come from.
+    """Queue of messages for one receiver, whatever thread they come from.
 
     Attributes:
         closed: Whether there will be no more.
@@ -58,7 +58,7 @@ class Mailbox:
         return messages
 
     def close(self) -> None:
-        """Wake whoever waits; from now on there is nothing to take."""
+        """Wake waiting calls; from now on there is nothing to take."""
         with self._changed:
             self.closed = True
             self._changed.notify_all()

@@ -22,7 +22,7 @@ from d4orm_planners.d_d4orm.transport import WAITING, Mailbox
 logger = logging.getLogger(__name__)
 
 LOOPBACK = ("tcp/127.0.0.1:0",)
-"""Where nodes listen unless configured otherwise: at a free port that only this machine reaches."""
+"""Default endpoint that nodes listen at: a free port that only this machine reaches."""
 
 PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws")
 
@@ -35,7 +35,7 @@ RESERVED = {
     "scouting/multicast/enabled": "multicast",
     "namespace": "namespace",
 }
-"""What a zenoh configuration file leaves to the settings, and the setting."""
+"""Keys that a zenoh configuration file leaves to the settings, and the setting."""
 
 DEFAULTS: Mapping[str, object] = {
     "mode": "peer",
@@ -55,14 +55,14 @@ _NAMESPACE = re.compile(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*")
 
 @dataclass(frozen=True, kw_only=True)
 class ZenohSettings:
-    """Where a node finds the others. By default that is on this machine only, and no port is open beyond loopback.
+    """Network of the nodes. By default that is this machine only, and no port is open beyond loopback.
 
     Attributes:
         namespace: What the nodes of one solve have in common and others on the network have not: their messages have
             the key ``NAMESPACE/candidates``.
         listen: Endpoints to listen at, as ``tcp/192.168.1.10:7447``; port 0 for any free one.
-        connect: Endpoints of other nodes or of a zenoh router; who is away is tried again and again. One is enough, as
-            connected nodes let each other know of the rest.
+        connect: Endpoints of other nodes or of a zenoh router; one that is away is tried again and again. One is
+            enough, as connected nodes let each other know of the rest.
         multicast: Whether to find others by UDP multicast: on the network, or on this machine where the node listens
             on loopback only.
         config_file: A zenoh configuration in JSON5, for TLS, access control and whatever else zenoh has; the settings
@@ -109,7 +109,7 @@ class ZenohSettings:
 
     @property
     def on_loopback(self) -> bool:
-        """Whether nobody beyond this machine can connect."""
+        """True if nobody beyond this machine can connect."""
         return all(_is_loopback(endpoint) for endpoint in self.listen)
 
 
@@ -183,7 +183,7 @@ class ZenohTransport:
 
     @property
     def has_listeners(self) -> bool:
-        """Whether anybody would receive what is published now."""
+        """Check whether any node would receive what is published now."""
         return bool(self._publisher.matching_status.matching)
 
 
@@ -244,5 +244,5 @@ def _is_loopback(endpoint: str) -> bool:
 
 
 def _reason(error: Exception) -> str:
-    """What zenoh says, on one line and without the places in its sources."""
+    """Return zenoh's message, on one line and without the places in its sources."""
     return " ".join(re.sub(r" at /\S+\.rs:\d+\.?", "", str(error)).split())

@@ -41,7 +41,7 @@ LOOK = 0.03
 
 
 class _Static(NamedTuple):
-    """What a compiled denoising run depends on besides shapes."""
+    """Static inputs of a compiled denoising run, besides shapes."""
 
     models: tuple[str, ...]
     rules: SamplingRules
@@ -51,7 +51,7 @@ class _Static(NamedTuple):
 
 
 class _Inputs(NamedTuple):
-    """What it is called with."""
+    """Inputs that it is called with."""
 
     arrays: ProblemArrays
     units: Array

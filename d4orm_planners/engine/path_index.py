@@ -1,8 +1,8 @@
-"""Where a team is at every step, compiled with numba: who comes near whom, without looking at every pair.
+"""Index of a team's positions at every step, compiled with numba: near robots without looking at every pair.
 
 Time is cut into blocks of a few steps, in which robots get not far. In every block the robots are chained in the
-buckets of a hash table, by the cell of a grid that the middle of each one's way through the block is in. Whoever comes
-near a way is in one of the few cells around it. Memory and time grow with the robots, not with the pairs.
+buckets of a hash table, by the cell of a grid that the middle of each one's way through the block is in. A robot that
+comes near a way is in one of the few cells around it. Memory and time grow with the robots, not with the pairs.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ BLOCK = 8
 """Steps in a block."""
 
 _DOUBT, _ROUNDING = 1 / 750, 64 * 2.0**-23
-"""How far from the goal radius rounding may decide, as a share of it and as a share of the coordinates: farther than
-:mod:`d4orm_env.verify.docking` has it."""
+"""Distance from the goal radius within which rounding may decide, as a share of it and as a share of the coordinates:
+farther than :mod:`d4orm_env.verify.docking` has it."""
 
 _NOBODY = np.int32(-1)
 _WIDER = 1 + 2.0**-20
-"""By how much distances up to which there may be somebody are stretched for rounding."""
+"""Factor by which distances up to which there may be a robot are stretched for rounding."""
 
 
 class PathTable(NamedTuple):
@@ -44,7 +44,7 @@ class PathTable(NamedTuple):
         middle: ``(B, K, 3)`` float64 where each robot is in each block, more or less [m],
         spread: ``(B, K)`` float64 and how far from there it gets [m].
         widest: ``(1,)`` float64 the largest spread there has been.
-        moving: ``(1,)`` int64 the last block in which there has been anybody moving.
+        moving: ``(1,)`` int64 the last block in which any robot has moved.
         first: ``(B, N)`` int32 the first robot in each bucket of each block.
         following: ``(B, K)`` int32 the robot after each in its bucket.
     """
@@ -67,7 +67,7 @@ class PathIndex:
     """The paths of a team, some of which may change.
 
     Args:
-        positions: ``(H+1, K, d)`` [m], finite; copied. At the start nobody counts as near.
+        positions: ``(H+1, K, d)`` [m], finite; copied. At the start none counts as near.
         radius: ``(K,)`` [m].
         margin: What robots are to keep between them [m].
 
@@ -102,7 +102,7 @@ class PathIndex:
         _move(self.table, np.asarray(robots, np.int64), np.ascontiguousarray(paths, np.float32))
 
     def pairs(self) -> IntArray:
-        """``(P, 2)`` who comes within the margin of whom at any step: the lower number first, in ascending order."""
+        """``(P, 2)`` pairs of robots ever within the margin of each other: the lower number first, ascending."""
         num_blocks, num_robots = self.table.following.shape
         parts: dict[int, IntArray] = {}
         self._threads.over(num_blocks, lambda part: parts.update({int(part[0]): _pairs(self.table, part)}))
@@ -112,7 +112,7 @@ class PathIndex:
     def count_meetings(
         self, robots: ArrayLike, ways: FloatArray, until: ArrayLike | None = None
     ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """How many others each of some robots would meet on each of some ways, if nobody else's changed.
+        """Count the others that robots would meet on each of some paths, if nobody else's changed.
 
         Args:
             robots: ``(R,)``.
@@ -120,7 +120,7 @@ class PathIndex:
             until: ``(R,)`` the last step that counts, or ``None`` for the horizon.
 
         Returns:
-            ``(R, V)``, and the first step at which each meets somebody, ``H+1`` if it meets nobody.
+            ``(R, V)``, and the first step at which each meets one, ``H+1`` if it meets none.
         """
         index, paths = np.asarray(robots, np.int64), np.ascontiguousarray(ways, np.float32)
         last = np.full(len(index), paths.shape[2]) if until is None else np.asarray(until, np.int64)
@@ -130,7 +130,7 @@ class PathIndex:
 
 
 def judge_alone(arrays: ProblemArrays, robots: ArrayLike, ways: FloatArray) -> NDArray[np.int32]:
-    """What can be said of some robots' ways without looking at the others.
+    """Judge some robots' paths without looking at the others.
 
     Args:
         arrays: The problem.
@@ -289,7 +289,7 @@ def _is_among(robot: Whole, robots: IntArray) -> bool:
 
 @compiled
 def count_near(table: PathTable, robot: Whole, without: IntArray, path: FloatArray, begin: Whole, block: Whole) -> int:
-    """How many a robot meets in a block, on a path that begins with its place at step ``begin``.
+    """Count the robots that one meets in a block, on a path that begins with its position at step ``begin``.
 
     Those in ``without`` ``(N,)`` do not count; it has to be one of them.
     """
@@ -405,7 +405,7 @@ def _is_same_place(path: FloatArray, dimension: int, t: int) -> bool:
 
 @inlined
 def is_unsure(arrays: ProblemArrays, place: FloatArray, goal: FloatArray) -> bool:
-    """Whether rounding may decide, here or where the plan is judged, if a robot at this place is at its goal."""
+    """Check whether rounding may decide, here or where the plan is judged, if a robot at this place is at its goal."""
     gap2, extent = 0.0, 0.0
     for axis in range(goal.shape[0]):
         gap = np.float64(place[axis]) - np.float64(goal[axis])

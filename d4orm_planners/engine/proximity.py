@@ -1,4 +1,4 @@
-"""Which contacts a tile has to check, so that the checks do not stay quadratic where nothing is near.
+"""Contacts that a tile has to check, so that the checks do not stay quadratic where nothing is near.
 
 A tile moves its robots a block of steps at a time and checks the block's places afterwards. Sixteen boxes hold a
 robot's places in the block, each those of four of the tile's samples, one box a lane of a vector: four comparisons tell
@@ -37,7 +37,7 @@ from d4orm_env.engine.simd import (
 from d4orm_env.engine.tiles import near_round
 
 WIDER = np.float32(1 + 2.0**-6)
-"""By how much robots' boxes are stretched for rounding, of coordinates many thousand times as large too."""
+"""Factor by which robots' boxes are stretched for rounding, of coordinates many thousand times as large too."""
 
 _INFINITY = np.float32(np.inf)
 _CHUNK_BITS = np.uint64((1 << CHUNK) - 1)
@@ -45,14 +45,14 @@ _HALF = np.float32(0.5)
 
 
 class Scratch(NamedTuple):
-    """What a tile notes of ``K`` robots.
+    """Scratch of a tile of ``K`` robots.
 
     Attributes:
         boxes: ``(K d BOX,)`` where the robots are within a block, see :func:`~d4orm_env.engine.simd.enclose`, widened
             so that what is within the margin of each other touches.
         num_robots: ``(K,)`` how many robots before it each may touch,
         robots: ``(K, K)`` and which.
-        near: ``(K, BLOCK)`` who is near a robot or a body at which step of the block, a bit for every sample.
+        near: ``(K, BLOCK)`` near a robot or a body at a step of the block, a bit for every sample.
         spare: ``(2 TILE,)`` two rows to overwrite.
     """
 
@@ -117,13 +117,13 @@ def _widened(low: FloatArray, high: FloatArray, margin: np.float32) -> FloatArra
 
 @inlined
 def place_of(k: Whole, step: int, dimension: int) -> Whole:
-    """Where the rows of robot ``k``'s places after a step of the block begin: a row an axis."""
+    """Return where the rows of robot ``k``'s positions after a step of the block begin: a row an axis."""
     return (k * BLOCK + step) * dimension * TILE
 
 
 @inlined
 def box_of(thing: Whole, dimension: int) -> Whole:
-    """Where the rows of a thing's boxes begin."""
+    """Return where the rows of a thing's boxes begin."""
     return thing * dimension * BOX
 
 
@@ -137,7 +137,7 @@ def enclose(k: int, reach: np.float32, dimension: int, places: FloatArray, boxes
 
 @inlined
 def _overlap(a: Whole, b: Whole, dimension: int, boxes: FloatArray) -> bool:
-    """Whether two things may touch in any lane."""
+    """Check whether two things may touch in any lane."""
     if dimension == 2:
         return lanes_overlap_2(boxes, box_of(a, dimension), box_of(b, dimension)) != NOWHERE
     return lanes_overlap_3(boxes, box_of(a, dimension), box_of(b, dimension)) != NOWHERE
@@ -153,7 +153,7 @@ def _samples_overlap(a: Whole, b: Whole, dimension: int, boxes: FloatArray) -> n
 
 @inlined
 def _near_pair(reach: np.float32, a: Whole, b: Whole, dimension: int, places: FloatArray) -> np.uint64:
-    """Where two centres are within reach, of the first ``CHUNK`` samples in the rows from ``a`` and from ``b`` on."""
+    """Return where two centres are within reach, of the first ``CHUNK`` samples in the rows from ``a`` and ``b`` on."""
     if dimension == 2:
         return chunk_within_2(places, a, b, reach * reach)
     return chunk_within_3(places, a, b, reach * reach)
@@ -161,7 +161,7 @@ def _near_pair(reach: np.float32, a: Whole, b: Whole, dimension: int, places: Fl
 
 @inlined
 def _meets(k: int, thing: int, dimension: int, boxes: FloatArray, limits: FloatArray) -> bool:
-    """Whether robot ``k`` may touch, in any lane, the thing of this number in ``limits`` ``(. d 2,)``."""
+    """Check whether robot ``k`` may touch, in any lane, the thing of this number in ``limits`` ``(. d 2,)``."""
     if dimension == 2:
         return lanes_meet_2(boxes, box_of(k, dimension), limits, thing * 4)
     return lanes_meet_3(boxes, box_of(k, dimension), limits, thing * 6)
@@ -239,8 +239,8 @@ def mark_robots(
 
 @inlined
 def near_static(arrays: ProblemArrays, k: int, bounds: FloatArray, boxes: FloatArray, spare: FloatArray) -> bool:
-    """Whether in this block any sample of robot ``k`` may be within the margin of an obstacle, or of ``bounds``, see
-    :func:`bound_boxes`. ``spare`` is two rows to overwrite.
+    """Check whether in this block any sample of robot ``k`` may be within the margin of an obstacle, or of ``bounds``,
+    see :func:`bound_boxes`. ``spare`` is two rows to overwrite.
     """
     dimension, limits, touch = arrays.goal.shape[1], bounds.reshape(-1), False
     if arrays.grid.clearance.shape[0] > 0:

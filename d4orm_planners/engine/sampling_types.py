@@ -28,7 +28,7 @@ class MovingObstacles(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SamplingTask:
-    """What to sample around and how to score it.
+    """Distribution to sample from, and rules to score by.
 
     Attributes:
         problem: The robots that are sampled, their world and horizon.
@@ -103,7 +103,7 @@ class SamplingResult(NamedTuple):
 
 
 class DenoisingStep(NamedTuple):
-    """One step of a denoising run, for whoever watches it.
+    """One step of a denoising run, for observers.
 
     Attributes:
         task: What is sampled around, and how it is scored.

@@ -42,7 +42,7 @@ CONTROL_ROWS = 3
 
 
 class Workspace(NamedTuple):
-    """What one thread needs to score tiles of ``K`` robots over ``H`` steps.
+    """Per-thread workspace to score tiles of ``K`` robots over ``H`` steps.
 
     Attributes:
         w: ``(K STRIDE,)`` the robots.
@@ -52,7 +52,7 @@ class Workspace(NamedTuple):
         moved: ``(DOCKED TILE,)`` one robot's states, moved and not docked yet.
         keys: ``(2, K H P)`` keys of the noise streams, ``P`` pairs of components each.
         standing: ``(K,)`` whether a robot has docked in all samples.
-        scratch: What is noted of who is near what.
+        scratch: Scratch of :mod:`~d4orm_planners.engine.proximity`.
     """
 
     w: FloatArray
@@ -66,7 +66,7 @@ class Workspace(NamedTuple):
 
 
 class Scoring(NamedTuple):
-    """What samples are scored by, in all steps of a run.
+    """Rules by which samples are scored, in all steps of a run.
 
     Attributes:
         docked: ``(K,)`` bool, docked from the beginning.

@@ -19,7 +19,7 @@ _RESAMPLES = 2000
 
 @dataclass(frozen=True, kw_only=True)
 class Paired:
-    """What two policies made of the same problems, seeds and levels of noise.
+    """Paired comparison of two policies on the same problems, seeds and levels of noise.
 
     Attributes:
         pairs: How many trials they have in common.
@@ -84,7 +84,7 @@ def in_common(first: Sequence[Trial], second: Sequence[Trial]) -> list[tuple[Tri
 
 
 def mcnemar(only_first: int, only_second: int) -> float:
-    """How likely it is that two equally good policies differ so much in successes on the same trials, two-sided.
+    """Return the p-value of two policies' successes on the same trials, two-sided.
 
     Q. McNemar, "Note on the sampling error of the difference between correlated proportions", Psychometrika 12, 1947;
     exact, by the binomial distribution.
@@ -105,7 +105,7 @@ def _circumstances(trial: Trial) -> tuple[str, float, int, str, str]:
 
 @dataclass(frozen=True, kw_only=True)
 class PairedPolicies:
-    """How two policies differ under one condition, by trials with the same problem and seed.
+    """Paired comparison of two policies under one condition, by trials with the same problem and seed.
 
     Attributes:
         scenario: Scenario name.
@@ -218,7 +218,7 @@ def steps_to_solution(trial: Trial) -> int | None:
 
 
 def is_solved(trial: Trial) -> bool:
-    """Whether a sampling planner found a solution: everyone arrives, the margin is kept and ``verify()`` agrees."""
+    """Check whether a sampling planner found a solution: all arrive, the margin is kept and ``verify()`` agrees."""
     return steps_to_solution(trial) is not None
 
 
@@ -252,7 +252,7 @@ class Survival:
 
 
 def survival(costs: Sequence[float | None]) -> Survival:
-    """How many trials are still unsolved when so much has been spent, of trials with the same budget.
+    """Return the survival curve of trials with the same budget: how many are unsolved when so much has been spent.
 
     Args:
         costs: Of every trial what its solution cost; ``None`` without one.

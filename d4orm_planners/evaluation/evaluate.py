@@ -143,7 +143,7 @@ def run_study(
 
 
 def _missing(jobs: Sequence[Job], store: TrialStore) -> tuple[list[Job], int, int]:
-    """What is left of the jobs, how many trials are done, and how many there are in all."""
+    """Return the jobs that are left, the number of trials done, and the number in all."""
     finished = store.finished()
     wanted: set[TrialKey] = set()
     missing = []

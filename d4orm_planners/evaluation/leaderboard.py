@@ -80,7 +80,7 @@ def _condition(rate: SuccessRate) -> tuple[float, str]:
 
 
 def _labels(trials: Iterable[Trial]) -> dict[tuple[str, str, str], str]:
-    """What to call each label, model and configuration: where one stands for several, they say how they differ."""
+    """Return names of labels, models and configurations: where one stands for several, they say how they differ."""
     configs: dict[tuple[str, str], dict[str, Mapping[str, object]]] = {}
     for trial in trials:
         configs.setdefault((trial.label, trial.model), {}).setdefault(trial.config, json.loads(trial.config))
@@ -129,7 +129,7 @@ def _deadlines(groups: Mapping[Key, Sequence[Trial]], deadlines: Sequence[float]
 
 
 def origin(trials: Sequence[Trial]) -> str:
-    """Where the numbers come from: dates, machines and versions of at least one trial, under a heading."""
+    """Return the origin of the numbers: dates, machines and versions of at least one trial, under a heading."""
     dates = sorted(trial.date for trial in trials)
     lines = ["## Where the numbers come from", "", f"{len(trials)} trials, {dates[0][:10]} to {dates[-1][:10]}"]
     for machine in sorted({trial.machine for trial in trials}):

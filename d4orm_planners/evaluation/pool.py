@@ -28,7 +28,7 @@ QUEUED = 2
 
 
 class JobEvent(Enum):
-    """What a process says about a job, apart from its trials."""
+    """Event of a job, apart from its trials."""
 
     BEGUN = "begun"
     ENDED = "ended"
@@ -61,7 +61,7 @@ class Pool(Protocol):
     """Processes that run jobs."""
 
     def free(self) -> bool:
-        """Whether it takes another job now."""
+        """True if it takes another job now."""
 
     def start(self, job: Job) -> int:
         """Hand a job over; returns a ticket for it."""
@@ -141,7 +141,7 @@ def run_jobs(jobs: Iterable[Job], pool: Pool, trial_timeout: float | None = None
 
     Args:
         jobs: What to run.
-        pool: Who runs it; closed at the end, also when the iteration is broken off.
+        pool: Pool that runs it; closed at the end, also when the iteration is broken off.
         trial_timeout: Seconds that a trial may take, that of the plan included; ``None`` is no limit.
 
     Raises:
@@ -281,7 +281,7 @@ def _interrupts_wait() -> Iterator[None]:
 
 
 def _work(pipe: Connection, parent: Connection, threads: int, run: Callable[[Any], Iterator[object]]) -> None:
-    """Run jobs until the parent is gone; Ctrl-C is for the parent, who decides."""
+    """Run jobs until the parent is gone; Ctrl-C is for the parent, which decides."""
     os.environ.update(D4ORM_NUM_THREADS=str(threads), OMP_NUM_THREADS=str(threads))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 

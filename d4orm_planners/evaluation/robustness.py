@@ -1,4 +1,4 @@
-"""What policies stand, as tables and pictures: of noise on the controls, and of every disturbance."""
+"""Robustness of policies, as tables and pictures: to noise on the controls, and to every disturbance."""
 
 from __future__ import annotations
 
@@ -221,7 +221,7 @@ def _draw_cells(ax: Axes, group: Sequence[SuccessRate]) -> None:
 
 
 def _panels(rates: Sequence[SuccessRate]) -> dict[str, list[SuccessRate]]:
-    """As in the tables, but for levels of noise too."""
+    """Group rates as in the tables, but for levels of noise too."""
     groups: dict[str, list[SuccessRate]] = {}
     for title, group in panels(rates).items():
         for rate in group:

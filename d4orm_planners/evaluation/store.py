@@ -19,17 +19,17 @@ APPLICATION_ID = 0x64346F72
 """Marks the file as one of ours, in its header ("d4or")."""
 VERSION = 9
 READABLE = (4, 5, 6, 7, 8, VERSION)
-"""Of versions before some columns have other names, and some, and a setting, are missing."""
+"""Readable versions; in older ones some columns have other names, and some, and a setting, are missing."""
 STORE = "trials.sqlite"
 """Name of the file in a folder of results."""
 LARGEST_NUMBER = 2**63 - 1
-"""That a whole number in it can be, seeds among them."""
+"""Largest whole number in it, seeds among them."""
 PATIENCE = 60.0
 """Seconds to wait for another writer."""
 
 
 class TrialKey(NamedTuple):
-    """What tells one trial from another.
+    """Key of a trial.
 
     Attributes:
         policy: Registry name.
@@ -163,7 +163,7 @@ _KEY = ", ".join(TrialKey._fields)
 _FORMER = {"num_robots": "robots", "control_noise_std": "noise"}
 """Columns that had other names in version 4."""
 _FORMERLY = {"disturbances": "'[]'", "physics": "'model'"}
-"""What columns that were missing stand for; others are empty."""
+"""Values of columns that were missing; others are empty."""
 _TRUTHS = ("success", "verified")
 _JSON: Mapping[str, type | tuple[int, ...]] = {
     "config": dict,
@@ -172,7 +172,7 @@ _JSON: Mapping[str, type | tuple[int, ...]] = {
     "history": (3, 4),
     "disturbances": (2,),
 }
-"""What must be JSON: an object, or a list of lists of one of these lengths."""
+"""Columns that must be JSON: an object, or a list of lists of one of these lengths."""
 _SQL = {"str": "TEXT", "int": "INTEGER", "float": "REAL", "bool": "INTEGER"}
 _PYTHON: Mapping[str, tuple[type, ...]] = {
     "str": (str,),
@@ -183,7 +183,7 @@ _PYTHON: Mapping[str, tuple[type, ...]] = {
 }
 _TYPES = {field.name: str(field.type).split(" | ") for field in fields(Trial)}
 _KINDS = {name: tuple(chain(*(_PYTHON[kind] for kind in kinds))) for name, kinds in _TYPES.items()}
-"""What may be in a row, by column."""
+"""Types of a row's values, by column."""
 _COLUMNS = {name: f"{name} {_SQL[kinds[0]]}{'' if 'None' in kinds else ' NOT NULL'}" for name, kinds in _TYPES.items()}
 _TABLE = f"({', '.join(_COLUMNS.values())}, PRIMARY KEY ({_KEY})) WITHOUT ROWID"
 # What has run to its end stays as it is; only a trial that failed may be tried again.
@@ -398,7 +398,7 @@ def _use_wal(connection: sqlite3.Connection) -> None:
 
 
 def _is_json(text: str, kind: type | tuple[int, ...]) -> bool:
-    """Whether a text is JSON of this kind: an object, or a list of lists of one of these lengths."""
+    """Check whether a text is JSON of this kind: an object, or a list of lists of one of these lengths."""
     try:
         content = json.loads(text)
     except (ValueError, RecursionError):

@@ -1,4 +1,4 @@
-"""What to compare: policies with their settings, on problems by scenario, team size and seed, under conditions."""
+"""Study: policies with their settings, on problems by scenario, team size and seed, under conditions."""
 
 from __future__ import annotations
 
@@ -244,7 +244,7 @@ def _varied(name: str, levels: Levels) -> list[Varied]:
 
 
 def _holds(given: object) -> bool:
-    """Whether something is a disturbance, or a list of disturbances only."""
+    """Check whether something is a disturbance, or a list of disturbances only."""
     return isinstance(given, Disturbance) or all(isinstance(one, Disturbance) for one in given)  # type: ignore[attr-defined] # a sequence
 
 

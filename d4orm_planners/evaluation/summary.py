@@ -1,4 +1,4 @@
-"""Many trials in a few numbers: success rates, times, success within a deadline, and how much a policy stands."""
+"""Many trials in a few numbers: success rates, times, success within a deadline, tolerance of disturbances."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from d4orm_env.core.arrays import positive_number
 from d4orm_planners.evaluation.store import Trial
 
 THRESHOLD = 0.9
-"""Success rate below which a policy is said to stand a disturbance no longer."""
+"""Success rate below which a policy is said to tolerate a disturbance no longer."""
 
 
 class TrialGroup(NamedTuple):
@@ -33,7 +33,7 @@ class TrialGroup(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Compared:
-    """How often a policy succeeded on one scenario, model and team size, at one level of noise.
+    """Successes of a policy on one scenario, model and team size, at one level of noise.
 
     Attributes:
         label: What the policy with its settings was called.
@@ -75,7 +75,7 @@ class Compared:
 
     @staticmethod
     def of(trials: Sequence[Trial], successes: int, label: str) -> Compared:
-        """What the trials, at least one, have in common, so many of which succeeded."""
+        """Return the row of the trials, at least one, so many of which succeeded."""
         first, errors = trials[0], [trial.error for trial in trials if trial.error]
         lower, upper = wilson_interval(successes, len(trials))
         same = ("policy", "scenario", "num_robots", "model", "control_noise_std", "physics")
@@ -93,14 +93,14 @@ class Compared:
 
 @dataclass(frozen=True, kw_only=True)
 class SuccessRate(Compared):
-    """How often everyone arrived in time and none was ever in contact, and how long it took.
+    """Rate at which all arrived in time and none was ever in contact, and the time taken.
 
     Intervals are of 95% confidence.
 
     Attributes:
         verified: Trials with whose executed controls :func:`d4orm_env.verify` found no fault.
         contacts: Those in which robots touched something.
-        late: Those in which somebody did not arrive in time.
+        late: Those in which a robot did not arrive in time.
         travel_time: Mean over the successes of the mean arrival time [s]; ``None`` without any.
         travel_time_lower: Lower end of its interval (Student's t); ``None`` with fewer than two successes.
         travel_time_upper: Upper end.
@@ -131,7 +131,7 @@ class SuccessRate(Compared):
 
 @dataclass(frozen=True)
 class SuccessWithin:
-    """How many trials would have succeeded with so much time for planning.
+    """Successes of trials with so much time for planning.
 
     Attributes:
         deadline: The time [s].
@@ -242,7 +242,7 @@ def solved_after(trial: Trial) -> float | None:
 
 
 def success_by(trials: Iterable[Trial], deadline: float) -> SuccessWithin:
-    """How many trials would have succeeded, had planning been cut short; computed, not run again.
+    """Count the trials that would have succeeded, had planning been cut short; computed, not run again.
 
     A trial with execution noise counts by the plan that was executed: exact unless the planner went on improving
     (``improve=True``) after its first solution, which might have fared otherwise under the noise.
@@ -274,7 +274,7 @@ class Tolerance:
         control_noise_std: Standard deviation of the execution noise, in the controls' units.
         disturbance: What went wrong, such as ``"push.speed"``.
         stands: The last level before that, in the order in which they were given; ``None`` if it fails at the first.
-        fails: The first level with a success rate below the threshold; ``None`` if it stands all.
+        fails: The first level with a success rate below the threshold; ``None`` if it tolerates all.
         threshold: The threshold.
     """
 
@@ -290,7 +290,7 @@ class Tolerance:
 
     @property
     def text(self) -> str:
-        """In a word: ``"4"``, or ``"over 4"`` where it stands the last level, 4."""
+        """Return the level as text: ``"4"``, or ``"over 4"`` where it tolerates the last level, 4."""
         return f"{self.fails:g}" if self.fails is not None else f"over {self.stands:g}"
 
 

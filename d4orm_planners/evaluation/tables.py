@@ -1,4 +1,4 @@
-"""What a study came to as tables and files: Markdown, CSV and Parquet."""
+"""Results of a study as tables and files: Markdown, CSV and Parquet."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pyarrow.parquet import ParquetFile
 
 MAX_TRIALS, MAX_BYTES = 10**7, 2**32
-"""Of a Parquet file that is read."""
+"""Limits of a Parquet file that is read."""
 PARQUET_HINT = 'trials.parquet is not written, which needs pyarrow; install it with pip install "d4orm-env[evaluate]"'
 HEADER = ("policy", "noise", "success", "95% interval", "verified", "contact", "not in time", "errors",
           "travel time, s", "stretch", "planning, s", "decision, ms", "training, min",
@@ -152,7 +152,7 @@ def target(path: Path) -> Iterator[Path]:
 
 
 def markdown(rates: Sequence[SuccessRate]) -> str:
-    """One table per scenario and team, with errors below. Intervals of means stand in brackets."""
+    """One table per scenario and team, with errors below. Intervals of means are in brackets."""
     blocks = [rate_table(title, group) for title, group in panels(rates).items()]
     return "\n\n".join([*blocks, *errors((rate.label, rate.error) for rate in rates)]) + "\n"
 
@@ -218,7 +218,7 @@ def panels(rates: Iterable[SuccessRate]) -> dict[str, list[SuccessRate]]:
 
 
 def in_physics(physics: str) -> str:
-    """What moved the robots, to put behind a title; nothing for what planners believe in."""
+    """Return the physics, to put behind a title; nothing for what planners believe in."""
     return "" if physics == "model" else f", in {physics}"
 
 

@@ -35,7 +35,7 @@ LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "pyrvo", "casadi", "mujoco")
 
 @dataclass(frozen=True)
 class Condition:
-    """What goes wrong in a trial.
+    """Condition of a trial.
 
     Attributes:
         control_noise_std: Standard deviation of the execution noise, in the controls' units.
@@ -69,7 +69,7 @@ class Condition:
 
     @property
     def replayable(self) -> bool:
-        """Whether the executed controls alone tell how the robots have moved."""
+        """True if the executed controls alone tell how the robots have moved."""
         return self.physics == "model" and all(one.negligible or one.replayable for one in self.disturbances)
 
 
@@ -91,7 +91,7 @@ class Configuration:
 
     @property
     def source(self) -> Any:
-        """What makes the policy, with the settings."""
+        """Policy as :func:`~d4orm_planners.make_policy` takes it, with the settings."""
         return self.policy if self.given is None else self.given
 
     @cached_property
@@ -113,7 +113,7 @@ class Configuration:
 
     @cached_property
     def planned(self) -> bool:
-        """Whether it is a plan executed open loop."""
+        """True if it is a plan executed open loop."""
         return is_planned(self.source)
 
 
@@ -136,7 +136,7 @@ class Job:
     conditions: tuple[Condition, ...]
 
     def key(self, condition: Condition) -> TrialKey:
-        """Of the trial under one condition."""
+        """Return the key of the trial under one condition."""
         policy, noise = self.policy, condition.control_noise_std
         key = (policy.policy, policy.config, self.problem.digest, noise, self.seed, condition.text, condition.physics)
         return TrialKey(*key)
@@ -204,7 +204,7 @@ def _outcome(policy: _TimedPolicy, job: Job, condition: Condition) -> dict[str, 
 
 
 def _verdict(problem: Problem, episode: Episode) -> dict[str, object]:
-    """What the judge says of the executed controls."""
+    """Verify the executed controls."""
     # It looks at the whole horizon; an episode ends earlier when everyone has docked.
     executed = episode.trajectory.controls
     rest = np.zeros((problem.horizon - len(executed), *executed.shape[1:]), executed.dtype)
@@ -234,7 +234,7 @@ class _TimedPolicy(Policy):
 
     @property
     def training_time(self) -> float | None:
-        """Of what acts, see :attr:`Trial.training_time`."""
+        """Training time of what acts, see :attr:`Trial.training_time`."""
         time: float | None = getattr(self._policy, "training_time", None)
         return time
 

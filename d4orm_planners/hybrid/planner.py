@@ -1,4 +1,4 @@
-"""The hybrid planner: an initialiser, a repairer and an improver, each of them a part that stands elsewhere."""
+"""The hybrid planner: an initialiser, a repairer and an improver, each of them a part of its own."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from d4orm_planners.mapf.planner import (
 )
 
 State = Groups | Repairs | RoadmapSolution
-"""What is kept between iterations: the repairer's state, or the roadmap solution once there is one."""
+"""State between iterations: the repairer's, or the roadmap solution once there is one."""
 
 REPLANNING = MAPFConfig()
 MAPF_AFTER = 6
 """Iterations without a solution after which paths are looked for on a roadmap."""
 LNS_PERIOD = 5
-"""Of so many iterations on a roadmap solution one improves the motions, the others replan on the roadmap."""
+"""Number of iterations on a roadmap solution of which one improves the motions; the others replan on the roadmap."""
 
 
 class Hybrid(Planner):
@@ -68,7 +68,7 @@ class Hybrid(Planner):
         return self.config.improver == "lns"
 
     def iterate(self, search: SolveRun, state: State) -> tuple[State, Iteration]:
-        """See :meth:`Planner.iterate`: initialise, then repair who fails, then improve."""
+        """See :meth:`Planner.iterate`: initialise, then repair robots that fail, then improve."""
         if isinstance(state, RoadmapSolution):
             return self.improve_roadmap_solution(search, state)
         if self.finds_paths(search):
@@ -80,7 +80,7 @@ class Hybrid(Planner):
         return self.without_paths(search, state)
 
     def without_paths(self, search: SolveRun, state: Groups | Repairs) -> tuple[State, Iteration]:
-        """Start straight or with the whole team, repair who fails, then improve."""
+        """Start straight or with the whole team, repair robots that fail, then improve."""
         if search.iteration == 0 and not search.current.controls.any():
             drives = self.straight_start(search.problem)
             return self.whole_team(search, state) if drives is None else (state, Iteration(drives))
@@ -94,11 +94,11 @@ class Hybrid(Planner):
         return self.repair(team, state), team.iteration()
 
     def straight_start(self, problem: Problem) -> FloatArray | None:
-        """Controls ``(H, K, m)`` that send everybody straight to its goal, or ``None`` to start with the whole team."""
+        """Controls ``(H, K, m)`` that send all straight to their goals, or ``None`` to start with the whole team."""
         return straight_start(problem) if self.config.start == "auto" else self.denoiser.straight_start(problem)
 
     def repair(self, team: DeformedPlan, state: Repairs) -> Repairs:
-        """Search for paths around others for who fails, and deform who fails nevertheless."""
+        """Search for paths around others for robots that fail, and deform those that fail nevertheless."""
         if self.config.reroute:
             # Here, because importing numba takes long.
             from d4orm_planners.hybrid.rerouting import reroute
@@ -109,7 +109,7 @@ class Hybrid(Planner):
         return state
 
     def whole_team(self, search: SolveRun, state: Groups | Repairs) -> tuple[State, Iteration]:
-        """Deform everybody's controls at once, as D4orm-D does, and improve them if nobody fails."""
+        """Deform all controls at once, as D4orm-D does, and improve them if none fails."""
         state, iteration = self.denoiser.whole_team(search, state)
         if not isinstance(state, Repairs):
             return state, iteration
@@ -118,7 +118,7 @@ class Hybrid(Planner):
         return state, replace(iteration, controls=team.controls)
 
     def follow(self, search: SolveRun, solution: RoadmapSolution) -> Iteration:
-        """What a team does on a roadmap solution, a little improved if that is all that is left to do."""
+        """Return the team's controls on a roadmap solution, a little improved if that is all that is left to do."""
         iteration = roadmap_iteration(search, solution)
         if not self.improves_by_lns:
             return iteration
@@ -155,6 +155,6 @@ class Hybrid(Planner):
         return stuck and start == "auto"
 
     def improve_first(self, team: DeformedPlan, rounds: int = FIRST_ROUNDS) -> None:
-        """Improve a team in which nobody fails any more, for some rounds."""
+        """Improve a team in which none fails any more, for some rounds."""
         if self.improves_by_lns and not team.faults(np.arange(team.problem.num_robots))[0].any():
             improve_first_paths(team, rounds)

@@ -16,7 +16,7 @@ from d4orm_planners.mapf.beams import MotionPrimitives, OtherAgents, find_ways
 from d4orm_planners.tracking.steering import drives, standing
 
 AWAY = np.float32(1e6)
-"""Where a robot is that is in nobody's way [m]."""
+"""Position of a robot that is in nobody's way [m]."""
 SPREAD = 20 / 3
 """Deviation of detours' points from straight ways, beyond half of their lengths, in radii of the largest robot."""
 
@@ -24,8 +24,8 @@ SPREAD = 20 / 3
 def reroute(team: WorkingPlan) -> None:
     """Let the robots that fail look for other ways, some times in turn, those that meet most others first.
 
-    As prioritised planning does, but robots that have no way yet are in the way of others all the same, at a cost: who
-    cannot get past all of them gets past most (MAPF-LNS2, Li et al., AAAI 2022).
+    As prioritised planning does, but robots that have no way yet are in the way of others all the same, at a cost: one
+    that cannot get past all of them gets past most (MAPF-LNS2, Li et al., AAAI 2022).
     """
     everybody = np.arange(team.problem.num_robots)
     for sweep in range(REROUTE_RULES.sweeps):

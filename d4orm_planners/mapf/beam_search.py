@@ -27,17 +27,17 @@ from d4orm_env.engine.tile_layout import Row
 from d4orm_planners.engine.path_index import PathTable, count_near, is_unsure, steps_of
 
 _FAR = np.float32(10)
-"""How far ahead a robot that turns off looks, in seconds at full speed."""
+"""Look-ahead of a robot that turns off, in seconds at full speed."""
 
 _AHEAD = np.float32(0.5)
-"""How far ahead of a robot the rest of its way is measured from [s]."""
+"""Distance ahead of a robot from which the rest of its path is measured [s]."""
 
 _TOUCH = 100.0
 """Robots that are met rather than an obstacle touched for a step."""
 
 
 class Moves(NamedTuple):
-    """What a robot may do in a block, ``P`` things.
+    """The ``P`` moves of a robot in a block.
 
     Attributes:
         turns: ``(P, 3)`` directions, along that to the goal and two across.
@@ -51,7 +51,7 @@ class Moves(NamedTuple):
 
 
 class BeamRules(NamedTuple):
-    """What ways are kept.
+    """Rules by which the beam keeps paths.
 
     Attributes:
         width: How many.
@@ -74,7 +74,7 @@ class Queries(NamedTuple):
         limits: ``(R,)`` what their ways must cost less than [s]: the step at which one ends, and what contacts cost.
         without: ``(R, N)`` numbers of robots that they do not mind, their own among them.
         beside: ``(R, M, H+1, d)`` ways that they mind as well [m],
-        radius: ``(R, M)`` and the radii of who is on them [m].
+        radius: ``(R, M)`` and the radii of the agents on them [m].
     """
 
     robots: NDArray[np.int64]
@@ -163,7 +163,7 @@ _TURNED, _SLOWED = {2: _turned_2, 3: _turned_3}, {2: _slowed_2, 3: _slowed_3}
 
 @compiled
 def _is_like_another(ways: _Beam, way: Whole, kept: _Beam, size: int, apart2: float) -> bool:
-    """Whether a way is about where one of those kept is, about as fast."""
+    """Check whether a path is about where one of those kept is, about as fast."""
     for other in range(size):
         gap2, change2 = 0.0, 0.0
         for axis in range(ways.velocities.shape[1]):
@@ -190,7 +190,7 @@ def _keep(ways: _Beam, way: Whole, kept: _Beam, number: Whole) -> None:
 def _count_beside(
     table: PathTable, robot: Whole, seekers: Queries, r: int, path: FloatArray, first: Whole, last: Whole
 ) -> int:
-    """How many of the further ways a path meets from one step to another; at its end it stands still."""
+    """Count the further paths that a path meets from one step to another; at its end it is at rest."""
     count, end = 0, path.shape[0] - 1
     for other in range(seekers.beside.shape[1]):
         reach = table.radius[robot] + seekers.radius[r, other] + table.margin
@@ -231,7 +231,7 @@ def search_kernel(name: str) -> Search:
     def aim_of(
         place: FloatArray, at: Row, limits: Row, goal: FloatArray, goal_radius: np.float32, moves: Moves, number: Whole
     ) -> Row:
-        """Where to head: ``place`` is an array, ``at`` a tuple of the same numbers."""
+        """Return the position to head for: ``place`` is an array, ``at`` a tuple of the same numbers."""
         turn = to_fixed_tuple(moves.turns[number], 3)
         if moves.homewards[number]:
             return turned(to_fixed_tuple(goal, d), goal_radius, turn, _frame(place, goal))

@@ -20,12 +20,12 @@ from d4orm_planners.tracking.steering import Rollouts, by_model
 
 @dataclass(frozen=True)
 class MotionPrimitives:
-    """What robots that look for a way may do.
+    """Moves of robots that look for a path.
 
     Attributes:
         angles: By which a robot turns off from the way to its goal [degrees]; in space up and down as well.
         paces: Shares of its speed with which it heads for its goal: waiting has no direction.
-        beside: Goal radii beside its goal to which it may head too: who docks there keeps clear of a neighbour.
+        beside: Goal radii beside its goal to which it may head too: one that docks there keeps clear of a neighbour.
         on_the_spot: The share with which one that has a heading turns, to its goal or to one side, as if it stood.
     """
 
@@ -57,12 +57,12 @@ class MotionPrimitives:
 
 @dataclass(frozen=True, eq=False)
 class OtherAgents:
-    """Whom robots that look for a way mind other than they drive at present.
+    """Agents that robots which look for a path avoid, other than the team as it drives at present.
 
     Attributes:
         without: ``(R, N)`` numbers of robots that each does not mind.
         beside: ``(R, M, H+1, d)`` ways that it minds as well [m].
-        radius: ``(R, M)`` radii of who is on them [m].
+        radius: ``(R, M)`` radii of the agents on them [m].
     """
 
     without: NDArray[np.int64]
@@ -85,7 +85,7 @@ def find_ways(
     limits: ArrayLike = np.inf,
     company: OtherAgents | None = None,
 ) -> Rollouts:
-    """The best ways that robots ``(R,)`` find; who finds none does what it does, and does not arrive.
+    """The best ways that robots ``(R,)`` find; one that finds none does what it does, and does not arrive.
 
     So do those left over when the search should stop.
 
@@ -96,7 +96,7 @@ def find_ways(
         manner: What they may do.
         rules: What ways are kept on the search.
         limits: ``(R,)`` what a way must cost less than [s]: its time, and what it costs to meet others.
-        company: Whom else they mind or do not mind.
+        company: Agents that they mind, or do not mind.
 
     Returns:
         A single way of each.
@@ -122,7 +122,7 @@ def find_ways(
 def _search(
     team: WorkingPlan, model: Model, moves: Moves, rules: BeamRules, seekers: Queries, u: FloatArray, x: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Controls ``(R, H, m)``, states ``(R, H+1, n)`` and who arrives, of robots of one model that did as given."""
+    """Controls ``(R, H, m)``, states ``(R, H+1, n)`` and arrivals, of robots of one model that did as given."""
     found, search = np.zeros(len(u), bool), search_kernel(model.name)
     arrays, table = team.problem.arrays, team.index.table
 

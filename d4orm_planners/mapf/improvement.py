@@ -33,7 +33,7 @@ def improve_by_lns(search: SolveRun) -> Iteration:
 
 
 def _better_roundabout(search: SolveRun) -> Trajectory | None:
-    """A roundabout in which nobody fails, with more reward than the best plan so far."""
+    """A roundabout in which none fails, with more reward than the best plan so far."""
     best = search.best
     for side in (1, -1):
         controls = drive_roundabout(search.problem, search.engine, side)
@@ -46,7 +46,7 @@ def _better_roundabout(search: SolveRun) -> Trajectory | None:
 
 
 def improve_first_paths(team: WorkingPlan, rounds: int = FIRST_ROUNDS) -> None:
-    """Take what faster ways there are at once for a team in which nobody fails, in so many rounds."""
+    """Take what faster ways there are at once for a team in which none fails, in so many rounds."""
     from d4orm_planners.mapf.lns import improve_paths
 
     rounds = min(rounds, FIRST_ROBOT_STEPS // (team.problem.num_robots * team.problem.horizon))

@@ -30,13 +30,13 @@ class SearchConstraint(NamedTuple):
 
 @dataclass(eq=False)
 class TeamConfiguration:
-    """Where the team is, and what has been tried from there.
+    """Nodes of the team, and what has been tried from there.
 
     Attributes:
         positions: ``(K,)`` nodes.
         parent: Where it came from; ``None`` for the start.
         moves: ``(M, 2)`` robots and edges in the order of the moves that led here.
-        priorities: ``(K,)`` who goes first.
+        priorities: ``(K,)`` the highest goes first.
         untried: Constraints.
     """
 
@@ -51,7 +51,7 @@ class TeamConfiguration:
         self.order = np.argsort(-self.priorities, kind="stable").astype(np.int64)
 
     def next_constraint(self, roadmap: Roadmap) -> SearchConstraint:
-        """What to try next; those that say of one robot more where it goes come after all others."""
+        """Return the next constraint to try; those on one robot more come after all others."""
         constraint = self.untried.popleft()
         if len(constraint.robots) < len(self.order):
             robot = int(self.order[len(constraint.robots)])
@@ -63,11 +63,11 @@ class TeamConfiguration:
 
 @dataclass(frozen=True, eq=False)
 class TeamMoves:
-    """What a search found.
+    """Result of a search.
 
     Attributes:
         moves: ``(M, 2)`` robots and edges, in an order in which all can be made one after another.
-        arrived: ``(K,)`` who is at its goal in the end: everybody, unless the search was ended before.
+        arrived: ``(K,)`` robots at their goals in the end: all, unless the search was ended before.
     """
 
     moves: IntArray
@@ -100,12 +100,12 @@ class TeamOnRoadmap:
         self.waits_for = [self.nobody] * num_robots
 
     def order_arrivals(self) -> None:
-        """Find out who must arrive before whom."""
+        """Find the order in which robots must arrive."""
         if self.bodies.docks:
             self.waits_for = [self.closed_by(robot) for robot in range(len(self.waits_for))]
 
     def closed_by(self, robot: int) -> BoolArray:
-        """``(K,)`` who has no way left once a robot has docked, and so must arrive before it."""
+        """``(K,)`` robots without a path once a robot has docked, which must arrive before it."""
         alone, others = self.nobody.copy(), self.nobody.copy()
         alone[robot] = True
         docked, starts = self.docked_at(alone), self.roadmap.starts
@@ -120,7 +120,7 @@ class TeamOnRoadmap:
         return others
 
     def docked_at(self, mask: BoolArray) -> NDArray[np.int32]:
-        """``(N,)`` who has docked at each node, of the robots in a mask ``(K,)``; -1 for nobody."""
+        """``(N,)`` the robot docked at each node, of those in a mask ``(K,)``; -1 for none."""
         docked = np.full(len(self.roadmap.nodes), -1, np.int32)
         docked[self.roadmap.goals[mask]] = np.flatnonzero(mask)
         return docked
@@ -132,11 +132,11 @@ class TeamOnRoadmap:
         self.masks[robot], self.holds[robot] = mask, holds
 
     def arrived(self, positions: IntArray) -> BoolArray:
-        """``(K,)`` who is at its goal."""
+        """``(K,)`` robots at their goals."""
         return positions == self.roadmap.goals
 
     def find_ways(self, positions: IntArray) -> bool:
-        """Bring all ways up to date; whether everybody has one, around those that have docked."""
+        """Bring all paths up to date; whether each robot has one, around those that have docked."""
         mask = self.arrived(positions) if self.bodies.docks else self.nobody
         docked = self.docked_at(mask)
         for robot in np.flatnonzero(~mask).tolist():
@@ -154,7 +154,7 @@ class TeamOnRoadmap:
     def after(
         self, here: TeamConfiguration, scratch: PibtWorkspace, seed: int, known: dict[bytes, TeamConfiguration]
     ) -> TeamConfiguration | None:
-        """Where a step leads under the next constraint that is untried; ``None`` where that cannot be kept.
+        """Take a step under the next untried constraint; ``None`` where that cannot be kept.
 
         A configuration that is ``known`` is returned itself; others are added.
         """
@@ -183,7 +183,7 @@ class TeamOnRoadmap:
 def find_moves(
     problem: Problem, roadmap: Roadmap, seed: int, should_stop: Callable[[], bool], max_steps: int = 1_000_000
 ) -> TeamMoves | None:
-    """Moves that bring everybody to its goal, or as many as possible until the search is stopped.
+    """Moves that bring all to their goals, or as many as possible until the search is stopped.
 
     Args:
         problem: The team.
@@ -193,7 +193,7 @@ def find_moves(
         max_steps: Steps of the team after which the search ends.
 
     Returns:
-        The moves; ``None`` where somebody has no way on the roadmap.
+        The moves; ``None`` where a robot has no path on the roadmap.
     """
     team, num_robots = TeamOnRoadmap(problem, roadmap), problem.num_robots
     length = team.bodies.costs[np.arange(num_robots), roadmap.starts].astype(np.float64)

@@ -30,7 +30,7 @@ class NeighbourhoodRules:
         size: Robots in a group, at most.
         give: How much later than before a robot of a group may arrive for the sake of those after it [s].
         temperature: How much worse the ways of a group may be and still be taken over, on average and at first [s].
-        least_delay: Who arrives as soon as if it were alone is chosen as often as who arrives so much later [s].
+        least_delay: A robot that arrives as soon as alone is chosen as often as one so much later [s].
         nearness: How much farther away a robot may be and still be chosen for a group, at random, in radii of the
             largest robot.
         angles: By which robots turn off [degrees], all times the same number, ...
@@ -38,7 +38,7 @@ class NeighbourhoodRules:
         paces: Shares of their speed with which they head for their goals.
         width: Ways that a search keeps after each block of steps.
         apart: How far apart the ways that are kept must be, in the same radii, or else twice as much in speed [1/s].
-        contact: What meeting anybody costs [s]: too much.
+        contact: Cost of meeting another robot [s]: too much.
     """
 
     groups: int = 8
@@ -65,7 +65,7 @@ def improve_paths(team: WorkingPlan, seed: int, rounds: int, temperature: float 
     first: the first is what travel takes, the second what the reward is made of.
 
     Args:
-        team: A team in which nobody fails; changed.
+        team: A team in which none fails; changed.
         seed: Of what is tried.
         rounds: How often :attr:`NeighbourhoodRules.groups` groups try.
         temperature: See :attr:`NeighbourhoodRules.temperature`; it falls to zero with the rounds.
@@ -98,7 +98,7 @@ class _Neighbourhoods:
 
     @property
     def cost(self) -> float:
-        """Of all together [s]."""
+        """Sum of all costs [s]."""
         return float((self.arrival + self.lag).sum())
 
     def costs(self, robots: IntArray, places: FloatArray) -> tuple[Floats, Floats]:

@@ -1,4 +1,4 @@
-"""What is near what among many points, compiled with numba: points sorted into cells."""
+"""Near neighbours among many points, compiled with numba: points sorted into cells."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def squared_gap(points: Floats, u: Whole, tails: Floats, v: Whole, heads: Floats
 def near_lines(
     cells: Cells, tails: Floats, heads: Floats, reach: float, first: IntArray, items: Ints, after: bool
 ) -> int:
-    """Which points come within ``reach`` of lines.
+    """Find the points that come within ``reach`` of lines.
 
     Args:
         cells: The ``N`` points.

@@ -2,8 +2,8 @@
 
 After K. Okumura, M. Machida, X. Defago and Y. Tamura, *Priority inheritance with backtracking for iterative multi-agent
 path finding* (AIJ 2022). Here a step is a sequence of moves of single robots, each of which keeps clear of where all
-others stand at that moment: who is in a robot's way moves first. So no two ever exchange places or turn in a ring,
-robots may have any size and nodes lie anywhere, and the sequence says who goes first wherever ways cross.
+others are at rest: a robot in another's way moves first. So no two ever exchange places or turn in a ring, robots may
+have any size and nodes lie anywhere, and the sequence gives the precedence wherever paths cross.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class Footprints(NamedTuple):
         reach: ``(K,)`` radius and margin to obstacles [m].
         margin: Between robots [m].
         slack: Distance beyond it that they keep where they can [m].
-        docked: By how much a robot may stand off its goal [m].
-        docks: Whether who has arrived stands there for ever.
+        docked: Distance from its goal at which a robot may stop [m].
+        docks: Whether a robot that has arrived stays there for good.
         starts: ``(K,)`` int64 nodes.
         goals: ``(K,)`` int64 nodes.
         costs: ``(K, N)`` float32 length of the way from every node to each robot's goal [m].
@@ -57,13 +57,13 @@ class Footprints(NamedTuple):
 
 
 class PibtWorkspace(NamedTuple):
-    """What a step is worked out in.
+    """Workspace of a step.
 
     Attributes:
         state: ``(K,)`` int8.
-        may_dock: ``(K,)`` bool who may come to its goal.
-        who: ``(N,)`` int32 the robot at each node; -1 for nobody.
-        robots: ``(K,)`` int64 those that others make way for, the first one first.
+        may_dock: ``(K,)`` bool: may come to its goal.
+        who: ``(N,)`` int32 the robot at each node; -1 for none.
+        robots: ``(K,)`` int64 those that others yield to, the first one first.
         edges: ``(K,)`` int64 by which each wants to go.
         tried: ``(K,)`` int64 how many edges each has tried.
         options: ``(K, D)`` int64 the edges that each tries in turn.
@@ -91,7 +91,7 @@ def _gap(points: Floats, u: Whole, v: Whole) -> float:
 def _too_near(
     roadmap: Roadmap, bodies: Footprints, k: Whole, tail: Whole, head: Whole, i: Whole, u: Whole, gap: float
 ) -> bool:
-    """Whether robot ``k`` passes robot ``i`` at node ``u`` too near, ``gap``, on its way from one node to another.
+    """Check whether robot ``k`` passes robot ``i`` at node ``u`` too near, ``gap``, on its way between two nodes.
 
     Starts and goals may be nearer to each other than robots keep: then it may leave its own, and come to its own, if it
     comes no nearer on the way.
@@ -110,7 +110,7 @@ def _too_near(
 
 @compiled
 def closed(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, tail: Whole, e: Whole) -> bool:
-    """Whether a robot can never take an edge, because it would dock in passing, or of somebody who has docked.
+    """Check whether an edge is closed to a robot for good: it would dock in passing, or be too near a docked one.
 
     ``docked`` ``(N,)`` is the robot docked at each node, -1 for none.
     """
@@ -152,7 +152,7 @@ def fill_costs(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, end
 
 @cached_kernel(variant="open", **OPTIONS)
 def is_open(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, at: Whole, costs: FloatArray) -> bool:
-    """Whether nobody who has docked closes the way that a robot at a node would take by these costs."""
+    """Check whether no docked robot closes the path that a robot at a node would take by these costs."""
     if not costs[at] < np.inf:
         return False
     while at != bodies.goals[k]:
@@ -214,7 +214,7 @@ def _rank_options(
 def _in_the_way(
     roadmap: Roadmap, bodies: Footprints, scratch: PibtWorkspace, positions: IntArray, k: Whole, e: Whole, depth: int
 ) -> Whole:
-    """The first robot that has to make way before ``k`` takes an edge; -1 for none, -2 where that cannot be."""
+    """The first robot that has to yield before ``k`` takes an edge; -1 for none, -2 where that cannot be."""
     nodes, head, at = roadmap.nodes, np.int64(roadmap.heads[e]), positions[k]
     found = -1
     for number in range(roadmap.near_first[e], roadmap.near_first[e + 1]):
@@ -323,14 +323,14 @@ def step_team(
         roadmap: The roadmap.
         bodies: The robots.
         scratch: Working space; its moves are output.
-        order: ``(K,)`` who goes first.
+        order: ``(K,)`` robots, the first one first.
         robots: ``(C,)`` robots that must go ...
         places: ... to these nodes ``(C,)``, or stay there.
         seed: Of ties.
         positions: ``(K,)`` int64 the robots' nodes, changed in place.
 
     Returns:
-        How many moves there are; -1 where somebody could not go where it must.
+        The number of moves; -1 where a robot could not go where it must.
     """
     count = 0
     scratch.state[:] = FREE

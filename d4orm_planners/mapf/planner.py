@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from d4orm_planners.mapf.roadmap_team import Replanning, TeamRollout
 
 FINENESS = (1.6, 1.25, 1.0, 2.2, 3.0)
-"""How fine the roadmaps are that are tried; see :func:`~d4orm_planners.mapf.roadmap.lay_roadmap`."""
+"""Fineness of the roadmaps that are tried; see :func:`~d4orm_planners.mapf.roadmap.lay_roadmap`."""
 TURNS = 30
 """Ways that are planned per robot before path finding for all at once is tried."""
 MAX_ROBOT_STEPS = 4_000_000
 """Most steps of all robots together, whose drives are kept several times over."""
 DETOUR_RATIO = 1.25
-"""How many times as long as straight a way is that leads far round; on a lattice any may be 1.1 times as long."""
+"""Ratio of path to straight line from which a path is a detour; on a lattice any may be 1.1 times as long."""
 LEISURELY = 10
 """Times that a straight drive at full speed takes that the robots have for which kernels are compiled."""
 STEPS = 3000
@@ -76,7 +76,7 @@ class NoPaths:
 
     @classmethod
     def unless_reachable(cls, problem: Problem) -> NoPaths | None:
-        """Why there are no ways, if :meth:`Problem.check_reachable` knows."""
+        """Return why there are no paths, if :meth:`Problem.check_reachable` knows."""
         try:
             problem.check_reachable()
         except ValueError as error:
@@ -111,12 +111,12 @@ class MAPF(Planner):
 
 
 def roadmap_iteration(search: SolveRun, guide: RoadmapSolution) -> Iteration:
-    """What a team that drives so does within the horizon."""
+    """Return the team's controls within the horizon."""
     return Iteration(guide.driven.until(search.problem.horizon))
 
 
 def going_on_from_best(search: SolveRun, guide: RoadmapSolution) -> RoadmapSolution:
-    """The guide of a team that drives as in the best plan so far, whoever found it."""
+    """The guide of a team that drives as in the best plan so far."""
     # Here, because importing numba takes long.
     from d4orm_planners.mapf.roadmap_team import TeamRollout
 
@@ -181,7 +181,7 @@ def compile_roadmap(problem: Problem) -> None:
 
 
 def needs_detour(problem: Problem) -> bool:
-    """Whether obstacles lead somebody's shortest way far round, so that straight ways are no place to begin."""
+    """Check whether obstacles make some robot's shortest path a long detour, so that straight lines are no start."""
     if not problem.world.num_obstacles:
         return False
     from d4orm_planners.mapf.lacam import TeamOnRoadmap

@@ -1,8 +1,8 @@
-"""Who goes first: from moves on a roadmap to routes, and whom each robot has to let pass before it goes on.
+"""Precedence: from moves on a roadmap to routes, and whom each robot has to let pass before it goes on.
 
 As in action dependency graphs (W. Hoenig, S. Kiesel, A. Tinka, J. W. Durham and N. Ayanian, 2019) only the order
-matters, not the time: wherever two routes come too near to each other, who moved there first goes first. Since the
-moves can be made one after another, in their order, nobody ever waits in a ring.
+matters, not the time: wherever two routes come too near to each other, the robot that moved there first goes first.
+Since the moves can be made one after another, in their order, robots never wait in a ring.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def make_routes(problem: Problem, stops: Corners, robots: Sequence[int], cut: fl
 
 
 def join_routes(problem: Problem, routes: Sequence[Route]) -> Routes:
-    """Everybody's routes, and who waits for whom."""
+    """All robots' routes, and their precedence."""
     points, times, bends = (np.concatenate(parts) for parts in zip(*routes))
     first = np.append(0, np.cumsum([len(route.times) for route in routes])).astype(np.int64)
     arcs = np.append(0.0, np.cumsum(_lengths(np.diff(points, axis=0))))
@@ -199,7 +199,7 @@ def find_waits(
     wait_first: IntArray,
     waits: IntArray,
 ) -> int:
-    """Whom robots have to let pass; see :class:`Routes`.
+    """Find whom robots have to let pass; see :class:`Routes`.
 
     ``owner`` ``(T,)`` is the robot of each point, and ``waits`` ``(room, 3)`` is at which point, for whom and until it
     has come where.

@@ -10,25 +10,25 @@ from d4orm_planners.mapf.roadmap import lay_roadmap
 from d4orm_planners.mapf.roadmap_team import FAR, Replanning, TeamRollout
 
 FINENESS = 1.6
-"""How fine the roadmap is."""
+"""Fineness of the roadmap."""
 LINGER = 1.0
-"""For so long others keep off the goal of a robot that has arrived; by then it drives on to another [s]."""
+"""Time for which others keep off the goal of a robot that has arrived; by then it drives on to another [s]."""
 TURNS = 3
 """Ways that are planned per robot before it gives up."""
 
 
 def relay_ways(problem: Problem, ways: FloatArray, changed: BoolArray, seed: int) -> FloatArray | None:
-    """Plan the ways of some robots around all others, who give way only where there is no other one.
+    """Plan the ways of some robots around all others, which yield only where there is no other one.
 
     Args:
         problem: The team where it is now, and its goals.
         ways: ``(T + 1, K, d)`` where the robots are going to be, from now on [m]; those of ``changed`` are not looked
             at.
         changed: ``(K,)`` whose way is planned.
-        seed: Of who may have to give way, and of how leisurely they drive.
+        seed: Of the robots that may have to yield, and of how leisurely they drive.
 
     Returns:
-        ``(H + 1, K, d)`` where everybody is going to be [m]; ``None`` if no ways were found.
+        ``(H + 1, K, d)`` future positions of all robots [m]; ``None`` if no paths were found.
     """
     from d4orm_planners.mapf.planner import compile_path_finding
 

@@ -19,12 +19,12 @@ from d4orm_planners.mapf.roadmap import Roadmap
 from d4orm_planners.mapf.safe_intervals import Others, find_visits, free_intervals, interval_at
 
 BLOCK = 16
-"""Steps for which it is known at once whether somebody is about."""
+"""Steps for which it is known at once whether a robot is about."""
 
 
 @compiled
 def _is_clear(others: Others, k: Whole, step: Whole, x: float, y: float, z: float) -> bool:
-    """Whether nobody is near a place at a step."""
+    """Check whether no robot is near a position at a step."""
     row = min(step, others.positions.shape[0] - 1)
     for i in range(others.positions.shape[1]):
         dx, dy = others.positions[row, i, 0] - x, others.positions[row, i, 1] - y
@@ -36,7 +36,7 @@ def _is_clear(others: Others, k: Whole, step: Whole, x: float, y: float, z: floa
 
 @compiled
 def _fill_boxes(others: Others, boxes: Floats) -> None:
-    """The lowest and highest places of everybody in every block of steps; ``boxes`` ``(B, K, 6)`` is output."""
+    """The lowest and highest positions of all robots in every block of steps; ``boxes`` ``(B, K, 6)`` is output."""
     positions, num_robots = others.positions, others.positions.shape[1]
     for block in range(boxes.shape[0]):
         for i in range(num_robots):
@@ -79,7 +79,7 @@ def _is_line_free(
 
 @compiled
 def _is_line_clear(others: Others, k: Whole, tail: Floats, head: Floats, depart: Whole, arrive: Whole) -> bool:
-    """Whether nobody is near a robot that drives straight from one place to another between two steps."""
+    """Check whether none is near a robot that drives straight from one position to another between two steps."""
     for step in range(depart + 1, arrive + 1):
         share = (step - depart) / (arrive - depart)
         x, y = tail[0] + share * (head[0] - tail[0]), tail[1] + share * (head[1] - tail[1])
@@ -129,7 +129,7 @@ def straighten(
 
 @cached_kernel(variant="touches", **OPTIONS)
 def touches(others: Others, k: Whole, places: Floats) -> bool:
-    """Whether a robot at places ``(T + 1, 3)`` comes nearer to any other than it may, after the start."""
+    """Check whether a robot at places ``(T + 1, 3)`` comes nearer to any other than it may, after the start."""
     for step in range(1, places.shape[0]):
         if not _is_clear(others, k, step, places[step, 0], places[step, 1], places[step, 2]):
             return True
@@ -137,7 +137,7 @@ def touches(others: Others, k: Whole, places: Floats) -> bool:
 
 
 class Trip(NamedTuple):
-    """How a robot is taken to drive when its way is planned.
+    """Motion that a robot is taken to make when its path is planned.
 
     Attributes:
         stride: How far it drives in a step [m].

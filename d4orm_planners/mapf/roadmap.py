@@ -58,7 +58,7 @@ class Roadmap(NamedTuple):
 def lay_roadmap(problem: Problem, fineness: float = 1.0) -> Roadmap:
     """The roadmap of a team's world.
 
-    Nodes of the lattice are so far apart that a robot at one is in nobody's way on the diagonals around it.
+    Nodes of the lattice are so far apart that a robot at one leaves room on the diagonals around it.
 
     Args:
         problem: The team, its starts and goals, and the world.
@@ -128,7 +128,7 @@ def _room(problem: Problem, space: Space | None, reaches: Floats, tails: Floats,
 def measure_gaps(
     nodes: Floats, tails: IntArray, heads: IntArray, near_first: IntArray, near: Ints, gaps: Floats
 ) -> None:
-    """How near to edges nodes are: ``gaps`` is output, all others as in :class:`Roadmap`."""
+    """Measure the distances of nodes from edges: ``gaps`` is output, all others as in :class:`Roadmap`."""
     for e in range(tails.shape[0]):
         for number in range(near_first[e], near_first[e + 1]):
             gaps[number] = np.sqrt(near_neighbours.squared_gap(nodes, near[number], nodes, tails[e], nodes, heads[e]))

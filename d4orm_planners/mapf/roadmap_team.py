@@ -25,7 +25,7 @@ from d4orm_planners.tracking.routes import Corners
 from d4orm_planners.tracking.timed_path import drive_by_clock, timed_kernel
 
 FIRST_CUT = 0.2
-"""By how much corners are cut at most on first routes, in radii of the largest robot, as all lengths below."""
+"""Most by which corners are cut on first routes, in radii of the largest robot, as all lengths below."""
 MANNERS = ((1.0, 5 / 3), (0.9, 2 / 3), (0.75, 0.2), (0.6, 1 / 15))
 """Shares of its speed that a robot is taken to drive at when its way is planned, and by how much it cuts corners; the
 next where it is late so, or comes too near to something."""
@@ -36,26 +36,26 @@ LAUNCH = 0.4
 OVERTIME = 3
 """Horizons within which first routes must be driven; they become shorter afterwards."""
 SOON, PATIENCE = 1.5, 60
-"""How many times as long as alone, and how many steps more, a way may take that is looked for at first."""
+"""Bounds of the first search for a path: so many times as long as alone, and so many steps more."""
 FAR = 1e9
-"""Where robots are that are not there yet [m]."""
+"""Position of robots that are not there yet [m]."""
 LATER = 30
 """Steps by which a robot may come later for the sake of others."""
 KEEP, TOUCH, ROUNDING = 0.4, 1 / 30, 2.0**-17
 """Distances beyond radii and margin that a way is planned to keep, where starts and goals allow it, and keeps; and what
 starts and goals themselves must be apart less, for rounding."""
 NEARNESS = 10 / 3
-"""How much farther away a robot may be and still be replanned with another, at random."""
+"""Random distance by which a robot may be farther away and still be replanned with another."""
 
 
 @dataclass(frozen=True, eq=False)
 class TeamRollout:
-    """How a team drives.
+    """Rollout of a team.
 
     Attributes:
         controls: ``(T, K, m)`` float32.
         places: ``(T + 1, K, 3)`` float64 [m].
-        arrivals: ``(K,)`` int64 step of arrival; ``T + 1`` or more for who has not arrived.
+        arrivals: ``(K,)`` int64 step of arrival; ``T + 1`` or more for one that has not arrived.
     """
 
     controls: FloatArray
@@ -64,7 +64,7 @@ class TeamRollout:
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> TeamRollout:
-        """How a team drives that docks."""
+        """Return the rollout of a team that docks."""
         places = np.zeros((*trajectory.positions.shape[:2], 3))
         places[..., : trajectory.positions.shape[2]] = trajectory.positions
         return cls(trajectory.controls, places, arrival_steps(trajectory.arrived))
@@ -97,7 +97,7 @@ class Replanning:
     Args:
         problem: The team.
         roadmap: The roadmap of its world.
-        linger: Steps after which a robot that has arrived is nobody's obstacle any more, for it goes on to another
+        linger: Steps after which a robot that has arrived is no obstacle any more, for it goes on to another
             goal; ``None`` if it stays.
 
     Attributes:
@@ -149,15 +149,15 @@ class Replanning:
         return changed if changed.cost(self.problem.horizon) < driven.cost(self.problem.horizon) else None
 
     def one_by_one(self, random: np.random.Generator, should_stop: Callable[[], bool], most: int) -> TeamRollout | None:
-        """The team with ways planned one after another; who finds none displaces others, whose turn comes again.
+        """The team, its paths planned one by one; a robot that finds none displaces others, whose turn comes again.
 
         Args:
-            random: Of the order, and of who may be displaced.
+            random: Of the order, and of the robots that may be displaced.
             should_stop: Asked before every way.
             most: Ways planned after which it gives up.
 
         Returns:
-            Everybody's ways within the horizon; ``None`` if they were not found.
+            All robots' paths within the horizon; ``None`` if they were not found.
         """
         problem, steps, num_robots = self.problem, self.problem.horizon, self.problem.num_robots
         places = np.full((steps + 1, num_robots, 3), FAR)
@@ -204,7 +204,7 @@ class Replanning:
         return None if waiting else driven
 
     def leaves(self, arrival: int) -> int | None:
-        """The step from which on a robot that arrives at a step is nobody's obstacle any more, if any."""
+        """The step from which on a robot that arrives at a step is no obstacle any more, if any."""
         return None if self.linger is None else arrival + self.linger + 1
 
     def replan_one(self, driven: TeamRollout, robot: int, latest: int, random: np.random.Generator) -> bool:
@@ -244,7 +244,7 @@ class Replanning:
         return False
 
     def fits(self, others: Others, robot: int, drive: tuple[FloatArray, Floats, int], latest: int) -> bool:
-        """Whether a drive of a robot ends in time, and comes near to nobody and nothing."""
+        """Check whether a robot's rollout ends in time, clear of all others and of obstacles."""
         _, places, arrival = drive
         if arrival > latest or touches(others, robot, places[: self.leaves(arrival)]):
             return False
@@ -255,7 +255,7 @@ class Replanning:
 
 
 def is_compiled(problem: Problem) -> bool:
-    """Whether all that a team like this in a world like this needs has been compiled in this process."""
+    """Check whether all that a team like this in a world like this needs has been compiled in this process."""
     open_world = not problem.world.num_obstacles
     return all(timed_kernel(model).signatures for model in set(problem.team.models)) and any(
         (signature[2] is types.none) == open_world for signature in straighten.signatures

@@ -1,9 +1,9 @@
-"""A roundabout: everybody drives round the place where most ways cross, on the same side.
+"""A roundabout: all drive round the point where most paths cross, on the same side.
 
-The oldest rule for many who cross at one place, as in L. Pallottino, V. G. Scordio, A. Bicchi and E. Frazzoli,
+The oldest rule for many that cross at one point, as in L. Pallottino, V. G. Scordio, A. Bicchi and E. Frazzoli,
 *Decentralized cooperative policy for conflict resolution in multivehicle systems* (IEEE Transactions on Robotics,
 2007).
-Search among single robots' ways does not find it, because nobody gains by beginning alone.
+Search among single robots' paths does not find it, because none gains by beginning alone.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SLACK = 1 / 75
 PARALLEL = 1e-6
 """Ways are parallel whose directions differ by less, squared [rad^2]."""
 CORRECTION = 1.0
-"""What of its distance from where it should be a robot makes good in a second [1/s]."""
+"""Share of its distance from where it should be that a robot makes good in a second [1/s]."""
 
 
 class Bends(NamedTuple):
@@ -65,7 +65,7 @@ def drive_roundabout(problem: Problem, engine: Engine, side: int) -> FloatArray 
         side: 1 to pass the middle to the left of it, -1 to the right.
 
     Returns:
-        ``None`` in space, where ways do not cross, where somebody begins or ends within the roundabout, or comes within
+        ``None`` in space, where ways do not cross, where a robot begins or ends within the roundabout, or comes within
         the margin of anything.
     """
     if problem.dimension != 2 or problem.num_robots < 2:
@@ -92,7 +92,7 @@ def drive_roundabout(problem: Problem, engine: Engine, side: int) -> FloatArray 
 
 
 def _driven(time: float | Floats, speed: Floats, acceleration: Floats) -> Floats:
-    """How far robots have driven that set out at time zero, as fast as they can."""
+    """Return the distance driven by robots that set out at time zero, as fast as they can."""
     gaining = np.minimum(time, speed / acceleration)
     driven: Floats = 0.5 * acceleration * gaining**2 + speed * (time - gaining)
     return driven

@@ -1,4 +1,4 @@
-"""Safe intervals of a roadmap's nodes, compiled with numba; kept only where somebody comes by."""
+"""Safe intervals of a roadmap's nodes, compiled with numba; kept only where robots come by."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from d4orm_planners.mapf.near_neighbours import Cells, cells_about
 
 
 class Others(NamedTuple):
-    """Where everybody is at every step.
+    """Positions of all robots at every step.
 
     Attributes:
         positions: ``(T + 1, K, 3)`` float64; afterwards they stay where they are [m].
@@ -25,7 +25,7 @@ class Others(NamedTuple):
 
 
 class Intervals(NamedTuple):
-    """When nobody is near each node.
+    """Intervals in which no robot is near a node, for each node.
 
     Attributes:
         first: ``(N + 1,)`` int64 where the intervals of each node begin.
@@ -40,7 +40,7 @@ class Intervals(NamedTuple):
 
 @register_jitable(nogil=True, **OPTIONS)
 def find_visits(cells: Cells, others: Others, k: Whole, steps: Whole) -> tuple[IntArray, Ints]:
-    """Stretches of steps for which somebody is near a node.
+    """Stretches of steps for which a robot is near a node.
 
     Returns:
         ``(V, 3)`` first step, step after the last, and the visit before that to the same node; and ``(N,)`` int32 the
@@ -83,7 +83,7 @@ def find_visits(cells: Cells, others: Others, k: Whole, steps: Whole) -> tuple[I
 
 @register_jitable(nogil=True, **OPTIONS)
 def free_intervals(visits: IntArray, last: Ints, start: Whole, steps: Whole) -> Intervals:
-    """When nobody visits each node, in so many steps; at the first step a robot may be where it starts anyway."""
+    """Return the intervals, in so many steps, in which none visits a node; at first a robot may be at its start."""
     count = last.shape[0]
     most = count + visits.shape[0] + 1
     first, begins, ends = np.empty(count + 1, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)

@@ -1,4 +1,4 @@
-"""What a session is asked for and has not done yet: so many things at most, and of every setting the last one."""
+"""Requests that a session has not done yet: so many at most, and of every setting the last one."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class CommandQueue:
             return self._waiting.pop(next(iter(self._waiting)))
 
     def dropped(self) -> int:
-        """How many were dropped since this was last asked."""
+        """Return the number dropped since this was last asked."""
         with self._changed:
             dropped, self._dropped = self._dropped, 0
         return dropped
@@ -48,12 +48,12 @@ class CommandQueue:
             self._changed.wait_for(lambda: self._closed or self._waiting, timeout)
 
     def close(self) -> None:
-        """Have nobody wait any more, and nothing to take."""
+        """Wake waiting calls; there is nothing to take any more."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
 
     @property
     def closed(self) -> bool:
-        """Whether it was closed."""
+        """True if it was closed."""
         return self._closed

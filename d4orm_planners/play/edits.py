@@ -1,4 +1,4 @@
-"""What one may do to a scene: functions from a problem, whose start is where the robots are now, to another.
+"""Edits of a scene: functions from a problem, whose start is where the robots are now, to another.
 
 All raise a ``ValueError`` of one line where the scene would make no sense; it then stays as it is.
 """
@@ -44,7 +44,7 @@ def move_robot(problem: Problem, robot: int, place: ArrayLike) -> Problem:
 
 
 def check_robot(problem: Problem, robot: int) -> None:
-    """Refuse a robot that somebody has taken away while it was dragged."""
+    """Refuse a robot that was taken away while it was dragged."""
     if not 0 <= robot < problem.num_robots:
         raise ValueError(f"robot_{robot} is not there any more; take another")
 
@@ -137,7 +137,7 @@ def followed(before: Problem, after: Problem, other: Problem, who: str) -> Probl
         before: This scene.
         after: What has become of it.
         other: Another with the same team and world, whose robots are elsewhere.
-        who: Whose that is, for messages.
+        who: Its owner, for messages.
     """
     kept = min(before.num_robots, after.num_robots)
     places, moved = [], []

@@ -27,7 +27,7 @@ class _Snapshot(NamedTuple):
 
 
 class EpisodeBuffer:
-    """What happened since team, world or policies last changed; one thread may add while others make replays."""
+    """Steps since team, world or policies last changed; one thread may add while others make replays."""
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
@@ -48,7 +48,7 @@ class EpisodeBuffer:
             self._snapshots.append(_Snapshot(*snapshot))
 
     def motion(self, policy: str) -> ReplayMotion:
-        """What happened, for a replay."""
+        """Return the motion for a replay."""
         with self._lock:
             problem, snapshots = self._problem, list(self._snapshots)
         states = np.stack([snapshot.states for snapshot in snapshots])

@@ -34,7 +34,7 @@ def linear(colors: Numbers) -> Colors:
 
 
 def puck(sections: int, height: float = 1.0) -> trimesh.Trimesh:
-    """What stands for something in the plane: a flat prism of radius 1 about the origin, open below."""
+    """Return the shape of things in the plane: a flat prism of radius 1 about the origin, open below."""
     mesh = trimesh.creation.cylinder(1.0, height, sections=sections)
     mesh.update_faces(mesh.face_normals[:, 2] > -0.5)
     mesh.unmerge_vertices()  # so that edges are sharp
@@ -42,7 +42,7 @@ def puck(sections: int, height: float = 1.0) -> trimesh.Trimesh:
 
 
 def ball(subdivisions: int) -> trimesh.Trimesh:
-    """What stands for something in space: a sphere of radius 1 about the origin."""
+    """Return the shape of things in space: a sphere of radius 1 about the origin."""
     return trimesh.creation.icosphere(subdivisions=subdivisions)
 
 

@@ -1,4 +1,4 @@
-"""Who may ask for anything: a browser that shows the playground's own page, and nobody else's; and for what.
+"""Access to the playground: a browser that shows its own page, and nobody else's; and requests it may make.
 
 Any page in a browser may open a web socket to a port of this machine. The browser then tells on whose behalf it does
 (``Origin``) and by which name it came (``Host``): a foreign page has another origin, and one that has had its own name
@@ -58,7 +58,7 @@ class OriginCheck:
         connection.recv = partial(self._receive, connection, client.client_id)  # type: ignore[method-assign, assignment]
 
     async def _receive(self, connection: ServerConnection, client: int) -> bytes:
-        """The next message that may come through; whoever sends something else than messages is hung up on."""
+        """The next message that may come through; a connection with anything else is closed."""
         while True:
             await asyncio.sleep(_MESSAGE_PERIOD)
             data = await ServerConnection.recv(connection)
@@ -76,7 +76,7 @@ class OriginCheck:
 
 
 def comes_from_here(headers: Headers) -> bool:
-    """Whether a request was made by a page of this machine's own, or by no page at all."""
+    """Check whether a request was made by a page of this machine's own, or by no page at all."""
     hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
     if len(hosts) != 1 or _hostname(hosts[0]) not in LOOPBACK:
         return False

@@ -188,7 +188,7 @@ class Panel:
         load.on_upload(lambda _: self._session.load(partial(read_scene, load.value.content)))
 
     def _saved(self, name: str, text: Callable[[], str]) -> Callable[[viser.GuiEvent[viser.GuiButtonHandle]], None]:
-        """What sends a file to whoever asks for it: one at a time, as a long replay takes seconds to write."""
+        """Return a handler that sends a file: one at a time, as a long replay takes seconds to write."""
 
         def save(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
             if not self._saving.acquire(blocking=False):
@@ -214,7 +214,7 @@ def _send(client: viser.ClientHandle | None, name: str, text: str) -> None:
 
 
 def status_text(frames: Sequence[Frame]) -> str:
-    """What the page says of a moment."""
+    """Return the page's text on a moment."""
     first, status = frames[0], frames[0].status
     team = first.problem.num_robots
     who = ", ".join(frame.policy for frame in frames)

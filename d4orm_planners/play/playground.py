@@ -20,7 +20,7 @@ from d4orm_planners.play.view import View
 
 FRAMES_PER_SECOND = 33
 LAST_WAIT = 1.5
-"""Seconds that closing takes at most, whatever is planned, and whoever does not hang up."""
+"""Seconds that closing takes at most, whatever is planned or connected."""
 
 
 class _Server(viser.ViserServer):
@@ -31,7 +31,7 @@ class _Server(viser.ViserServer):
 
 
 class Playground:
-    """A page that shows a session, and lets whoever looks at it change it.
+    """A page that shows a session, and lets its viewers change it.
 
     Args:
         problem: The scene to begin with.
@@ -96,7 +96,7 @@ class Playground:
 
     @property
     def clients(self) -> dict[int, viser.ClientHandle]:
-        """Who looks at the page, by number."""
+        """Clients that look at the page, by number."""
         return self._server.get_clients()
 
     def show(self) -> None:
@@ -116,7 +116,7 @@ class Playground:
 
 
 def _free_port(host: str, port: int) -> int:
-    """That port, or any that is free for 0.
+    """Return that port, or any that is free for 0.
 
     Raises:
         ValueError: If it is taken, or the host is not one of this machine's.

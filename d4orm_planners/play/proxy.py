@@ -1,4 +1,4 @@
-"""A door before a page: who comes from another machine needs the token that is in the address."""
+"""A proxy before a page: requests from other machines need the token that is in the address."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 GATE_HEADER = "X-D4orm-Gate"
-"""What the gate writes its token into, so that what is behind it can tell who has come through the gate."""
+"""Header that the gate writes its token into, so that what is behind it can tell what has come through the gate."""
 
 logger = logging.getLogger(__name__)
 
 _HEAD = 16_384
 _PATIENCE = 10.0
 _MOST_WAITING = 100
-"""Connections that have not shown the token yet; who comes while so many wait is hung up on."""
+"""Connections that have not shown the token yet; further ones are closed."""
 
 
 class AuthenticatingProxy:
@@ -109,7 +109,7 @@ class AuthenticatingProxy:
             self._waiting -= 1
 
     def _answer(self, head: bytes) -> bytes:
-        """What to say to a request; nothing if it may pass. One that cannot be read has shown no token."""
+        """Return the answer to a request; nothing if it may pass. One that cannot be read has shown no token."""
         lines = head.decode("latin-1").split("\r\n")
         headers = {
             name.strip().lower(): value.strip() for name, _, value in (line.partition(":") for line in lines[1:])
@@ -165,5 +165,5 @@ async def _pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
 
 
 def _tell_quietly(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Whoever knocks must not be able to fill the terminal."""
+    """Requests must not be able to fill the terminal."""
     logger.debug("%s", context["message"], exc_info=context.get("exception"))

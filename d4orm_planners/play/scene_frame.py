@@ -1,4 +1,4 @@
-"""What a session shows of a moment: read by the page while the session goes on."""
+"""Frame of a session's scene: read by the page while the session goes on."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from d4orm_env.core.problem import Problem
 
 @dataclass(frozen=True)
 class Status:
-    """What all that drive side by side have in common.
+    """Common status of all that drive side by side.
 
     Attributes:
         generation: Counts changes of team, world and policies.
@@ -85,7 +85,7 @@ class Frame:
         return self.bodies[:, :d] - (1 - self._share(now)) * np.float32(self.problem.dt) * self.bodies[:, d : 2 * d]
 
     def _share(self, now: float) -> np.float32:
-        """How much of the step before this moment has been shown."""
+        """Return the share of the step before this moment that has been shown."""
         status = self.status
         return np.float32(min(max((now - status.since) / max(status.pace, 1e-3), 0.0), 1.0))
 

@@ -1,6 +1,6 @@
 """A simulation that goes on by a clock in a thread of its own, and that others may look at and change meanwhile.
 
-The thread plans and steps; nobody waits for it but the simulated clock. Changes are put into a queue and made between
+The thread plans and steps; only the simulated clock waits for it. Changes are put into a queue and made between
 two steps: the team then goes on from where it is, and the policy plans anew. Where several policies drive side by side,
 each has a team of its own in the same world, and whatever is changed is changed for all.
 """
@@ -84,7 +84,7 @@ class Session:
 
     @property
     def levels(self) -> Mapping[str, float]:
-        """What goes wrong, by name and level."""
+        """Disturbances, by name and level."""
         return self._levels
 
     @property
@@ -95,11 +95,11 @@ class Session:
 
     @property
     def recorded_steps(self) -> int:
-        """How much has happened since team, world or policies last changed."""
+        """Number of steps since team, world or policies last changed."""
         return len(self._lanes[0].recording) - 1
 
     def replay(self) -> Replay:
-        """What happened since team, world or policies last changed, side by side."""
+        """Return a replay since team, world or policies last changed, side by side."""
         lanes = self._lanes
         scene = lanes[0].scene
         motions = [lane.recording.motion(lane.name) for lane in lanes]
@@ -116,7 +116,7 @@ class Session:
             self._thread.join()
 
     def refuse(self, reason: str) -> None:
-        """Say why what somebody asked for is left."""
+        """Say why a request is refused."""
 
         def make() -> None:
             raise ValueError(reason)
@@ -146,7 +146,7 @@ class Session:
     def push(self, robot: int | None, velocity: ArrayLike, lane: int = 0) -> None:
         """Give a robot a velocity on top of its own at the next step's beginning, in all that drive side by side.
 
-        Nobody tells the policies, which have to find out.
+        The policies are not told, and have to find out.
 
         Args:
             robot: Which one; ``None`` is the one that is farthest from its goal.
@@ -194,7 +194,7 @@ class Session:
         self._post(make, "policies")
 
     def set_horizon(self, steps: int) -> None:
-        """How many steps a policy that predicts looks ahead; others have no such setting."""
+        """Set the steps that a policy which predicts looks ahead; others have no such setting."""
 
         def make() -> None:
             former, self._horizon = self._horizon, steps
@@ -207,11 +207,11 @@ class Session:
         self._post(make, "horizon")
 
     def set_lifelong(self, lifelong: bool) -> None:
-        """Whether robots that arrive go on to new goals."""
+        """Set whether robots that arrive go on to new goals."""
         self._post(lambda: self._begin_here(replace(self._terms, lifelong=lifelong)), "lifelong")
 
     def disturb(self, levels: Mapping[str, float]) -> None:
-        """What goes wrong from the next step on.
+        """Set the disturbances from the next step on.
 
         Args:
             levels: Names and levels of :func:`~d4orm_env.disturbances.disturbance_registry.disturbances_at`.
@@ -242,7 +242,7 @@ class Session:
         self._post(make, "step")
 
     def set_speed(self, speed: float) -> None:
-        """How many times faster than real time the clock runs."""
+        """Set how many times faster than real time the clock runs."""
         self._speed = min(max(float(speed), 0.05), 50.0)
 
     def _post(self, command: Command, setting: str | None = None) -> None:
@@ -309,7 +309,7 @@ class Session:
         return "arrived" if all(lane.finished for lane in self._lanes) else "running"
 
     def _begin_here(self, terms: EpisodeOptions | None = None) -> None:
-        """Go on from where everybody is."""
+        """Go on from the present states."""
         self._begin([lane.scene for lane in self._lanes], terms=terms)
 
     def _begin(

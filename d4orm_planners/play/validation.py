@@ -1,6 +1,6 @@
 """Checks of what a page asks for, by the type of its message and against what the page offers.
 
-Whoever may open a web socket may send anything. What a message may be is written down here, once; all else goes no
+A web socket may carry anything. What a message may be is written down here, once; all else goes no
 further, and what does is encoded anew, so that nothing but what was checked is read behind it.
 """
 
@@ -19,7 +19,7 @@ LARGEST_UPLOAD = 2_000_000
 
 _LARGEST_COORDINATE = 1e9
 _ROUNDING = 1e-3
-"""By how much of its step a slider's value may be off."""
+"""Share of its step by which a slider's value may be off."""
 
 Coordinate = Annotated[float, Meta(ge=-_LARGEST_COORDINATE, le=_LARGEST_COORDINATE)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
@@ -101,7 +101,7 @@ class MessageValidator:
         }
 
     def checked(self, client: int, data: str | bytes) -> bytes:
-        """What a client has sent, encoded anew.
+        """Return a client's message, encoded anew.
 
         Args:
             client: Its number.
@@ -160,7 +160,7 @@ class MessageValidator:
 
 
 def _is_on_scale(value: object, control: Any) -> bool:
-    """Whether a value is one of a slider's, from its least by its step to its greatest."""
+    """Check whether a value is one of a slider's, from its least by its step to its greatest."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not control.min <= value <= control.max:
         return False
     steps = (value - control.min) / control.step

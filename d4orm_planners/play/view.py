@@ -1,4 +1,4 @@
-"""What the page shows of a session: those that drive side by side, in rows."""
+"""View of a session: those that drive side by side, in rows."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class View:
 
 
 def _places(number: int, limits: Points) -> Points:
-    """``(number, 3)`` where scenes of this size stand side by side, in rows of about as many."""
+    """``(number, 3)`` where scenes of this size are side by side, in rows of about as many."""
     columns = math.ceil(math.sqrt(number))
     row, column = np.divmod(np.arange(number), columns)
     size = (1 + GAP) * np.ptp(limits, axis=0)

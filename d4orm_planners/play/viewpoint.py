@@ -1,4 +1,4 @@
-"""Where each browser looks from at first: all of the scene, beside the controls."""
+"""First viewpoint of each browser: all of the scene, beside the controls."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Vector = NDArray[np.float64]
 
 
 class Viewpoint:
-    """Shows all that lies between two corners to whoever looks at a page.
+    """Shows a page's viewers all that lies between two corners.
 
     Args:
         server: The page.
@@ -58,7 +58,7 @@ def _looking_nowhere() -> Iterator[None]:
 
 
 def view_from(limits: Points, dimension: int, aspect: float) -> tuple[Vector, Vector]:
-    """Where to look from, and where to, for all between two corners to be seen beside the controls.
+    """Return camera and target for all between two corners to be seen beside the controls.
 
     Args:
         limits: ``(2, 3)`` corners.

@@ -21,12 +21,12 @@ from d4orm_planners.play.episode_buffer import EpisodeBuffer
 from d4orm_planners.play.scene_frame import Frame, Status, closest_approach, guidance, plan
 
 MOST_CYCLES = 10_000_000
-"""Steps of an episode that ends only when somebody changes it."""
+"""Steps of an episode that ends only when it is changed."""
 
 
 @dataclass(frozen=True)
 class EpisodeOptions:
-    """What holds for all that drive side by side.
+    """Common options of all that drive side by side.
 
     Attributes:
         seed: Of the policies, of what goes wrong, and of new goals.
@@ -81,12 +81,12 @@ class Viewport:
 
     @property
     def docked(self) -> BoolArray:
-        """``(K,)`` bool: who stands at the goal for good."""
+        """``(K,)`` bool: at the goal for good."""
         return self._joint.arrived & self._scene.docks
 
     @property
     def farthest(self) -> int:
-        """Of the robots, from its goal."""
+        """Number of the robot that is farthest from its goal."""
         joint = self._joint
         return int(np.argmax(np.linalg.norm(joint.goals - joint.states[:, : self._scene.dimension], axis=1)))
 
@@ -110,12 +110,12 @@ class Viewport:
         self._remember()
 
     def push(self, robot: int, velocity: FloatArray) -> None:
-        """Give a robot a velocity ``(d,)`` [m/s] on top of its own, which nobody tells the policy of.
+        """Give a robot a velocity ``(d,)`` [m/s] on top of its own, which the policy is not told of.
 
         As with :class:`~d4orm_env.disturbances.Push`, none becomes faster than it may be.
 
         Raises:
-            ValueError: If it stands at its goal.
+            ValueError: If it is at its goal for good.
         """
         joint, problem = self._joint, self._scene
         check_robot(problem, robot)
@@ -130,7 +130,7 @@ class Viewport:
         self._observations, _ = self._env.set_state(states)
 
     def frame(self, status: Status) -> Frame:
-        """What is shown of the present."""
+        """Return the frame of the present."""
         joint = self._joint
         return Frame(
             status=status,

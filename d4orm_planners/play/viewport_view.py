@@ -40,20 +40,20 @@ TRAIL_SEGMENTS = 8
 """Lines that a trail consists of."""
 
 PLAN_TOLERANCE = 0.1
-"""How far the line of a way ahead may be off, in radii of a robot."""
+"""Error allowed in the line of a path ahead, in radii of a robot."""
 
 PUSH_PER_METER = 1.0
 """Velocity that a robot gets for every metre of the arrow that pushes it [1/s]."""
 
 WIDTHS = {"guidance": 1.5, "plans": 4.0, "trails": 2.0}
-"""Of lines that fade, in pixels."""
+"""Widths of lines that fade, in pixels."""
 
 LINES_EVERY = 0.1
 """Seconds between new trails and plans."""
 
 
 class LaneView:
-    """What the page shows of one that drives.
+    """View of one that drives.
 
     Args:
         server: The page.
@@ -91,7 +91,7 @@ class LaneView:
             )  # fmt: skip
 
     def name(self, text: str, place: Points) -> None:
-        """Write who drives at a place of this scene."""
+        """Write the policy's name at a position of this scene."""
         self._nodes["name"] = self._scene.add_label(
             f"{self._root}/name", text, position=place, anchor="bottom-center", font_screen_scale=1.3
         )
@@ -126,7 +126,7 @@ class LaneView:
             self._draw_lines(frame)
 
     def _with_held(self, kind: str, places: Points) -> Points:
-        """Places with those that somebody drags at the pointer."""
+        """Positions, with those that are dragged at the pointer."""
         for (what, index), place in list(self._held.items()):
             if what == kind and index < len(places):
                 places[index] = place
@@ -154,7 +154,7 @@ class LaneView:
         self._drag_pushes()
 
     def _add_bodies(self, frame: Frame) -> None:
-        """What moves about and is no robot."""
+        """Add the dynamic obstacles."""
         if len(frame.bodies):
             radius = frame.bodies[:, -1]
             mesh, high = (puck(24), 0.5 * radius) if frame.problem.dimension == 2 else (ball(2), radius)
@@ -243,7 +243,7 @@ class LaneView:
         return np.array(self._nodes[kind].position if many is None else self._nodes[many].batched_positions[index])
 
     def _pointed(self, event: viser.SceneNodeDragEvent[viser.SceneNodeHandle], at: Points) -> Points:
-        """Where the pointer is: on the plane that planar robots drive on, or as far from the camera as the shape."""
+        """Return the pointer's position: on the plane that planar robots drive on, or as far off as the shape."""
         end = np.asarray(event.end_position, np.float64)
         if self._frame.problem.dimension == 3:
             return end.astype(np.float32)

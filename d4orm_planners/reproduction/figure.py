@@ -16,7 +16,7 @@ from d4orm_planners.evaluation.store import Trial, TrialKey
 from d4orm_planners.evaluation.study import Study
 
 PaperNumbers = Mapping[tuple[str, str, str], Mapping[str, str]]
-"""By section, label and metric: what the paper says, by column."""
+"""The paper's numbers by section, label and metric, and in these by column."""
 Cost = Literal["runtime", "travel_time", "first_steps"]
 Across = Literal["num_robots", "nodes", "scenario", "control_noise_std", "policy"]
 
@@ -92,7 +92,7 @@ class Figure:
     Attributes:
         name: What to call it on the command line.
         title: What it shows.
-        source: Where it stands in the paper.
+        source: Its place in the paper.
         sections: Its panels.
         across: What varies from left to right.
         metrics: What is tabulated, see :data:`~d4orm_planners.reproduction.numbers.METRICS`.
@@ -244,5 +244,5 @@ def _studies(figure: Figure, seeds: int) -> list[tuple[str, Study]]:
 
 
 def _place(label: str, key: TrialKey) -> tuple[object, ...]:
-    """Where a trial stands in a figure."""
+    """Return a trial's place in a figure."""
     return label, json.loads(key.config).get("nodes"), *key[2:]

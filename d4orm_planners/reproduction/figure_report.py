@@ -1,4 +1,4 @@
-"""What a reproduced figure found: numbers per policy and problem, as CSV and as tables beside the paper's."""
+"""Report of a reproduced figure: numbers per policy and problem, as CSV and as tables beside the paper's."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def _pairs(figure: Figure, groups: Sequence[Group]) -> list[str]:
 
 
 def _cost(figure: Figure, trials: Sequence[Trial]) -> Callable[[Trial], float]:
-    """What a trial cost, of trials that are compared."""
+    """Return the function that gives a trial's cost, for trials that are compared."""
 
     def known(trial: Trial) -> float | None:
         if figure.compared_by == "first_steps":
@@ -139,7 +139,7 @@ def _deadlines(figure: Figure, groups: Sequence[Group]) -> list[str]:
 
 
 def _is_told(figure: Figure, name: str) -> bool:
-    """Whether a table of numbers has an attribute of :class:`Measured`."""
+    """Check whether a table of numbers has an attribute of :class:`Measured`."""
     if name.startswith("first_steps"):
         return "first_steps" in figure.metrics
     return figure.timed or not is_time(name)

@@ -1,4 +1,4 @@
-"""What a reproduced figure found, in numbers: each policy on each problem, and how the tables write it."""
+"""Numbers of a reproduced figure: each policy on each problem, and how the tables write it."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Measured(Compared):
 
 
 def is_time(name: str) -> bool:
-    """Whether an attribute of :class:`Measured` is about seconds of planning."""
+    """Check whether an attribute of :class:`Measured` is about seconds of planning."""
     return name.startswith("runtime") or name in TIMES
 
 
@@ -124,7 +124,7 @@ def measured(group: Group) -> Measured:
 
 
 def _quartiles(times: Sequence[float | None]) -> tuple[float | None, ...]:
-    """Of what all trials took; ``None`` is never."""
+    """Return the quartiles of the times of all trials; ``None`` is never."""
     # Not infinite: percentiles multiply the distance to the next trial by zero where they fall on one.
     never = 1e300
     quartiles = np.percentile([never if time is None else time for time in times], (25, 50, 75))
@@ -174,7 +174,7 @@ def _number(name: str, digits: int, scale: float = 1.0) -> Callable[[Measured], 
 
 
 NEVER = "∞"
-"""For the time to the first solution of a trial that found none."""
+"""Text for the time to the first solution of a trial that found none."""
 
 
 def _success(row: Measured) -> str:
@@ -212,10 +212,10 @@ METRICS: Mapping[str, Metric] = MappingProxyType({
     "waiting_share": Metric("waiting, %", _number("waiting_share", 0, 100)),
     "step_time": Metric("control loop, ms", _number("step_time", 0, 1000)),
 })  # fmt: skip
-"""What can be tabulated."""
+"""Metrics that can be tabulated."""
 
 
 def column(figure: Figure, row: Measured) -> str:
-    """Which column of the figure's tables a row is in."""
+    """Return the column of the figure's tables that a row is in."""
     value = row.label if figure.across == "policy" else getattr(row, figure.across)
     return f"{value:g}" if isinstance(value, float) else str(value)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 NUMERIC: Mapping[str, str] = MappingProxyType(
     {"num_robots": "robots", "nodes": "nodes", "control_noise_std": "standard deviation of the noise"}
 )
-"""What may vary from left to right as a number, and what to write below."""
+"""Attributes that may vary from left to right as a number, and their labels."""
 INSTANTS = 200
 """Points of an anytime curve."""
 
@@ -69,7 +69,7 @@ Shown = Sequence[tuple[Group, Measured]]
 
 
 def _lines(figure: Figure, shown: Shown) -> dict[str, list[Measured]]:
-    """Rows by line of a plot: one per policy, or a single one where policies stand from left to right."""
+    """Rows by line of a plot: one per policy, or a single one where policies go from left to right."""
     lines: dict[str, list[Measured]] = {}
     for _, row in shown:
         lines.setdefault("" if figure.across == "policy" else row.label, []).append(row)
@@ -129,7 +129,7 @@ def _survival(ax: Axes, figure: Figure, shown: Shown) -> None:
 
 
 def _effort(figure: Figure, num_robots: int) -> str:
-    """What planning costs, to write below."""
+    """Return the label for the effort of planning."""
     what = "denoising steps" if figure.compared_by == "first_steps" else "planning time, s"
     return f"{what} ({num_robots} robots)"
 
@@ -197,4 +197,4 @@ PLOTS: Mapping[str, Callable[[Axes, Figure, Shown], None]] = MappingProxyType({
     "survival": _survival,
     "anytime": _anytime,
 })  # fmt: skip
-"""What can be drawn."""
+"""Plots by name."""

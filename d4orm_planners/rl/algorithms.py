@@ -84,7 +84,7 @@ class Algorithm:
         buffer.source, buffer.random = robots, np.random.default_rng(seed)
 
     def set_learning_rate(self, model: BaseAlgorithm, remaining: float, first: float | None = None) -> None:
-        """For the share of the training that remains, 1 to 0, where it began with ``first``, by default its own."""
+        """Set the rate for the share of the training that remains, 1 to 0, from ``first`` on, by default its own."""
         model.lr_schedule = FloatSchedule((first or self.learning_rate) * (0.1 + 0.9 * remaining))
 
 
@@ -159,4 +159,4 @@ class _SAC(Algorithm):
 
 
 ALGORITHMS: Mapping[str, Algorithm] = MappingProxyType({"ppo": _PPO(), "sac": _SAC()})
-"""By the names of the policies that come of them."""
+"""Algorithms by the names of their policies."""

@@ -190,7 +190,7 @@ def _room(model: BaseAlgorithm, env: VecNormalize) -> dict[str, np.ndarray]:
 
 
 def _numbers(model: BaseAlgorithm, env: VecNormalize) -> dict[str, Any]:
-    """What Stable-Baselines3 does not keep in its zip, or keeps pickled."""
+    """Return numbers that Stable-Baselines3 does not keep in its zip, or keeps pickled."""
     numbers = {name: np.array(getattr(model, name)) for name in _COUNTERS}
     for name, running in _running(env).items():
         numbers |= {f"{name}_{part}": np.array(getattr(running, part)) for part in ("mean", "var", "count")}

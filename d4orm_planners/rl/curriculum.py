@@ -1,4 +1,4 @@
-"""What a learner practises, and in which order."""
+"""Curriculum: a learner's tasks, and their order."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How well a policy in training does on instances that it is not trained on."""
+"""Learning curve: success of a policy in training on instances that it is not trained on."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Evaluation:
 
 
 def evaluate_network(network: Network, worlds: RobotVecEnv | MixedVecEnv, seed: int) -> Outcome:
-    """How the worlds end in one episode each, without exploring; of a mixture, the mean of its parts."""
+    """Run one episode in each world, without exploring; of a mixture, the mean of its parts."""
     parts = worlds.parts if isinstance(worlds, MixedVecEnv) else (worlds,)
     means = [np.mean(run_worlds(network, part, seed), axis=0) for part in parts]
     success, travel_time = (float(np.mean(values)) for values in zip(*means))

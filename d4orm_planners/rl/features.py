@@ -1,4 +1,4 @@
-"""What a learned policy sees of an observation: the same things, seen from the robot and in its own measure.
+"""Features of an observation: the same things, seen from the robot and in its own measure.
 
 A problem that is turned or moved as a whole is the same problem. Vectors are therefore given in a frame of the robot's
 own: its first axis points to the goal where controls are vectors of the world, which are turned back, and forward where
@@ -22,7 +22,7 @@ TURNED_MODELS = frozenset({"holonomic2d", "holonomic3d", "velocity2d"})
 """Models whose controls are vectors of the world."""
 
 ArrayOrTensor: TypeAlias = Any
-"""Of NumPy or of torch."""
+"""An array of NumPy or of torch."""
 
 Frame: TypeAlias = Literal["goal", "heading"]
 
@@ -53,7 +53,7 @@ class Features:
 
     @classmethod
     def of(cls, slices: ObservationSlices, model: str) -> Features:
-        """For the observations of robots of a model."""
+        """Make features for the observations of robots of a model."""
         turns = get_model(model).heading_index is not None
         return cls(slices, model in TURNED_MODELS, "heading" if turns else "goal")
 
@@ -167,7 +167,7 @@ class Features:
         """The actions that :meth:`decode` makes these controls of.
 
         Args:
-            controls: ``(N, m)`` in physical units; what goes beyond the limits is brought within.
+            controls: ``(N, m)`` in physical units; clipped to the limits.
             frames: ``(N, 2)`` as from :meth:`encode`.
             limits: ``(N, m)`` largest controls.
 

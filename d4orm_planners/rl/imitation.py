@@ -38,7 +38,7 @@ from d4orm_planners.rl.train_config import VALIDATION_SEED, Many, TrainConfig
 from d4orm_planners.rl.training import Progress, TrainingResult
 
 LEARNER = "ppo"
-"""Whose network learns, and whose policy it is then."""
+"""Algorithm whose network learns, and whose policy it is then."""
 HELD_OUT = 10
 """One in so many episodes is not learned from but tells the imitation error."""
 
@@ -51,7 +51,7 @@ they are late, weak, noisy or stalled."""
 
 @dataclass(frozen=True, kw_only=True)
 class ImitationSettings(TrainConfig):
-    """Whom to imitate, and how long.
+    """Settings of imitation: the expert, and how long.
 
     Attributes:
         expert: A planner or policy by name or import path. A planner's plan is executed open loop, which tells nothing
@@ -81,7 +81,7 @@ class ImitationSettings(TrainConfig):
 
     @property
     def all_expert_settings(self) -> dict[str, object]:
-        """What the expert is made with."""
+        """All settings of the expert."""
         own = {name: value for name, value in OTHERS_DRIVE.items() if name in setting_names(self.expert)}
         return own | dict(self.expert_settings)
 
@@ -96,7 +96,7 @@ def imitate(
     recorded.
 
     Args:
-        settings: Whom to imitate.
+        settings: Settings of the imitation.
         out: Folder to write to, and to go on from.
         progress: Called as ``progress(what, episodes and epochs done, in all)``.
         command: How the training was called, for the policy file.
@@ -175,7 +175,7 @@ class _ImitationRun:
         return f"; success {self.evaluations[-1].success_rate:.0%}" if self.evaluations else ""
 
     def _network(self, index: int, seconds: float = 0.0) -> Network:
-        """What has been learned by now, the last ``seconds`` in this round."""
+        """Return the network as it is now, the last ``seconds`` in this round."""
         spent = round(seconds + sum(earlier.seconds for earlier in self.evaluations), 1)
         details = {"command": self._command, "round": index + 1, "training_time": spent}
         return network_of(self.settings.header(LEARNER, self._validation, **details), self._model, self._env)

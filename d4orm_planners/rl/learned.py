@@ -49,7 +49,7 @@ class LearnedConfig(CheckedSettings):
 
 
 class LearnedPolicy(Policy):
-    """What PPO and SAC have in common: every robot by itself maps what it observes to its most likely control.
+    """Base of PPO and SAC policies: every robot by itself maps what it observes to its most likely control.
 
     Attributes:
         training_time: Seconds of training behind what acts now, where its file tells; else ``None``.
@@ -83,7 +83,7 @@ class LearnedPolicy(Policy):
         return [SHIPPED / f"{cls.name}{SUFFIX}", *sorted(SHIPPED.glob(f"{cls.name}-*{SUFFIX}"))]
 
     def _file(self) -> Path:
-        """That for robots of the team's model in a world like this, or else the nearest."""
+        """Return the file for robots of the team's model in a world like this, or else the nearest."""
         files, model = self._files(self.config), self.problem.team.models[0]
         walls = "-walls" if self._walled else ""
         stems = (f"{self.name}-{model}{walls}", f"{self.name}-{model}", f"{self.name}{walls}")
@@ -91,7 +91,7 @@ class LearnedPolicy(Policy):
 
     @property
     def _walled(self) -> bool:
-        """Whether ways matter: round a few round obstacles, all of which it sees, a robot finds by what it sees."""
+        """True if paths matter: round a few round obstacles, all of which it sees, a robot finds by what it sees."""
         world = self.problem.world
         return len(world.boxes) + len(world.polygons) > 0 or world.num_obstacles > SEEN_OBSTACLES
 
@@ -121,7 +121,7 @@ class LearnedPolicy(Policy):
         return within_limits(self.problem, dict(zip(observations, controls)))
 
     def _look_along_ways(self, network: Network, robots: list[int], seen: FloatArray, state: FloatArray) -> None:
-        """Change the goals in ``seen`` ``(N, D)`` as in training, by the map that everybody has.
+        """Change the goals in ``seen`` ``(N, D)`` as in training, by the map that all have.
 
         Where a robot is follows from its goal and where it sees that.
         """

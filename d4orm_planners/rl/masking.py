@@ -71,7 +71,7 @@ class MaskedReplayBuffer(_MaskedBuffer, ReplayBuffer):
         return self.to_torch(normalized)
 
     def _acted_steps(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As many steps as there are rows, drawn again until somebody acted in them."""
+        """Return as many steps as there are rows, drawn again until a robot acted in them."""
         slots = self.random.integers(0, self.n_envs, len(rows))
         last = self.buffer_size if self.full else self.pos
         while (idle := ~self.acted[rows, slots]).any():

@@ -25,14 +25,14 @@ EPSILON = 0.1
 """Added to variances. Features are of order one; what was never seen to vary, as a fourth neighbour in teams of four,
 must not be blown up when it does."""
 CLIP = 10.0
-"""Of normalised features."""
+"""Bound of normalised features."""
 MAX_BYTES = 64 * 2**20
 SUFFIX = ".safetensors"
 _ACTIVATIONS: Mapping[str, Callable[[FloatArray], FloatArray]] = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, 0)}
 
 
 class Header(BaseModel):
-    """What a policy file says about itself.
+    """Header of a policy file.
 
     Attributes:
         format: Version of the file format.
@@ -68,7 +68,7 @@ class Header(BaseModel):
     training: dict[str, object]
 
     def text(self) -> str:
-        """As JSON, which earlier versions read where it says nothing that they do not know."""
+        """Return it as JSON, which earlier versions read where it says nothing that they do not know."""
         unsaid = {name for name in ("encoder", "frame", "ways") if getattr(self, name) is None}
         return self.model_dump_json(exclude=unsaid)
 
@@ -89,7 +89,7 @@ class Network:
 
     @property
     def features(self) -> Features:
-        """What it sees."""
+        """Features that it sees."""
         head = self.header
         features = Features.of(ObservationSlices(head.dimension, head.num_neighbors, head.num_obstacles), head.model)
         return replace(features, frame=head.frame or "goal")
@@ -124,13 +124,13 @@ class Network:
         return features.decode(self(seen), frames, limits)
 
     def features_for(self, size: int) -> Features | None:
-        """What it sees of observations of ``size`` numbers; ``None`` if it cannot act by those."""
+        """Return its features of observations of ``size`` numbers; ``None`` if it cannot act by those."""
         if self.header.encoder is None:
             return self.features if size == self.features.slices.size else None
         return self.features.of_observation_size(size)
 
     def _inputs(self, features: FloatArray) -> FloatArray:
-        """Of the first layer."""
+        """Return the input of the first layer."""
         if self.header.encoder == "sets":
             return encode(self.features, self.arrays, np.clip(features, -CLIP, CLIP))
         mean, variance = self.arrays["observation_mean"], self.arrays["observation_variance"]

@@ -1,4 +1,4 @@
-"""Scenarios to train on: those whose symmetry or fixed places nobody should learn by heart, made irregular."""
+"""Scenarios to train on: those whose symmetry or fixed positions should not be learned by heart, made irregular."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ class RobotVecEnv(VecEnv):
     Environment ``b * K + k`` is robot ``k`` of world ``b``. Observations are the :class:`Features` ``(B * K, F)``,
     actions ``(B * K, m)`` in ``[-1, 1]``. A robot's episode ends when it arrives (terminated) or its world is out of
     time (truncated, ``infos[i]["TimeLimit.truncated"]``); ``infos[i]["terminal_observation"]`` is what it saw last, and
-    ``is_success`` says whether it arrived without ever touching anything. An arrived robot then stands in its world
+    ``is_success`` says whether it arrived without ever touching anything. An arrived robot then stays in its world
     until that begins anew, when all have arrived or time is up: meanwhile its observation and reward are zero, its
     action is ignored, and :attr:`acted` is ``False``. What happens then is nothing to learn from.
 
@@ -177,7 +177,7 @@ class RobotVecEnv(VecEnv):
     def conclude(
         self, features: FloatArray, frames: FloatArray
     ) -> tuple[FloatArray, FloatArray, BoolArray, list[Info]]:
-        """What a step gives, with the features and frames of what :meth:`drive` returned."""
+        """Return the result of a step, with the features and frames of what :meth:`drive` returned."""
         shown, terminal = self.show(features, frames)
         robot_infos, dones = self._robot_infos(self._finishing, terminal, self._arrived), self._dones
         for values in (self._touched, self._return, self._length):
@@ -185,7 +185,7 @@ class RobotVecEnv(VecEnv):
         return shown, self._rewards.ravel().astype(np.float32), dones.ravel(), robot_infos
 
     def _in_sight(self, observations: FloatArray, last: list[FloatArray]) -> FloatArray:
-        """What the robots are to see now, and what those whose episodes have ended saw last."""
+        """Return what the robots are to see now, and what those whose episodes have ended saw last."""
         seen = observations.reshape(self.num_envs, -1)
         seen = np.concatenate([seen, last]) if last else seen
         if self._hidden.any():

@@ -1,4 +1,4 @@
-"""What robots saw and what an expert would have had them do: recorded, and kept in files."""
+"""Samples of robots' observations and an expert's actions: recorded, and kept in files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Driver = Callable[[FloatArray, FloatArray], FloatArray]
 
 MAX_BYTES = 2**31
-"""Of one array of a file that is read."""
+"""Largest array of a file that is read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,10 +80,10 @@ def record_samples(env: ParallelEnv, expert: Policy, seed: int, learner: Driver 
 
     Args:
         env: A :mod:`d4orm_env.navigation_v0` parallel environment of a team of one model.
-        expert: Who is asked.
+        expert: Policy that is asked.
         seed: Seeds both.
-        learner: Who drives, as ``(observations (N, D), limits (N, m)) -> controls (N, m)``; by default the expert. With
-            a learner the expert is asked where that has led the team.
+        learner: Policy that drives, as ``(observations (N, D), limits (N, m)) -> controls (N, m)``; by default the
+            expert. With a learner the expert is asked where that has led the team.
 
     Returns:
         What the robots saw until they arrived, and what the expert said.

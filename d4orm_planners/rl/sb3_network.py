@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecNormalize
 
 START_COUNT = 1e6
-"""How many observations the normalisation of a network that learns on counts for: what it knows is not forgotten."""
+"""Observations that a trained network's normalisation counts for: what it knows is not forgotten."""
 
 
 def network_of(header: Mapping[str, Any], model: BaseAlgorithm, normalization: VecNormalize) -> Network:
@@ -98,7 +98,7 @@ def _squashed(model: BaseAlgorithm) -> bool:
 
 
 def _actor(model: BaseAlgorithm) -> list[torch.nn.Module]:
-    """What a model acts by, in order."""
+    """Return the layers that a model acts by, in order."""
     policy: Any = model.policy
     if _squashed(model):
         return [*policy.actor.latent_pi, policy.actor.mu]

@@ -16,7 +16,7 @@ from d4orm_planners.rl.network import EPSILON
 from d4orm_planners.rl.set_network import KINDS, SUM_SCALE
 
 WIDTHS = (64, 32)
-"""Of the layers that neighbours go through, and of those of obstacles."""
+"""Widths of the layers that neighbours go through, and of those of obstacles."""
 
 
 class _Set(nn.Module):
@@ -36,7 +36,7 @@ class _Set(nn.Module):
 
 
 class SetExtractor(BaseFeaturesExtractor):
-    """What every neighbour and every obstacle adds, pooled, beside what a robot knows of itself.
+    """Pooled features of neighbours and obstacles, beside a robot's own.
 
     Args:
         observation_space: Of features ``(F,)``.

@@ -1,4 +1,4 @@
-"""What a network of sets makes of features: neighbours and obstacles in any order, and any number of neighbours.
+"""Network of sets: neighbours and obstacles in any order, and any number of neighbours.
 
 Every neighbour goes, with what the robot knows of itself, through the same two layers, and what comes out is pooled by
 its maximum and its sum over the neighbours that are there (deep sets: M. Zaheer et al., NeurIPS 2017). Obstacles
@@ -15,9 +15,9 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_planners.rl.features import Features
 
 KINDS = ("neighbor", "obstacle")
-"""What there are sets of, in the order in which features have them."""
+"""Kinds of sets, in the order in which features have them."""
 SUM_SCALE = 0.25
-"""Of sums, which keeps those of a few of order one."""
+"""Scale of sums, which keeps those of a few of order one."""
 
 
 def array_shapes(features: Features, arrays: Mapping[str, FloatArray]) -> dict[str, tuple[int | None, ...]]:

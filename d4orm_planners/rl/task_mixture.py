@@ -118,7 +118,7 @@ class TrainTask:
 
     @classmethod
     def parse(cls, text: str) -> TrainTask:
-        """From a scenario, a team size, and settings ``name=value``, separated by blanks.
+        """Parse a scenario, a team size, and settings ``name=value``, separated by blanks.
 
         ``sight=4`` and ``disturb.delay=2``, with any disturbance's name and level, are among the settings.
 
@@ -157,7 +157,7 @@ class TrainTask:
         return make_problem(self.scenario, self.num_robots, seed, model=model, **self.settings)
 
     def draws(self, model: str | None = None) -> bool:
-        """Whether its instances differ."""
+        """Check whether its instances differ."""
         return find_scenario(self.scenario).draws or self.problem(0, model) != self.problem(1, model)
 
     def worlds(

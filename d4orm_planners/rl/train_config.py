@@ -1,4 +1,4 @@
-"""What a policy that all robots share is trained for: settings and worlds that all trainings have in common."""
+"""Common settings and worlds of all trainings of a policy that all robots share."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Seed = Annotated[Whole, Field(ge=0)]
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig(CheckedSettings):
-    """What to train for.
+    """Common settings of all trainings.
 
     Attributes:
         scenario: What is to be learned. Instances of ``random`` are practised along with any other scenario.
@@ -60,8 +60,8 @@ class TrainConfig(CheckedSettings):
         return self.exercise(self.scenario, self.num_robots).problem(0, self.model)
 
     def arguments(self, scenario: str) -> dict[str, Any]:
-        """Of environments of the scenario to be learned, or of ``random`` with robots like its own, but for their
-        number.
+        """Arguments of environments of the scenario to be learned, or of ``random`` with robots like its own, but for
+        their number.
         """
         settings = self.exercise(scenario, self.num_robots).settings
         return {"scenario": scenario, "model": self.model_in(scenario), **settings}
@@ -87,7 +87,7 @@ class TrainConfig(CheckedSettings):
         return exercise.validation(self.validation_worlds, VALIDATION_SEED, self.model, **options)
 
     def header(self, algorithm: str, worlds: RobotVecEnv | MixedVecEnv, **training: object) -> dict[str, object]:
-        """Of a policy file: what a model does not tell."""
+        """Return the header of a policy file: what a model does not tell."""
         slices, frame = worlds.features.slices, worlds.features.frame
         return {
             "algorithm": algorithm,

@@ -54,7 +54,7 @@ def _as_tuple(value: object) -> object:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingSettings(TrainConfig):
-    """What to train for, and how long.
+    """Settings of a training.
 
     Attributes:
         algorithm: ``"ppo"`` or ``"sac"``.
@@ -119,12 +119,12 @@ class TrainingSettings(TrainConfig):
 
     @property
     def reward(self) -> TrainingReward:
-        """What is learned from."""
+        """Reward to learn from."""
         return TrainingReward(**self.reward_settings)
 
     @property
     def worlds_of_exercises(self) -> tuple[int, ...]:
-        """How many worlds each part of the mixture has."""
+        """Number of worlds of each part of the mixture."""
         share = (self.num_envs or ALGORITHMS[self.algorithm].num_envs) / max(len(self.exercises), 1)
         return tuple(max(round(share / exercise.num_robots), 1) for exercise in self.exercises)
 
@@ -137,7 +137,7 @@ class TrainingSettings(TrainConfig):
         return common_batch(sizes, self.num_envs or ALGORITHMS[self.algorithm].num_envs)
 
     def parts(self, lesson: Stage) -> list[tuple[TrainTask, list[int | None], str | None]]:
-        """What is practised in a lesson: exercises, with the sight of each of their worlds and the robots' model."""
+        """Return the tasks of a stage, with the observed robots of each of their worlds and the robots' model."""
         if self.mixture:
             return [(*part, self.model) for part in gather_parts(self.exercises, self.worlds_of_exercises)]
         exercise = self.exercise(lesson.scenario, lesson.num_robots)
@@ -183,13 +183,13 @@ class TrainingSettings(TrainConfig):
 
     @property
     def _options(self) -> dict[str, Any]:
-        """Of the environments."""
+        """Options of the environments."""
         return {"observed_robots": self.observed_robots, "reward": self.reward, "ways": self.ways}
 
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """What came of a training.
+    """Result of a training.
 
     Attributes:
         network: The policy with the best validation.

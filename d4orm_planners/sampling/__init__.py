@@ -1,1 +1,1 @@
-"""What MPPI, CEM, MBD, i-MBD and D4orm share: noise schedules, weights and the loop over iterations."""
+"""Common parts of MPPI, CEM, MBD, i-MBD and D4orm: noise schedules, weights and the loop over iterations."""

@@ -59,7 +59,7 @@ class DenoisingFilm:
         return len(self._frames)
 
     def developed(self, most: int = 120) -> Denoising:
-        """Where the candidates and samples lead.
+        """Roll out the candidates and samples.
 
         Args:
             most: Steps to keep, spread evenly; the last is among them.

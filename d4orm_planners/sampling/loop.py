@@ -44,7 +44,7 @@ class SamplingPlanner(Planner):
         """``(base, mean)``, each ``(H, K, m)``: samples are drawn around ``mean`` on top of ``base``."""
 
     def task(self, search: SolveRun, base: FloatArray) -> SamplingTask:
-        """What this iteration samples and scores."""
+        """Return the sampling and scoring of this iteration."""
         credit = self.config.credit
         if credit == "alternate":
             credit = "team" if search.iteration % 2 else "robot"

@@ -24,7 +24,7 @@ PAPER = {
     "clip_between_iterations": False,
     "short_paths": False,
 }
-"""What the paper's experiments share (section IV-B)."""
+"""Settings that the paper's experiments share (section IV-B)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +54,7 @@ class SamplingConfig(PlannerConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class SoftmaxSettings(CheckedSettings):
-    """Of methods that weight samples by a softmax.
+    """Settings of methods that weight samples by a softmax.
 
     Attributes:
         temperature: ``lambda`` of the softmax over normalised rewards.
@@ -72,7 +72,7 @@ class SoftmaxSettings(CheckedSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class DiffusionSettings(CheckedSettings):
-    """Of methods whose noise follows the diffusion schedule.
+    """Settings of methods whose noise follows the diffusion schedule.
 
     Attributes:
         beta_start: First variance of the diffusion schedule.
@@ -97,7 +97,7 @@ class DiffusionSettings(CheckedSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class ContinuationSettings(CheckedSettings):
-    """Of methods whose iterations go on from the last one's controls.
+    """Settings of methods whose iterations go on from the last one's controls.
 
     Attributes:
         clip_between_iterations: Start the next iteration from the controls as executed, inside the limits, rather than

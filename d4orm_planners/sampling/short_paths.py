@@ -1,4 +1,4 @@
-"""What is sampled where robots have to pass each other on short paths.
+"""Sampling where robots have to pass each other on short paths.
 
 A robot that evades another makes a detour. On a path that is long next to the robots it costs next to nothing; on a
 short one nearly as much as driving through the other, by a reward that counts distances relative to the path and most

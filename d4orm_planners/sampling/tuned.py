@@ -1,4 +1,4 @@
-"""What tuning found for D4orm and its rivals: the preset ``"tuned"``.
+"""Tuned settings of D4orm and its rivals: the preset ``"tuned"``.
 
 From ``examples/tune_rivals.py --candidates 27 --seeds 4``: 27 settings each, the preset ``"paper"`` among them, on four
 teams of 8 and 16 robots with seeds from 100 on. A third of the settings went on to twice the seeds, and a third of
@@ -21,4 +21,4 @@ TUNED: Mapping[str, Mapping[str, object]] = MappingProxyType({
     "d4orm": {"temperature": 0.495, "beta_start": 1.55e-5, "beta_end": 2.03e-2, "num_steps": 50,
               "clip_between_iterations": False},
 })  # fmt: skip
-"""By planner, what differs from the preset ``"paper"``."""
+"""Differences from the preset ``"paper"``, by planner."""

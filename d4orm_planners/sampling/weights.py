@@ -17,7 +17,7 @@ Array: TypeAlias = Any
 class SoftmaxWeights:
     """``exp(normalised reward / temperature)``, normalised to sum to one (paper, Eq. for the Monte Carlo estimate).
 
-    Rewards are brought to mean zero and standard deviation one over the samples (paper, section III-C).
+    Rewards are normalised to mean zero and standard deviation one over the samples (paper, section III-C).
 
     Attributes:
         temperature: ``lambda``; smaller values follow the best samples more closely.

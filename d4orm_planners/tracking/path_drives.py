@@ -1,7 +1,7 @@
 """Driving along routes under the robots' own dynamics, compiled with numba.
 
-Nobody enters a stretch before all whom it has to let pass have passed, and nobody is ever faster than it can stop
-before the next such stretch. Corners are rounded as far as the slack allows, and taken no faster than that.
+No robot enters a stretch before all that it has to let pass have passed, or is ever faster than it can stop before the
+next such stretch. Corners are rounded as far as the slack allows, and taken no faster than that.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ BRAKING = 0.5
 RESERVE = 0.8
 """Share of the way to where it must stop that a robot plans to stop in."""
 BEYOND = 4.0
-"""How far beyond its goal a robot plans to drive that is stopped by arriving, in lengths of a stop from full speed."""
+"""Distance beyond its goal that a robot plans to drive if stopped by arriving, in lengths of a stop from full speed."""
 SLOWEST = 0.1
 """Share of its speed at which a robot creeps round the sharpest corner."""
 
 
 class Progress(NamedTuple):
-    """How far robots are, and what they are to do next.
+    """Progress of robots along their routes.
 
     Attributes:
         at: ``(K,)`` int64 the point of its route that each is at, counted from its first.
@@ -51,7 +51,7 @@ class Progress(NamedTuple):
 
     @classmethod
     def of(cls, routes: Routes) -> Progress:
-        """Of robots that are about to set out."""
+        """Return that of robots that are about to set out."""
         waits, size = routes.wait_first[:-1].copy(), len(routes.first) - 1
         targets = np.zeros((size, 3), np.float32)
         return cls(np.zeros(size, np.int64), waits, targets, np.zeros(size, np.float32), np.zeros(size, np.float32))
@@ -63,7 +63,7 @@ class Part(NamedTuple):
     Attributes:
         time_step: ``(4,)`` see :class:`~d4orm_env.dynamics.robot_model.TimeStep`.
         docking: ``(2,)`` squares of the goal radius and of the goal speed.
-        docks: Whether who has arrived stands there for ever.
+        docks: Whether a robot that has arrived stays there for good.
         robots: ``(B,)`` int64.
         limits: ``(B, L)``.
         goals: ``(B, d)`` [m].
@@ -93,7 +93,7 @@ def direct(
     standing: BoolArray,
     progress: Progress,
 ) -> None:
-    """Say where everybody is to drive next.
+    """Set the next target of all robots.
 
     Args:
         routes: The routes.
@@ -103,7 +103,7 @@ def direct(
         beyond: How far robots may plan to drive beyond their goals, which stop them [m].
         size: The radius of the largest robot [m].
         positions: ``(K, 3)`` float64 where they are [m].
-        standing: ``(K,)`` bool who has docked, and so is at the end of its route.
+        standing: ``(K,)`` bool: docked, and so at the end of its route.
         progress: Changed in place.
     """
     points, arcs, num_robots = routes.points, routes.arcs, routes.first.shape[0] - 1
@@ -131,7 +131,7 @@ def direct(
 
 @cached_kernel(variant="paces", **OPTIONS)
 def fill_paces(arcs: Floats, dt: float, corner: Floats, speed: float, braking: float, paces: Floats) -> None:
-    """How fast every point of a route may be passed.
+    """Fill in the speed at which every point of a route may be passed.
 
     Args:
         arcs: ``(P,)`` length of the route up to each [m].
@@ -182,7 +182,7 @@ def drive_kernel(name: str) -> Drive:
 
 
 def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[FloatArray, Floats, IntArray]:
-    """Drive the team along its routes until everybody has arrived, or for ``most_steps``.
+    """Drive the team along its routes until all have arrived, or for ``most_steps``.
 
     Args:
         problem: The team.
@@ -191,7 +191,7 @@ def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[Floa
 
     Returns:
         Controls ``(T, K, m)``, places ``(T + 1, K, 3)`` float64 [m] and ``(K,)`` the step of each arrival; ``T + 1``
-        for who has not arrived.
+        for one that has not arrived.
     """
     d, num_robots = problem.dimension, problem.num_robots
     paces = np.concatenate(
@@ -219,7 +219,7 @@ def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[Floa
 
 
 def beyond_goal(problem: Problem) -> float:
-    """How far beyond their goals robots plan to drive, if these stop them [m]."""
+    """Return the distance beyond their goals that robots plan to drive, if these stop them [m]."""
     if not problem.docks or problem.goal_speed is not None:
         return 0.0
     speed, acceleration = (problem.team.limits[:, column].astype(np.float64) for column in (SPEED, ACCELERATION))

@@ -1,8 +1,9 @@
 """Driving towards points of a route under a robot's own dynamics, compiled with numba.
 
-Who turns in place turns before it drives. Who turns only as it drives pursues a point ahead of it, as far off as its
-turning circle takes (R. C. Coulter, *Implementation of the pure pursuit path tracking algorithm*, CMU-RI-TR-92-01,
-1992), in reverse where that lies behind, and where it lies aside it swings round or backs up until it can drive there.
+A robot that turns in place turns before it drives. One that turns only as it drives pursues a point ahead of it, as far
+off as its turning circle takes (R. C. Coulter, *Implementation of the pure pursuit path tracking algorithm*,
+CMU-RI-TR-92-01, 1992), in reverse where that lies behind, and where it lies aside it swings round or backs up until it
+can drive there.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ Steering: TypeAlias = Callable[[Row, Row, np.float32, np.float32, bool, Row, Tim
 Turning: TypeAlias = Callable[[Row, Row, Row, np.float32, bool, Row], tuple[Row, np.float32]]
 
 LOOKAHEAD = 1 / 3
-"""Of the point of its route that a robot heads for, beyond what it drives in a step and a half, in radii of the largest
-robot, as all lengths below."""
+"""Distance to the point of its route that a robot heads for, beyond what it drives in a step and a half, in radii of
+the largest robot, as all lengths below."""
 CIRCLES = 0.8
 """The same of one that drives in order to turn, in radii of its turning circle."""
 REACHED, COINCIDING = 2 / 15, 1 / 15
@@ -45,7 +46,7 @@ BEHIND = np.float32(0.5)
 BESIDE = (np.float32(0.3), np.float32(0.954))
 """Cosine and sine of the angle beyond which a point is steered for as sharply as this."""
 ASIDE = (np.float32(0.7), np.float32(0.3), np.float32(0.2))
-"""Sine of the angle beyond which a robot backs up that comes nearer, stands, or is backing up already."""
+"""Sine of the angle beyond which a robot backs up that comes nearer, is at rest, or is backing up already."""
 BACKING = np.float32(0.5)
 """Share of its pace at which a robot backs up."""
 
@@ -185,7 +186,7 @@ def _vectors(dimension: int) -> tuple[Callable[[Row, Row, np.float32], Row], Len
 
 
 def _turning(robot: Model, length: Length) -> Turning:
-    """What a robot makes of a velocity towards a point that is so far off, and of its pace, in order to face it."""
+    """Return a function that changes a velocity towards a point so far off, and its pace, in order to face it."""
     heading, velocity = -1 if robot.heading_index is None else robot.heading_index, inlined(robot.functions.velocity)
     at_rest = (ZERO,) * robot.control_size
 

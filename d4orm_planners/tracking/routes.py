@@ -1,4 +1,4 @@
-"""Routes: one robot's path as a row of points, and a whole team's with who waits for whom."""
+"""Routes: one robot's path as a row of points, and a whole team's with its precedence."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Route(NamedTuple):
 
 
 class Routes(NamedTuple):
-    """Every robot's way, and whom it waits for.
+    """Every robot's route, and the robots that it waits for.
 
     Attributes:
         points: ``(T, 3)`` float64 points of all routes, one robot's after another's [m].

@@ -1,4 +1,4 @@
-"""Tracking a velocity, and driving straight to the goal as if nobody else were there: one law for every model."""
+"""Tracking a velocity, and driving straight to the goal as if alone: one law for every model."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.dynamics.transition import TimeStep
 
 NEAR_VIA = 10 / 3
-"""How near to a point on its way a robot turns to its goal, in radii of the largest robot."""
+"""Distance to a point on its way at which a robot turns to its goal, in radii of the largest robot."""
 
 
 def drive_to_goal(problem: Problem, states: FloatArray, goals: FloatArray) -> FloatArray:
@@ -47,7 +47,7 @@ def preferred_velocities(problem: Problem, states: FloatArray, goals: FloatArray
 
 
 def goals_along_ways(problem: Problem, places: FloatArray | Floats, goals: FloatArray) -> FloatArray:
-    """Where robots without a plan should head: along their shortest free ways, as far off as those are long.
+    """Return where robots without a plan should head: along their shortest paths, as far off as those are long.
 
     It is their goals where the world is empty, for robots with new goals, and for those without a way.
 
@@ -68,7 +68,7 @@ def goals_along_ways(problem: Problem, places: FloatArray | Floats, goals: Float
 
 
 def along_ways(direction: ArrayLike, length: ArrayLike) -> tuple[Floats, BoolArray]:
-    """Vectors along ways ``(N, d)``, as long as they are, and ``(N,)`` who has one: is neither at its goal nor lost.
+    """Vectors along paths ``(N, d)``, as long as they are, and ``(N,)`` robots with one: neither at the goal nor lost.
 
     Args:
         direction: ``(N, d)`` unit vectors, zero at a goal.

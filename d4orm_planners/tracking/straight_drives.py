@@ -20,12 +20,12 @@ from d4orm_env.engine.tile_layout import SQUARED_GAP
 
 
 class DriveRules(NamedTuple):
-    """What holds for all ways.
+    """Rules for all paths.
 
     Attributes:
         time_step: ``(4,)`` see :class:`~d4orm_env.dynamics.robot_model.TimeStep`.
         docking: ``(2,)`` squares of the goal radius and of the goal speed.
-        docks: Whether who has arrived stands there for ever.
+        docks: Whether a robot that has arrived stays there for good.
         near2: Square of how near to a point is near [m^2].
     """
 
@@ -36,12 +36,12 @@ class DriveRules(NamedTuple):
 
 
 class RobotSpec(NamedTuple):
-    """A robot that drives as if nobody else were there.
+    """A robot that drives as if alone.
 
     Attributes:
         time_step: As of :class:`DriveRules`, like the next two.
         docking: ``(2,)``.
-        docks: Whether it stands for ever where it has arrived.
+        docks: Whether it stays for good where it has arrived.
         limits: ``(L,)``.
         goal: ``(d,)`` [m].
         start: ``(n,)``.
@@ -84,7 +84,7 @@ class DriveOutputs(NamedTuple):
 
 @cache
 def drive_kernel(name: str) -> Kernel[[DriveRules, DriveOutputs, IntArray, FloatArray, FloatArray, BoolArray], None]:
-    """The compiled drives of robots of the model with this name, each as if nobody else were there.
+    """The compiled drives of robots of the model with this name, each as if alone.
 
     The kernel fills, for robots of these numbers, controls ``u`` ``(R, V, H, m)``, left alone once docked,
     states ``x`` ``(R, V, H+1, n)`` and ``arrived`` ``(R, V)``.

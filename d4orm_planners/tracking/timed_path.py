@@ -23,7 +23,7 @@ from d4orm_planners.tracking.straight_drives import RobotSpec
 HURRYING = 0.85
 """Share of its acceleration that a robot counts on that hurries: if it leaves its route so, it drives by the clock."""
 NEAR, SHORT = 2 / 15, 2 / 3
-"""How near to a corner or a stop a robot has come to it, and a way to a stop that it may drive all of, in radii."""
+"""Distance at which a robot has reached a corner or stop, and length of a path to a stop that it may drive [radii]."""
 
 
 class Timed(NamedTuple):
@@ -72,7 +72,7 @@ def stop_before(route: Timed, step: int, at: int, corner: int, stride: float) ->
 
 @inlined
 def pace_to(route: Timed, step: int, at: int, corner: int, stop: float, dt: np.float32) -> np.float32:
-    """How fast it should be, in order to come to the next corner at its time [m/s]."""
+    """Return the speed at which to come to the next corner at its time [m/s]."""
     pace, time = np.float32(route.paces[at]), route.arrives[corner] - step
     if time > 1.0 and stop >= route.corners[corner]:
         pace = min(pace, np.float32((route.corners[corner] - route.arcs[at] + NEAR * route.size) / (time * dt)))

@@ -28,7 +28,7 @@ SETTLING = 8
 """Times that controls are executed at most until they stay the same; two do."""
 
 DRIFT = 0.01
-"""How far a robot may be from where the course has it [m]."""
+"""Most deviation of a robot from its course [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ class Course:
         return rest
 
     def is_left(self, tick: int, states: Any, dimension: int) -> bool:
-        """Whether a robot is elsewhere than it should be at a tick."""
+        """Check whether a robot is elsewhere than it should be at a tick."""
         return bool(np.abs(self.states_at(tick) - states)[:, :dimension].max() > DRIFT)
 
     def with_stops(self, problem: Problem, engine: Engine, joint: JointState, lost: Collection[int]) -> Course:

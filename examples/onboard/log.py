@@ -1,4 +1,4 @@
-"""What a robot writes down as it happens, so that it is there even if the robot is killed."""
+"""Log of a robot, written as things happen, so that it is there even if the robot is killed."""
 
 from __future__ import annotations
 

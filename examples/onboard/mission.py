@@ -1,4 +1,4 @@
-"""What the world and every robot have to know before they start: the same for all."""
+"""Settings of the world and every robot: the same for all."""
 
 from __future__ import annotations
 
@@ -66,12 +66,12 @@ class Mission:
         return cls(**json.loads(text))
 
     def written(self) -> str:
-        """As JSON."""
+        """Return the settings as JSON."""
         return json.dumps(asdict(self))
 
     @property
     def round_ticks(self) -> int:
-        """From the beginning of a round until its plan takes over."""
+        """Number of ticks from the beginning of a round until its plan takes over."""
         return self.think + self.agree
 
     def problem(self) -> Problem:

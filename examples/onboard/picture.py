@@ -16,7 +16,7 @@ from onboard.results import Row, makers
 
 INK, FAINT = "#1F2937", "#B8BEC7"
 HEIGHT = 0.5
-"""Of a bar, where robots are 1 apart."""
+"""Height of a bar, where robots are 1 apart."""
 
 
 def draw(rows: Sequence[Row], num_robots: int, seconds: float) -> Any:
@@ -114,7 +114,7 @@ def draw_round(axes: Any, rows: Sequence[Row], number: int, num_robots: int) -> 
 
 
 def draw_run(axes: Any, rows: Sequence[Row], num_robots: int, seconds: float) -> None:
-    """What every robot computed, when it reached a goal, and when plans were taken over."""
+    """Draw what every robot computed, when it reached a goal, and when plans were taken over."""
     colors = robot_colors(num_robots)
     shown = [row for row in rows if 0 <= row["time"] <= seconds]
     for row in shown:

@@ -1,4 +1,4 @@
-"""From the records of the world and the robots to tables and an animation."""
+"""Results: tables and an animation from the records of the world and the robots."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def timeline(record: Record, logs: Sequence[Path]) -> list[Row]:
 
 
 def makers(rows: Sequence[Row]) -> dict[str, int]:
-    """Who computed which plan first, by its digest."""
+    """Return the robot that computed each plan first, by the plan's digest."""
     found: dict[str, int] = {}
     for row in rows:
         if row["event"] == "computed":

@@ -30,7 +30,7 @@ LOOK = 0.5
 
 
 class Robot:
-    """What a robot does from tick to tick.
+    """A robot from tick to tick.
 
     Args:
         mission: The settings.
@@ -56,7 +56,7 @@ class Robot:
         planner.solve(self._problem, max_iterations=1)
 
     def answer(self, tick: wire.Tick) -> wire.Command:
-        """What to do in a tick."""
+        """Return the command of a tick."""
         joint = split_state(self._problem, tick.state)
         self._log.tick = tick.number
         self._heed_stops(joint, tick.lost)
@@ -75,7 +75,7 @@ class Robot:
             self._round.end(self._mission.patience)
 
     def _heed_stops(self, joint: JointState, lost: list[int]) -> None:
-        """When somebody stands or is elsewhere than planned, whoever is in danger stops, and planning begins anew."""
+        """Stop robots in danger when another stands or is elsewhere than planned, and begin to plan anew."""
         if lost == self._lost and not self._course.is_left(joint.steps, joint.states, self._problem.dimension):
             return
         self._lost = lost
@@ -123,7 +123,7 @@ class Robot:
         self._round = Round(agenda, self._mission, self._number, self._engine, self._team, self._log.observe)
 
     def _choose(self, tick: wire.Tick) -> None:
-        """When thinking is over announce the best plan known, and then the best of those that all have announced."""
+        """Announce the best plan known when thinking is over, and then the best of those that all have announced."""
         if self._round is None:
             return
         left, wait = self._round.agenda.takeover - tick.number, self._mission.patience / 3

@@ -33,7 +33,7 @@ SEQUENCE = 10_000
 
 @dataclass(frozen=True)
 class Agenda:
-    """What a round of planning is about.
+    """Task of a round of planning.
 
     Attributes:
         number: Of the round; later ones have larger numbers.

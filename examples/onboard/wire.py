@@ -1,4 +1,4 @@
-"""What the world and the robots tell each other in every tick, as JSON: nothing is unpickled, bad messages are None."""
+"""Messages between the world and the robots in every tick, as JSON: nothing is unpickled, bad messages are None."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MAX_BYTES = 2**20
 
 @dataclass(frozen=True)
 class Tick:
-    """What the world tells all robots.
+    """Message of the world to all robots.
 
     Attributes:
         number: Ticks since the start; -1 for the last message, which ends the run.
@@ -31,7 +31,7 @@ class Tick:
 
 @dataclass(frozen=True)
 class Command:
-    """What a robot does in a tick.
+    """Message of a robot in a tick.
 
     Attributes:
         number: The tick.

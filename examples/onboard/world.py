@@ -19,7 +19,7 @@ AGAIN = 0.25
 """Seconds after which robots that have not answered are told again, as messages may get lost."""
 
 FAREWELLS, FAREWELL = 3, 0.1
-"""How often the robots are told that it is over, and the seconds between."""
+"""Number of times that the robots are told that it is over, and the seconds between."""
 
 START = 300.0
 """Seconds within which every robot must have answered for the first time."""
@@ -27,7 +27,7 @@ START = 300.0
 
 @dataclass
 class Record:
-    """What happened, tick by tick.
+    """Record of a run, tick by tick.
 
     Attributes:
         joints: The joint states, one more than steps.
@@ -54,7 +54,7 @@ class Record:
 
     @property
     def goals_reached(self) -> int:
-        """By all robots."""
+        """Number of goals reached by all robots."""
         return int(np.sum(self.reached))
 
     @property

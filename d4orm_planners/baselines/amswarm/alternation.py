@@ -19,7 +19,7 @@ from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
 
 MOST_PENALTY = 5e7
-"""What the weight of the constraints grows to at most, as in the authors' code: it would overflow in the end."""
+"""Largest weight of the constraints, as in the authors' code: it would overflow in the end."""
 
 
 class Method(NamedTuple):
@@ -54,7 +54,7 @@ class Method(NamedTuple):
 
 
 class Neighbourhood(NamedTuple):
-    """What a team keeps clear of.
+    """Surroundings that a team keeps clear of.
 
     Attributes:
         paths: ``(K, T, d)`` where robots are predicted to be [m].
@@ -80,7 +80,7 @@ class Guess(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """What directions and lengths make of a :class:`Guess`: the sums over all constraints, each ``(T, d)``."""
+    """Sums over all constraints that directions and lengths make of a :class:`Guess`, each ``(T, d)``."""
 
     place: Floats
     velocity: Floats
@@ -245,7 +245,7 @@ def _stay_within(bounds: Floats, radius: float, limits: Floats, guess: Guess, ta
 
 @compiled
 def _gap(place: Floats, low: Floats, high: Floats) -> float:
-    """How far a place is from a box, zero within."""
+    """Return the distance of a place from a box, zero within."""
     square = 0.0
     for axis in range(len(place)):
         gap = max(low[axis] - place[axis], place[axis] - high[axis], 0.0)
@@ -293,7 +293,7 @@ def _shorten(vector: Floats, most: float, target: Floats) -> float:
 
 @compiled
 def _accumulate(method: Method, targets: Targets, bends: float, right: Floats) -> None:
-    """What the targets ask of the coefficients: ``F^T`` of them, into ``right`` ``(n+1, d)``."""
+    """Add up the targets' share of the coefficients: ``F^T`` of them, into ``right`` ``(n+1, d)``."""
     (steps, size), d = method.place.shape, right.shape[1]
     for i in range(size):
         for axis in range(d):

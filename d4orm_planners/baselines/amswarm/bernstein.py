@@ -59,7 +59,7 @@ def _polynomials(degree: int, times: Floats) -> Floats:
 
 
 def _power(base: Floats, exponent: int) -> Floats:
-    """By multiplication, which has the same bits on every processor."""
+    """Return a power by multiplication, which has the same bits on every processor."""
     result = np.ones_like(base)
     for _ in range(exponent):
         result = result * base

@@ -102,7 +102,7 @@ class Swarm:
         return np.where(self._fixed[:, None] > 1, velocities, mean).astype(np.float32)
 
     def _first_guesses(self) -> Guess:
-        """Everybody straight to the goal, as fast as allowed."""
+        """All robots straight to their goals, as fast as allowed."""
         problem = self._problem
         places = problem.start[:, None, : problem.dimension].astype(np.float64)
         ahead = self._goals[:, None] - places

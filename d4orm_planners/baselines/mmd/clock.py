@@ -1,4 +1,4 @@
-"""When a robot can be at the points of a motion at the earliest: the network knows nothing of accelerations."""
+"""Earliest times of a robot at the points of a motion: the network knows nothing of accelerations."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from d4orm_env.core.arrays import Floats
 from d4orm_env.engine.compiling import compiled
 
 SHARE = 0.7
-"""Of its acceleration that a robot counts on, so that it can make up for what it is off."""
+"""Share of its acceleration that a robot counts on, so that it can make up for what it is off."""
 
 
 @compiled

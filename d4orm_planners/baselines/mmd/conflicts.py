@@ -1,4 +1,4 @@
-"""Where robots that drive along known ways come too near to each other, compiled with numba."""
+"""Conflicts of robots that drive along known paths, compiled with numba."""
 
 from __future__ import annotations
 

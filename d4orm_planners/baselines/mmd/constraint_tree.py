@@ -1,4 +1,4 @@
-"""The search over constraints: who plans again because of whom, and what it must keep clear of (CBS, ECBS, xECBS)."""
+"""The search over constraints: which robot plans again, and what it must keep clear of (CBS, ECBS, xECBS)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 SPARE = 1 / 75
 """Added to distances when conflicts are sought, for rounding, in radii of the largest robot."""
 PADDING = 2
-"""Of the 64 points of a motion, how many a constraint lasts before and after its conflict, as in the publication."""
+"""Number of a motion's 64 points by which a constraint outlasts its conflict on either side, as published."""
 
 
 class Constraint(NamedTuple):
@@ -40,7 +40,7 @@ class Constraint(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What one robot does in a node of the tree.
+    """Motion of one robot in a node of the tree.
 
     Attributes:
         motions: ``(B, SIZE)`` all that were denoised with it, which the next ones begin with.
@@ -110,7 +110,7 @@ class Tree:
 
 
 class Planning:
-    """How robots of one problem plan around each other; all that changes is in nodes.
+    """Planner of one robot around the others of a problem; all that changes is in nodes.
 
     Args:
         problem: The team.
@@ -133,7 +133,7 @@ class Planning:
         self.steps = 0
 
     def root(self, seeds: list[int]) -> TreeNode:
-        """Everybody's motion, one robot after another around those that have planned (soft constraints only)."""
+        """All robots' motions, one after another around those that have planned (soft constraints only)."""
         motions: list[Motion] = []
         for robot, seed in enumerate(seeds):
             motions.append(self._plan(robot, motions, list(range(robot)), (), seed, None))
@@ -150,7 +150,7 @@ class Planning:
         return TreeNode(int(pairs) + failing, cost, number, motions, constraints, (int(one), int(another)), int(step))
 
     def children(self, node: TreeNode, number: int, seeds: list[int], unlucky: int) -> list[TreeNode]:
-        """What follows from a node: for each of two robots in conflict, one in which it keeps clear of where they met.
+        """Return a node's children: for each of two robots in conflict, one in which it keeps clear of where they met.
 
         In a node without a pair in conflict a robot that fails plans anew, or if none does, ``unlucky``.
         """

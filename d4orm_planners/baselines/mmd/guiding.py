@@ -28,7 +28,7 @@ the rest."""
 
 
 class Surroundings(NamedTuple):
-    """What a robot's motion has to mind.
+    """Constraints on a robot's motion.
 
     Attributes:
         space: The world.

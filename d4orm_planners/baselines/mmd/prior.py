@@ -19,7 +19,7 @@ from d4orm_env.engine.compiling import OPTIONS
 from d4orm_planners.baselines.mmd.way_frame import FEATURES, MODES
 
 WEIGHTS = Path(__file__).with_name("weights.npz")
-"""What comes with the package; see `docs/planners/mmd.md` for its card."""
+"""Weights that come with the package; see `docs/planners/mmd.md` for their card."""
 SIZE = 2 * MODES
 """Numbers of a motion: modes along the way's line, then across."""
 LEVELS = 9
@@ -27,7 +27,7 @@ LEVELS = 9
 CLIP = np.float32(4.0)
 """Deviations from the mean beyond which the network is not believed."""
 _END = 0.98
-"""Where the cosine schedule ends, short of pure noise."""
+"""End of the cosine schedule, short of pure noise."""
 
 
 class Prior(NamedTuple):
@@ -93,7 +93,7 @@ def level_features(signal: FloatArray | Floats) -> FloatArray:
 
 
 def posterior(now: float, then: float) -> tuple[float, float, float]:
-    """Of a less noisy motion, given a clean one and a noisier one: its mean's share of both, and its deviation.
+    """Return the mean's shares of a clean and of a noisier motion in a less noisy one, and its deviation.
 
     Ho, Jain and Abbeel, *Denoising diffusion probabilistic models* (NeurIPS 2020), equations 6 and 7.
 

@@ -42,7 +42,7 @@ class DenoisingNetwork(nn.Module):
         nn.init.zeros_(self.out.weight)
 
     def forward(self, noisy: Tensor, level: Tensor, features: Tensor) -> Tensor:
-        """What is to be added to ``sqrt(alpha_bar)`` times the noisy motion, over ``sqrt(1 - alpha_bar)``."""
+        """Return what is to be added to ``sqrt(alpha_bar)`` times the noisy motion, over ``sqrt(1 - alpha_bar)``."""
         layer = torch.relu(self.into(torch.cat([noisy, level], dim=1)) + self.context(features))
         for hidden in self.hidden:
             layer = layer + torch.relu(hidden(layer))

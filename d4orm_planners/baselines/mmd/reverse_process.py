@@ -47,7 +47,7 @@ class Batch:
 
 
 class Denoiser:
-    """What denoises the motions of a team's robots, one robot at a time.
+    """Denoiser of the motions of a team's robots, one robot at a time.
 
     Args:
         problem: The team.

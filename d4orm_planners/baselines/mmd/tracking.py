@@ -25,7 +25,7 @@ GAIN = np.float32(1.5)
 
 
 class TrackedMotions(NamedTuple):
-    """What came of driving along ``B`` motions.
+    """Rollouts along ``B`` motions.
 
     Attributes:
         controls: ``(B, H, m)`` float32, zero once docked.

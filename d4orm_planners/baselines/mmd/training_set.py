@@ -1,4 +1,4 @@
-"""What the diffusion model learns from: plans of single robots among things that it is not told of."""
+"""Training set of the diffusion model: plans of single robots among things that it is not told of."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ KINDS: tuple[tuple[str, dict[str, object]], ...] = (
 )
 """Scenarios and their settings that maps are drawn from, in turn."""
 PLANNERS = ("mapf", "hybrid")
-"""Whose plans are learned from, in turn."""
+"""Planners whose plans are learned from, in turn."""
 _PHANTOMS = 3
 """Most circles near the way that a plan has to go round and the model is not told of."""
 _SIZES, _ASIDE = (0.1, 0.45), 0.5
-"""Of these: radius, and distance from the way at most [m]."""
+"""Radius of these, and distance from the way at most [m]."""
 _LONGEST = 1.4
 """Times the length of the way that a plan may be; a longer one leads elsewhere."""
 _PER_MAP = 4

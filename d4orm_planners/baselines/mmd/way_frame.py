@@ -30,9 +30,9 @@ FEATURES = 5 * LOOKS + 2
 _ROUNDING = 2
 """Points before and after one over which a way's direction is averaged."""
 _ANY = 1e6
-"""How often robots that take any velocity at once could reach their full speed in a second [1/s]."""
+"""Rate at which robots that take any velocity at once could reach their full speed [1/s]."""
 _FAR = 4.0
-"""Of room the model is told up to so many times the robot's reach."""
+"""Largest room that the model is told of, in robots' reach."""
 
 
 class WayFrame(NamedTuple):

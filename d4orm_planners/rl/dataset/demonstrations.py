@@ -1,4 +1,4 @@
-"""What a dataset is made of: a policy in an environment, seed by seed."""
+"""Demonstrations that a dataset is made of: a policy in an environment, seed by seed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 LARGEST_SEED = 2**63 - 1
 AGENTS = ("team", "robot")
-"""Whose an episode of a dataset may be."""
+"""Owner of an episode of a dataset."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +84,7 @@ class Demonstrations:
 
     @property
     def policy_name(self) -> str:
-        """What to call the policy."""
+        """Name of the policy."""
         policy = self.policy
         return policy if isinstance(policy, str) else getattr(policy, "__name__", type(policy).__name__)
 
@@ -93,7 +93,7 @@ class Demonstrations:
         """All that an episode depends on beside its seed, as JSON has it.
 
         Raises:
-            ValueError: If something has no form in JSON, or the source of what was brought cannot be read.
+            ValueError: If something has no form in JSON, or a user's source cannot be read.
         """
         whole = {
             "policy": self.policy_name,
@@ -120,7 +120,7 @@ class Demonstrations:
 
 
 def _described(thing: object) -> object:
-    """What JSON has no word for, as something that tells it from others."""
+    """Describe what JSON has no word for, so that it is told from others."""
     if isinstance(thing, Problem):
         return {"problem": thing.digest}
     if isinstance(thing, Disturbance):

@@ -51,7 +51,7 @@ class DatasetFiles:
         return sorted(path for path in (self.folder / "shards").glob("*") if path.name.isdecimal())
 
     def seeds(self) -> set[int]:
-        """Of the episodes that are in shards."""
+        """Return the seeds of the episodes that are in shards."""
         return {int(seed) for shard in self.shards for seed in _metadata(shard)["recorded_seeds"]}
 
     def add_shard(self, episodes: Sequence[RecordedEpisode]) -> None:
@@ -101,7 +101,7 @@ class DatasetFiles:
 
 
 def _metadata(folder: Path) -> dict[str, Any]:
-    """Of a storage.
+    """Return the metadata of a storage.
 
     Raises:
         ValueError: If it cannot be read.
@@ -121,7 +121,7 @@ def _metadata(folder: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _Shard:
-    """What one episode of the dataset takes of a recorded one.
+    """Part of a recorded episode that one episode of the dataset takes.
 
     Attributes:
         steps: Steps ``T'`` from the beginning.

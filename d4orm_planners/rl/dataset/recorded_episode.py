@@ -1,4 +1,4 @@
-"""What a team saw, did and got in one episode."""
+"""Observations, actions and rewards of a team in one episode."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
 
 MAX_BYTES = 2**31
-"""Of one array of an episode that is read."""
+"""Largest array of an episode that is read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class RecordedEpisode:
 
     @property
     def success(self) -> bool:
-        """Whether all arrived in time and none was ever in contact; never in lifelong mode."""
+        """True if all arrived in time and none was ever in contact; never in lifelong mode."""
         return bool(self.metadata.get("success", False))
 
     def save(self, path: Path) -> None:
@@ -88,7 +88,7 @@ class RecordedEpisode:
 _ARRAYS = tuple(field.name for field in fields(RecordedEpisode) if field.name != "metadata")
 _FLAGS = ("acting", "terminations", "arrived", "collided", "margin_violated")
 _OF_STEPS = ("actions", "acting", "rewards", "terminations")
-"""Of ``T`` moments; the others have one more."""
+"""Arrays of ``T`` moments; the others have one more."""
 
 
 def _check(arrays: Mapping[str, np.ndarray], metadata: object) -> None:
@@ -167,7 +167,7 @@ class _Recorder(Policy):
         return actions
 
     def team_actions(self) -> tuple[BoolArray, FloatArray]:
-        """``(T, K)`` bool who acted, and ``(T, K, m)`` how."""
+        """``(T, K)`` bool: acted, and the actions ``(T, K, m)``."""
         shape = (len(self._actions), self.problem.num_robots)
         acting, controls = np.zeros(shape, np.bool_), np.zeros((*shape, self.problem.control_size), np.float32)
         for step, actions in enumerate(self._actions):

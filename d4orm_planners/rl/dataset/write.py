@@ -93,7 +93,7 @@ def checked_id(dataset_id: str) -> str:
 
 
 def dataset_folder(dataset_id: str) -> Path:
-    """Where Minari looks for a dataset: below ``MINARI_DATASETS_PATH``, or ``~/.minari/datasets``.
+    """Return the folder of a Minari dataset: below ``MINARI_DATASETS_PATH``, or ``~/.minari/datasets``.
 
     Raises:
         ValueError: If there is no home folder.
@@ -117,7 +117,7 @@ def dataset_files(demonstrations: Demonstrations, folder: Path) -> DatasetFiles:
 
 
 def _spec(environment: Mapping[str, object]) -> EnvSpec | None:
-    """From which Gymnasium makes the joint environment again; ``None`` if its arguments have no form in JSON."""
+    """Return the spec by which Gymnasium makes the joint environment; ``None`` if its arguments have no JSON form."""
     spec = copy.deepcopy(gymnasium.spec(ENV_ID))
     spec.kwargs = dict(environment)
     try:
@@ -154,7 +154,7 @@ def _pack(recording: Recording, files: DatasetFiles, shard_size: int) -> None:
 
 
 def _metadata(demonstrations: Demonstrations, dataset_id: str, dropped: int) -> dict[str, object]:
-    """What the dataset says about itself."""
+    """Return the metadata of the dataset."""
     identity = demonstrations.identity
     return {
         "dataset_id": dataset_id,
