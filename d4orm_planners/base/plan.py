@@ -2,44 +2,33 @@
 
 from __future__ import annotations
 
-import json
 import os
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
-from math import prod
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from d4orm_env.core.archives import ArrayArchive
 from d4orm_env.core.arrays import BoolArray, FloatArray
-from d4orm_env.core.errors import first_line
-from d4orm_env.core.files import replaced_when_done, require_file
 from d4orm_env.core.infeasibility import prove_infeasible
-from d4orm_env.core.metrics import mean_stretch, trajectory_metrics
+from d4orm_env.core.metrics import mean_stretch
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import Row, count, outcome_rows
-from d4orm_env.core.team import DEFAULT_RADIUS
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.rollout import rollout
-from d4orm_env.scenarios.schema import describe, parse
 from d4orm_env.verify import VerificationReport, verify
 from d4orm_planners.base.conflict_groups import conflicts
 from d4orm_planners.base.display import DisplayMixin
 from d4orm_planners.base.provenance import Provenance
 
+if TYPE_CHECKING:
+    from d4orm_planners.setpoints.export import ExportReport
+    from d4orm_planners.setpoints.setpoints import Setpoints
+    from d4orm_planners.setpoints.smoothing import SmoothMotion
+
 Status = Literal["solved", "iteration_limit", "time_limit", "stopped", "interrupted", "infeasible", "refuted"]
 """End of a search; see :class:`Plan`."""
-
-FORMAT = "d4orm-plan-1"
-
-HEADER_BYTES = 64 * 2**20
-"""Largest header of a plan file, which has the problem and the history."""
-
-TOLERANCE = 1e-3
-"""Deviation allowed between a file's trajectory and its controls' rollout, in SI units for robots of the default size:
-processors round differently."""
 
 
 @dataclass(frozen=True)
@@ -191,6 +180,66 @@ class Plan(DisplayMixin):
                 faults.append("comes so near to the margin of something that rounding decides")
         return reasons
 
+    def sample(
+        self, rate: float = 100.0, *, max_acceleration: ArrayLike | None = None, max_jerk: ArrayLike | None = None
+    ) -> Setpoints:
+        """Return smooth setpoints for the robots' own controllers, verified again.
+
+        The controls of a plan jump at every step. This is a spline of class C4 through its positions, driven as much
+        more slowly as the limits need (:mod:`d4orm_planners.setpoints.smoothing`).
+
+        Args:
+            rate: Of the setpoints [Hz].
+            max_acceleration: Limit of each robot, one or ``K`` [m/s^2]; by default the team's own.
+            max_jerk: The same for the jerk [m/s^3]; by default none.
+
+        Raises:
+            ValueError: If the plan is not solved, or the smoothed motion touches something or takes more than four
+                times as long; the message has the number that fails.
+        """
+        from d4orm_planners.setpoints.setpoints import sample_motion
+
+        return sample_motion(self._smooth(max_acceleration, max_jerk), rate)
+
+    def export(
+        self,
+        format: str,
+        path: str | os.PathLike[str],
+        *,
+        rate: float = 100.0,
+        height: float = 0.0,
+        max_acceleration: ArrayLike | None = None,
+        max_jerk: ArrayLike | None = None,
+    ) -> ExportReport:
+        """Write the setpoints of :meth:`sample` for robots to execute.
+
+        Args:
+            format: ``"csv"``, ``"crazyswarm2"`` (polynomials), ``"rosbag2"`` or ``"mcap"`` (ROS 2 messages);
+                see :data:`d4orm_planners.setpoints.export.FORMATS`.
+            path: Folder for the files, which is made.
+            rate: Of the setpoints [Hz]; polynomials have none.
+            height: z of a team that moves in the plane [m].
+            max_acceleration: See :meth:`sample`.
+            max_jerk: See :meth:`sample`.
+
+        Raises:
+            ValueError: As :meth:`sample`; if there is no such format, or the motion does not fit it.
+            ModuleNotFoundError: If the format needs a library that is missing.
+            OSError: If the files cannot be written.
+        """
+        from d4orm_planners.setpoints.export import export_motion
+
+        return export_motion(self._smooth(max_acceleration, max_jerk), format, Path(path), rate, height)
+
+    def _smooth(self, max_acceleration: ArrayLike | None, max_jerk: ArrayLike | None) -> SmoothMotion:
+        from d4orm_planners.setpoints.smoothing import MotionLimits, smooth_motion
+
+        limits = MotionLimits.of(self.problem, max_acceleration, max_jerk)
+        if not self.solved:
+            reasons = "; ".join(f"{robot} {reason}" for robot, reason in self.failures.items())
+            raise ValueError(f"the plan is not solved, and robots do not execute it: {reasons}")
+        return smooth_motion(self.problem, self.trajectory, limits)
+
     @property
     def title(self) -> str:
         """Title: planner, problem and status."""
@@ -210,17 +259,9 @@ class Plan(DisplayMixin):
             ValueError: If the path does not end in ``.npz``.
             OSError: If it cannot be written; nothing is left behind then.
         """
-        target = _npz_path(path)
-        header = {
-            "format": FORMAT,
-            "problem": describe(self.problem),
-            "history": [{name: getattr(record, name) for name in _RECORDED} for record in self.history],
-            "provenance": None if self.provenance is None else asdict(self.provenance),
-            **{name: getattr(self, name) for name in _SCALARS},
-        }
-        arrays = {field.name: getattr(self.trajectory, field.name) for field in fields(Trajectory)}
-        with replaced_when_done(target) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
+        from d4orm_planners.base.plan_file import save_plan
+
+        save_plan(self, path)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:
@@ -233,39 +274,9 @@ class Plan(DisplayMixin):
             FileNotFoundError: If there is no such file.
             ValueError: If the file is damaged or is not a plan.
         """
-        source = _npz_path(path)
-        try:
-            require_file(source, "a plan")
-            with source.open("rb") as stream, ArrayArchive(stream, ("header", *_ARRAYS)) as archive:
-                header = json.loads(str(archive.array("header", HEADER_BYTES)))
-                if header.pop("format") != FORMAT:
-                    raise ValueError("written by another version")
-                problem = parse(header.pop("problem"))
-                claimed = _checked_trajectory(problem, archive)
-            history = tuple(_read_record(record) for record in header.pop("history"))
-            made = header.pop("provenance", None)
-            provenance = None if made is None else Provenance(**made)
-            return cls._judged(problem, history, claimed, _checked(header) | {"provenance": provenance})
-        except FileNotFoundError:
-            raise FileNotFoundError(f"there is no plan at {source}") from None
-        except Exception as error:  # a damaged archive makes zipfile, zlib and NumPy raise errors of a dozen kinds
-            raise ValueError(
-                f"{source} is not a readable plan ({first_line(error)}); write it anew with Plan.save"
-            ) from error
+        from d4orm_planners.base.plan_file import read_plan
 
-    @classmethod
-    def _judged(
-        cls, problem: Problem, history: tuple[IterationRecord, ...], claimed: Trajectory, scalars: dict[str, Any]
-    ) -> Plan:
-        """The plan of a file, with what is true of its controls."""
-        actual = rollout(problem, claimed.controls, engine="cpu")
-        trajectory = claimed if _agree(problem, claimed, actual) else actual
-        solved = not failed_robots(trajectory).any() and verify(problem, trajectory.controls).ok
-        if scalars["status"] in ("solved", "infeasible", "refuted"):
-            proved = not solved and scalars["status"] == "infeasible" and prove_infeasible(problem)
-            scalars["status"] = "solved" if solved else "infeasible" if proved else "refuted"
-        scalars |= {"solved": solved, "metrics": scalars["metrics"] | trajectory_metrics(problem, trajectory)}
-        return cls(problem=problem, history=history, trajectory=trajectory, controls=trajectory.controls, **scalars)
+        return read_plan(path)
 
 
 def load_plan(path: str | os.PathLike[str]) -> Plan:
@@ -281,69 +292,3 @@ def failed_robots(trajectory: Trajectory, check_interval: int = 1) -> BoolArray:
     violated = trajectory.margin_violated[check_interval::check_interval]
     failed: BoolArray = ~trajectory.arrived[-1] | violated.any(axis=0)
     return failed
-
-
-_RECORDED = tuple(field.name for field in fields(IterationRecord) if field.compare)
-_ARRAYS = tuple(field.name for field in fields(Trajectory))
-_NUMBERS = ("states", "positions", "controls", "rewards")
-_SCALARS = ("planner", "seed", "solved", "status", "iterations", "denoising_steps", "wall_time", "metrics")
-
-
-def _npz_path(path: str | os.PathLike[str]) -> Path:
-    target = Path(path)
-    if target.suffix != ".npz":
-        raise ValueError(f"plan file {str(target)!r} must end in .npz")
-    return target
-
-
-def _read_record(record: dict[str, Any]) -> IterationRecord:
-    if not record.keys() <= set(_RECORDED):
-        raise ValueError(f"its history has {', '.join(sorted(record.keys() - set(_RECORDED)))}")
-    return IterationRecord(**record | {"unreachable": tuple(record.get("unreachable", ()))})
-
-
-def _checked(header: dict[str, Any]) -> dict[str, object]:
-    kinds = {"planner": str, "seed": int, "solved": bool, "status": str, "iterations": int, "denoising_steps": int}
-    for name, kind in {**kinds, "wall_time": (int, float), "metrics": dict}.items():
-        if not isinstance(header[name], kind):  # type: ignore[arg-type]
-            raise ValueError(f"{name} is {header[name]!r}")
-    if not all(isinstance(value, (int, float)) for value in header["metrics"].values()):
-        raise ValueError(f"metrics are {header['metrics']!r}, not all numbers")
-    return {name: header[name] for name in _SCALARS}
-
-
-def _checked_trajectory(problem: Problem, archive: ArrayArchive) -> Trajectory:
-    steps, robots = problem.horizon, problem.num_robots
-    shapes = {
-        "states": (steps + 1, robots, problem.state_size),
-        "positions": (steps + 1, robots, problem.dimension),
-        "controls": (steps, robots, problem.control_size),
-        "rewards": (steps, robots),
-        "arrived": (steps + 1, robots),
-        "collided": (steps + 1, robots),
-        "margin_violated": (steps + 1, robots),
-    }
-    content = {}
-    for name, shape in shapes.items():
-        kind: np.dtype = np.dtype(np.float32 if name in _NUMBERS else np.bool_)
-        array = archive.array(name, prod(shape) * kind.itemsize)
-        if array.shape != shape or array.dtype != kind or not np.isfinite(array).all():
-            raise ValueError(f"{name} does not fit the problem")
-        content[name] = array
-    return Trajectory(**content)
-
-
-def _agree(problem: Problem, claimed: Trajectory, actual: Trajectory) -> bool:
-    """Check whether two trajectories are the same but for rounding."""
-    size = problem.team.largest_radius / DEFAULT_RADIUS
-    return all(
-        np.allclose(
-            getattr(claimed, name),
-            getattr(actual, name),
-            rtol=TOLERANCE,
-            atol=TOLERANCE * (1 if name == "rewards" else size),
-        )
-        if name in _NUMBERS
-        else np.array_equal(getattr(claimed, name), getattr(actual, name))
-        for name in _ARRAYS
-    )

@@ -25,6 +25,7 @@ from d4orm_planners.cli.common_options import Quiet
 from d4orm_planners.cli.dataset_command import dataset
 from d4orm_planners.cli.demo import demo
 from d4orm_planners.cli.evaluate_command import evaluate
+from d4orm_planners.cli.export_command import export
 from d4orm_planners.cli.leaderboard_command import leaderboard
 from d4orm_planners.cli.node_command import node
 from d4orm_planners.cli.outputs import print_table
@@ -64,7 +65,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-for command in (demo, plan, run, play, evaluate, robustness, reproduce, leaderboard, dataset, train, bench, node):
+COMMANDS = (demo, plan, run, export, play, evaluate, robustness, reproduce, leaderboard, dataset, train, bench, node)
+for command in COMMANDS:
     app.command()(command)
 
 

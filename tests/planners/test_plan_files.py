@@ -294,7 +294,7 @@ def test_what_does_not_belong_there_is_not_unpacked(saved: Path, monkeypatch: py
         unpacked.append(getattr(member, "filename", member))
         return open_member(archive, member, *rest, **options)
 
-    monkeypatch.setattr("d4orm_planners.base.plan.HEADER_BYTES", 10**6)
+    monkeypatch.setattr("d4orm_planners.base.plan_file.HEADER_BYTES", 10**6)
     large = {"extra": np.zeros(10**7), "controls": np.zeros(10**7), "header": np.array("0" * 10**6)}
     for name, content in large.items():
         np.savez_compressed(saved, **({"header": np.array(json.dumps(header)), **arrays} | {name: content}))

@@ -1,0 +1,254 @@
+"""Smooth motions through a plan: splines of class C4 within limits on speed, acceleration and jerk, verified again.
+
+A plan's accelerations jump at every step, which no robot follows. Its positions are fitted by quintic P-splines (P. H.
+C. Eilers and B. D. Marx, Statistical Science, 1996), which begin and end without acceleration; where they need more
+than a limit allows, the whole team drives them more slowly: that changes neither where anybody drives nor who meets
+whom. The smoother the curves the quicker they may be driven, but the farther are they from the plan, and the first that
+touch nothing are taken, in the order of their duration.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import BSpline
+from scipy.sparse import diags_array
+from scipy.sparse.linalg import splu
+
+from d4orm_env.core.arrays import Floats
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.verify import VerificationReport
+from d4orm_env.verify.curves import verify_curves
+
+DEGREE = 5
+SMOOTHNESS = (1e-2, 1e-1, 1.0, 1e1, 1e2)
+"""Weights of the squared third differences of a curve's coefficients, against the squared distances from the plan."""
+SETTLING = 5
+"""Steps after the last arrival in which the team comes to rest."""
+PER_STEP = 16
+"""Times a step at which a motion's speeds, accelerations and jerks are looked at."""
+RESERVE = 1e-3
+"""Share of the limits that is left for what happens between these times."""
+SLOWEST = 4.0
+"""Times the plan's duration that a motion may take."""
+
+
+@dataclass(frozen=True, eq=False)
+class MotionLimits:
+    """Most that a robot's controller is asked for, each ``(K,)``; infinite where anything goes.
+
+    Attributes:
+        speed: [m/s].
+        acceleration: [m/s^2]; of robots with a heading along it.
+        turn_rate: [rad/s].
+        jerk: [m/s^3].
+    """
+
+    speed: Floats
+    acceleration: Floats
+    turn_rate: Floats
+    jerk: Floats
+
+    @classmethod
+    def of(cls, problem: Problem, acceleration: ArrayLike | None = None, jerk: ArrayLike | None = None) -> MotionLimits:
+        """The team's own limits, but for those that are given.
+
+        Raises:
+            ValueError: If one is not positive, or neither one number nor one per robot.
+        """
+        team = problem.team
+        models = zip(team.robot_models, team.limits, team.max_acceleration, strict=True)
+        own = [
+            (np.inf if model.first_order else most, model.turn_rate(limits) or np.inf) for model, limits, most in models
+        ]
+        accelerations, turn_rates = np.array(own, np.float64).T
+        return cls(
+            team.max_speed.astype(np.float64),
+            _each("max_acceleration", acceleration, accelerations),
+            turn_rates,
+            _each("max_jerk", jerk, np.full(team.num_robots, np.inf)),
+        )
+
+
+def _each(name: str, value: ArrayLike | None, otherwise: Floats) -> Floats:
+    if value is None:
+        return otherwise
+    try:
+        each: Floats = np.broadcast_to(np.asarray(value, np.float64), otherwise.shape)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be one number or one per robot ({len(otherwise)}), not {value!r}") from None
+    if not (each > 0).all():
+        raise ValueError(f"{name} is {value!r}; it must be positive")
+    return each
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothMotion:
+    """A team's motion as splines over the plan's own time, driven ``stretch`` times as slowly.
+
+    Attributes:
+        problem: The team and its world.
+        curves: Of :meth:`position`, ``(K, d)`` by the plan's time [m].
+        headings: ``(K,)`` by the plan's time [rad]; zero for robots without one.
+        deviation: Largest distance from the plan at its steps [m].
+        stretch: Times the plan's duration that it takes, at least 1.
+    """
+
+    problem: Problem
+    curves: BSpline
+    headings: BSpline
+    deviation: float
+    stretch: float = 1.0
+
+    @property
+    def duration(self) -> float:
+        """When everybody is at rest [s]."""
+        return float(self.curves.t[-1]) * self.stretch
+
+    def position(self, times: Floats, derivative: int = 0) -> Floats:
+        """``(T, K, d)`` positions [m], or derivatives of them, from 0 s to the duration and at rest from then on."""
+        return self._values(self.curves, times, derivative)
+
+    def heading(self, times: Floats, derivative: int = 0) -> Floats:
+        """``(T, K)`` headings [rad], or derivatives of them."""
+        return self._values(self.headings, times, derivative)
+
+    def _values(self, spline: BSpline, times: Floats, derivative: int) -> Floats:
+        own = np.clip(np.asarray(times, np.float64) / self.stretch, 0, spline.t[-1])
+        values: Floats = spline(own, nu=derivative) / self.stretch**derivative
+        return values
+
+    @cached_property
+    def peaks(self) -> MotionLimits:
+        """Peaks of speed, acceleration, turn rate and jerk of each robot."""
+        steps = round(self.curves.t[-1] / self.problem.dt)
+        times = np.linspace(0, self.duration, steps * PER_STEP + 1)
+        velocity, acceleration, jerk = (self.position(times, order) for order in (1, 2, 3))
+        heading = self.heading(times)
+        along = np.abs(acceleration[..., 0] * np.cos(heading) + acceleration[..., 1] * np.sin(heading))
+        has_heading = np.array([model.heading_index is not None for model in self.problem.team.robot_models])
+        sizes = np.where(has_heading, along, np.linalg.norm(acceleration, axis=2))
+        return MotionLimits(
+            np.linalg.norm(velocity, axis=2).max(axis=0),
+            sizes.max(axis=0),
+            np.abs(self.heading(times, 1)).max(axis=0),
+            np.linalg.norm(jerk, axis=2).max(axis=0),
+        )
+
+    @cached_property
+    def report(self) -> VerificationReport:
+        """Verdict of :func:`d4orm_env.verify.curves.verify_curves`."""
+        times = np.linspace(0, self.duration, round(self.curves.t[-1] / self.problem.dt) * PER_STEP + 1)
+        bend = np.linalg.norm(self.position(times, 2), axis=2).max(axis=0)
+        return verify_curves(self.problem, self.position, self.duration, bend)
+
+    def within(self, limits: MotionLimits) -> SmoothMotion:
+        """The same motion, as slow as these limits need."""
+        peaks = self.peaks
+        needed = [
+            (1 + RESERVE) * (peaks.speed / limits.speed).max(),
+            (1 + RESERVE) * (peaks.turn_rate / limits.turn_rate).max(),
+            np.sqrt((1 + RESERVE) * (peaks.acceleration / limits.acceleration).max()),
+            np.cbrt((1 + RESERVE) * (peaks.jerk / limits.jerk).max()),
+        ]
+        return replace(self, stretch=self.stretch * max(1.0, *map(float, needed)))
+
+
+def smooth_motion(problem: Problem, trajectory: Trajectory, limits: MotionLimits) -> SmoothMotion:
+    """The quickest smooth motion along a trajectory in which nobody touches anything.
+
+    Args:
+        problem: What the trajectory solves.
+        trajectory: Of a plan that is solved.
+        limits: Not to be exceeded.
+
+    Raises:
+        ValueError: If there is none, with what is in its way; or if robots that drive at the start would have to drive
+            more slowly than they do.
+    """
+    fitted = (_fitted(problem, trajectory, smoothness) for smoothness in SMOOTHNESS)
+    motions = sorted((motion.within(limits) for motion in fitted), key=lambda motion: motion.stretch)
+    best = motions[0]
+    if _initial_velocity(problem).any():
+        if best.stretch > 1 + RESERVE:
+            raise ValueError(_too_fast(best, limits, "its robots drive at the start, so they cannot take longer"))
+        motions = [replace(motion, stretch=1.0) for motion in motions if motion.stretch <= 1 + RESERVE]
+    if best.stretch > SLOWEST:
+        raise ValueError(_too_fast(best, limits, f"it would take {best.stretch:.1f} times as long"))
+    for motion in motions:
+        if motion.report.ok and motion.stretch <= SLOWEST:
+            return motion
+    raise ValueError(
+        f"smoothed, the plan fails: {best.report.violations[0]}; plan with a larger margin, or allow more acceleration "
+        "with max_acceleration"
+    )
+
+
+def _too_fast(motion: SmoothMotion, limits: MotionLimits, why: str) -> str:
+    peaks = replace(motion, stretch=1.0).peaks
+    for name, unit in (("acceleration", "m/s^2"), ("jerk", "m/s^3"), ("turn_rate", "rad/s"), ("speed", "m/s")):
+        most, limit = getattr(peaks, name), getattr(limits, name)
+        robot = int(np.argmax(most / limit))
+        if most[robot] > limit[robot]:
+            values = f"{most[robot]:.3g} {unit} of {name.replace('_', ' ')}, limit {limit[robot]:.3g}"
+            break
+    remedy = "plan with goal_speed, for robots stop in one step without it"
+    demand = f"robot_{robot} needs {values}, and {why}"
+    return f"smoothed, the plan asks for too much: {demand}; {remedy}, or allow more with max_{name}"
+
+
+def _initial_velocity(problem: Problem) -> Floats:
+    """``(K, d)`` velocities at the start [m/s]."""
+    velocity = np.zeros((problem.num_robots, problem.dimension))
+    for robot, model in enumerate(problem.team.robot_models):
+        state = problem.start[robot].astype(np.float64)
+        if model.heading_index is not None and model.speed_indices:
+            heading = state[model.heading_index]
+            velocity[robot, :2] = state[model.speed_indices[0]] * np.array([np.cos(heading), np.sin(heading)])
+        elif model.speed_indices:
+            velocity[robot] = state[list(model.speed_indices)]
+    return velocity
+
+
+def _fitted(problem: Problem, trajectory: Trajectory, smoothness: float) -> SmoothMotion:
+    """The plan's positions and headings by splines, as they are timed."""
+    moving = np.any(trajectory.positions[1:] != trajectory.positions[:-1], axis=(1, 2))
+    last = int(np.flatnonzero(moving).max(initial=0)) + 1 + SETTLING
+    rows = np.minimum(np.arange(last + 1), len(trajectory.positions) - 1)
+    headings = np.zeros((len(rows), problem.num_robots))
+    for robot, model in enumerate(problem.team.robot_models):
+        if model.heading_index is not None:
+            headings[:, robot] = np.unwrap(trajectory.states[rows, robot, model.heading_index].astype(np.float64))
+    places = trajectory.positions[rows].astype(np.float64)
+    velocity, no_turn = _initial_velocity(problem), np.zeros(problem.num_robots)
+    curves = fit_spline(places, velocity, problem.dt, smoothness)
+    offset = curves(np.linspace(0, last * problem.dt, last + 1)) - places
+    deviation = float(np.linalg.norm(offset, axis=2).max())
+    return SmoothMotion(problem, curves, fit_spline(headings, no_turn, problem.dt, smoothness), deviation)
+
+
+def fit_spline(values: Floats, velocity: Floats, dt: float, smoothness: float) -> BSpline:
+    """A quintic P-spline near ``values`` ``(N+1, ...)``, one every ``dt``, from a velocity to rest.
+
+    It begins and ends at the first and the last of them without acceleration.
+    """
+    steps, shape = len(values) - 1, values.shape[1:]
+    knots = np.concatenate([np.zeros(DEGREE), np.linspace(0, steps * dt, steps + 1), np.full(DEGREE, steps * dt)])
+    count = steps + DEGREE
+    coefficients = np.zeros((count, int(np.prod(shape))))
+    first, rows = values[0].ravel(), values.reshape(len(values), -1)
+    coefficients[0], coefficients[1] = first, first + velocity.ravel() * dt / DEGREE
+    coefficients[2] = 3 * coefficients[1] - 2 * first
+    coefficients[-4:] = rows[-1]
+    basis = BSpline.design_matrix(np.linspace(0, steps * dt, steps + 1), knots, DEGREE).tocsc()
+    differences = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(count - 3, count)).tocsc()
+    matrix = (basis.T @ basis + smoothness * (differences.T @ differences)).tocsc()
+    free = np.arange(3, count - 4)
+    fixed = np.setdiff1d(np.arange(count), free)
+    target = (basis.T @ rows)[free] - matrix[free][:, fixed] @ coefficients[fixed]
+    coefficients[free] = splu(matrix[free][:, free].tocsc()).solve(target)
+    return BSpline(knots, coefficients.reshape(count, *shape), DEGREE)

@@ -1,0 +1,327 @@
+"""Setpoints for robots: exact derivatives within limits, verified again, and files that others read."""
+
+from __future__ import annotations
+
+import csv
+import sqlite3
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.polynomial.polynomial import polyder, polyval
+
+from d4orm_env import Problem, Team, World, make_problem
+from d4orm_env.verify.curves import verify_curves
+from d4orm_planners import Plan, make_planner
+from d4orm_planners.base.candidate import evaluate_controls
+from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.setpoints.export import FORMATS
+from d4orm_planners.setpoints.polynomials import MOST_PIECES
+from d4orm_planners.setpoints.smoothing import fit_spline
+
+CASES: dict[str, dict[str, Any]] = {
+    "plane": {"scenario": "circle", "num_robots": 5},
+    "slow goals": {"scenario": "circle", "num_robots": 5, "goal_speed": 0.1},
+    "space": {"scenario": "random", "num_robots": 5, "model": "holonomic3d"},
+    "wheels": {"scenario": "circle", "num_robots": 4, "model": "differential_drive"},
+    "unicycles": {"scenario": "circle", "num_robots": 4, "model": "unicycle"},
+    "first order": {"scenario": "circle", "num_robots": 4, "model": "velocity2d"},
+    "walls": {"scenario": "warehouse", "num_robots": 4, "goal_speed": 0.1},
+}
+
+
+def planned(name: str) -> Plan:
+    plan = make_planner(engine="cpu").solve(make_problem(**CASES[name], seed=1), seed=0, max_iterations=20)
+    assert plan.solved
+    return plan
+
+
+@pytest.fixture(scope="module")
+def plans() -> dict[str, Plan]:
+    return {name: planned(name) for name in CASES}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_setpoints_are_derivatives_within_the_limits(plans: dict[str, Plan], name: str) -> None:
+    plan = plans[name]
+    problem, s = plan.problem, plan.sample(rate=500.0)
+    np.testing.assert_allclose(np.diff(s.time), 0.002, rtol=1e-9)
+    shape = (len(s.time), problem.num_robots, problem.dimension)
+    assert s.position.shape == s.velocity.shape == s.acceleration.shape == s.jerk.shape == shape
+    assert s.heading.shape == shape[:2]
+    for lower, upper in ((s.position, s.velocity), (s.velocity, s.acceleration), (s.acceleration, s.jerk)):
+        slope = (lower[2:] - lower[:-2]) / 0.004
+        np.testing.assert_allclose(slope, upper[1:-1], atol=2e-3 * np.abs(upper).max())
+    np.testing.assert_allclose(s.position[0], problem.start[:, : problem.dimension], atol=1e-9)
+    assert np.linalg.norm(s.position[-1] - problem.goal, axis=1).max() <= problem.goal_radius
+    for still in (s.velocity[-1], s.acceleration[0], s.acceleration[-1]):
+        np.testing.assert_allclose(still, 0, atol=1e-9)
+    assert (np.linalg.norm(s.velocity, axis=2) <= problem.team.max_speed * (1 + 1e-6)).all()
+    first_order = problem.team.robot_models[0].first_order
+    if not first_order and problem.team.robot_models[0].heading_index is None:
+        assert (np.linalg.norm(s.acceleration, axis=2) <= problem.team.max_acceleration * (1 + 1e-6)).all()
+    turning = np.abs(np.diff(s.heading, axis=0)).max() * 500
+    assert turning <= problem.team.max_turn_rate.max() * (1 + 1e-3)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_report_is_what_samples_show(plans: dict[str, Plan], name: str) -> None:
+    plan = plans[name]
+    s, radius = plan.sample(rate=400.0), plan.problem.team.radius
+    gaps = np.linalg.norm(s.position[:, :, None] - s.position[:, None], axis=-1) - radius[:, None] - radius
+    least = gaps[:, ~np.eye(len(radius), dtype=bool)].min()
+    assert s.report.ok
+    assert s.report.min_separation <= least + 1e-4
+    assert least - s.report.min_separation < 0.005  # between two samples robots drive as far
+    clearance = (plan.problem.world.clearance(s.position) - radius).min()
+    assert s.report.min_clearance <= clearance + 1e-4
+
+
+def test_more_acceleration_takes_less_time_and_less_jerk_more(plans: dict[str, Plan]) -> None:
+    plan = plans["slow goals"]
+    usual, strong, gentle = plan.sample(), plan.sample(max_acceleration=2.0), plan.sample(max_jerk=2.0)
+    assert strong.stretch < usual.stretch < gentle.stretch
+    assert strong.time[-1] < usual.time[-1] < gentle.time[-1]
+    assert np.linalg.norm(gentle.jerk, axis=2).max() <= 2.0 * (1 + 1e-6)
+    each = plan.sample(max_acceleration=[1.0, 1.0, 1.0, 1.0, 0.5])
+    assert np.linalg.norm(each.acceleration[:, 4], axis=1).max() <= 0.5 * (1 + 1e-6)
+
+
+def test_rows_as_a_table(plans: dict[str, Plan]) -> None:
+    s = plans["space"].sample(rate=10)
+    table = s.to_dataframe()
+    assert list(table.columns)[:6] == ["time", "robot", "x", "y", "z", "vx"]
+    np.testing.assert_array_equal(table[table.robot == 2].vz, s.velocity[:, 2, 2])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"rate": 0}, "rate"), ({"rate": np.nan}, "rate"), ({"rate": 1e9}, "rate"), ({"rate": "fast"}, "rate"),
+        ({"max_acceleration": 0}, "max_acceleration is 0; it must be positive"),
+        ({"max_acceleration": [1, 2]}, r"max_acceleration must be one number or one per robot \(5\)"),
+        ({"max_jerk": "soft"}, "max_jerk must be one number"),
+        ({"max_acceleration": 0.01}, r"needs .* m/s\^2 of acceleration, limit 0.01, and it would take"),
+    ],
+)  # fmt: skip
+def test_bad_wishes_are_named(plans: dict[str, Plan], arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        plans["plane"].sample(**arguments)
+
+
+def test_a_plan_that_fails_is_not_for_robots() -> None:
+    plan = make_planner("d4orm", engine="cpu", num_samples=16, num_steps=2).solve(
+        make_problem("circle", num_robots=8), max_iterations=1
+    )
+    assert not plan.solved
+    with pytest.raises(ValueError, match=r"the plan is not solved, and robots do not execute it: robot_\d "):
+        plan.sample()
+
+
+def driven(problem: Problem, controls: Any) -> Plan:
+    """A plan of controls that are given."""
+    search = SolveRun(make_planner("d4orm", engine="cpu"), problem, 0, None)
+    search.best = evaluate_controls(get_sampling_engine("cpu"), problem, np.asarray(controls, np.float32))
+    return search.plan("solved" if search.best.solved else "iteration_limit")
+
+
+def round_a_corner(**changes: Any) -> Plan:
+    """Right and then up, half a millimetre from a box; splines cut corners."""
+    controls = np.zeros((30, 1, 2))
+    controls[:10, 0, 0] = controls[10:20, 0, 1] = 1.0
+    world = World(boxes=[[-1.0, 0.1505, 0.8495, 3.0]])
+    settings: dict[str, Any] = {"margin": 0.0, "goal_radius": 0.01, "horizon": 30}
+    return driven(Problem(Team(("velocity2d",)), [[0, 0]], [[1, 1]], world, **settings | changes), controls)
+
+
+def test_what_touches_when_smoothed_is_refused() -> None:
+    plan = round_a_corner()
+    assert plan.solved
+    with pytest.raises(ValueError, match=r"smoothed, the plan fails: obstacle contact at .* robot_0: touches"):
+        plan.sample()
+
+
+def test_robots_that_drive_at_the_start_are_not_slowed_down() -> None:
+    controls = np.zeros((30, 1, 2))
+    controls[:10, 0, 0] = -1.0
+    problem = Problem(Team(("holonomic2d",)), [[0, 0, 1, 0]], [[0.5, 0]], horizon=30)
+    plan = driven(problem, controls)
+    assert plan.solved
+    with pytest.raises(ValueError, match="its robots drive at the start, so they cannot take longer"):
+        plan.sample()
+    s = plan.sample(max_acceleration=9.0)
+    assert s.stretch == 1
+    np.testing.assert_allclose(s.velocity[0], [[1, 0]], atol=1e-9)
+
+
+@pytest.mark.parametrize("smoothness", [1e-2, 1.0, 100.0])
+def test_a_spline_through_rest_is_rest(smoothness: float) -> None:
+    values = np.full((12, 2), 3.0)
+    spline = fit_spline(values, np.zeros(2), 0.1, smoothness)
+    np.testing.assert_allclose(spline(np.linspace(0, 1.1, 50)), 3.0, atol=1e-12)
+
+
+def test_curves_are_judged_in_numbers() -> None:
+    """Two robots of radius 0.15 pass each other 1 m apart; one ends 0.2 m from a box."""
+    team = Team(("velocity2d",) * 2)
+    world = World(boxes=[[1.35, -1, 2, 0.5]])
+    problem = Problem(team, [[0, 0], [1, 1]], [[1, 0], [0, 1]], world)
+
+    def lines(times: Any) -> Any:
+        x = np.asarray(times)[:, None] / 2
+        return np.stack([np.hstack([x, 0 * x]), np.hstack([1 - x, 0 * x + 1])], axis=1)
+
+    report = verify_curves(problem, lines, 2.0, np.zeros(2))
+    assert report.ok
+    assert report.min_separation == pytest.approx(0.7, abs=1e-6)
+    assert report.min_clearance == pytest.approx(0.2, abs=1e-6)
+    far = verify_curves(problem, lines, 1.0, np.zeros(2))
+    assert [violation.kind for violation in far.violations] == ["not arrived", "not arrived"]
+    through = verify_curves(problem, lambda times: lines(2 * np.asarray(times)), 2.0, np.zeros(2))
+    assert {violation.kind for violation in through.violations} == {"obstacle contact", "not arrived"}
+
+
+# Files.
+
+
+def test_tables_hold_the_setpoints(plans: dict[str, Plan], tmp_path: Path) -> None:
+    plan = plans["space"]
+    report = plan.export("csv", tmp_path / "new" / "out", rate=50)
+    s = plan.sample(rate=50)
+    assert [path.name for path in report.files] == [f"robot_{robot}.csv" for robot in range(5)]
+    for robot, path in enumerate(report.files):
+        with path.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        read = np.array([[float(row[name]) for name in ("time", "x", "z", "vy", "az", "heading")] for row in rows])
+        p, v, a = s.position[:, robot], s.velocity[:, robot], s.acceleration[:, robot]
+        expected = np.column_stack([s.time, p[:, 0], p[:, 2], v[:, 1], a[:, 2], s.heading[:, robot]])
+        np.testing.assert_allclose(read, expected, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["space", "walls", "wheels"])
+def test_polynomials_are_close_to_the_motion(plans: dict[str, Plan], name: str, tmp_path: Path) -> None:
+    plan, height = plans[name], 0.8
+    report = plan.export("crazyswarm2", tmp_path, height=height)
+    s = plan.sample(rate=200)
+    assert report.pieces is not None
+    assert report.pieces <= MOST_PIECES
+    assert report.num_bytes == 132 * report.pieces
+    for robot, path in enumerate(report.files):
+        with path.open() as file:
+            header, *lines = list(csv.reader(file))
+        assert header[:3] == ["Duration", "x^0", "x^1"]
+        assert header[-1] == "yaw^7"
+        table = np.array(lines, float)
+        ends = np.cumsum(table[:, 0])
+        assert ends[-1] == pytest.approx(report.duration, abs=1e-6)
+        for i, time in enumerate(s.time[:-1:20]):
+            piece = int(np.searchsorted(ends, time, side="right"))
+            own = time - (ends[piece] - table[piece, 0])
+            x, y, z, yaw = (polyval(own, table[piece, 1 + 8 * k : 9 + 8 * k]) for k in range(4))
+            place = s.position[i * 20, robot]
+            np.testing.assert_allclose([x, y], place[:2], atol=0.004)
+            assert z == pytest.approx(place[2] if len(place) == 3 else height, abs=0.004)
+            assert yaw == pytest.approx(s.heading[i * 20, robot], abs=0.05)
+        # Pieces meet in value and velocity.
+        for before, after in pairwise(table):
+            end = polyval(before[0], before[1:9])
+            speed = polyval(before[0], polyder(before[1:9]))
+            assert end == pytest.approx(after[1], abs=1e-5)
+            assert speed == pytest.approx(after[2], abs=1e-4)
+
+
+def test_a_bag_is_read_by_its_database(plans: dict[str, Plan], tmp_path: Path) -> None:
+    from rosbags.rosbag2 import Reader
+    from rosbags.typesys import Stores, get_typestore
+
+    plan = plans["wheels"]
+    plan.export("rosbag2", tmp_path, rate=20, height=0.3)
+    with sqlite3.connect(tmp_path / "motion" / "motion.db3") as database:
+        topics = dict(database.execute("select name, type from topics").fetchall())
+    assert topics["/robot_3/path"] == "nav_msgs/msg/Path"
+    assert topics["/robot_0/trajectory"] == "trajectory_msgs/msg/MultiDOFJointTrajectory"
+    assert len(topics) == 8
+    store, s = get_typestore(Stores.ROS2_HUMBLE), plan.sample(rate=20)
+    with Reader(tmp_path / "motion") as bag:
+        for connection, _, raw in bag.messages():
+            robot = int(connection.topic.split("/")[1].removeprefix("robot_"))
+            message: Any = store.deserialize_cdr(raw, connection.msgtype)
+            if connection.topic.endswith("path"):
+                places = [[p.pose.position.x, p.pose.position.y, p.pose.position.z] for p in message.poses]
+                turned = [2 * np.arctan2(p.pose.orientation.z, p.pose.orientation.w) for p in message.poses]
+                np.testing.assert_allclose(np.cos(turned), np.cos(s.heading[:, robot]), atol=1e-6)
+            else:
+                assert message.joint_names == [f"robot_{robot}"]
+                places = [[p.transforms[0].translation.x, p.transforms[0].translation.y, 0.3] for p in message.points]
+                speeds = [[p.velocities[0].linear.x, p.velocities[0].linear.y] for p in message.points]
+                np.testing.assert_allclose(speeds, s.velocity[:, robot], atol=1e-9)
+                time = message.points[7].time_from_start
+                assert time.sec + 1e-9 * time.nanosec == pytest.approx(s.time[7])
+            expected = np.column_stack([s.position[:, robot], np.full(len(s.time), 0.3)])
+            np.testing.assert_allclose(places, expected, atol=1e-9)
+
+
+def test_an_mcap_is_read_by_foxglove_s_reader(plans: dict[str, Plan], tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    plan = plans["space"]
+    plan.export("mcap", tmp_path, rate=20)
+    s, seen = plan.sample(rate=20), set()
+    with (tmp_path / "motion" / "motion.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, channel, _, message in reader.iter_decoded_messages():
+            seen.add(channel.topic)
+            if channel.topic == "/robot_1/path":
+                places = [[p.pose.position.x, p.pose.position.y, p.pose.position.z] for p in message.poses]
+                np.testing.assert_allclose(places, s.position[:, 1], atol=1e-9)
+    assert seen == {f"/robot_{robot}/{topic}" for robot in range(5) for topic in ("path", "trajectory")}
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_files_are_written_again_and_others_stay(plans: dict[str, Plan], tmp_path: Path, format: str) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    reports = [plans["plane"].export(format, tmp_path, rate=10, height=1.0) for _ in range(2)]
+    assert reports[0].files == reports[1].files
+    assert all(path.exists() for path in reports[1].files)
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+    assert not list(tmp_path.parent.glob(".export*"))
+
+
+@pytest.mark.parametrize(
+    ("format", "arguments", "message"),
+    [
+        ("cvs", {}, "format 'cvs' is unknown; choose one of csv, crazyswarm2, rosbag2, mcap"),
+        ("crazyswarm2", {}, "height is 0 m; a team that moves in the plane flies at a height above 0"),
+        ("csv", {"height": np.nan}, "height is nan; it must be finite"),
+    ],
+)
+def test_bad_exports_are_refused_and_leave_nothing(
+    plans: dict[str, Plan], tmp_path: Path, format: str, arguments: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        plans["plane"].export(format, tmp_path / "out", **arguments)
+    assert not list(tmp_path.iterdir())
+
+
+def test_too_long_a_motion_for_the_memory_on_board_is_refused(
+    plans: dict[str, Plan], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("d4orm_planners.setpoints.polynomials.MOST_PIECES", 2)
+    with pytest.raises(ValueError, match=r"2 polynomials, which is all that 4096 bytes on board hold, are"):
+        plans["walls"].export("crazyswarm2", tmp_path, height=1.0)
+
+
+def test_the_command(plans: dict[str, Plan], tmp_path: Path, d4orm: Any) -> None:
+    plans["slow goals"].save(tmp_path / "plan.npz")
+    status, out, _ = d4orm("export", str(tmp_path / "plan.npz"), "--format", "crazyswarm2", "-o", str(tmp_path / "out"),
+                           "--height", "1")  # fmt: skip
+    assert status == 0
+    assert "polynomials a robot" in out
+    assert len(list((tmp_path / "out").iterdir())) == 5
+    status, _, err = d4orm("export", str(tmp_path / "plan.npz"), "-f", "cvs", "-o", str(tmp_path / "other"))
+    assert (status, err.count("\n")) == (2, 1)
+    assert not (tmp_path / "other").exists()
