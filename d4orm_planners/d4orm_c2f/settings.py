@@ -65,7 +65,7 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
         num_samples: ``M`` of a control loop.
         num_steps: ``N`` of a control loop.
         credit: ``"robot"`` or ``"team"``: whose reward weights the samples of a control loop.
-        penalty: What a violation costs per step in a control loop, against the paper's one.
+        penalty: Cost of a violation per step in a control loop, against the paper's one.
         relative_distance: Whether distances to subgoals count relative to the initial one, as in the paper, rather than
             to how far robots get in ``m`` steps: then a robot next to its subgoal has no more to lose than others.
         safe_mix: Whether robots follow a fine plan only as far as it keeps the margin.

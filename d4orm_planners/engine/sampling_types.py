@@ -38,7 +38,7 @@ class SamplingTask:
             part of a sample by that robot's own reward.
         moving: Bodies to avoid that are not sampled, or ``None``.
         arrived: ``(K,)`` robots docked from the beginning, or ``None`` for none.
-        penalty: What a violation of the margin costs per step, against a reward of one for being at the goal.
+        penalty: Cost of a violation of the margin per step, against a reward of one for being at the goal.
         reference_distance: Distances count relative to the initial one (paper, section III-D), or to this if that is
             less: a robot that starts next to its goal then loses no more by waiting than others do. ``None`` for the
             paper's.
@@ -105,7 +105,7 @@ class DenoisingStep(NamedTuple):
     """One step of a denoising run, for observers.
 
     Attributes:
-        task: What is sampled around, and how it is scored.
+        task: Distribution of the samples, and their scoring.
         noise_scale: Standard deviation of the samples.
         mean: ``(H, K, m)`` the weighted mean of the deformations, which the next step samples around.
         samples: ``(S, H, K, m)`` the first deformations that it is the mean of, at most :data:`WATCHED_SAMPLES`.

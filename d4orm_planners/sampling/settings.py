@@ -38,7 +38,7 @@ class SamplingConfig(PlannerConfig):
             part of a sample by the robot's own reward, which keeps the signal from diluting with the number of robots;
             ``"alternate"`` does the second in the first iteration, the first in the next, and so on; ``"group"``
             weights by the reward of those that a robot was in conflict with, directly or by others, in the last plan.
-        penalty: What a violation of the margin costs a robot per step, 1 in the paper. A robot's own reward does not
+        penalty: Cost of a violation of the margin for a robot per step, 1 in the paper. A robot's own reward does not
             tell what touching it costs the other, so that going through can be cheaper than making way; 2 makes up for
             that.
         short_paths: Whether robots whose paths are all short next to their size are sampled over the steps that evading
